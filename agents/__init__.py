@@ -1,0 +1,7 @@
+"""Controllers for the middle-point temperature. They know numbers, not the environment."""
+
+from agents.controller import Controller
+from agents.direct_nn import DirectNNController, Weights
+from agents.pi import PIController
+
+__all__ = ["Controller", "DirectNNController", "PIController", "Weights"]

@@ -1,0 +1,103 @@
+"""What every controller is: something that resets and acts."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Values = NDArray[np.float64] | np.float64  # one value a loop: shape (), or (batch,)
+
+
+def action_from_command(command: Values, u_min: float, u_max: float) -> NDArray[np.float32]:
+    """Scale commands to normalised actions, -1 at `u_min` and 1 at `u_max`.
+
+    Parameters
+    ----------
+    command
+        u, t/h, any shape. Commands beyond the limits become actions beyond +-1.
+    u_min, u_max
+        The actuator's limits, t/h.
+
+    Returns
+    -------
+    ndarray of float32
+        Actions, with one more axis of length 1 at the end.
+    """
+    action = 2.0 * (command - u_min) / (u_max - u_min) - 1.0
+    return np.asarray(action, dtype=np.float32)[..., np.newaxis]
+
+
+class Controller(ABC):
+    """A controller of one loop, or of a batch of loops side by side.
+
+    Parameters
+    ----------
+    n_obs
+        The least number of elements of an observation.
+    u_min, u_max
+        The actuator's limits, t/h.
+
+    Attributes
+    ----------
+    command : float64 or ndarray of float64
+        The last command u before the actuator, t/h: a number after `act` on one observation,
+        shape (batch,) after `act` on a batch.
+
+    Raises
+    ------
+    ValueError
+        If the limits are not finite or not in order.
+    """
+
+    def __init__(self, *, n_obs: int, u_min: float, u_max: float) -> None:
+        if not (math.isfinite(u_min) and math.isfinite(u_max) and u_min < u_max):
+            raise ValueError(
+                f"u_min and u_max must be finite, u_min below u_max, got {u_min!r}, {u_max!r}"
+            )
+        self.n_obs = n_obs
+        self.u_min = u_min
+        self.u_max = u_max
+        self.command: Values = np.float64(0.0)
+
+    def reset(self) -> None:
+        """Forget the episode. What was learnt stays."""
+        self.command = np.float64(0.0)
+
+    def act(self, observation: ArrayLike) -> NDArray[np.float32]:
+        """Return the action for an observation.
+
+        Parameters
+        ----------
+        observation
+            Shape (n_obs,), or (batch, n_obs) with a row for each loop. Elements beyond those
+            that the controller reads are ignored.
+
+        Returns
+        -------
+        ndarray of float32
+            The normalised action, shape (1,) or (batch, 1). It lies outside [-1, 1] where the
+            command lies outside the actuator's limits.
+
+        Raises
+        ------
+        ValueError
+            If the observation has another shape, or a value that is not finite. The controller
+            is unchanged then.
+        """
+        values = np.asarray(observation, dtype=np.float64)
+        if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs:
+            raise ValueError(
+                f"observation must have shape (n_obs,) or (batch, n_obs), n_obs at least "
+                f"{self.n_obs}, got {values.shape}"
+            )
+        if not np.isfinite(values).all():
+            raise ValueError(f"observation must be finite, got {observation!r}")
+        self.command = self._control(values)
+        return action_from_command(self.command, self.u_min, self.u_max)
+
+    @abstractmethod
+    def _control(self, observation: NDArray[np.float64]) -> Values:
+        """Return u in t/h for an observation that has been checked."""

@@ -1,0 +1,255 @@
+"""The paper's neural-network controller, trained online from the output error of the plant."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.controller import Controller, Values
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights and thresholds of one network, or with a leading batch axis of many.
+
+    Attributes
+    ----------
+    W : ndarray, shape (N_1, N)
+        W_ij, from input i to hidden node j.
+    theta_1 : ndarray, shape (N_1,)
+        theta_1j, thresholds of the hidden nodes.
+    W_1 : ndarray, shape (N_1,)
+        W_1j1, from hidden node j to the output.
+    theta_2 : ndarray, shape ()
+        theta_21, threshold of the output.
+    """
+
+    W: Array
+    theta_1: Array
+    W_1: Array
+    theta_2: Array
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the weights to a `.npz` file."""
+        with Path(path).open("wb") as file:
+            np.savez(file, **{field.name: getattr(self, field.name) for field in fields(self)})
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Weights:
+        """Read weights that `save` has written.
+
+        Raises
+        ------
+        ValueError
+            If the file does not hold the four arrays.
+        """
+        with np.load(path, allow_pickle=False) as file:
+            missing = [field.name for field in fields(cls) if field.name not in file]
+            if missing:
+                raise ValueError(f"{path} must hold weights, {', '.join(missing)} not found")
+            return cls(**{field.name: file[field.name] for field in fields(cls)})
+
+
+class DirectNNController(Controller):
+    """A network of N inputs, N_1 hidden nodes and one output that learns while it controls.
+
+    It implements steps A to E of Section 4 of the paper: the forward pass with the weights of
+    sample k, then their update with e(k) and the activations of the same pass. Of the plant it
+    knows the direction D(G) of its response and nothing else.
+
+    Parameters
+    ----------
+    n_inputs
+        N, number of inputs: the first N elements of the observation.
+    n_hidden
+        N_1, number of hidden nodes.
+    eta
+        eta^y, gain factor of the weights W from the inputs to the hidden nodes.
+    eta_1
+        eta_1^y, gain factor of the weights W_1 from the hidden nodes to the output.
+    eta_theta
+        eta_theta^y, gain factor of the thresholds theta_1 of the hidden nodes.
+    eta_1_theta
+        eta_1theta^y, gain factor of the threshold theta_2 of the output.
+    direction
+        D(G), -1 for a plant whose output falls when its input rises, 1 for the opposite.
+    input_scale
+        Factor from the observation (degC) to the inputs X_i. The paper does not state one.
+    weight_scale
+        Initial weights and thresholds are uniform in [-weight_scale, weight_scale]. The paper
+        says "selected randomly".
+    error_index
+        Where the observation holds e(k), degC.
+    seed
+        Of the initial weights.
+    num_envs
+        Number of loops in a batch, each with a network of its own; None for a single loop.
+        Member i is to the bit the single controller with seed `seed + i`.
+    learning
+        Whether the weights are updated. May be changed at any time.
+    update_interval
+        The weights are updated at every `update_interval`-th sample, the first of an episode
+        included.
+    u_min, u_max
+        U_min and U_max, t/h: the range of the command.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range; the message names it.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_inputs: int = 6,
+        n_hidden: int = 3,
+        eta: float = 0.03,
+        eta_1: float = 0.1,
+        eta_theta: float = 0.01,
+        eta_1_theta: float = 0.01,
+        direction: int = -1,
+        input_scale: float = 0.2,
+        weight_scale: float = 0.5,
+        error_index: int = 3,
+        seed: int = 0,
+        num_envs: int | None = None,
+        learning: bool = True,
+        update_interval: int = 1,
+        u_min: float = -10.0,
+        u_max: float = 10.0,
+    ) -> None:
+        super().__init__(n_obs=max(n_inputs, error_index + 1), u_min=u_min, u_max=u_max)
+        for name, count in (
+            ("n_inputs", n_inputs),
+            ("n_hidden", n_hidden),
+            ("update_interval", update_interval),
+            ("num_envs", 1 if num_envs is None else num_envs),
+        ):
+            if not isinstance(count, int) or count < 1:
+                raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
+        for name, value in (
+            ("eta", eta),
+            ("eta_1", eta_1),
+            ("eta_theta", eta_theta),
+            ("eta_1_theta", eta_1_theta),
+            ("weight_scale", weight_scale),
+        ):
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
+        if not math.isfinite(input_scale):
+            raise ValueError(f"input_scale must be a finite number, got {input_scale!r}")
+        if direction not in (-1, 1):
+            raise ValueError(f"direction must be -1 or 1, got {direction!r}")
+        self.n_inputs = n_inputs
+        self.n_hidden = n_hidden
+        self.eta = eta
+        self.eta_1 = eta_1
+        self.eta_theta = eta_theta
+        self.eta_1_theta = eta_1_theta
+        self.direction = direction
+        self.input_scale = input_scale
+        self.weight_scale = weight_scale
+        self.error_index = error_index
+        self.num_envs = num_envs
+        self.learning = learning
+        self.update_interval = update_interval
+        self._shapes = {
+            "W": (n_hidden, n_inputs),
+            "theta_1": (n_hidden,),
+            "W_1": (n_hidden,),
+            "theta_2": (),
+        }
+        self._sample = 0  # k
+        drawn = [self._draw(np.random.default_rng(seed + i)) for i in range(num_envs or 1)]
+        if num_envs is None:
+            self.weights = Weights(*drawn[0])
+        else:
+            self.weights = Weights(*(np.stack(arrays) for arrays in zip(*drawn, strict=True)))
+
+    def _draw(self, generator: np.random.Generator) -> list[Array]:
+        scale = self.weight_scale
+        return [np.array(generator.uniform(-scale, scale, s)) for s in self._shapes.values()]
+
+    @property
+    def weights(self) -> Weights:
+        """The present weights, as a copy; with `num_envs`, each with a leading batch axis.
+
+        What is set must have the same shapes; in a batch, those of one network set them all.
+
+        Raises
+        ------
+        ValueError
+            If a shape does not fit or a value is not finite; nothing is changed then.
+        """
+        batch_last = (self._W.swapaxes(0, 1), self._theta_1, self._W_1, self._theta_2)
+        batch_first = [np.moveaxis(array, -1, 0) for array in batch_last]
+        if self.num_envs is None:
+            batch_first = [array[0] for array in batch_first]
+        return Weights(*(np.array(array, order="C") for array in batch_first))
+
+    @weights.setter
+    def weights(self, weights: Weights) -> None:
+        batch = () if self.num_envs is None else (self.num_envs,)
+        arrays = []
+        for name, shape in self._shapes.items():
+            array = np.asarray(getattr(weights, name), dtype=np.float64)
+            if array.shape not in (shape, batch + shape):
+                raise ValueError(
+                    f"weights.{name} must have shape {batch + shape}, got {array.shape}"
+                )
+            if not np.isfinite(array).all():
+                raise ValueError(f"weights.{name} must be finite")
+            every = np.broadcast_to(array, (self.num_envs or 1, *shape))
+            arrays.append(np.array(np.moveaxis(every, 0, -1), order="C"))
+        # The batch axis is last, so that sums over nodes add long rows; W as (N, N_1, batch).
+        W, self._theta_1, self._W_1, self._theta_2 = arrays
+        self._W = np.array(W.swapaxes(0, 1), order="C")
+
+    def reset(self) -> None:
+        """Forget the episode. The weights stay."""
+        super().reset()
+        self._sample = 0
+
+    def _control(self, observation: Array) -> Values:
+        batch = np.atleast_2d(observation)
+        if batch.shape[0] != (self.num_envs or 1) or (
+            self.num_envs is not None and observation.ndim == 1
+        ):
+            expected = "(n_obs,)" if self.num_envs is None else f"({self.num_envs}, n_obs)"
+            raise ValueError(f"observation must have shape {expected}, got {observation.shape}")
+        X = self.input_scale * np.ascontiguousarray(batch[:, : self.n_inputs].T)  # (N, batch)
+        e = batch[:, self.error_index]
+
+        X_1 = _sigmoid(_sum_of_rows(self._W * X[:, np.newaxis]) + self._theta_1)  # A
+        X_2 = _sigmoid(_sum_of_rows(self._W_1 * X_1) + self._theta_2)  # B
+        u = X_2 * (self.u_max - self.u_min) + self.u_min  # Section 4, last formula
+
+        if self.learning and self._sample % self.update_interval == 0:
+            delta_1 = e * self.direction * X_2 * (1.0 - X_2)  # (27)
+            delta = delta_1 * self._W_1 * X_1 * (1.0 - X_1)  # D, with W_1(k): before C
+            self._W_1 += self.eta_1 * delta_1 * X_1  # C
+            self._W += self.eta * delta * X[:, np.newaxis]  # D
+            self._theta_2 += self.eta_1_theta * delta_1  # E
+            self._theta_1 += self.eta_theta * delta  # E
+        self._sample += 1
+        return u[0] if observation.ndim == 1 else u
+
+
+def _sum_of_rows(terms: Array) -> Array:
+    # One after the other, whatever the shape: np.sum may add in another order for another
+    # batch size, and then a batch would not be to the bit what its members are alone.
+    total: Array = np.add.accumulate(terms, axis=0)[-1]
+    return total
+
+
+def _sigmoid(x: Array) -> Array:
+    activation: Array = 1.0 / (1.0 + np.exp(np.minimum(-x, 700.0)))  # (4); no overflow
+    return activation

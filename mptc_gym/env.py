@@ -1,0 +1,341 @@
+"""The Gymnasium environment `MiddlePoint-v0`: one plant, its set point and its transmitter."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import Any, ClassVar, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box, Space
+from numpy.typing import NDArray
+
+from mptc_gym.parameters import Parameters
+from mptc_gym.plant import Plant, action_from_command, command_from_action
+from mptc_gym.signals import EpisodeStream, Noise, SetPoint
+
+BLOCK = 256  # samples of set point and noise made at a time
+_FLOAT32 = np.dtype(np.float32)  # quicker to pass on than the type
+
+Observation = NDArray[np.float32]
+Action = NDArray[np.float32]
+
+
+def observation_space(parameters: Parameters) -> Space[Observation]:
+    """Bounds of the observation, shape (observation_size,), float32.
+
+    They depend on the set point only if it leaves the transmitter's range, so that a policy
+    trained on one set point can be run on another.
+    """
+    span = parameters.temperature_span
+    setpoint_limit = max(span, parameters.largest_setpoint)
+    high = np.repeat(
+        np.array([setpoint_limit, setpoint_limit + span, span, 1.0]),
+        [
+            parameters.setpoint_window,
+            parameters.error_window,
+            parameters.output_window,
+            parameters.action_window,
+        ],
+    ).astype(np.float32)
+    return Box(-high, high, dtype=np.float32)
+
+
+class MiddlePointEnv(gymnasium.Env[Observation, Action]):
+    """Control the temperature at the middle point of a once-through boiler by feedwater flow.
+
+    At the middle point of a once-through boiler, water becomes steam. More feedwater makes it
+    cooler, but only after a transport delay of 18 samples of 8 s; the actuator has a dead zone
+    and saturates; noise disturbs the temperature. The plant is the one of W. Cui and K. G. Shin,
+    "Application of Neural Networks to Temperature Control in Thermal Power Plants" (1992);
+    numbers in parentheses are its equations. All quantities are deviations from the operating
+    point.
+
+    ## Plant
+
+    ::
+
+        (28)  y(k) = 0.45181 y(k-1) + 0.47546 y(k-2)
+                     - 0.04560 u_a(k-d-1) - 0.00404 u_a(k-d-2) + n(k),       d = 18
+              n(k) = xi(k) - 0.35740 xi(k-1) - 0.03392 xi(k-2),              xi ~ N(0, R)
+        (29)  u_a = 0 where |u| < dead_zone, otherwise u limited to [u_min, u_max]
+
+    y is the temperature (degC), y_d its set point, e = y_d - y the error, u the commanded and
+    u_a the applied feedwater flow (t/h). `step` call number k (k = 0, 1, ...) takes u(k), moves
+    the plant from sample k to k+1 and returns the observation at k+1 and the reward of e(k+1).
+    So u(0) first shows in y(19).
+
+    ## Action space
+
+    `Box(-1, 1, (1,), float32)`: u = u_min + (a + 1) / 2 * (u_max - u_min).
+
+    | Index | Action | at -1 | at 1 | Unit |
+    |---|---|---|---|---|
+    | 0 | feedwater flow u | u_min = -10 | u_max = 10 | t/h |
+
+    An action outside the box is a command outside the range, and the actuator saturates it.
+
+    ## Observation space
+
+    A 1-D float32 `Box` with the following blocks, each with the newest sample first. `y` here is
+    the transmitter's reading, which saturates at +-`temperature_span`.
+
+    | Block | Elements (default) | Bounds (default) | Unit |
+    |---|---|---|---|
+    | set points y_d(k), y_d(k-1), ... | `setpoint_window` (3) | +-50 | degC |
+    | errors e(k), e(k-1), ... | `error_window` (3) | +-100 | degC |
+    | outputs y(k), y(k-1), ... | `output_window` (0) | +-50 | degC |
+    | actions a(k-1), a(k-2), ... | `action_window` (0) | +-1 | 1 |
+
+    The default is the six inputs of the paper's neural network. Past actions are shown as the
+    actuator limits them, within +-1. With `action_window=delay+2` the noise-free problem is
+    Markov while the set point holds. If the set point can exceed the span, its bounds widen to
+    hold it.
+
+    ## Reward
+
+    | `reward` | reward of the step to k+1 |
+    |---|---|
+    | "quadratic" | -(e(k+1) / error_scale)^2 / 2 - move_weight * abs(a(k) - a(k-1)) |
+    | "absolute" | -abs(e(k+1)) / error_scale - move_weight * abs(a(k) - a(k-1)) |
+
+    "quadratic" is the negative of the paper's cost (12), scaled. The best possible reward of a
+    step is 0; at the default set point, a plant that is left alone earns -0.5 a step. There is
+    no lower bound: e is the error of the true temperature, which no transmitter limits.
+
+    ## Starting state
+
+    Before k = 0 the plant has been at rest: y, y_d, e, u, u_a and xi are all 0, so y(0) = 0.
+    Noise and set point are drawn from the seed alone, in separate streams, so that every
+    controller meets the same ones. The j-th episode after a seed is the same however long the
+    episodes before it were. `reset` knows no options.
+
+    ## Episode end
+
+    Nothing terminates an episode. `gymnasium.make` truncates it after 1200 steps.
+
+    ## Arguments
+
+    All are keyword-only and can be given to `gymnasium.make`.
+
+    | Argument | Default | Meaning |
+    |---|---|---|
+    | `a` | (1, -0.45181, -0.47546) | coefficients of A in (28), from z^0 on; the first is 1 |
+    | `b` | (-0.04560, -0.00404) | coefficients of B in (28), from z^-1 on, degC per t/h |
+    | `c` | (1, -0.35740, -0.03392) | coefficients of C in (28), from z^0 on; the first is 1 |
+    | `delay` | 18 | transport delay d, samples |
+    | `dead_zone` | 5.0 | half width of the dead zone, t/h |
+    | `u_min`, `u_max` | -10.0, 10.0 | the actuator's limits, t/h |
+    | `noise_variance` | 0.0 | R, the variance of xi, degC^2 |
+    | `sampling_interval` | 8.0 | s; the scale of the time axis, without effect on the dynamics |
+    | `setpoint` | "square" | "square", "random", a number (constant), or a list of numbers (one a sample, the last one held) |
+    | `setpoint_amplitude` | 5.0 | A, degC. "square": A for the first half period, then -A. "random": levels uniform in [-A, A] |
+    | `setpoint_period` | 600 | samples. "random": each level is held for a length uniform in [period/6, period/2] |
+    | `setpoint_window`, `error_window` | 3, 3 | how many of the latest y_d and e the observation holds |
+    | `output_window`, `action_window` | 0, 0 | the same for measured outputs and past actions |
+    | `temperature_span` | 50.0 | degC; the measurement saturates at +-span |
+    | `reward` | "quadratic" | "quadratic" or "absolute" |
+    | `error_scale` | 5.0 | degC; the error that costs 1/2 ("quadratic") or 1 ("absolute") a step |
+    | `move_weight` | 0.0 | cost of a unit change of the normalised action |
+    | `render_mode` | None | None |
+
+    ## Info
+
+    `reset` and `step` return a fresh dict of floats: `output` (the true y, degC), `setpoint`
+    (y_d, degC), `error` (y_d - y, degC), `command` (u, t/h), `applied` (u_a, t/h) and `noise`
+    (n, degC). After a step `command` and `applied` are those of the step, the others those of
+    the sample it leads to. At reset `command`, `applied` and `noise` are 0.
+
+    ## Errors
+
+    A bad argument is a `ValueError` from the constructor that names it; a misspelt one a
+    `TypeError`. An action that is not one finite number is a `ValueError` from `step` and leaves
+    the plant as it was.
+
+    ## Version history
+
+    * v0: first version.
+    """  # noqa: E501 (the tables)
+
+    metadata: dict[str, Any] = {"render_modes": [], "render_fps": 30}  # noqa: RUF012 (as in Env)
+
+    # One list of arguments, that of `Parameters`; help() and editors see it spelt out here.
+    __signature__: ClassVar[inspect.Signature] = inspect.Signature(
+        [
+            *inspect.signature(Parameters).parameters.values(),
+            inspect.Parameter(
+                "render_mode",
+                inspect.Parameter.KEYWORD_ONLY,
+                default=None,
+                annotation="str | None",
+            ),
+        ]
+    )
+
+    def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
+        self.parameters = parameters = Parameters(**arguments)
+        if render_mode is not None:
+            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+        self.render_mode = render_mode
+        self.action_space = Box(-1.0, 1.0, (1,), np.float32)
+        self.observation_space = observation_space(parameters)
+        # What step uses, in two tuples: unpacking one costs less than as many attributes.
+        self._constants = (
+            parameters.u_min,
+            parameters.u_max,
+            parameters.error_scale,
+            parameters.reward == "quadratic",
+            parameters.move_weight,
+        )
+        error_head = parameters.setpoint_window  # where each block of the observation begins
+        output_head = error_head + parameters.error_window
+        action_head = output_head + parameters.output_window
+        self._layout = (
+            parameters.temperature_span,
+            error_head,
+            output_head,
+            action_head,
+            parameters.observation_size,
+        )
+        self._streams: tuple[EpisodeStream, EpisodeStream] | None = None
+        # (y_d, n) of the samples ahead, the next one last.
+        self._ahead: list[tuple[float, float]] = []
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, float]]:
+        """Bring the plant to rest and start an episode at k = 0.
+
+        Parameters
+        ----------
+        seed
+            Starts the environment's random streams anew. Without it, the next episode of the
+            present streams begins.
+        options
+            Not used.
+
+        Returns
+        -------
+        observation
+            The observation at k = 0, shape (observation_size,), float32.
+        info
+            See the class docstring.
+        """
+        super().reset(seed=seed)
+        if seed is not None or self._streams is None:
+            # In this order for ever: a later stream must not change these two.
+            root = cast("np.random.SeedSequence", self.np_random.bit_generator.seed_seq)
+            noise_seed, setpoint_seed = root.spawn(2)
+            self._streams = EpisodeStream(noise_seed), EpisodeStream(setpoint_seed)
+        parameters = self.parameters
+        noise_stream, setpoint_stream = self._streams
+        self._noise = Noise(parameters, noise_stream)
+        self._setpoint = SetPoint(parameters, setpoint_stream)
+        self._plant = Plant(parameters)
+
+        # At rest u is 0, whatever action that is.
+        self._action = action_from_command(0.0, parameters.u_min, parameters.u_max)
+        size, actions = parameters.observation_size, parameters.action_window
+        rest = _limited(self._action, 1.0)
+        self._window = [0.0] * (size - actions) + [rest] * (actions + 1)
+        self._ahead.clear()
+
+        setpoint = float(self._setpoint.take(1)[0])
+        return self._observe(setpoint, 0.0, self._action), {
+            "output": 0.0,
+            "setpoint": setpoint,
+            "error": setpoint,
+            "command": 0.0,
+            "applied": 0.0,
+            "noise": 0.0,
+        }
+
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
+        """Apply a normalised action for one sample.
+
+        Parameters
+        ----------
+        action
+            a(k), shape (1,).
+
+        Returns
+        -------
+        observation, reward, terminated, truncated, info
+            At k+1; see the class docstring.
+
+        Raises
+        ------
+        ValueError
+            If the action is not one finite number. The plant is untouched then.
+        ResetNeeded
+            If the environment has never been reset.
+        """
+        a = _scalar(action)
+        if not self._ahead:
+            self._look_ahead()
+        setpoint, noise = self._ahead.pop()
+        u_min, u_max, error_scale, quadratic, move_weight = self._constants
+
+        command = command_from_action(a, u_min, u_max)
+        applied, output = self._plant.step(command, noise)
+        error = setpoint - output
+        scaled = error / error_scale
+        cost = scaled * scaled / 2.0 if quadratic else abs(scaled)  # (12)
+        if move_weight:
+            cost += move_weight * abs(a - self._action)
+        self._action = a
+        return (
+            self._observe(setpoint, output, a),
+            -cost,
+            False,
+            False,
+            {
+                "output": output,
+                "setpoint": setpoint,
+                "error": error,
+                "command": command,
+                "applied": applied,
+                "noise": noise,
+            },
+        )
+
+    def render(self) -> None:
+        """Do nothing: there is no render mode yet."""
+
+    def _look_ahead(self) -> None:
+        if self._streams is None:
+            raise ResetNeeded("call reset before step")
+        setpoints = self._setpoint.take(BLOCK).tolist()
+        noises = self._noise.take(BLOCK).tolist()
+        self._ahead = list(zip(setpoints, noises, strict=True))[::-1]
+
+    def _observe(self, setpoint: float, output: float, action: float) -> Observation:
+        span, error_head, output_head, action_head, size = self._layout
+        measured = output if -span <= output <= span else _limited(output, span)
+        # All blocks move by one at once; what crosses into the next block is overwritten there.
+        # An empty block begins where the next one does, which is written after it, or at the
+        # spare element at the end.
+        window = self._window
+        window.insert(0, setpoint)
+        window.pop()
+        window[error_head] = setpoint - measured
+        window[output_head] = measured
+        window[action_head] = action if -1.0 <= action <= 1.0 else _limited(action, 1.0)
+        # The quickest way from a few floats to an array.
+        return np.fromiter(window, _FLOAT32, size)
+
+
+def _limited(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)
+
+
+def _scalar(action: Action) -> float:
+    try:
+        value = float(np.asarray(action).item())
+    except (TypeError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"action must be an array of one finite number, got {action!r}")
+    return value
