@@ -1,0 +1,97 @@
+"""Measures of how well a run went."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.rollout import Trajectory
+from mptc_gym import Parameters
+
+Array = NDArray[np.float64]
+
+SETTLING_BAND = 0.05  # of the set-point change
+
+# Name in tables and CSV files: heading.
+METRICS: dict[str, str] = {
+    "mae": "mean |e| (°C)",
+    "ise": "ISE (°C² min)",
+    "itae": "ITAE (°C min²)",
+    "total_variation": "total variation (t/h)",
+    "overshoot": "overshoot (%)",
+    "settling_time": "settling time (min)",
+    "dead_zone_share": "in dead zone (%)",
+    "saturation_share": "saturated (%)",
+}
+
+
+def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
+    """Compute every measure of `METRICS` for every run.
+
+    Parameters
+    ----------
+    trajectory
+        The runs.
+    parameters
+        The environment's arguments in these runs.
+
+    Returns
+    -------
+    dict of ndarray, shape (runs,)
+        In degC, t/h and minutes, and shares in percent:
+
+        - `mae`: mean of |e|;
+        - `ise`: integral of e^2;
+        - `itae`: integral of t |e|, t counted from the latest set-point change;
+        - `total_variation`: of the applied input, sum of |u_a(k) - u_a(k-1)| from rest;
+        - `overshoot`: how far the output goes beyond the new set point, as a percentage of the
+          set-point change; the largest of all changes;
+        - `settling_time`: from a set-point change until the error stays within
+          `SETTLING_BAND` of the change; the longest of all changes, infinite if one of them is
+          not settled when the next comes or the run ends;
+        - `dead_zone_share`: samples whose command lies inside the dead zone;
+        - `saturation_share`: samples whose command lies at or beyond a limit.
+    """
+    interval = parameters.sampling_interval / 60.0  # min
+    command = trajectory.command
+    error = trajectory.setpoint - trajectory.output
+    moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
+    saturated = (command <= parameters.u_min) | (command >= parameters.u_max)
+    by_steps = [
+        _measure_steps(setpoint, output)
+        for setpoint, output in zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
+    ]
+    samples_itae, overshoot, settling = np.array(by_steps).T
+    return {
+        "mae": np.abs(error).mean(axis=0),
+        "ise": interval * np.square(error).sum(axis=0),
+        "itae": interval**2 * samples_itae,
+        "total_variation": np.abs(moves).sum(axis=0),
+        "overshoot": 100.0 * overshoot,
+        "settling_time": interval * settling,
+        "dead_zone_share": 100.0 * (np.abs(command) < parameters.dead_zone).mean(axis=0),
+        "saturation_share": 100.0 * saturated.mean(axis=0),
+    }
+
+
+def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]:
+    """ITAE (degC samples^2), overshoot (share) and settling time (samples) of one run."""
+    changes = np.flatnonzero(np.diff(setpoint, prepend=0.0))
+    bounds = np.unique(np.r_[0, changes, len(setpoint)])
+    itae, overshoot, settling = 0.0, 0.0, 0.0
+    before = 0.0  # the set point before k = 0
+    for start, stop in itertools.pairwise(bounds):
+        error = setpoint[start:stop] - output[start:stop]
+        itae += float(np.arange(stop - start) @ np.abs(error))
+        change = setpoint[start] - before
+        before = setpoint[start]
+        if change == 0.0:  # a run that begins at set point 0
+            continue
+        overshoot = max(overshoot, float(np.max(-error / change)))
+        outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(change))
+        last = outside[-1] if len(outside) else -1
+        settling = max(settling, math.inf if last == stop - start - 1 else float(last + 1))
+    return itae, overshoot, settling

@@ -1,0 +1,332 @@
+"""PPO of Stable-Baselines3, trained on simulated plants before it is compared."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import pickle
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from benchmarks.metrics import measure
+from benchmarks.rollout import make_plants, rollout
+from benchmarks.scenarios import SCENARIOS
+from benchmarks.storage import ROOT, replacing, versions, write_json
+from mptc_gym import Parameters
+
+DELAY = Parameters().delay
+CHECKPOINT_INTERVAL = 65_536  # samples of experience between checkpoints
+PROBE = SCENARIOS["square"]  # where the learning curve is measured, on the plant trained on
+PROBE_SEED = 1_000_000  # met by no comparison
+
+
+@dataclass(frozen=True)
+class PPOArguments:
+    """Everything that shapes a policy, except versions and code."""
+
+    seed: int = 0
+    """Of the initial policy, the exploration, and the set points and noise met in training."""
+    steps: int = 1_000_000
+    """Samples of experience, all plants together."""
+    plant: dict[str, Any] = field(default_factory=dict)
+    """Arguments of the environment trained on that are not its defaults."""
+    setpoint_amplitude: float = 6.0
+    """Random set points are uniform within this, degC."""
+    action_window: int = DELAY + 2
+    """Past actions in the observation; with delay + 2 the noise-free problem is Markov."""
+    n_envs: int = 64
+    """Plants that are run side by side."""
+    n_steps: int = 128
+    """Samples of each plant between two updates."""
+    batch_size: int = 1024
+    n_epochs: int = 5
+    learning_rate: float = 1e-3
+    """At the start; it falls linearly to zero."""
+    gamma: float = 0.95
+    """Discount a sample."""
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    ent_coef: float = 0.0
+    log_std_init: float = -0.5
+    """Logarithm of the initial standard deviation of the normalised action."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Nodes of the hidden layers, of policy and value function alike."""
+
+    @property
+    def observation(self) -> dict[str, Any]:
+        """Arguments of the environment that give the policy its observation."""
+        return {"action_window": self.action_window}
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """Arguments of the environment trained on."""
+        return {
+            **self.plant,
+            **self.observation,
+            "setpoint": "random",
+            "setpoint_amplitude": self.setpoint_amplitude,
+        }
+
+
+class FixedScaling(BaseFeaturesExtractor):
+    """Scales observations by fixed factors: the same in training and in use."""
+
+    def __init__(self, observation_space: gymnasium.spaces.Box, factors: list[float]) -> None:
+        super().__init__(observation_space, features_dim=len(factors))
+        self.register_buffer("factors", torch.tensor(factors))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Return scaled observations."""
+        return observations * self.factors
+
+
+class PolicyController:
+    """A trained policy as a controller; it takes the mean of the policy's distribution."""
+
+    def __init__(self, model: PPO) -> None:
+        self._model = model
+
+    def reset(self) -> None:
+        """Do nothing: the observation holds all that the policy remembers."""
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
+        actions, _ = self._model.predict(observation, deterministic=True)
+        return actions
+
+
+class Trained:
+    """Builds PPO controllers, and trains a policy for every plant that has none yet.
+
+    Parameters
+    ----------
+    arguments
+        How to train; `plant` is replaced by the plant to be controlled.
+    folder
+        Where policies are kept.
+    retrain
+        Whether to train even where a finished policy is at hand.
+    progress
+        Whether to show a progress bar.
+
+    Attributes
+    ----------
+    folders : dict of str to Path
+        Where the policies used so far are kept, by the plant they were trained on.
+    """
+
+    def __init__(
+        self, arguments: PPOArguments, folder: Path, *, retrain: bool, progress: bool
+    ) -> None:
+        self.arguments = arguments
+        self.folder = folder
+        self.retrain = retrain
+        self.progress = progress
+        self.observation = arguments.observation
+        self.folders: dict[str, Path] = {}
+        self._models: dict[str, PPO] = {}
+
+    def __call__(self, parameters: Parameters) -> PolicyController:
+        """Return a controller for a plant."""
+        plant = plant_arguments(parameters)
+        label = ", ".join(f"{name} = {value}" for name, value in plant.items()) or "nominal"
+        if label not in self._models:
+            arguments = replace(self.arguments, plant=plant)
+            self.folders[label] = self.folder / policy_key(arguments)
+            self._models[label] = trained_policy(
+                arguments,
+                self.folders[label],
+                retrain=self.retrain,
+                progress=self.progress,
+                title=f"PPO on the plant with {label}" if plant else "PPO on the nominal plant",
+            )
+        return PolicyController(self._models[label])
+
+
+def plant_arguments(parameters: Parameters) -> dict[str, Any]:
+    """Return the arguments that say which plant it is, where they are not the defaults."""
+    names = ("a", "b", "c", "delay", "dead_zone", "u_min", "u_max", "noise_variance")
+    nominal = Parameters()
+    return {
+        name: getattr(parameters, name)
+        for name in names
+        if getattr(parameters, name) != getattr(nominal, name)
+    }
+
+
+def policy_key(arguments: PPOArguments) -> str:
+    """Return a name made of everything that shapes a policy: arguments, versions and code."""
+    sources = [*sorted((ROOT / "mptc_gym").glob("*.py")), Path(__file__)]
+    shaped_by = {
+        "arguments": asdict(arguments),
+        "versions": versions(),
+        "sources": [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources],
+    }
+    return hashlib.sha256(json.dumps(shaped_by, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def trained_policy(
+    arguments: PPOArguments, folder: Path, *, retrain: bool, progress: bool, title: str
+) -> PPO:
+    """Load the policy that a folder holds, or finish or begin its training.
+
+    Parameters
+    ----------
+    arguments
+        How to train.
+    folder
+        Where the policy is kept: `policy.zip`, `learning.csv` (the learning curve) and
+        `arguments.json` when it is finished, `checkpoint.pkl` until then.
+    retrain
+        Whether to forget what the folder holds.
+    progress
+        Whether to show a progress bar.
+    title
+        What to call the training on the screen.
+
+    Returns
+    -------
+    PPO
+        The finished policy. Training that was interrupted and resumed ends in the same policy,
+        to the bit, as training that was not.
+    """
+    policy, checkpoint = folder / "policy.zip", folder / "checkpoint.pkl"
+    if retrain:
+        policy.unlink(missing_ok=True)
+        checkpoint.unlink(missing_ok=True)
+    if policy.exists():
+        return PPO.load(policy, device="cpu")
+
+    torch.set_num_threads(1)  # the network is too small for more
+    if checkpoint.exists():
+        model, curve = _resume(checkpoint)
+    else:
+        model, curve = _begin(arguments), []
+    if progress:
+        print(f"{title}: {arguments.steps - model.num_timesteps} samples to go", flush=True)
+    keeper = _Keeper(arguments, checkpoint, curve)
+    model.learn(
+        arguments.steps - model.num_timesteps,
+        callback=keeper,
+        reset_num_timesteps=False,
+        progress_bar=progress,
+    )
+    keeper.record()
+    with replacing(folder / "learning.csv") as partial:
+        pd.DataFrame(keeper.curve).to_csv(partial, index=False)
+    write_json(folder / "arguments.json", asdict(arguments) | {"versions": versions()})
+    with replacing(policy) as partial:
+        model.save(partial)
+    checkpoint.unlink(missing_ok=True)
+    return model
+
+
+def _begin(arguments: PPOArguments) -> PPO:
+    def make_plant() -> gymnasium.Env[Any, Any]:
+        return gymnasium.make("MiddlePoint-v0", **arguments.training)
+
+    plants = DummyVecEnv([make_plant] * arguments.n_envs)
+    parameters = Parameters(**arguments.training)
+    degrees = parameters.observation_size - parameters.action_window
+    factors = [1.0 / parameters.error_scale] * degrees + [1.0] * parameters.action_window
+    return PPO(
+        "MlpPolicy",
+        plants,
+        learning_rate=LinearSchedule(arguments.learning_rate, 0.0, 1.0),
+        n_steps=arguments.n_steps,
+        batch_size=arguments.batch_size,
+        n_epochs=arguments.n_epochs,
+        gamma=arguments.gamma,
+        gae_lambda=arguments.gae_lambda,
+        clip_range=arguments.clip_range,
+        ent_coef=arguments.ent_coef,
+        policy_kwargs={
+            "features_extractor_class": FixedScaling,
+            "features_extractor_kwargs": {"factors": factors},
+            "log_std_init": arguments.log_std_init,
+            "net_arch": list(arguments.hidden),
+        },
+        seed=arguments.seed,
+        device="cpu",
+    )
+
+
+class _Keeper(BaseCallback):
+    """Records the learning curve and keeps checkpoints, both between two updates."""
+
+    def __init__(
+        self, arguments: PPOArguments, checkpoint: Path, curve: list[dict[str, float]]
+    ) -> None:
+        super().__init__()
+        self.curve = curve
+        self._arguments = arguments
+        self._checkpoint = checkpoint
+        self._probe = replace(PROBE, arguments={**PROBE.arguments, **arguments.plant})
+        self._errors: list[float] = []
+        self._began = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
+
+    def _on_step(self) -> bool:
+        self._errors += [abs(info["error"]) for info in self.locals["infos"]]
+        return True
+
+    def _on_rollout_start(self) -> None:
+        before = self.curve[-1]["steps"] if self.curve else 0
+        if self.num_timesteps - before >= CHECKPOINT_INTERVAL:
+            self.record()
+            _save(self.model, self.curve, self._checkpoint)
+
+    def record(self) -> None:
+        """Add a point to the learning curve."""
+        samples = self._probe.samples
+        plants = make_plants(1, samples, **self._arguments.observation, **self._probe.arguments)
+        trajectory = rollout(plants, PolicyController(self.model), samples, seed=PROBE_SEED)
+        self.curve.append(
+            {
+                "steps": self.num_timesteps,
+                "seconds": time.perf_counter() - self._began,
+                "training_mae": float(np.mean(self._errors)) if self._errors else math.nan,
+                "square_mae": float(measure(trajectory, self._probe.parameters)["mae"][0]),
+            }
+        )
+        self._errors.clear()
+
+
+def _save(model: PPO, curve: list[dict[str, float]], path: Path) -> None:
+    saved = io.BytesIO()
+    model.save(saved)
+    state = {
+        "model": saved.getvalue(),
+        "plants": model.get_env(),
+        "numpy": np.random.get_state(),  # noqa: NPY002 (SB3 shuffles its batches with it)
+        "torch": torch.get_rng_state(),
+        "curve": curve,
+    }
+    with replacing(path) as partial, partial.open("wb") as file:
+        pickle.dump(state, file)
+
+
+def _resume(path: Path) -> tuple[PPO, list[dict[str, float]]]:
+    with path.open("rb") as file:
+        state = pickle.load(file)
+    # force_reset=False: go on in the middle of the episodes.
+    model = PPO.load(
+        io.BytesIO(state["model"]), env=state["plants"], device="cpu", force_reset=False
+    )
+    np.random.set_state(state["numpy"])  # noqa: NPY002
+    torch.set_rng_state(state["torch"])
+    return model, state["curve"]

@@ -1,0 +1,86 @@
+"""The one rollout loop: a controller on a batch of plants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+import mptc_gym  # noqa: F401 (registers the environment)
+
+
+class Agent(Protocol):
+    """What a controller must offer to be rolled out."""
+
+    def reset(self) -> None:
+        """Forget the episode."""
+
+    def act(self, observation: Any) -> Any:
+        """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What happened in a batch of runs; every array has shape (samples, runs).
+
+    Attributes
+    ----------
+    setpoint, output
+        y_d(k) and y(k), degC.
+    command, applied
+        u(k) and u_a(k), t/h.
+    noise
+        n(k), degC.
+    """
+
+    setpoint: NDArray[np.float64]
+    output: NDArray[np.float64]
+    command: NDArray[np.float64]
+    applied: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+
+def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vector.VectorEnv:
+    """Make a batch of plants whose episodes last `samples` samples."""
+    return gymnasium.make_vec(
+        "MiddlePoint-v0", num_envs=num_envs, max_episode_steps=samples, **arguments
+    )
+
+
+def rollout(
+    plants: gymnasium.vector.VectorEnv, agent: Agent, samples: int, seed: int
+) -> Trajectory:
+    """Run one episode of every plant in a batch.
+
+    Parameters
+    ----------
+    plants
+        The batch.
+    agent
+        The controller of the batch; it is reset first.
+    samples
+        Number of samples, k = 0 to samples - 1. Not more than an episode lasts.
+    seed
+        Run i meets the noise and the set point of seed `seed + i`.
+
+    Returns
+    -------
+    Trajectory
+        Of all runs.
+    """
+    shape = samples, plants.num_envs
+    trajectory = Trajectory(*(np.empty(shape) for _ in fields(Trajectory)))
+    agent.reset()
+    observation, info = plants.reset(seed=seed)
+    for k in range(samples):
+        trajectory.setpoint[k] = info["setpoint"]
+        trajectory.output[k] = info["output"]
+        trajectory.noise[k] = info["noise"]
+        observation, _, _, _, info = plants.step(agent.act(observation))
+        # A step reports the command and the applied input of the sample that it starts from.
+        trajectory.command[k] = info["command"]
+        trajectory.applied[k] = info["applied"]
+    return trajectory
