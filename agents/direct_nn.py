@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from numbers import Integral
 from os import PathLike
 from pathlib import Path
 
@@ -127,14 +128,17 @@ class DirectNNController(Controller):
         u_max: float = 10.0,
     ) -> None:
         super().__init__(n_obs=max(n_inputs, error_index + 1), u_min=u_min, u_max=u_max)
-        for name, count in (
-            ("n_inputs", n_inputs),
-            ("n_hidden", n_hidden),
-            ("update_interval", update_interval),
-            ("num_envs", 1 if num_envs is None else num_envs),
+        for name, count, least in (
+            ("n_inputs", n_inputs, 1),
+            ("n_hidden", n_hidden, 1),
+            ("update_interval", update_interval, 1),
+            ("num_envs", 1 if num_envs is None else num_envs, 1),
+            ("seed", seed, 0),
         ):
-            if not isinstance(count, int) or count < 1:
-                raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
+            if not isinstance(count, Integral) or count < least:
+                raise ValueError(
+                    f"{name} must be an integer of at least {least}, got {count!r}"
+                )
         for name, value in (
             ("eta", eta),
             ("eta_1", eta_1),

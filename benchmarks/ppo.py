@@ -22,6 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
+from tqdm import tqdm
 
 from benchmarks.metrics import measure
 from benchmarks.rollout import make_plants, rollout
@@ -47,30 +48,41 @@ class PPOArguments:
     """Arguments of the environment trained on that are not its defaults."""
     setpoint_amplitude: float = 6.0
     """Random set points are uniform within this, degC."""
+    reward: str = "absolute"
+    """The environment's; "absolute" is what the comparison measures."""
+    output_window: int = 2
+    """Past outputs in the observation."""
     action_window: int = DELAY + 2
     """Past actions in the observation; with delay + 2 the noise-free problem is Markov."""
-    n_envs: int = 64
+    n_envs: int = 128
     """Plants that are run side by side."""
-    n_steps: int = 128
+    n_steps: int = 64
     """Samples of each plant between two updates."""
-    batch_size: int = 1024
-    n_epochs: int = 5
+    batch_size: int = 2048
+    """Samples of a gradient step."""
+    n_epochs: int = 10
+    """How often an update goes through its samples."""
     learning_rate: float = 1e-3
     """At the start; it falls linearly to zero."""
     gamma: float = 0.95
     """Discount a sample."""
     gae_lambda: float = 0.95
+    """Trade-off between bias and variance of the advantages."""
     clip_range: float = 0.2
-    ent_coef: float = 0.0
-    log_std_init: float = -0.5
-    """Logarithm of the initial standard deviation of the normalised action."""
+    """How far an update may move the probability of an action."""
+    log_std: tuple[float, float] = (-0.5, -2.0)
+    """Logarithm of the standard deviation of the normalised action, at the start and at the end.
+
+    It falls linearly. Left to itself it stays high, and as the actuator cuts the noise off at its
+    limits, a mean that is right with so much noise is wrong without it.
+    """
     hidden: tuple[int, ...] = (64, 64)
     """Nodes of the hidden layers, of policy and value function alike."""
 
     @property
     def observation(self) -> dict[str, Any]:
         """Arguments of the environment that give the policy its observation."""
-        return {"action_window": self.action_window}
+        return {"output_window": self.output_window, "action_window": self.action_window}
 
     @property
     def training(self) -> dict[str, Any]:
@@ -78,6 +90,7 @@ class PPOArguments:
         return {
             **self.plant,
             **self.observation,
+            "reward": self.reward,
             "setpoint": "random",
             "setpoint_amplitude": self.setpoint_amplitude,
         }
@@ -217,16 +230,19 @@ def trained_policy(
         model, curve = _resume(checkpoint)
     else:
         model, curve = _begin(arguments), []
-    if progress:
-        print(f"{title}: {arguments.steps - model.num_timesteps} samples to go", flush=True)
-    keeper = _Keeper(arguments, checkpoint, curve)
-    model.learn(
-        arguments.steps - model.num_timesteps,
-        callback=keeper,
-        reset_num_timesteps=False,
-        progress_bar=progress,
+    left = arguments.steps - model.num_timesteps
+    bar = tqdm(
+        desc=title,
+        total=arguments.steps,
+        initial=model.num_timesteps,
+        unit=" samples",
+        unit_scale=True,
+        disable=not progress,
     )
-    keeper.record()
+    with bar:
+        keeper = _Keeper(arguments, checkpoint, curve, bar)
+        model.learn(left, callback=keeper, reset_num_timesteps=False)
+        keeper.record()
     with replacing(folder / "learning.csv") as partial:
         pd.DataFrame(keeper.curve).to_csv(partial, index=False)
     write_json(folder / "arguments.json", asdict(arguments) | {"versions": versions()})
@@ -254,11 +270,9 @@ def _begin(arguments: PPOArguments) -> PPO:
         gamma=arguments.gamma,
         gae_lambda=arguments.gae_lambda,
         clip_range=arguments.clip_range,
-        ent_coef=arguments.ent_coef,
         policy_kwargs={
             "features_extractor_class": FixedScaling,
             "features_extractor_kwargs": {"factors": factors},
-            "log_std_init": arguments.log_std_init,
             "net_arch": list(arguments.hidden),
         },
         seed=arguments.seed,
@@ -270,10 +284,15 @@ class _Keeper(BaseCallback):
     """Records the learning curve and keeps checkpoints, both between two updates."""
 
     def __init__(
-        self, arguments: PPOArguments, checkpoint: Path, curve: list[dict[str, float]]
+        self,
+        arguments: PPOArguments,
+        checkpoint: Path,
+        curve: list[dict[str, float]],
+        bar: tqdm[Any],
     ) -> None:
         super().__init__()
         self.curve = curve
+        self._bar = bar
         self._arguments = arguments
         self._checkpoint = checkpoint
         self._probe = replace(PROBE, arguments={**PROBE.arguments, **arguments.plant})
@@ -282,9 +301,14 @@ class _Keeper(BaseCallback):
 
     def _on_step(self) -> bool:
         self._errors += [abs(info["error"]) for info in self.locals["infos"]]
+        self._bar.update(len(self.locals["infos"]))
         return True
 
     def _on_rollout_start(self) -> None:
+        first, last = self._arguments.log_std
+        progress = min(self.num_timesteps / self._arguments.steps, 1.0)
+        with torch.no_grad():
+            self.model.policy.log_std.fill_(first + progress * (last - first))
         before = self.curve[-1]["steps"] if self.curve else 0
         if self.num_timesteps - before >= CHECKPOINT_INTERVAL:
             self.record()
@@ -304,6 +328,9 @@ class _Keeper(BaseCallback):
             }
         )
         self._errors.clear()
+        self._bar.set_postfix_str(
+            f"mean |e| {self.curve[-1]['square_mae']:.3f} on the square wave"
+        )
 
 
 def _save(model: PPO, curve: list[dict[str, float]], path: Path) -> None:

@@ -48,8 +48,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
     At the middle point of a once-through boiler, water becomes steam. More feedwater makes it
     cooler, but only after a transport delay of 18 samples of 8 s; the actuator has a dead zone
-    and saturates; noise disturbs the temperature. The plant is the one of W. Cui and K. G. Shin,
-    "Application of Neural Networks to Temperature Control in Thermal Power Plants" (1992);
+    and saturates; noise disturbs the temperature. The plant is the one of X. Cui and K. G. Shin,
+    "Application of neural networks to temperature control in thermal power plants" (1992);
     numbers in parentheses are its equations. All quantities are deviations from the operating
     point.
 
@@ -177,7 +177,10 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         self.parameters = parameters = Parameters(**arguments)
         if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+            # Not a ValueError: after a TypeError, Stable-Baselines3 tries again without a mode.
+            raise TypeError(
+                f"render_mode must be None, got {render_mode!r}: nothing is drawn yet"
+            )
         self.render_mode = render_mode
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = observation_space(parameters)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
@@ -10,8 +10,6 @@ from typing import Any, Final, NoReturn
 
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
-
-_LARGEST: Any = sys.float_info.max
 
 
 def _reject(name: str, value: object, allowed: str) -> NoReturn:
@@ -21,8 +19,10 @@ def _reject(name: str, value: object, allowed: str) -> NoReturn:
 def _is_number(value: Any) -> bool:
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
-    # Neither NaN nor infinite nor an integer beyond all floats.
-    return bool(-_LARGEST <= value <= _LARGEST)
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond all floats
+        return False
 
 
 def _number(name: str, value: Any, allowed: str = "a finite number") -> float:

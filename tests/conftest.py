@@ -1,0 +1,39 @@
+"""What several test files use."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mptc_gym
+
+
+def run(
+    env: gymnasium.Env[Any, Any], actions: NDArray[np.float32], seed: int | None = 0
+) -> dict[str, NDArray[np.float64]]:
+    """Reset, take all actions, and return observations, rewards and infos, k = 0 first."""
+    observation, info = env.reset(seed=seed)
+    observations, rewards, infos = [observation], [], [info]
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(np.asarray([action]))
+        assert not terminated
+        assert not truncated
+        observations.append(observation)
+        rewards.append(reward)
+        infos.append(info)
+    record = {key: np.array([info[key] for info in infos]) for key in info}
+    return {"observation": np.array(observations), "reward": np.array(rewards)} | record
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20261121)
+
+
+@pytest.fixture
+def env() -> mptc_gym.MiddlePointEnv:
+    return mptc_gym.MiddlePointEnv()

@@ -1,0 +1,290 @@
+"""The controllers: equations by hand and by automatic differentiation, batches, files."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents import DirectNNController, PIController, Weights
+from benchmarks.rollout import make_plants, rollout
+
+FIELDS = ("W", "theta_1", "W_1", "theta_2")
+
+
+def operate(controller, samples):
+    env = gymnasium.make("MiddlePoint-v0")
+    observation, _ = env.reset(seed=0)
+    for _ in range(samples):
+        observation, *_ = env.step(controller.act(observation))
+
+
+def same(first, second):
+    return all(np.array_equal(getattr(first, f), getattr(second, f)) for f in FIELDS)
+
+
+class TestPI:
+    def test_by_hand(self):
+        controller = PIController(kp=2.0, ki=0.5, error_index=0, u_min=-4.0, u_max=8.0)
+        # u = -2 e - 0.5 (sum of e): -2 - 0.5, 4 + 0.5, -6 - 1
+        actions = [controller.act([e]) for e in (1.0, -2.0, 3.0)]
+        # a = (u + 4) / 6 - 1
+        assert [float(a[0]) for a in actions] == pytest.approx([-0.75, 5 / 12, -1.5])
+        assert controller.command == -7.0
+
+    def test_paper_gains_and_place_of_the_error(self):
+        controller = PIController()
+        controller.act([0, 0, 0, 1.0, 9, 9])
+        assert controller.command == pytest.approx(-2.5)
+        controller.act([0, 0, 0, 1.0, 9, 9])
+        assert controller.command == pytest.approx(-2.8)
+
+    def test_no_anti_windup(self):
+        controller = PIController()
+        for _ in range(100):
+            action = controller.act([5, 5, 5, 5.0, 5, 5])
+        assert controller.command == pytest.approx(-2.2 * 5 - 0.3 * 500)
+        assert action[0] < -10  # beyond the actuator's range, as printed
+
+    def test_reset_forgets_the_integral(self):
+        controller = PIController()
+        first = controller.act([0, 0, 0, 1.0, 0, 0])
+        controller.reset()
+        assert controller.command == 0.0
+        assert np.array_equal(controller.act([0, 0, 0, 1.0, 0, 0]), first)
+
+    def test_batch_equals_singles(self, rng):
+        observations = rng.normal(size=(30, 5, 6)).astype(np.float32)
+        batch, singles = PIController(), [PIController() for _ in range(5)]
+        for observation in observations:
+            alone = [c.act(row) for c, row in zip(singles, observation, strict=True)]
+            assert np.array_equal(batch.act(observation), alone)
+
+    def test_batch_size_is_fixed_until_reset(self):
+        controller = PIController()
+        controller.act(np.zeros((3, 6)))
+        with pytest.raises(ValueError, match="loops until reset"):
+            controller.act(np.zeros((1, 6)))
+        controller.reset()
+        controller.act(np.zeros((1, 6)))
+
+
+@pytest.fixture(params=[PIController, DirectNNController])
+def controller(request):
+    return request.param()
+
+
+class TestEveryController:
+    def test_action_is_one_of_the_environment(self, controller):
+        env = gymnasium.make("MiddlePoint-v0")
+        action = controller.act(env.reset(seed=0)[0])
+        assert action.shape == (1,)
+        assert action.dtype == np.float32
+        _, _, _, _, info = env.step(action)
+        assert info["command"] == pytest.approx(controller.command, rel=1e-6)
+
+    @pytest.mark.parametrize("bad", [np.zeros(3), np.zeros((2, 2, 6)), np.full(6, np.nan)])
+    def test_bad_observation_changes_nothing(self, controller, bad):
+        twin = type(controller)()
+        controller.act(np.ones(6)), twin.act(np.ones(6))
+        with pytest.raises(ValueError, match="observation must"):
+            controller.act(bad)
+        assert np.array_equal(controller.act(np.ones(6)), twin.act(np.ones(6)))
+
+    @pytest.mark.parametrize("limits", [(1.0, 1.0), (2.0, 1.0), (-np.inf, 1.0)])
+    def test_bad_limits(self, controller, limits):
+        with pytest.raises(ValueError, match="u_min"):
+            type(controller)(u_min=limits[0], u_max=limits[1])
+
+    def test_it_reads_no_more_than_it_needs(self, controller):
+        twin = type(controller)()
+        longer = np.r_[np.arange(6.0), 99.0, -99.0]
+        assert np.array_equal(controller.act(longer), twin.act(np.arange(6.0)))
+
+
+class TestDirectNN:
+    def test_one_update_by_hand(self):
+        # N = 2, N_1 = 1, inputs (0.5, 1) after scaling by 0.5, error e(k) = 2.
+        nn = DirectNNController(
+            n_inputs=2, n_hidden=1, eta=0.5, eta_1=2.0, eta_theta=0.25, eta_1_theta=4.0,
+            input_scale=0.5, error_index=1, u_min=-10.0, u_max=10.0,
+        )  # fmt: skip
+        nn.weights = Weights(
+            W=np.array([[2.0, -1.0]]), theta_1=np.zeros(1), W_1=np.array([2.0]), theta_2=-1.0
+        )
+        action = nn.act([1.0, 2.0])
+        # O_1 = 2 * 0.5 - 1 * 1 = 0, X_1 = 1/2; O_2 = 2 * 1/2 = 1, X_2 = 1 / (1 + e^0) = 1/2
+        assert action[0] == 0.0
+        assert nn.command == 0.0
+        # delta_1 = 2 * -1 * 1/4 = -1/2; delta = -1/2 * 2 * 1/4 = -1/4
+        weights = nn.weights
+        assert pytest.approx([2.0 + 2.0 * -0.5 * 0.5]) == weights.W_1
+        assert (
+            pytest.approx(np.array([[2.0 + 0.5 * -0.25 * 0.5, -1.0 + 0.5 * -0.25 * 1.0]]))
+            == weights.W
+        )
+        assert weights.theta_2 == pytest.approx(-1.0 + 4.0 * -0.5)
+        assert weights.theta_1 == pytest.approx([0.25 * -0.25])
+
+    @settings(max_examples=40, deadline=None)
+    @given(
+        n_inputs=st.integers(1, 12),
+        n_hidden=st.integers(1, 8),
+        direction=st.sampled_from([-1, 1]),
+        seed=st.integers(0, 10**6),
+    )
+    def test_updates_are_the_gradient_that_autograd_finds(
+        self, n_inputs, n_hidden, direction, seed
+    ):
+        gains = {"eta": 0.3, "eta_1": 0.7, "eta_theta": 0.2, "eta_1_theta": 0.9}
+        nn = DirectNNController(
+            n_inputs=n_inputs, n_hidden=n_hidden, error_index=0, direction=direction, seed=seed,
+            weight_scale=2.0, **gains,
+        )  # fmt: skip
+        observation = np.random.default_rng(seed).normal(0, 5, max(n_inputs, 1))
+        before = nn.weights
+        W, theta_1, W_1, theta_2 = (
+            torch.tensor(getattr(before, f), requires_grad=True) for f in FIELDS
+        )
+        hidden = torch.sigmoid(W @ torch.tensor(0.2 * observation) + theta_1)
+        output = torch.sigmoid(W_1 @ hidden + theta_2)
+        # (15): dE/dw = -e dy/du dX_21/dw with D(G) in place of dy/du; w moves against it.
+        (-observation[0] * direction * output).backward()
+        action = nn.act(observation)
+        assert action[0] == pytest.approx(2 * output.item() - 1, abs=1e-6)
+        for field, leaf, gain in zip(
+            FIELDS,
+            (W, theta_1, W_1, theta_2),
+            ("eta", "eta_theta", "eta_1", "eta_1_theta"),
+            strict=True,
+        ):
+            moved = getattr(nn.weights, field) - getattr(before, field)
+            np.testing.assert_allclose(moved, -gains[gain] * leaf.grad.numpy(), atol=1e-12)
+
+    @pytest.mark.parametrize(("n_inputs", "n_hidden"), [(6, 3), (6, 1), (1, 1), (12, 9)])
+    @pytest.mark.parametrize("num_envs", [1, 2, 7, 64])
+    def test_batch_is_its_members_to_the_bit(self, n_inputs, n_hidden, num_envs, rng):
+        shape = {"n_inputs": n_inputs, "n_hidden": n_hidden, "error_index": 0}
+        batch = DirectNNController(seed=5, num_envs=num_envs, **shape)
+        singles = [DirectNNController(seed=5 + i, **shape) for i in range(num_envs)]
+        for _ in range(20):
+            observation = rng.normal(0, 4, (num_envs, max(n_inputs, 1)))
+            alone = [nn.act(row) for nn, row in zip(singles, observation, strict=True)]
+            assert np.array_equal(batch.act(observation), alone)
+            assert np.array_equal(batch.command, [nn.command for nn in singles])
+        for field in FIELDS:
+            stacked = np.stack([getattr(nn.weights, field) for nn in singles])
+            assert np.array_equal(getattr(batch.weights, field), stacked)
+
+    def test_shapes_of_the_weights(self):
+        single, batch = DirectNNController().weights, DirectNNController(num_envs=4).weights
+        for field, shape in zip(FIELDS, [(3, 6), (3,), (3,), ()], strict=True):
+            assert getattr(single, field).shape == shape
+            assert getattr(batch, field).shape == (4, *shape)
+
+    def test_initial_weights_are_uniform_and_of_the_seed_alone(self):
+        weights = DirectNNController(num_envs=2000, weight_scale=0.5).weights
+        for field in FIELDS:
+            values = getattr(weights, field)
+            assert np.abs(values).max() <= 0.5
+            quartiles = np.quantile(values, [0.25, 0.5, 0.75])
+            assert quartiles == pytest.approx([-0.25, 0, 0.25], abs=0.04)
+        assert same(DirectNNController(seed=1).weights, DirectNNController(seed=1).weights)
+        assert not same(DirectNNController(seed=1).weights, DirectNNController(seed=2).weights)
+
+    def test_weights_are_copies(self):
+        nn = DirectNNController()
+        given = nn.weights
+        nn.weights = given
+        given.W[:] = 7.0
+        nn.weights.W_1[:] = 7.0
+        assert np.abs(nn.weights.W).max() < 1.0
+        assert np.abs(nn.weights.W_1).max() < 1.0
+
+    def test_weights_of_one_network_set_a_batch(self):
+        weights = DirectNNController(seed=3).weights
+        batch = DirectNNController(num_envs=2)
+        batch.weights = weights
+        assert np.array_equal(batch.weights.W, [weights.W, weights.W])
+
+    @pytest.mark.parametrize(
+        ("field", "value"),
+        [("W", np.zeros((6, 3))), ("W_1", np.zeros(4)), ("theta_2", [1.0]), ("W", np.nan)],
+    )
+    def test_bad_weights_change_nothing(self, field, value):
+        nn = DirectNNController()
+        before = nn.weights
+        if value is np.nan:
+            value = np.full((3, 6), np.nan)
+        with pytest.raises(ValueError, match=rf"weights\.{field}"):
+            nn.weights = Weights(**{f: getattr(before, f) + 1 for f in FIELDS} | {field: value})
+        assert same(nn.weights, before)
+
+    def test_save_load_and_operate_without_learning(self, tmp_path):
+        trained = DirectNNController()
+        operate(trained, samples=300)
+        trained.weights.save(tmp_path / "weights.npz")
+        operated = DirectNNController(seed=9, learning=False)
+        operated.weights = Weights.load(tmp_path / "weights.npz")
+        assert same(operated.weights, trained.weights)
+        operate(operated, samples=50)
+        assert same(operated.weights, trained.weights)
+
+    def test_load_of_something_else(self, tmp_path):
+        np.savez(tmp_path / "other.npz", W=np.zeros(3))
+        with pytest.raises(ValueError, match="theta_1, W_1, theta_2 not found"):
+            Weights.load(tmp_path / "other.npz")
+
+    def test_update_interval(self):
+        nn = DirectNNController(update_interval=3)
+        changed = []
+        for _ in range(7):
+            before = nn.weights
+            nn.act(np.ones(6))
+            changed.append(not same(nn.weights, before))
+        assert changed == [True, False, False, True, False, False, True]
+        nn.reset()  # the count begins again, the weights stay
+        before = nn.weights
+        nn.act(np.ones(6))
+        assert not same(nn.weights, before)
+
+    def test_reset_keeps_what_was_learnt(self):
+        nn = DirectNNController()
+        nn.act(np.ones(6))
+        before = nn.weights
+        nn.reset()
+        assert same(nn.weights, before)
+
+    def test_learns_the_paper_case_and_fails_with_the_wrong_direction(self):
+        plants = make_plants(20, 600, setpoint=5.0)
+        right = rollout(plants, DirectNNController(num_envs=20), 600, seed=0)
+        wrong = rollout(plants, DirectNNController(num_envs=20, direction=1), 600, seed=0)
+        late = np.abs(5.0 - right.output[-100:]).mean(axis=0)
+        assert np.median(late) < 0.1
+        # With -D(G) it drives the plant to the limit of the other side: 10 t/h * -0.6825.
+        assert wrong.output[-1] == pytest.approx(np.full(20, -6.8), abs=0.05)
+
+    def test_extreme_inputs_do_not_overflow(self):
+        nn = DirectNNController(input_scale=1e6)
+        assert np.isfinite(nn.act(np.full(6, 1e3)))
+        assert np.isfinite(nn.act(np.full(6, -1e3)))
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("n_inputs", 0), ("n_hidden", 1.5), ("eta", -0.1), ("eta_1", np.nan),
+            ("eta_theta", np.inf), ("eta_1_theta", -1), ("direction", 0), ("direction", 0.5),
+            ("input_scale", np.nan), ("weight_scale", -1.0), ("num_envs", 0),
+            ("update_interval", 0), ("seed", -1),
+        ],
+    )  # fmt: skip
+    def test_bad_arguments_are_named(self, name, value):
+        with pytest.raises(ValueError, match=name):
+            DirectNNController(**{name: value})
+
+    def test_batch_size_must_fit(self):
+        with pytest.raises(ValueError, match=r"\(3, n_obs\)"):
+            DirectNNController(num_envs=3).act(np.zeros(6))
+        with pytest.raises(ValueError, match=r"\(n_obs,\)"):
+            DirectNNController().act(np.zeros((2, 6)))

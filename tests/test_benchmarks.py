@@ -1,0 +1,440 @@
+"""Scenarios, measures, tables, PPO and the comparison, on small budgets."""
+
+import json
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from agents import PIController
+from benchmarks import compare, ppo, storage, tables
+from benchmarks.metrics import METRICS, measure
+from benchmarks.rollout import Trajectory, make_plants, rollout
+from benchmarks.roster import build, load_factory
+from benchmarks.scenarios import SCENARIOS
+from mptc_gym import Parameters
+
+ROOT = Path(__file__).parent.parent
+
+SMALL = ppo.PPOArguments(n_envs=4, n_steps=32, batch_size=64, n_epochs=2, steps=1024)
+
+
+def trajectory(setpoint, output, command=None, applied=None):
+    """One run, as columns."""
+    still = np.zeros(len(setpoint))
+    columns = (setpoint, output, still if command is None else command)
+    columns += (columns[2] if applied is None else applied, still)
+    return Trajectory(*(np.array(column, dtype=float)[:, np.newaxis] for column in columns))
+
+
+def measured(runs, **arguments):
+    # One sample a minute, so that minutes are samples.
+    values = measure(runs, Parameters(sampling_interval=60.0, **arguments))
+    assert set(values) == set(METRICS)
+    return {name: value[0] for name, value in values.items()}
+
+
+class TestMeasures:
+    def test_errors_by_hand(self):
+        values = measured(trajectory([4, 4, 4, -2, -2], [0, 1, 6, 0, -2]))
+        assert values["mae"] == pytest.approx((4 + 3 + 2 + 2 + 0) / 5)
+        assert values["ise"] == pytest.approx(16 + 9 + 4 + 4 + 0)
+        # t starts again with the change: 0*4 + 1*3 + 2*2, then 0*2 + 1*0
+        assert values["itae"] == pytest.approx(7)
+        # 2 beyond a change of 4; the second change, of -6, is not exceeded
+        assert values["overshoot"] == pytest.approx(50)
+
+    def test_overshoot_downwards(self):
+        values = measured(trajectory([0, -4, -4], [9, 0, -5]))
+        assert values["overshoot"] == pytest.approx(25)
+
+    def test_settling(self):
+        # Within 5 % of 10 from the third sample after the change on.
+        assert measured(trajectory([10] * 5, [0, 9.6, 9.4, 9.5, 10.5]))["settling_time"] == 3
+        # Of two changes the longer counts: 1 sample, then 2.
+        two = trajectory([10, 10, 10, 0, 0, 0], [0, 10, 10, 10, 10, 0])
+        assert measured(two)["settling_time"] == 2
+
+    @pytest.mark.parametrize(
+        "output", [[0, 10, 10, 9, 0, 0], [0, 10, 10, 10, 1, 2], [0, 0, 0, 0, 0, 0]]
+    )
+    def test_not_settled(self, output):
+        runs = trajectory([10, 10, 10, 10, 0, 0], output)
+        assert measured(runs)["settling_time"] == math.inf
+
+    def test_input_by_hand(self):
+        commands = [0, 4.9, 5, -12, -10, 10]
+        applied = [0, 0, 5, -10, -10, 10]
+        values = measured(trajectory([1] * 6, [0] * 6, commands, applied))
+        assert values["total_variation"] == 5 + 15 + 0 + 20
+        assert values["dead_zone_share"] == pytest.approx(100 * 2 / 6)
+        assert values["saturation_share"] == pytest.approx(100 * 3 / 6)
+
+    def test_runs_are_measured_apart(self):
+        one, other = trajectory([1, 1], [0, 1]), trajectory([3, 3], [0, 0])
+        both = Trajectory(
+            *(np.hstack([getattr(t, f) for t in (one, other)]) for f in vars(one))
+        )
+        assert list(measure(both, Parameters())["mae"]) == [0.5, 3.0]
+
+
+class TestTables:
+    def test_percentiles(self):
+        values = tables.percentiles(np.arange(11.0))
+        assert values == {"median": 5.0, "p10": 1.0, "p90": 9.0}
+
+    def test_percentiles_of_some_that_do_not_settle(self):
+        values = tables.percentiles(np.array([1.0, 2.0, 3.0, np.inf]))
+        assert values == {"median": 3.0, "p10": 2.0, "p90": np.inf}
+
+    def test_not_settled_is_written_in_words(self):
+        table = tables.for_csv(pd.DataFrame({"a": ["x", "y"], "s": [1.5, np.inf]}))
+        assert table.to_csv(index=False) == "a,s\nx,1.5\ny,not settled\n"
+
+
+class TestScenarios:
+    def test_the_cases_of_the_paper(self):
+        plants = {
+            (s.parameters.dead_zone, s.parameters.noise_variance) for s in SCENARIOS.values()
+        }
+        assert plants == {(5.0, 0.0), (7.0, 0.0), (5.0, 0.5)}
+        assert {s.parameters.setpoint for s in SCENARIOS.values()} == {"square", 5.0}
+        assert len(SCENARIOS) == 6
+        assert all(name == scenario.name for name, scenario in SCENARIOS.items())
+
+
+class Constant:
+    """Always the same action."""
+
+    def __init__(self, action):
+        self.action = action
+
+    def reset(self):
+        """Nothing to forget."""
+
+    def act(self, observation):
+        return np.full((len(observation), 1), self.action, np.float32)
+
+
+class TestRollout:
+    def test_samples_line_up(self):
+        plants = make_plants(2, 50, setpoint=5.0)
+        runs = rollout(plants, Constant(-1.0), 50, seed=0)
+        assert np.all(runs.command == -10.0)  # u(0) is in row 0 ...
+        assert np.all(runs.output[:19] == 0.0)
+        assert np.all(runs.output[19] == pytest.approx(0.456))  # ... and shows in row 19
+
+    def test_every_controller_meets_the_same_noise(self):
+        noises = [
+            rollout(make_plants(3, 30, noise_variance=0.5), agent, 30, seed=8).noise
+            for agent in (Constant(-1.0), PIController())
+        ]
+        np.testing.assert_array_equal(*noises)
+        assert not np.array_equal(noises[0][:, 0], noises[0][:, 1])
+
+    def test_runs_do_not_depend_on_how_many_there_are(self):
+        many = rollout(make_plants(3, 30, noise_variance=0.5), PIController(), 30, seed=8)
+        one = rollout(make_plants(1, 30, noise_variance=0.5), PIController(), 30, seed=10)
+        np.testing.assert_array_equal(many.output[:, 2], one.output[:, 0])
+
+
+class TestRoster:
+    def test_a_factory_gets_what_it_asks_for(self):
+        def factory(num_envs, seed, parameters, gain=2):
+            return num_envs, seed, parameters, gain
+
+        parameters = Parameters()
+        assert build(factory, parameters, 3, 7) == (3, 7, parameters, 2)
+        assert isinstance(build(PIController, parameters, 3, 7), PIController)
+
+    @pytest.mark.parametrize("location", ["agents", "agents:", "nowhere:x", "agents:__name__"])
+    def test_bad_locations(self, location):
+        with pytest.raises(ValueError, match=location):
+            load_factory(location)
+
+
+class TestStorage:
+    def test_a_failed_write_leaves_the_old_file(self, tmp_path):
+        path = tmp_path / "file.txt"
+        storage.write_text(path, "old")
+
+        def write_half():
+            with storage.replacing(path) as partial:
+                partial.write_text("half of the n")
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            write_half()
+        assert path.read_text() == "old"
+        assert list(tmp_path.iterdir()) == [path]
+
+
+def train(folder, arguments=SMALL, *, retrain=False):
+    return ppo.trained_policy(arguments, folder, retrain=retrain, progress=False, title="")
+
+
+def weights(model):
+    return torch.cat([p.detach().flatten() for p in model.policy.parameters()])
+
+
+class TestPPO:
+    @pytest.fixture(autouse=True)
+    def small(self, monkeypatch):
+        monkeypatch.setattr(ppo, "CHECKPOINT_INTERVAL", 256)
+        monkeypatch.setattr(ppo, "PROBE", replace(ppo.PROBE, samples=20))
+
+    def test_a_finished_policy_is_loaded(self, tmp_path, monkeypatch):
+        trained = train(tmp_path)
+        with monkeypatch.context() as patch:
+            patch.setattr(ppo.PPO, "learn", None)  # training again would raise
+            loaded = train(tmp_path)
+        assert torch.equal(weights(loaded), weights(trained))
+        stamp = (tmp_path / "policy.zip").stat().st_mtime_ns
+        train(tmp_path, retrain=True)
+        assert (tmp_path / "policy.zip").stat().st_mtime_ns > stamp
+
+    def test_learning_curve_is_kept(self, tmp_path):
+        train(tmp_path)
+        curve = pd.read_csv(tmp_path / "learning.csv")
+        assert list(curve["steps"]) == [256, 512, 768, 1024]
+        assert (curve[["training_mae", "square_mae"]] > 0).all(axis=None)
+        assert curve["seconds"].is_monotonic_increasing
+
+    @pytest.mark.parametrize("calls", [65, 100, 140])
+    def test_interrupted_training_resumes_to_the_same_policy(
+        self, tmp_path, monkeypatch, calls
+    ):
+        whole = train(tmp_path / "whole")
+        keep = ppo._Keeper._on_step
+        count = 0
+
+        def interrupt(self):
+            nonlocal count
+            count += 1
+            if count == calls:
+                raise KeyboardInterrupt
+            return keep(self)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(ppo._Keeper, "_on_step", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                train(tmp_path / "parts")
+        assert [path.name for path in (tmp_path / "parts").iterdir()] == ["checkpoint.pkl"]
+        np.random.seed(0)  # noqa: NPY002 (whatever happens between)
+        torch.manual_seed(0)
+        parts = train(tmp_path / "parts")
+        assert torch.equal(weights(parts), weights(whole))
+        columns = ["steps", "training_mae", "square_mae"]
+        curves = [
+            pd.read_csv(tmp_path / n / "learning.csv")[columns] for n in ("whole", "parts")
+        ]
+        pd.testing.assert_frame_equal(*curves)
+        assert not (tmp_path / "parts" / "checkpoint.pkl").exists()
+
+    def test_seed_is_honoured(self, tmp_path):
+        first, again, other = (
+            weights(train(tmp_path / name, replace(SMALL, steps=256, seed=seed)))
+            for name, seed in (("first", 3), ("again", 3), ("other", 4))
+        )
+        assert torch.equal(first, again)
+        assert not torch.equal(first, other)
+
+    def test_key_names_all_that_shapes_a_policy(self, monkeypatch):
+        keys = {
+            ppo.policy_key(arguments)
+            for arguments in (
+                SMALL, replace(SMALL, seed=1), replace(SMALL, gamma=0.9),
+                replace(SMALL, plant={"dead_zone": 7.0}),
+            )
+        }  # fmt: skip
+        assert len(keys) == 4
+        assert ppo.policy_key(SMALL) == ppo.policy_key(replace(SMALL))
+        monkeypatch.setattr(ppo, "versions", lambda: {"torch": "another"})
+        assert ppo.policy_key(SMALL) not in keys
+
+    def test_it_is_trained_on_the_plant_to_be_controlled(self):
+        plant = ppo.plant_arguments(SCENARIOS["square-dead-zone-7"].parameters)
+        assert plant == {"dead_zone": 7.0}
+        training = replace(SMALL, plant=plant).training
+        assert training["dead_zone"] == 7.0
+        assert training["setpoint"] == "random"
+        assert training["action_window"] == 20
+
+    def test_inputs_are_scaled_by_fixed_numbers(self):
+        model = ppo._begin(SMALL)
+        observation = torch.arange(1.0, 29.0)
+        scaled = model.policy.features_extractor(observation)
+        assert scaled[:8].tolist() == pytest.approx([0.2 * i for i in range(1, 9)])  # degC
+        assert scaled[8:].tolist() == list(range(9, 29))  # actions
+
+
+def run_compare(out, *options):
+    policies = out.parent / "policies"
+    return compare.main(["--out", str(out), "--policies", str(policies), *map(str, options)])
+
+
+class TestCompare:
+    def test_files_and_their_contents(self, tmp_path, capsys):
+        out = tmp_path / "out"
+        status = run_compare(
+            out, "--agents", "nn,pi", "--scenarios", "constant", "constant-noise", "--seeds", 3
+        )
+        assert status == 0
+        runs = pd.read_csv(out / "runs.csv")
+        assert list(runs.columns) == ["scenario", "agent", "seed", *METRICS]
+        cells = [(s, a) for a in ("nn", "pi") for s in ("constant", "constant-noise")]
+        expected = [(s, a, i) for s, a in cells for i in range(3)]
+        assert list(runs.iloc[:, :3].itertuples(index=False, name=None)) == expected
+        # The paper's PI is the same in every run without noise, and never settles.
+        pi = runs[(runs.agent == "pi") & (runs.scenario == "constant")]
+        assert pi["mae"].nunique() == 1
+        assert pi["mae"].iloc[0] == pytest.approx(1.6, abs=0.05)
+        assert set(pi["settling_time"]) == {"not settled"}
+
+        summary = pd.read_csv(out / "summary.csv")
+        row = summary.query("agent == 'nn' and scenario == 'constant' and metric == 'mae'")
+        nn = runs[(runs.agent == "nn") & (runs.scenario == "constant")]["mae"]
+        assert float(row["median"].iloc[0]) == pytest.approx(nn.median())
+        assert float(row["p90"].iloc[0]) == pytest.approx(nn.quantile(0.9))
+
+        text, screen = (out / "summary.md").read_text(), capsys.readouterr().out
+        for shown in (text, screen):
+            assert f"{nn.median():.3f}" in shown
+            assert "not settled" in shown
+
+        provenance = json.loads((out / "provenance.json").read_text())
+        assert provenance["complete"] is True
+        assert provenance["seeds"] == [0, 1, 2]
+        assert provenance["options"]["agents"] == ["nn", "pi"]
+        assert {"gymnasium", "numpy", "torch"} <= set(provenance["versions"])
+
+        responses = pd.read_csv(out / "constant.csv")
+        assert len(responses) == 2 * 600
+        assert (responses["output_p10"] <= responses["output_p90"]).all()
+        for name in ("constant.png", "constant-noise.png", "mae.png"):
+            picture = matplotlib.image.imread(out / name)
+            assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
+
+    def test_same_command_same_numbers(self, tmp_path):
+        options = ("--agents", "nn", "--scenarios", "constant-noise", "--seeds", 2)
+        run_compare(tmp_path / "one", *options)
+        run_compare(tmp_path / "two", *options)
+        assert (tmp_path / "one/runs.csv").read_text() == (
+            tmp_path / "two/runs.csv"
+        ).read_text()
+
+    def test_ppo_is_trained_once(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(
+            ppo.PPOArguments, "__init__", _with_defaults(ppo.PPOArguments.__init__, SMALL)
+        )
+        options = (
+            "--agents",
+            "ppo",
+            "--scenarios",
+            "constant",
+            "--seeds",
+            1,
+            "--ppo-steps",
+            256,
+        )
+        assert run_compare(tmp_path / "one", *options) == 0
+        curve = pd.read_csv(tmp_path / "one/learning.csv")
+        assert list(curve["steps"]) == [256]
+        assert (tmp_path / "one/learning.png").exists()
+        provenance = json.loads((tmp_path / "one/provenance.json").read_text())
+        assert list(provenance["policies"]) == ["nominal"]
+
+        with monkeypatch.context() as patch:
+            patch.setattr(ppo.PPO, "learn", None)  # training again would raise
+            assert run_compare(tmp_path / "two", *options) == 0
+        assert (tmp_path / "one/runs.csv").read_text() == (
+            tmp_path / "two/runs.csv"
+        ).read_text()
+        with monkeypatch.context() as patch:
+            patch.setattr(ppo.PPO, "learn", None)
+            with pytest.raises(TypeError):
+                run_compare(tmp_path / "three", *options, "--retrain")
+
+    def test_a_controller_of_the_user(self, tmp_path, monkeypatch):
+        (tmp_path / "mine.py").write_text(
+            "import numpy as np\n"
+            "class Mine:\n"
+            "    observation = {'output_window': 1, 'error_window': 0}\n"
+            "    def __init__(self, num_envs): self.num_envs = num_envs\n"
+            "    def reset(self): pass\n"
+            "    def act(self, observations):\n"
+            "        assert observations.shape == (self.num_envs, 4)\n"
+            "        return np.full((self.num_envs, 1), -1.0, np.float32)\n"
+        )
+        monkeypatch.syspath_prepend(tmp_path)
+        status = run_compare(
+            tmp_path / "out", "--agents", "pi", "--agent", "mine=mine:Mine",
+            "--scenarios", "constant", "--seeds", 2,
+        )  # fmt: skip
+        assert status == 0
+        runs = pd.read_csv(tmp_path / "out/runs.csv")
+        assert list(runs["agent"]) == ["pi", "pi", "mine", "mine"]
+        assert set(runs[runs.agent == "mine"]["saturation_share"]) == {100.0}
+
+    def test_an_interrupted_run_keeps_what_it_has(self, tmp_path, monkeypatch, capsys):
+        calls = 0
+
+        def interrupted(*arguments):
+            nonlocal calls
+            calls += 1
+            if calls == 3:
+                raise KeyboardInterrupt
+            return rollout(*arguments)
+
+        monkeypatch.setattr(compare, "rollout", interrupted)
+        status = run_compare(
+            tmp_path / "out", "--agents", "pi", "nn", "--scenarios", "constant", "square",
+            "--seeds", 1,
+        )  # fmt: skip
+        assert status == 130
+        assert "Interrupted" in capsys.readouterr().out
+        runs = pd.read_csv(tmp_path / "out/runs.csv")
+        assert list(runs["scenario"]) == ["constant", "square"]
+        assert json.loads((tmp_path / "out/provenance.json").read_text())["complete"] is False
+        assert (tmp_path / "out/summary.md").exists()
+        assert (tmp_path / "out/square.png").exists()
+
+    @pytest.mark.parametrize(
+        ("options", "complaint"),
+        [
+            (["--agents", "nn", "pid"], "no 'pid'"),
+            (["--scenarios", "circle"], "no 'circle'"),
+            (["--seeds", "0"], "must be at least 1"),
+            (["--seeds", "many"], "--seeds"),
+            (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
+            (["--agent", "pi=agents:PIController"], "NEW_NAME"),
+            (["--agent", "x=agents:Nothing"], "agents:Nothing"),
+        ],
+    )
+    def test_bad_options(self, options, complaint, capsys, tmp_path):
+        with pytest.raises(SystemExit) as stop:
+            run_compare(tmp_path / "out", *options)
+        assert stop.value.code == 2
+        assert complaint in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+
+    def test_as_a_command(self, tmp_path):
+        command = [sys.executable, "-m", "benchmarks.compare", "--agents", "pi", "--seeds", "1"]
+        command += ["--scenarios", "constant", "--out", str(tmp_path / "out")]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+        assert "1.62" in done.stdout
+        assert (tmp_path / "out/summary.md").exists()
+
+
+def _with_defaults(init, defaults):
+    def initialise(self, **given):
+        init(self, **(vars(defaults) | given))
+
+    return initialise

@@ -1,0 +1,391 @@
+"""The environment as the contract describes it."""
+
+import copy
+import inspect
+import pickle
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+from stable_baselines3.common.env_util import make_vec_env
+
+import mptc_gym
+from mptc_gym import MiddlePointEnv
+from tests.conftest import run
+
+INFO = {"output", "setpoint", "error", "command", "applied", "noise"}
+
+coefficients = st.floats(-0.3, 0.3)
+valid_arguments = st.fixed_dictionaries(
+    {},
+    optional={
+        "a": st.lists(coefficients, max_size=3).map(lambda tail: [1.0, *tail]),
+        "b": st.lists(coefficients, min_size=1, max_size=3),
+        "c": st.lists(coefficients, max_size=3).map(lambda tail: [1.0, *tail]),
+        "delay": st.integers(0, 30),
+        "dead_zone": st.floats(0, 10),
+        "u_min": st.floats(-20, -10),
+        "u_max": st.floats(0, 20),
+        "noise_variance": st.floats(0, 4),
+        "sampling_interval": st.floats(0.1, 60),
+        "setpoint": st.one_of(
+            st.sampled_from(["square", "random"]),
+            st.floats(-100, 100),
+            st.lists(st.floats(-100, 100), min_size=1, max_size=5),
+        ),
+        "setpoint_amplitude": st.floats(0, 100),
+        "setpoint_period": st.integers(1, 1000),
+        "setpoint_window": st.integers(1, 5),
+        "error_window": st.integers(0, 5),
+        "output_window": st.integers(0, 5),
+        "action_window": st.integers(0, 30),
+        "temperature_span": st.floats(0.5, 200),
+        "reward": st.sampled_from(["quadratic", "absolute"]),
+        "error_scale": st.floats(0.1, 20),
+        "move_weight": st.floats(0, 2),
+    },
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(arguments=valid_arguments)
+def test_both_checkers_are_content_with_any_valid_arguments(arguments):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gymnasium.make("MiddlePoint-v0", **arguments).unwrapped)
+        check_env_sb3(gymnasium.make("MiddlePoint-v0", **arguments).unwrapped)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    arguments=valid_arguments,
+    actions=st.lists(st.floats(-1e3, 1e3, width=32), min_size=1, max_size=60),
+    seed=st.integers(0, 2**31),
+)
+def test_observations_stay_in_their_space_whatever_the_actions(arguments, actions, seed):
+    env = MiddlePointEnv(**arguments)
+    record = run(env, np.array(actions, dtype=np.float32), seed)
+    for observation in record["observation"]:
+        assert env.observation_space.contains(observation)
+
+
+def test_registration():
+    env = gymnasium.make("mptc_gym:MiddlePoint-v0")
+    assert env.spec.max_episode_steps == 1200
+    assert isinstance(env.unwrapped, MiddlePointEnv)
+    assert env.action_space == gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    assert env.observation_space.shape == (6,)
+    assert env.observation_space.dtype == np.float32
+
+
+def test_episode_is_truncated_and_never_terminated():
+    env = gymnasium.make("MiddlePoint-v0")
+    env.reset(seed=0)
+    flags = [env.step(np.ones(1, np.float32))[2:4] for _ in range(1200)]
+    assert flags == [(False, False)] * 1199 + [(False, True)]
+
+
+def test_make_vec_runs_many():
+    envs = gymnasium.make_vec("MiddlePoint-v0", num_envs=3, noise_variance=0.5)
+    observations, _ = envs.reset(seed=7)
+    assert observations.shape == (3, 6)
+    _, _, _, _, infos = envs.step(np.ones((3, 1), np.float32))
+    alone = [
+        run(MiddlePointEnv(noise_variance=0.5), np.ones(1), seed)["noise"][1]
+        for seed in (7, 8, 9)
+    ]
+    assert list(infos["noise"]) == alone
+
+
+# Its make_vec_env asks for pictures first, and does without where there are none.
+@pytest.mark.filterwarnings("ignore:.*render_mode='rgb_array':UserWarning")
+def test_stable_baselines3_makes_it():
+    envs = make_vec_env("MiddlePoint-v0", n_envs=2, seed=0)
+    assert envs.reset().shape == (2, 6)
+
+
+def test_reset_is_at_rest():
+    env = MiddlePointEnv(noise_variance=0.5, output_window=2, action_window=3)
+    observation, info = env.reset(seed=0)
+    assert list(observation) == [5, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0]
+    rest = {"output": 0.0, "command": 0.0, "applied": 0.0, "noise": 0.0}
+    assert info == {"setpoint": 5.0, "error": 5.0, **rest}
+
+
+def test_timeline_by_hand():
+    # y(k+1) = 0.5 y(k) - u_a(k - 1): a pole at 0.5, one sample of delay.
+    env = MiddlePointEnv(
+        a=[1, -0.5], b=[-1.0], delay=1, dead_zone=1.0, u_min=-4.0, u_max=4.0,
+        setpoint=[3.0, 2.0, 1.0], output_window=2, action_window=2,
+        reward="absolute", error_scale=2.0, move_weight=0.5,
+    )  # fmt: skip
+    record = run(env, np.array([0.5, -0.125, -2.0, 0.0]))
+    assert list(record["command"]) == [0, 2.0, -0.5, -8.0, 0.0]
+    assert list(record["applied"]) == [0, 2.0, 0.0, -4.0, 0.0]  # dead zone, then saturation
+    # y(1) = 0, y(2) = -2, y(3) = -1 - 0, y(4) = -0.5 + 4
+    assert list(record["output"]) == [0, 0, -2, -1, 3.5]
+    assert list(record["setpoint"]) == [3, 2, 1, 1, 1]
+    assert list(record["error"]) == [3, 2, 3, 2, -2.5]
+    # |e(k+1)| / 2 + 0.5 |a(k) - a(k-1)|: 1 + 0.25, 1.5 + 0.3125, 1 + 0.9375, 1.25 + 1
+    assert list(record["reward"]) == [-1.25, -1.8125, -1.9375, -2.25]
+    # y_d newest first, e, y, and actions as the actuator limits them
+    assert list(record["observation"][4]) == [1, 1, 1, -2.5, 2, 3, 3.5, -1, 0, -1]
+
+
+def test_quadratic_reward_by_hand():
+    env = MiddlePointEnv(setpoint=4.0, error_scale=2.0)
+    assert run(env, np.zeros(1))["reward"][0] == -2.0  # -(4 / 2)^2 / 2
+    assert run(MiddlePointEnv(), np.zeros(1))["reward"][0] == -0.5
+
+
+def test_rest_of_an_unsymmetric_actuator_is_zero_flow():
+    env = MiddlePointEnv(u_min=-5.0, u_max=15.0, action_window=2, move_weight=1.0)
+    observation, _ = env.reset(seed=0)
+    assert list(observation[-2:]) == [-0.5, -0.5]  # u = 0 is a quarter of the way up
+    _, reward, *_ = env.step(np.array([-0.5], np.float32))
+    assert reward == -0.5  # no move, so only the error costs
+
+
+@pytest.mark.parametrize(
+    ("windows", "expected"),
+    [
+        ({"setpoint_window": 0}, [4, 3, 2]),
+        ({"error_window": 0}, [5, 5, 5]),
+        ({"setpoint_window": 1, "error_window": 2}, [5, 4, 3]),
+        ({"setpoint_window": 0, "error_window": 0, "output_window": 4}, [1, 2, 3, 0]),
+        ({"setpoint_window": 0, "error_window": 0, "action_window": 2}, [-0.5, -0.75]),
+        ({"setpoint_window": 0, "output_window": 1, "error_window": 1}, [4, 1]),
+    ],
+)
+def test_windows(windows, expected):
+    env = MiddlePointEnv(
+        a=[1.0], b=[1.0], delay=0, dead_zone=0.0, u_min=-4.0, u_max=4.0, setpoint=5.0, **windows
+    )
+    env.reset(seed=0)
+    for action in (0.75, 0.5, 0.25):  # y = 3, 2, 1
+        observation, *_ = env.step(np.array([action], np.float32))
+    if "action_window" in windows:
+        for action in (-0.75, -0.5):
+            observation, *_ = env.step(np.array([action], np.float32))
+    assert list(observation) == expected
+
+
+def test_measurement_saturates_and_truth_does_not():
+    env = MiddlePointEnv(temperature_span=2.0, output_window=1)
+    record = run(env, -np.ones(200))
+    assert record["output"][-1] > 6.8
+    assert record["error"][-1] == 5.0 - record["output"][-1]
+    assert record["reward"][-1] == pytest.approx(-((record["error"][-1] / 5.0) ** 2) / 2)
+    assert list(record["observation"][-1]) == [5, 5, 5, 3, 3, 3, 2]
+
+
+def test_space_is_the_same_for_all_set_points_within_the_span():
+    spaces = [
+        MiddlePointEnv(setpoint=setpoint).observation_space
+        for setpoint in ("square", "random", 5.0, [1.0, -3.0])
+    ]
+    assert all(space == spaces[0] for space in spaces)
+
+
+def test_square_set_point():
+    env = MiddlePointEnv(setpoint_amplitude=2.0, setpoint_period=6)
+    assert list(run(env, np.zeros(8))["setpoint"]) == [2, 2, 2, -2, -2, -2, 2, 2, 2]
+
+
+def test_listed_set_point_holds_its_last():
+    env = MiddlePointEnv(setpoint=[1.0, 2.0])
+    assert list(run(env, np.zeros(4))["setpoint"]) == [1, 2, 2, 2, 2]
+
+
+def test_random_set_point_has_levels_and_lengths_as_documented():
+    env = MiddlePointEnv(setpoint="random", setpoint_amplitude=3.0, setpoint_period=60)
+    setpoint = run(env, np.zeros(20_000))["setpoint"]
+    changes = np.flatnonzero(np.diff(setpoint)) + 1
+    lengths, levels = np.diff(np.r_[0, changes]), setpoint[np.r_[0, changes]]
+    assert len(levels) > 900
+    assert lengths.min() == 10
+    assert lengths.max() == 30
+    assert lengths.mean() == pytest.approx(20, abs=0.7)
+    assert np.abs(levels).max() <= 3.0
+    assert np.quantile(levels, [0.25, 0.5, 0.75]) == pytest.approx([-1.5, 0, 1.5], abs=0.25)
+
+
+def test_same_seed_same_trajectory_to_the_bit(rng):
+    actions = rng.uniform(-1, 1, 700)
+    arguments = {"noise_variance": 0.5, "setpoint": "random"}
+    first = run(MiddlePointEnv(**arguments), actions, seed=5)
+    env = MiddlePointEnv(**arguments)
+    run(env, actions[:10], seed=9)  # whatever happened before
+    second = run(env, actions, seed=5)
+    other = run(env, actions, seed=6)
+    for key in first:
+        np.testing.assert_array_equal(first[key], second[key])
+    assert not np.array_equal(first["noise"], other["noise"])
+    assert not np.array_equal(first["setpoint"], other["setpoint"])
+
+
+def test_every_controller_meets_the_same_noise_and_set_point(rng):
+    arguments = {"noise_variance": 0.5, "setpoint": "random"}
+    first = run(MiddlePointEnv(**arguments), rng.uniform(-1, 1, 600))
+    second = run(MiddlePointEnv(**arguments, action_window=20), rng.uniform(-1, 1, 600))
+    for key in ("noise", "setpoint"):
+        np.testing.assert_array_equal(first[key], second[key])
+
+
+def test_noise_and_set_point_come_from_separate_streams():
+    both = run(MiddlePointEnv(noise_variance=0.5, setpoint="random"), np.zeros(600))
+    noise = run(MiddlePointEnv(noise_variance=0.5), np.zeros(600))
+    setpoint = run(MiddlePointEnv(setpoint="random"), np.zeros(600))
+    np.testing.assert_array_equal(both["noise"], noise["noise"])
+    np.testing.assert_array_equal(both["setpoint"], setpoint["setpoint"])
+
+
+def test_later_episodes_differ_and_do_not_depend_on_the_length_of_earlier_ones():
+    env = MiddlePointEnv(noise_variance=0.5, setpoint="random")
+    first = run(env, np.zeros(900), seed=3)
+    second = run(env, np.zeros(300), seed=None)
+    run(env, np.zeros(2), seed=3)
+    again = run(env, np.zeros(300), seed=None)
+    for key in ("noise", "setpoint"):
+        assert not np.array_equal(first[key][:301], second[key])
+        np.testing.assert_array_equal(second[key], again[key])
+
+
+def test_a_generator_of_the_user_is_used():
+    noises = []
+    for _ in range(2):
+        env = MiddlePointEnv(noise_variance=0.5)
+        env.np_random = np.random.default_rng(4)
+        noises.append(run(env, np.zeros(5), seed=None)["noise"])
+    np.testing.assert_array_equal(*noises)
+
+
+def test_global_generator_is_left_alone():
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    run(MiddlePointEnv(noise_variance=0.5, setpoint="random"), np.zeros(5), seed=None)
+    assert np.array_equal(before, np.random.get_state()[1])  # noqa: NPY002
+
+
+def test_info_is_made_of_floats():
+    env = MiddlePointEnv(noise_variance=0.5)
+    _, info = env.reset(seed=0)
+    _, reward, *_, after = env.step(np.ones(1, np.float32))
+    for each in (info, after):
+        assert set(each) == INFO
+        assert all(type(value) is float for value in each.values())
+    assert type(reward) is float
+
+
+BAD = [
+    ("delay", 1.5), ("delay", -1), ("delay", "18"), ("delay", True),
+    ("dead_zone", -0.1), ("dead_zone", 10.1), ("dead_zone", float("nan")), ("dead_zone", "5"),
+    ("u_min", 10.0), ("u_min", 11.0), ("u_min", float("-inf")), ("u_max", float("inf")),
+    ("noise_variance", -0.5), ("noise_variance", float("inf")), ("noise_variance", None),
+    ("a", [2.0, 0.5]), ("a", []), ("a", [1.0, float("nan")]), ("a", 1.0), ("a", "1"),
+    ("b", []), ("b", [float("inf")]), ("b", [None]), ("c", [0.9]), ("c", {}),
+    ("sampling_interval", 0.0), ("sampling_interval", -8.0),
+    ("setpoint", "triangle"), ("setpoint", []), ("setpoint", [1.0, float("nan")]),
+    ("setpoint", float("nan")), ("setpoint", None), ("setpoint", 10**400),
+    ("setpoint_amplitude", -1.0), ("setpoint_period", 0), ("setpoint_period", 2.5),
+    ("setpoint_window", -1), ("error_window", 1.0), ("output_window", "2"),
+    ("action_window", -3), ("temperature_span", 0.0), ("temperature_span", float("inf")),
+    ("reward", "cubic"), ("reward", 2), ("error_scale", 0.0), ("error_scale", -5.0),
+    ("move_weight", -1.0), ("move_weight", float("nan")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), BAD, ids=[f"{n}={v!r:.20}" for n, v in BAD])
+def test_bad_arguments_are_named(name, value):
+    with pytest.raises(ValueError, match=rf"{name}.* must be .*got") as error:
+        MiddlePointEnv(**{name: value})
+    assert repr(value) in str(error.value)
+
+
+def test_an_observation_with_no_element_is_refused():
+    with pytest.raises(ValueError, match="error_window"):
+        MiddlePointEnv(setpoint_window=0, error_window=0)
+
+
+def test_misspelt_argument_is_refused():
+    with pytest.raises(TypeError, match="dead_zon"):
+        gymnasium.make("MiddlePoint-v0", dead_zon=5.0)
+
+
+def test_render_mode_is_refused():
+    with pytest.raises(TypeError, match="render_mode must be None, got 'human'"):
+        MiddlePointEnv(render_mode="human")
+
+
+def test_numpy_scalars_are_taken():
+    env = MiddlePointEnv(delay=np.int64(3), dead_zone=np.float32(2.0), setpoint=np.float64(1))
+    assert run(env, np.ones(5))["setpoint"][0] == 1.0
+
+
+@pytest.mark.parametrize(
+    "action", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.zeros(0), None, "up"]
+)
+def test_bad_action_leaves_the_plant_untouched(action):
+    reference = run(MiddlePointEnv(noise_variance=0.5), np.ones(40))
+    env = MiddlePointEnv(noise_variance=0.5)
+    env.reset(seed=0)
+    for k in range(40):
+        with pytest.raises(ValueError, match="action"):
+            env.step(action)
+        _, _, _, _, info = env.step(np.ones(1, np.float32))
+        assert info["output"] == reference["output"][k + 1]
+
+
+def test_step_before_reset():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        gymnasium.make("MiddlePoint-v0").step(np.zeros(1, np.float32))
+
+
+def test_spec_round_trips_through_json():
+    env = gymnasium.make(
+        "MiddlePoint-v0", a=[1.0, -0.5], setpoint=[1.0, 2.0], delay=3, noise_variance=0.5,
+        action_window=5, reward="absolute",
+    )  # fmt: skip
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.parameters == env.unwrapped.parameters
+    actions = np.linspace(-1, 1, 50)
+    assert data_equivalence(run(env, actions), run(again, actions), exact=True)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_copies_in_the_middle_of_an_episode_go_on_alike(copied, rng):
+    env = gymnasium.make("MiddlePoint-v0", noise_variance=0.5, setpoint="random")
+    run(env, rng.uniform(-1, 1, 300))
+    twin = copied(env)
+    for action in rng.uniform(-1, 1, (600, 1)).astype(np.float32):
+        assert data_equivalence(env.step(action), twin.step(action), exact=True)
+    assert data_equivalence(env.reset(), twin.reset(), exact=True)
+
+
+def test_help_shows_every_argument():
+    names = inspect.signature(MiddlePointEnv).parameters
+    assert {"dead_zone", "delay", "noise_variance", "render_mode"} <= set(names)
+    documented = mptc_gym.MiddlePointEnv.__doc__
+    assert all(f"`{name}`" in documented for name in names)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "outputs", "setpoint"),
+    [
+        ({}, [0.65682536, -0.6115650288267045, 0.15795357524280013], -5.0),
+        (
+            {"noise_variance": 0.5, "setpoint": "random"},
+            [1.4136041356100852, 0.05882366982027529, -0.545379463066878],
+            -3.9272474884252997,
+        ),
+    ],
+)
+def test_stored_trajectory(arguments, outputs, setpoint):
+    # No proof of anything, as it was made by this code: it notices when v0 changes.
+    record = run(MiddlePointEnv(**arguments), (np.arange(400) % 21 - 10) / 10, seed=42)
+    assert record["output"][[20, 100, 400]] == pytest.approx(outputs, rel=1e-12)
+    assert record["setpoint"][400] == pytest.approx(setpoint, rel=1e-12)

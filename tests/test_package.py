@@ -1,0 +1,78 @@
+"""The layout: who imports whom, what an import loads, and the README."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+STDLIB = set(sys.stdlib_module_names)
+ALLOWED = {
+    "mptc_gym": {"mptc_gym", "gymnasium", "numpy"},
+    "agents": {"agents", "numpy"},
+}
+
+
+def imported(path: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(node.module or "")
+    return {name.partition(".")[0] for name in names}
+
+
+@pytest.mark.parametrize("package", ALLOWED)
+def test_layers_import_downwards_only(package):
+    files = list((ROOT / package).rglob("*.py"))
+    assert files
+    for path in files:
+        assert imported(path) <= ALLOWED[package] | STDLIB, path
+
+
+def test_import_loads_nothing_heavy():
+    program = "import sys, mptc_gym; print(*{name.partition('.')[0] for name in sys.modules})"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+    loaded = set(done.stdout.decode().split())
+    assert {"mptc_gym", "gymnasium", "numpy"} <= loaded
+    assert not loaded & {
+        "torch",
+        "matplotlib",
+        "scipy",
+        "pygame",
+        "pandas",
+        "stable_baselines3",
+    }
+
+
+def test_top_level_holds_what_the_layout_says():
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if tracked.returncode:
+        pytest.skip("not a git checkout: the files of the project cannot be told from others")
+    top = {name.partition("/")[0] for name in tracked.stdout.split()}
+    assert {name for name in top if not name.startswith(".")} == {
+        "LICENSE", "README.md", "agents", "benchmarks", "mptc_gym", "pyproject.toml", "tests",
+    }  # fmt: skip
+
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=range(len(EXAMPLES)))
+@pytest.mark.filterwarnings("ignore:.*render_mode='rgb_array':UserWarning")
+def test_examples_of_the_readme_run(example, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    # A short time will do to see that it runs.
+    exec(example.replace("300_000", "2_000"), {})
+
+
+def test_readme_has_its_examples_and_pictures():
+    assert len(EXAMPLES) >= 2
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", README)
+    assert pictures
+    assert all((ROOT / picture).is_file() for picture in pictures)

@@ -1,0 +1,155 @@
+"""The plant (28) and the actuator (29), against things that are independent of them."""
+
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+
+import mptc_gym
+from mptc_gym.plant import Plant, action_from_command, command_from_action
+from tests.conftest import run
+
+A = [1, -0.45181, -0.47546]
+B = [-0.04560, -0.00404]
+C = [1, -0.35740, -0.03392]
+DELAY = 18
+
+
+def applied(command: float, **arguments: float) -> float:
+    return Plant(mptc_gym.Parameters(**arguments)).step(command, 0.0)[0]
+
+
+def test_dynamics_equal_a_transfer_function_with_noise(rng):
+    env = mptc_gym.MiddlePointEnv(noise_variance=0.5)
+    record = run(env, rng.uniform(-1, 1, 500))
+    # u(k) and u_a(k) are reported with sample k+1; B begins at z^-1, and d more delays it.
+    by_input = lfilter([0] * (DELAY + 1) + B, A, np.r_[record["applied"][1:], 0.0])
+    by_noise = lfilter([1], A, record["noise"])
+    np.testing.assert_allclose(record["output"], by_input + by_noise, rtol=0, atol=1e-12)
+    assert np.ptp(by_input) > 1.0  # both parts matter here
+    assert np.ptp(by_noise) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "c", "delay"),
+    [
+        ([1.0], [0.7], [1.0], 0),
+        ([1.0, -0.5], [0.0, 0.2, -0.1], [1.0, 0.3], 1),
+        ([1.0, -1.2, 0.5, -0.1], [0.4], [1.0, 0.1, 0.2, 0.3], 5),
+    ],
+)
+def test_dynamics_of_other_orders(a, b, c, delay, rng):
+    env = mptc_gym.MiddlePointEnv(a=a, b=b, c=c, delay=delay, noise_variance=1.0)
+    record = run(env, rng.uniform(-1, 1, 300))
+    by_input = lfilter([0] * (delay + 1) + b, a, np.r_[record["applied"][1:], 0.0])
+    by_noise = lfilter([1], a, record["noise"])
+    np.testing.assert_allclose(record["output"], by_input + by_noise, rtol=0, atol=1e-11)
+
+
+def test_noise_is_coloured_by_c():
+    env = mptc_gym.MiddlePointEnv(noise_variance=0.5)
+    noise = run(env, np.zeros(20_000))["noise"]
+    assert noise[0] == 0.0
+    xi = lfilter([1], C, noise)[1:]  # invert n = C xi
+    assert xi.var() == pytest.approx(0.5, rel=0.04)
+    for lag in (1, 2, 3):
+        assert abs(np.corrcoef(xi[lag:], xi[:-lag])[0, 1]) < 0.03
+    # With the colour the neighbours correlate, c_0 c_1 + c_1 c_2 over the sum of squares.
+    expected = (C[0] * C[1] + C[1] * C[2]) / (C[0] ** 2 + C[1] ** 2 + C[2] ** 2)
+    assert np.corrcoef(noise[1:], noise[:-1])[0, 1] == pytest.approx(expected, abs=0.03)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 18, 40])
+def test_first_command_shows_after_the_delay(delay):
+    env = mptc_gym.MiddlePointEnv(delay=delay)
+    output = run(env, np.r_[1.0, np.zeros(60)])["output"]
+    assert np.all(output[: delay + 1] == 0.0)  # u(0) first shows in y(d + 1)
+    assert output[delay + 1] == pytest.approx(10.0 * -0.04560, abs=1e-15)
+
+
+def test_steady_state_gain():
+    output = run(mptc_gym.MiddlePointEnv(), np.ones(600))["output"]
+    # (b_1 + b_2) / (1 + a_1 + a_2) = -0.04964 / 0.07273 = -0.682524; times 10 t/h
+    assert output[-1] == pytest.approx(-6.82524, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (0.0, 0.0),
+        (4.999, 0.0),
+        (-4.999, 0.0),
+        (5.0, 5.0),  # the edge passes
+        (-5.0, -5.0),
+        (7.5, 7.5),
+        (-7.5, -7.5),
+        (10.0, 10.0),
+        (-10.0, -10.0),
+        (10.001, 10.0),
+        (-10.001, -10.0),
+        (1e300, 10.0),
+    ],
+)
+def test_actuator(command, expected):
+    assert applied(command) == expected
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "expected"),
+    [
+        (0.1, {"dead_zone": 0.0}, 0.1),
+        (0.0, {"dead_zone": 0.0}, 0.0),
+        (6.9, {"dead_zone": 7.0}, 0.0),
+        (-12.0, {"u_min": -4.0}, -4.0),  # saturation comes after the dead zone
+        (4.0, {"u_min": -4.0}, 0.0),
+        (3.0, {"u_min": 6.0, "u_max": 8.0, "dead_zone": 2.0}, 6.0),
+    ],
+)
+def test_actuator_with_other_limits(command, arguments, expected):
+    assert applied(command, **arguments) == expected
+
+
+def test_scaling_by_hand():
+    assert command_from_action(-1.0, -4.0, 8.0) == -4.0
+    assert command_from_action(0.0, -4.0, 8.0) == 2.0
+    assert command_from_action(1.0, -4.0, 8.0) == 8.0
+    assert command_from_action(2.0, -4.0, 8.0) == 14.0  # beyond the range, on purpose
+    assert action_from_command(5.0, -4.0, 8.0) == 0.5
+
+
+@given(
+    action=st.floats(-10, 10),
+    limits=st.tuples(st.floats(-50, 50), st.floats(0.1, 50)),
+)
+def test_scaling_goes_back(action, limits):
+    u_min, u_max = limits[0], limits[0] + limits[1]
+    command = command_from_action(action, u_min, u_max)
+    assert action_from_command(command, u_min, u_max) == pytest.approx(action, abs=1e-9)
+
+
+def test_more_feedwater_never_makes_it_hotter(rng):
+    for _ in range(20):
+        low = rng.uniform(-1, 1, 200)
+        high = np.minimum(low + rng.uniform(0, 1, 200), 1.0)
+        env = mptc_gym.MiddlePointEnv(noise_variance=0.5)
+        cooler = run(env, high, seed=3)["output"]
+        hotter = run(env, low, seed=3)["output"]
+        assert np.all(cooler <= hotter + 1e-12)
+        assert cooler.sum() < hotter.sum()
+
+
+def test_superposition_away_from_the_actuator(rng):
+    env = mptc_gym.MiddlePointEnv(dead_zone=0.0)
+    first, second = rng.uniform(-0.5, 0.5, (2, 300))
+    together = run(env, first + second)["output"]
+    apart = run(env, first)["output"] + run(env, second)["output"]
+    np.testing.assert_allclose(together, apart, atol=1e-12)
+
+
+def test_reachable_range_without_noise(rng):
+    env = gymnasium.make("MiddlePoint-v0", max_episode_steps=-1)
+    output = run(env, rng.choice([-5.0, 0.0, 5.0], 3000))["output"]
+    # |y| <= 10 t/h times the sum of |impulse response| = 6.82524 + twice what is negative: none
+    assert np.abs(output).max() < 6.826
