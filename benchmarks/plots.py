@@ -113,26 +113,26 @@ def plot_mae(summary: pd.DataFrame, path: Path) -> None:
         _save(figure, path)
 
 
-def plot_learning(curves: pd.DataFrame, path: Path) -> None:
-    """Draw PPO's learning curves: mean |e| on the square wave over samples of experience."""
+def plot_learning(curve: pd.DataFrame, path: Path) -> None:
+    """Draw PPO's learning curve: mean |e| over samples of experience."""
+    shown = {
+        "training_mae": "training: random set points, noise, exploring",
+        "validation_mae": "validation: random set points, noise",
+        "square_mae": "square wave, no noise",
+    }
+    thousands = curve["steps"] / 1000
+    best = curve["validation_mae"].idxmin()
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(9, 4.5))
         axes = figure.subplots()
-        groups = curves.groupby("plant", sort=False)
-        for (plant, rows), colour in zip(groups, _COLOURS, strict=False):
-            thousands = rows["steps"] / 1000
-            axes.plot(
-                thousands, rows["square_mae"], color=colour, label=f"{plant}: square wave"
-            )
-            axes.plot(
-                thousands, rows["training_mae"], color=colour, linestyle=":",
-                label=f"{plant}: while exploring, random set points",
-            )  # fmt: skip
+        for (column, name), colour in zip(shown.items(), _COLOURS, strict=False):
+            axes.plot(thousands, curve[column], color=colour, label=name)
+        axes.axvline(thousands[best], color="0.4", linestyle=":", label="policy that is kept")
         axes.set_ylim(bottom=0)
         axes.set_xlim(left=0)
         axes.set_xlabel("samples of experience (thousands)")
         axes.set_ylabel(METRICS["mae"])
-        axes.set_title("PPO's learning curves", loc="left")
+        axes.set_title("PPO's learning curve", loc="left")
         axes.legend()
         _save(figure, path)
 

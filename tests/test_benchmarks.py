@@ -177,7 +177,7 @@ class TestStorage:
 
 
 def train(folder, arguments=SMALL, *, retrain=False):
-    return ppo.trained_policy(arguments, folder, retrain=retrain, progress=False, title="")
+    return ppo.trained_policy(arguments, folder, retrain=retrain, progress=False)
 
 
 def weights(model):
@@ -189,6 +189,7 @@ class TestPPO:
     def small(self, monkeypatch):
         monkeypatch.setattr(ppo, "CHECKPOINT_INTERVAL", 256)
         monkeypatch.setattr(ppo, "PROBE", replace(ppo.PROBE, samples=20))
+        monkeypatch.setattr(ppo, "VALIDATION_SAMPLES", 20)
 
     def test_a_finished_policy_is_loaded(self, tmp_path, monkeypatch):
         trained = train(tmp_path)
@@ -204,7 +205,7 @@ class TestPPO:
         train(tmp_path)
         curve = pd.read_csv(tmp_path / "learning.csv")
         assert list(curve["steps"]) == [256, 512, 768, 1024]
-        assert (curve[["training_mae", "square_mae"]] > 0).all(axis=None)
+        assert (curve[["training_mae", "validation_mae", "square_mae"]] > 0).all(axis=None)
         assert curve["seconds"].is_monotonic_increasing
 
     @pytest.mark.parametrize("calls", [65, 100, 140])
@@ -231,7 +232,7 @@ class TestPPO:
         torch.manual_seed(0)
         parts = train(tmp_path / "parts")
         assert torch.equal(weights(parts), weights(whole))
-        columns = ["steps", "training_mae", "square_mae"]
+        columns = ["steps", "training_mae", "validation_mae", "square_mae"]
         curves = [
             pd.read_csv(tmp_path / n / "learning.csv")[columns] for n in ("whole", "parts")
         ]
@@ -251,7 +252,7 @@ class TestPPO:
             ppo.policy_key(arguments)
             for arguments in (
                 SMALL, replace(SMALL, seed=1), replace(SMALL, gamma=0.9),
-                replace(SMALL, plant={"dead_zone": 7.0}),
+                replace(SMALL, noise_variance=0.1),
             )
         }  # fmt: skip
         assert len(keys) == 4
@@ -259,13 +260,40 @@ class TestPPO:
         monkeypatch.setattr(ppo, "versions", lambda: {"torch": "another"})
         assert ppo.policy_key(SMALL) not in keys
 
-    def test_it_is_trained_on_the_plant_to_be_controlled(self):
-        plant = ppo.plant_arguments(SCENARIOS["square-dead-zone-7"].parameters)
-        assert plant == {"dead_zone": 7.0}
-        training = replace(SMALL, plant=plant).training
-        assert training["dead_zone"] == 7.0
-        assert training["setpoint"] == "random"
-        assert training["action_window"] == 20
+    def test_it_is_trained_on_random_set_points_with_past_actions(self):
+        parameters = Parameters(**SMALL.training)
+        assert parameters.setpoint == "random"
+        assert parameters.action_window == parameters.delay + 2
+        assert parameters.noise_variance == SMALL.noise_variance
+
+    def test_the_best_in_validation_is_kept(self, tmp_path, monkeypatch):
+        seen = []
+
+        def scores(keeper, arguments, runs, samples, seed):
+            if seed == ppo.VALIDATION_SEED:
+                seen.append(weights(keeper.model))
+            return [3.0, 1.0, 2.0, 1.5][len(seen) - 1]
+
+        monkeypatch.setattr(ppo._Keeper, "_mae", scores)
+        kept = weights(train(tmp_path))
+        assert len(seen) == 4
+        assert torch.equal(kept, seen[1])
+        assert not torch.equal(kept, seen[3])
+
+    def test_exploration_falls_as_set(self, tmp_path, monkeypatch):
+        spreads = {}
+        record = ppo._Keeper.record
+
+        def spy(keeper):
+            record(keeper)
+            spreads[keeper.num_timesteps] = keeper.model.policy.log_std.item()
+
+        monkeypatch.setattr(ppo._Keeper, "record", spy)
+        train(tmp_path, replace(SMALL, log_std=(-1.0, -3.0), log_std_falls=(0.25, 0.75)))
+        # Recorded after the value for the coming rollout is set, but for the last.
+        assert spreads[256] == pytest.approx(-1.0)
+        assert spreads[512] == pytest.approx(-2.0)
+        assert spreads[768] == pytest.approx(-3.0)
 
     def test_inputs_are_scaled_by_fixed_numbers(self):
         model = ppo._begin(SMALL)
@@ -349,7 +377,7 @@ class TestCompare:
         assert list(curve["steps"]) == [256]
         assert (tmp_path / "one/learning.png").exists()
         provenance = json.loads((tmp_path / "one/provenance.json").read_text())
-        assert list(provenance["policies"]) == ["nominal"]
+        assert list(provenance["policies"]) == ["ppo"]
 
         with monkeypatch.context() as patch:
             patch.setattr(ppo.PPO, "learn", None)  # training again would raise
