@@ -85,7 +85,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--scenarios", default=list(SCENARIOS), help="cases", **names)
     add("--seeds", type=_count, default=20, help="number of runs of each case")
-    add("--ppo-steps", type=_count, default=None, help="samples of experience of each policy")
+    add(
+        "--ppo-steps",
+        type=_count,
+        default=None,
+        help="samples of experience of each PPO policy",
+    )
     add("--retrain", action="store_true", help="train PPO anew")
     add("--out", type=Path, default=Path("results/compare"), help="folder to write to")
     add(
@@ -144,7 +149,7 @@ class Comparison:
         self.runs = pd.DataFrame()
         self._options = options
         self._responses: dict[str, pd.DataFrame] = {}
-        self._curve = pd.DataFrame()
+        self._curves = pd.DataFrame()
         self._policies: dict[str, str] = {}
         self._started = datetime.now(timezone.utc)
         self._clock = time.perf_counter()
@@ -154,10 +159,9 @@ class Comparison:
         seeds, scenarios = self._options.seeds, [SCENARIOS[s] for s in self._options.scenarios]
         # Building may take long, as PPO is trained then, and shows a progress bar of its own.
         built = [build(factory, scenario.parameters, seeds, SEED) for scenario in scenarios]
-        policy_folder: Path | None = getattr(factory, "policy_folder", None)
-        if policy_folder is not None:
-            self._policies[agent] = str(policy_folder)
-            self._curve = pd.read_csv(policy_folder / "learning.csv")
+        if hasattr(factory, "curves"):
+            self._policies[agent] = factory.policy
+            self._curves = factory.curves
 
         cells = list(zip(scenarios, built, strict=True))
         for scenario, controller in tqdm(cells, desc=agent, unit="scenario"):
@@ -189,9 +193,9 @@ class Comparison:
         for name, responses in self._responses.items():
             _write_csv(out / f"{name}.csv", responses)
             plots.plot_responses(responses, SCENARIOS[name], out / f"{name}.png")
-        if not self._curve.empty:
-            _write_csv(out / "learning.csv", self._curve)
-            plots.plot_learning(self._curve, out / "learning.png")
+        if not self._curves.empty:
+            _write_csv(out / "learning.csv", self._curves)
+            plots.plot_learning(self._curves, out / "learning.png")
 
     def _write_runs(self, *, complete: bool) -> None:
         out = self._options.out

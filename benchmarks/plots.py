@@ -113,26 +113,33 @@ def plot_mae(summary: pd.DataFrame, path: Path) -> None:
         _save(figure, path)
 
 
-def plot_learning(curve: pd.DataFrame, path: Path) -> None:
-    """Draw PPO's learning curve: mean |e| over samples of experience."""
+def plot_learning(curves: pd.DataFrame, path: Path) -> None:
+    """Draw PPO's learning curves: mean |e| over samples of experience, for each candidate."""
     shown = {
         "training_mae": "training: random set points, noise, exploring",
         "validation_mae": "validation: random set points, noise",
         "square_mae": "square wave, no noise",
     }
-    thousands = curve["steps"] / 1000
-    best = curve["validation_mae"].idxmin()
+    chosen = curves.loc[curves["validation_mae"].idxmin()]
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(9, 4.5))
         axes = figure.subplots()
         for (column, name), colour in zip(shown.items(), _COLOURS, strict=False):
-            axes.plot(thousands, curve[column], color=colour, label=name)
-        axes.axvline(thousands[best], color="0.4", linestyle=":", label="policy that is kept")
+            for candidate, curve in curves.groupby("candidate"):
+                is_chosen = candidate == chosen["candidate"]
+                axes.plot(
+                    curve["steps"] / 1000, curve[column], color=colour,
+                    linewidth=1.5 if is_chosen else 0.7, alpha=1.0 if is_chosen else 0.5,
+                    label=name if is_chosen else None,
+                )  # fmt: skip
+        axes.axvline(
+            chosen["steps"] / 1000, color="0.4", linestyle=":", label="policy that is used"
+        )
         axes.set_ylim(bottom=0)
         axes.set_xlim(left=0)
         axes.set_xlabel("samples of experience (thousands)")
         axes.set_ylabel(METRICS["mae"])
-        axes.set_title("PPO's learning curve", loc="left")
+        axes.set_title("PPO's learning curves", loc="left")
         axes.legend()
         _save(figure, path)
 

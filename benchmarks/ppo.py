@@ -9,8 +9,7 @@ import json
 import math
 import pickle
 import time
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +33,7 @@ from mptc_gym import Parameters
 
 DELAY = Parameters().delay
 CHECKPOINT_INTERVAL = 32_768  # samples of experience between checkpoints
+CANDIDATES = 3  # policies trained, from seeds in sequence; the best in validation is used
 VALIDATION_RUNS, VALIDATION_SAMPLES = 16, 600
 VALIDATION_SEED = 2_000_000  # met neither in training nor by any comparison
 PROBE = SCENARIOS["square"]  # shown in the learning curve, without a part in the training
@@ -131,40 +131,64 @@ class PolicyController:
 class Trained:
     """Builds PPO controllers, all with one policy, which is trained when first asked for.
 
+    Of `CANDIDATES` policies that differ in their seeds, the one that does best in validation is
+    used: now and then training ends in a policy that is much worse than usual.
+
     Parameters
     ----------
     arguments
-        How to train.
+        How to train the first candidate.
     folder
         Where policies are kept, each in a folder of its own.
     retrain
         Whether to train even where a finished policy is at hand.
     progress
-        Whether to show a progress bar.
+        Whether to show progress bars.
 
     Attributes
     ----------
     observation : dict
         Arguments of the environment that give the policy its observation.
-    policy_folder : Path
-        Where this policy is kept.
+    curves : DataFrame
+        The learning curves of the candidates, when trained: a row a point, `candidate` is the
+        seed.
+    policy : str
+        The folder of the policy that is used, when trained.
     """
 
     def __init__(
         self, arguments: PPOArguments, folder: Path, *, retrain: bool, progress: bool
     ) -> None:
         self.observation = arguments.observation
-        self.policy_folder = folder / policy_key(arguments)
-        self._train = partial(
-            trained_policy, arguments, self.policy_folder, retrain=retrain, progress=progress
-        )
+        self.curves = pd.DataFrame()
+        self.policy = ""
+        self._arguments = arguments
+        self._folder = folder
+        self._retrain = retrain
+        self._progress = progress
         self._model: PPO | None = None
 
     def __call__(self) -> PolicyController:
         """Return a controller."""
         if self._model is None:
-            self._model = self._train()
+            self._model = self._best_candidate()
         return PolicyController(self._model)
+
+    def _best_candidate(self) -> PPO:
+        models, curves, folders = [], [], []
+        for seed in range(self._arguments.seed, self._arguments.seed + CANDIDATES):
+            arguments = replace(self._arguments, seed=seed)
+            folders.append(self._folder / policy_key(arguments))
+            models.append(
+                trained_policy(
+                    arguments, folders[-1], retrain=self._retrain, progress=self._progress
+                )
+            )
+            curves.append(pd.read_csv(folders[-1] / "learning.csv").assign(candidate=seed))
+        best = int(np.argmin([curve["validation_mae"].min() for curve in curves]))
+        self.curves = pd.concat(curves, ignore_index=True)
+        self.policy = str(folders[best])
+        return models[best]
 
 
 def policy_key(arguments: PPOArguments) -> str:
@@ -216,7 +240,7 @@ def trained_policy(
         model, curve, best = _begin(arguments), [], {}
     left = arguments.steps - model.num_timesteps
     bar = tqdm(
-        desc="training PPO",
+        desc=f"training PPO, seed {arguments.seed}",
         total=arguments.steps,
         initial=model.num_timesteps,
         unit=" samples",

@@ -70,12 +70,12 @@ class TestMeasures:
         assert measured(runs)["settling_time"] == math.inf
 
     def test_input_by_hand(self):
-        commands = [0, 4.9, 5, -12, -10, 10]
-        applied = [0, 0, 5, -10, -10, 10]
+        commands = [6, 4.9, 5, -12, -10, -4]
+        applied = [6, 0, 5, -10, -10, 0]
         values = measured(trajectory([1] * 6, [0] * 6, commands, applied))
-        assert values["total_variation"] == 5 + 15 + 0 + 20
+        assert values["total_variation"] == 6 + 6 + 5 + 15 + 0 + 10
         assert values["dead_zone_share"] == pytest.approx(100 * 2 / 6)
-        assert values["saturation_share"] == pytest.approx(100 * 3 / 6)
+        assert values["saturation_share"] == pytest.approx(100 * 2 / 6)
 
     def test_runs_are_measured_apart(self):
         one, other = trajectory([1, 1], [0, 1]), trajectory([3, 3], [0, 0])
@@ -138,6 +138,11 @@ class TestRollout:
         ]
         np.testing.assert_array_equal(*noises)
         assert not np.array_equal(noises[0][:, 0], noises[0][:, 1])
+
+    def test_the_controller_begins_afresh(self):
+        plants, agent = make_plants(1, 30, setpoint=5.0), PIController()
+        first, second = (rollout(plants, agent, 30, seed=0) for _ in range(2))
+        np.testing.assert_array_equal(first.command, second.command)
 
     def test_runs_do_not_depend_on_how_many_there_are(self):
         many = rollout(make_plants(3, 30, noise_variance=0.5), PIController(), 30, seed=8)
@@ -362,6 +367,7 @@ class TestCompare:
         monkeypatch.setattr(
             ppo.PPOArguments, "__init__", _with_defaults(ppo.PPOArguments.__init__, SMALL)
         )
+        monkeypatch.setattr(ppo, "CANDIDATES", 2)
         options = (
             "--agents",
             "ppo",
@@ -374,10 +380,13 @@ class TestCompare:
         )
         assert run_compare(tmp_path / "one", *options) == 0
         curve = pd.read_csv(tmp_path / "one/learning.csv")
-        assert list(curve["steps"]) == [256]
+        assert list(curve["steps"]) == [256, 256]
+        assert list(curve["candidate"]) == [0, 1]
         assert (tmp_path / "one/learning.png").exists()
         provenance = json.loads((tmp_path / "one/provenance.json").read_text())
-        assert list(provenance["policies"]) == ["ppo"]
+        used = Path(provenance["policies"]["ppo"])
+        better = curve["validation_mae"].idxmin()
+        assert json.loads((used / "arguments.json").read_text())["seed"] == better
 
         with monkeypatch.context() as patch:
             patch.setattr(ppo.PPO, "learn", None)  # training again would raise
