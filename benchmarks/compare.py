@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(str(error))
 
     # Wide enough for the tables where nothing says how wide the page is.
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    console = Console(width=None if sys.stdout.isatty() else 140)
     comparison = Comparison(options)
     try:
         for agent, factory in factories.items():
@@ -182,14 +182,15 @@ class Comparison:
             self._write_runs(complete=False)
 
     def finish(self, *, complete: bool) -> None:
-        """Write the summary and the plots of all that has been run."""
+        """Write the summary and the plots of all that has been run, if anything has."""
+        if self.runs.empty:
+            return
         out = self._options.out
         self._write_runs(complete=complete)
-        if not self.runs.empty:
-            summary = tables.summarise(self.runs)
-            _write_csv(out / "summary.csv", summary)
-            write_text(out / "summary.md", tables.markdown(summary, self._options.seeds))
-            plots.plot_mae(summary, out / "mae.png")
+        summary = tables.summarise(self.runs)
+        _write_csv(out / "summary.csv", summary)
+        write_text(out / "summary.md", tables.markdown(summary, self._options.seeds))
+        plots.plot_mae(summary, out / "mae.png")
         for name, responses in self._responses.items():
             _write_csv(out / f"{name}.csv", responses)
             plots.plot_responses(responses, SCENARIOS[name], out / f"{name}.png")

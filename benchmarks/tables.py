@@ -135,8 +135,7 @@ def on_screen(table: pd.DataFrame, title: str) -> Table:
     screen = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     for name in table.columns:
         is_name = name in ("scenario", "agent")
-        width = table[name].str.len().max()  # headings may wrap, values may not
-        screen.add_column(name, justify="left" if is_name else "right", min_width=width)
+        screen.add_column(name, justify="left" if is_name else "right", no_wrap=is_name)
     for row in table.itertuples(index=False):
         screen.add_row(*row)
     return screen

@@ -420,28 +420,43 @@ class TestCompare:
         assert list(runs["agent"]) == ["pi", "pi", "mine", "mine"]
         assert set(runs[runs.agent == "mine"]["saturation_share"]) == {100.0}
 
-    def test_an_interrupted_run_keeps_what_it_has(self, tmp_path, monkeypatch, capsys):
+    def run_and_stop(self, out, monkeypatch, error, after):
         calls = 0
 
-        def interrupted(*arguments):
+        def stopped(*arguments):
             nonlocal calls
             calls += 1
-            if calls == 3:
-                raise KeyboardInterrupt
+            if calls > after:
+                raise error
             return rollout(*arguments)
 
-        monkeypatch.setattr(compare, "rollout", interrupted)
-        status = run_compare(
-            tmp_path / "out", "--agents", "pi", "nn", "--scenarios", "constant", "square",
-            "--seeds", 1,
-        )  # fmt: skip
-        assert status == 130
+        monkeypatch.setattr(compare, "rollout", stopped)
+        return run_compare(
+            out, "--agents", "pi", "nn", "--scenarios", "constant", "square", "--seeds", 1
+        )
+
+    def test_an_interrupted_run_keeps_what_it_has(self, tmp_path, monkeypatch, capsys):
+        out = tmp_path / "out"
+        assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=2) == 130
         assert "Interrupted" in capsys.readouterr().out
-        runs = pd.read_csv(tmp_path / "out/runs.csv")
-        assert list(runs["scenario"]) == ["constant", "square"]
-        assert json.loads((tmp_path / "out/provenance.json").read_text())["complete"] is False
-        assert (tmp_path / "out/summary.md").exists()
-        assert (tmp_path / "out/square.png").exists()
+        assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
+        assert json.loads((out / "provenance.json").read_text())["complete"] is False
+        assert (out / "summary.md").exists()
+        assert (out / "square.png").exists()
+
+    def test_a_failing_controller_costs_only_itself(self, tmp_path, monkeypatch):
+        out = tmp_path / "out"
+        with pytest.raises(ZeroDivisionError):
+            self.run_and_stop(out, monkeypatch, ZeroDivisionError, after=2)
+        assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
+        assert json.loads((out / "provenance.json").read_text())["complete"] is False
+
+    def test_interrupted_before_anything_has_finished(self, tmp_path, monkeypatch):
+        out = tmp_path / "out"
+        out.mkdir()
+        (out / "runs.csv").write_text("of an earlier run")
+        assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=0) == 130
+        assert (out / "runs.csv").read_text() == "of an earlier run"
 
     @pytest.mark.parametrize(
         ("options", "complaint"),
