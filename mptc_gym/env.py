@@ -240,13 +240,19 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
         # At rest u is 0, whatever action that is.
         self._action = action_from_command(0.0, parameters.u_min, parameters.u_max)
-        size, actions = parameters.observation_size, parameters.action_window
         rest = _limited(self._action, 1.0)
+        size, actions = parameters.observation_size, parameters.action_window
+        # One element to spare at the end: see step.
         self._window = [0.0] * (size - actions) + [rest] * (actions + 1)
         self._ahead.clear()
 
         setpoint = float(self._setpoint.take(1)[0])
-        return self._observe(setpoint, 0.0, self._action), {
+        _, error_head, output_head, action_head, _ = self._layout
+        self._window[0] = setpoint
+        self._window[error_head] = setpoint
+        self._window[output_head] = 0.0
+        self._window[action_head] = rest
+        return np.fromiter(self._window, _FLOAT32, size), {
             "output": 0.0,
             "setpoint": setpoint,
             "error": setpoint,
@@ -275,11 +281,17 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         ResetNeeded
             If the environment has never been reset.
         """
-        a = _scalar(action)
+        # This is the hot path: built-ins and function calls only where they are rarely reached.
+        try:
+            a = float(action.item())
+        except (AttributeError, TypeError, ValueError):
+            a = _scalar(action)
+        shown = a if -1.0 <= a <= 1.0 else _beyond_the_box(a)
         if not self._ahead:
             self._look_ahead()
         setpoint, noise = self._ahead.pop()
         u_min, u_max, error_scale, quadratic, move_weight = self._constants
+        span, error_head, output_head, action_head, size = self._layout
 
         command = command_from_action(a, u_min, u_max)
         applied, output = self._plant.step(command, noise)
@@ -289,8 +301,21 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         if move_weight:
             cost += move_weight * abs(a - self._action)
         self._action = a
+
+        # All blocks move by one at once; what crosses into the next block is overwritten there.
+        # An empty block begins where the next one does, which is written after it, or at the
+        # spare element at the end.
+        measured = output if -span <= output <= span else _limited(output, span)
+        window = self._window
+        window.insert(0, setpoint)
+        window.pop()
+        window[error_head] = setpoint - measured
+        window[output_head] = measured
+        window[action_head] = shown
         return (
-            self._observe(setpoint, output, a),
+            np.fromiter(
+                window, _FLOAT32, size
+            ),  # the quickest way from a few floats to an array
             -cost,
             False,
             False,
@@ -314,31 +339,23 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         noises = self._noise.take(BLOCK).tolist()
         self._ahead = list(zip(setpoints, noises, strict=True))[::-1]
 
-    def _observe(self, setpoint: float, output: float, action: float) -> Observation:
-        span, error_head, output_head, action_head, size = self._layout
-        measured = output if -span <= output <= span else _limited(output, span)
-        # All blocks move by one at once; what crosses into the next block is overwritten there.
-        # An empty block begins where the next one does, which is written after it, or at the
-        # spare element at the end.
-        window = self._window
-        window.insert(0, setpoint)
-        window.pop()
-        window[error_head] = setpoint - measured
-        window[output_head] = measured
-        window[action_head] = action if -1.0 <= action <= 1.0 else _limited(action, 1.0)
-        # The quickest way from a few floats to an array.
-        return np.fromiter(window, _FLOAT32, size)
-
 
 def _limited(value: float, limit: float) -> float:
     return min(max(value, -limit), limit)
 
 
-def _scalar(action: Action) -> float:
+def _scalar(action: Any) -> float:
     try:
-        value = float(np.asarray(action).item())
+        return float(np.asarray(action).item())
     except (TypeError, ValueError):
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"action must be an array of one finite number, got {action!r}")
-    return value
+        raise _bad_action(action) from None
+
+
+def _beyond_the_box(action: float) -> float:
+    if not math.isfinite(action):
+        raise _bad_action(action)
+    return _limited(action, 1.0)
+
+
+def _bad_action(action: Any) -> ValueError:
+    return ValueError(f"action must be one finite number, shape (1,), got {action!r}")
