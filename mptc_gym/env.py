@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym.parameters import Parameters
-from mptc_gym.plant import Plant, action_from_command, command_from_action
+from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.signals import EpisodeStream, Noise, SetPoint
 
 BLOCK = 256  # samples of set point and noise made at a time
@@ -185,9 +185,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = observation_space(parameters)
         # What step uses, in two tuples: unpacking one costs less than as many attributes.
-        self._constants = (
-            parameters.u_min,
-            parameters.u_max,
+        self._reward = (
             parameters.error_scale,
             parameters.reward == "quadratic",
             parameters.move_weight,
@@ -290,11 +288,10 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         if not self._ahead:
             self._look_ahead()
         setpoint, noise = self._ahead.pop()
-        u_min, u_max, error_scale, quadratic, move_weight = self._constants
+        error_scale, quadratic, move_weight = self._reward
         span, error_head, output_head, action_head, size = self._layout
 
-        command = command_from_action(a, u_min, u_max)
-        applied, output = self._plant.step(command, noise)
+        command, applied, output = self._plant.step(a, noise)
         error = setpoint - output
         scaled = error / error_scale
         cost = scaled * scaled / 2.0 if quadratic else abs(scaled)  # (12)

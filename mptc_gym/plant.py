@@ -7,36 +7,18 @@ from collections import deque
 from mptc_gym.parameters import Parameters
 
 
-def command_from_action(action: float, u_min: float, u_max: float) -> float:
-    """Scale a normalised action to a command (Section 4, last formula).
-
-    Parameters
-    ----------
-    action
-        Normalised action, -1 at `u_min` and 1 at `u_max`. Values beyond are commands beyond
-        the range.
-    u_min, u_max
-        The actuator's limits, t/h.
-
-    Returns
-    -------
-    float
-        The command u before the actuator, t/h.
-    """
-    return u_min + (action + 1.0) / 2.0 * (u_max - u_min)
-
-
 def action_from_command(command: float, u_min: float, u_max: float) -> float:
-    """Scale a command (t/h) to a normalised action, the inverse of `command_from_action`."""
+    """Scale a command (t/h) to a normalised action: -1 at `u_min`, 1 at `u_max`."""
     return 2.0 * (command - u_min) / (u_max - u_min) - 1.0
 
 
 class Plant:
-    """Actuator (29) and middle-point temperature (28), at rest until moved.
+    """Command scaling, actuator (29) and middle-point temperature (28), at rest until moved.
 
-    As printed, (29) compares the magnitude of u with U_min in one of its cases. Meant is: no
-    effect inside the dead zone, otherwise the command limited to [U_min, U_max]. A command on
-    the edge of the dead zone passes.
+    The scaling is the last formula of Section 4, for actions from -1 to 1 in place of network
+    outputs from 0 to 1. As printed, (29) compares the magnitude of u with U_min in one of its
+    cases. Meant is: no effect inside the dead zone, otherwise the command limited to
+    [U_min, U_max]. A command on the edge of the dead zone passes.
 
     Parameters
     ----------
@@ -53,24 +35,27 @@ class Plant:
         self._outputs = _at_rest(len(self._alpha))
         self._inputs = _at_rest(parameters.delay + len(self._beta))
 
-    def step(self, command: float, noise: float) -> tuple[float, float]:
+    def step(self, action: float, noise: float) -> tuple[float, float, float]:
         """Move from sample k to k+1.
 
         Parameters
         ----------
-        command
-            u(k), t/h.
+        action
+            a(k), normalised: -1 at U_min and 1 at U_max. An action beyond is a command beyond.
         noise
             n(k+1), degC.
 
         Returns
         -------
+        command
+            u(k), t/h.
         applied
             u_a(k), t/h.
         output
             y(k+1), degC.
         """
         dead_zone, u_min, u_max = self._limits
+        command = u_min + (action + 1.0) / 2.0 * (u_max - u_min)
         applied = command  # (29) from here on
         if -dead_zone < command < dead_zone:
             applied = 0.0
@@ -86,7 +71,7 @@ class Plant:
         for lag, beta in self._beta:
             output += beta * inputs[lag]
         outputs.appendleft(output)
-        return applied, output
+        return command, applied, output
 
 
 def _at_rest(samples: int) -> deque[float]:
