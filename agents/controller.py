@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from numbers import Integral, Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +32,26 @@ def action_from_command(command: Values, u_min: float, u_max: float) -> NDArray[
     return np.asarray(action, dtype=np.float32)[..., np.newaxis]
 
 
+def check_count(name: str, value: Any, least: int) -> int:
+    """Return `value` if it is an integer of at least `least`; ValueError otherwise."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
+        raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+    return int(value)
+
+
+def check_number(name: str, value: Any, least: float = -math.inf) -> float:
+    """Return `value` if it is a finite number of at least `least`; ValueError otherwise."""
+    if (
+        not isinstance(value, Real)
+        or isinstance(value, bool)
+        or not math.isfinite(value)
+        or value < least
+    ):
+        bound = "" if least == -math.inf else f" of at least {least:g}"
+        raise ValueError(f"{name} must be a finite number{bound}, got {value!r}")
+    return float(value)
+
+
 class Controller(ABC):
     """A controller of one loop, or of a batch of loops side by side.
 
@@ -53,13 +75,11 @@ class Controller(ABC):
     """
 
     def __init__(self, *, n_obs: int, u_min: float, u_max: float) -> None:
-        if not (math.isfinite(u_min) and math.isfinite(u_max) and u_min < u_max):
-            raise ValueError(
-                f"u_min and u_max must be finite, u_min below u_max, got {u_min!r}, {u_max!r}"
-            )
         self.n_obs = n_obs
-        self.u_min = u_min
-        self.u_max = u_max
+        self.u_min = check_number("u_min", u_min)
+        self.u_max = check_number("u_max", u_max)
+        if self.u_min >= self.u_max:
+            raise ValueError(f"u_min must be below u_max = {u_max!r}, got {u_min!r}")
         self.command: Values = np.float64(0.0)
 
     def reset(self) -> None:
@@ -78,8 +98,8 @@ class Controller(ABC):
         Returns
         -------
         ndarray of float32
-            The normalised action, shape (1,) or (batch, 1). It lies outside [-1, 1] where the
-            command lies outside the actuator's limits.
+            The normalised action, shape (1,) or (batch, 1), in the precision of the action
+            space. It lies outside [-1, 1] where the command lies outside the actuator's limits.
 
         Raises
         ------

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
-from numbers import Integral
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import Controller, Values
+from agents.controller import Controller, Values, check_count, check_number
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # arrays have no single truth value
 class Weights:
     """Weights and thresholds of one network, or with a leading batch axis of many.
 
@@ -127,48 +125,28 @@ class DirectNNController(Controller):
         u_min: float = -10.0,
         u_max: float = 10.0,
     ) -> None:
-        super().__init__(n_obs=max(n_inputs, error_index + 1), u_min=u_min, u_max=u_max)
-        for name, count, least in (
-            ("n_inputs", n_inputs, 1),
-            ("n_hidden", n_hidden, 1),
-            ("update_interval", update_interval, 1),
-            ("num_envs", 1 if num_envs is None else num_envs, 1),
-            ("seed", seed, 0),
-        ):
-            if not isinstance(count, Integral) or count < least:
-                raise ValueError(
-                    f"{name} must be an integer of at least {least}, got {count!r}"
-                )
-        for name, value in (
-            ("eta", eta),
-            ("eta_1", eta_1),
-            ("eta_theta", eta_theta),
-            ("eta_1_theta", eta_1_theta),
-            ("weight_scale", weight_scale),
-        ):
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
-        if not math.isfinite(input_scale):
-            raise ValueError(f"input_scale must be a finite number, got {input_scale!r}")
+        self.n_inputs = check_count("n_inputs", n_inputs, 1)
+        self.n_hidden = check_count("n_hidden", n_hidden, 1)
+        self.error_index = check_count("error_index", error_index, 0)
+        n_obs = max(self.n_inputs, self.error_index + 1)
+        super().__init__(n_obs=n_obs, u_min=u_min, u_max=u_max)
+        self.eta = check_number("eta", eta, 0)
+        self.eta_1 = check_number("eta_1", eta_1, 0)
+        self.eta_theta = check_number("eta_theta", eta_theta, 0)
+        self.eta_1_theta = check_number("eta_1_theta", eta_1_theta, 0)
         if direction not in (-1, 1):
             raise ValueError(f"direction must be -1 or 1, got {direction!r}")
-        self.n_inputs = n_inputs
-        self.n_hidden = n_hidden
-        self.eta = eta
-        self.eta_1 = eta_1
-        self.eta_theta = eta_theta
-        self.eta_1_theta = eta_1_theta
         self.direction = direction
-        self.input_scale = input_scale
-        self.weight_scale = weight_scale
-        self.error_index = error_index
-        self.num_envs = num_envs
+        self.input_scale = check_number("input_scale", input_scale)
+        self.weight_scale = check_number("weight_scale", weight_scale, 0)
+        self.num_envs = None if num_envs is None else check_count("num_envs", num_envs, 1)
         self.learning = learning
-        self.update_interval = update_interval
+        self.update_interval = check_count("update_interval", update_interval, 1)
+        seed = check_count("seed", seed, 0)
         self._shapes = {
-            "W": (n_hidden, n_inputs),
-            "theta_1": (n_hidden,),
-            "W_1": (n_hidden,),
+            "W": (self.n_hidden, self.n_inputs),
+            "theta_1": (self.n_hidden,),
+            "W_1": (self.n_hidden,),
             "theta_2": (),
         }
         self._sample = 0  # k

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import Controller, Values
+from agents.controller import Controller, Values, check_count, check_number
 
 
 class PIController(Controller):
@@ -29,7 +27,7 @@ class PIController(Controller):
     Raises
     ------
     ValueError
-        If a gain or a limit is not a finite number.
+        If an argument is out of range; the message names it.
     """
 
     def __init__(
@@ -41,13 +39,10 @@ class PIController(Controller):
         u_min: float = -10.0,
         u_max: float = 10.0,
     ) -> None:
-        super().__init__(n_obs=error_index + 1, u_min=u_min, u_max=u_max)
-        for name, gain in (("kp", kp), ("ki", ki)):
-            if not math.isfinite(gain):
-                raise ValueError(f"{name} must be a finite number, got {gain!r}")
-        self.kp = kp
-        self.ki = ki
-        self.error_index = error_index
+        self.error_index = check_count("error_index", error_index, 0)
+        super().__init__(n_obs=self.error_index + 1, u_min=u_min, u_max=u_max)
+        self.kp = check_number("kp", kp)
+        self.ki = check_number("ki", ki)
         self._sum: Values | None = None  # of all errors so far
 
     def reset(self) -> None:

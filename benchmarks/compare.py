@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from collections.abc import Sequence
@@ -20,6 +21,7 @@ from benchmarks.rollout import make_plants, rollout
 from benchmarks.roster import BUILT_IN, Factory, build, load_factory, observation
 from benchmarks.scenarios import SCENARIOS
 from benchmarks.storage import commit, replacing, versions, write_json, write_text
+from mptc_gym import Parameters
 
 SEED = 0  # run i meets the noise, and starts from the weights, of seed SEED + i
 
@@ -47,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(str(error))
 
     # Wide enough for the tables where nothing says how wide the page is.
-    console = Console(width=None if sys.stdout.isatty() else 140)
+    console = Console(width=None if sys.stdout.isatty() else 140, markup=False)
     comparison = Comparison(options)
     try:
         for agent, factory in factories.items():
@@ -56,13 +58,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         console.print("\nInterrupted: what has finished is kept.")
         comparison.finish(complete=False)
         return 130
+    except Exception:
+        comparison.finish(complete=False)
+        raise
     comparison.finish(complete=True)
 
     summary = tables.summarise(comparison.runs)
     title = f"{METRICS['mae']}: median (10th to 90th percentile) of {options.seeds} runs"
-    console.print(tables.on_screen(tables.mae_table(summary), title))
+    console.print(title)
+    console.print(tables.on_screen(tables.mae_table(summary)))
     others = tables.metrics_table(summary, tables.format_median)
-    console.print(tables.on_screen(others, f"Other measures: median of {options.seeds} runs"))
+    console.print(f"Other measures: median of {options.seeds} runs")
+    console.print(tables.on_screen(others))
     console.print(f"Tables, data and plots are in {options.out}/", highlight=False)
     return 0
 
@@ -74,7 +81,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
-    names = {"nargs": "+", "metavar": "NAME"}
+    names = {"nargs": "*", "metavar": "NAME"}
     add("--agents", default=[*BUILT_IN, "ppo"], help="controllers of this repository", **names)
     add(
         "--agent",
@@ -84,12 +91,12 @@ def _parser() -> argparse.ArgumentParser:
         help="a controller of your own, beside those of --agents (may be given more than once)",
     )
     add("--scenarios", default=list(SCENARIOS), help="cases", **names)
-    add("--seeds", type=_count, default=20, help="number of runs of each case")
+    add("--seeds", type=number, default=20, help="number of runs of each case")
     add(
         "--ppo-steps",
-        type=_count,
-        default=None,
-        help="samples of experience of each PPO policy",
+        type=number,
+        default=argparse.SUPPRESS,
+        help="samples of experience of each PPO policy (default: 1000000)",
     )
     add("--retrain", action="store_true", help="train PPO anew")
     add("--out", type=Path, default=Path("results/compare"), help="folder to write to")
@@ -102,7 +109,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _count(text: str) -> int:
+def number(text: str) -> int:
+    """Read a number of at least 1; argparse shows this function's name in its complaints."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
@@ -121,18 +129,22 @@ def _factories(options: argparse.Namespace) -> dict[str, Factory]:
     factories = {name: load_factory(BUILT_IN[name]) for name in options.agents if name != "ppo"}
     for text in options.agent:
         name, equals, location = text.partition("=")
-        if not (name and equals) or name in [*BUILT_IN, "ppo", *factories]:
+        if not (name and equals) or name.lower() in [*BUILT_IN, "ppo", *factories]:
             raise ValueError(f"--agent must be NEW_NAME=MODULE:FACTORY, got {text!r}")
         factories[name] = load_factory(location)
     if "ppo" in options.agents:  # last, as it takes longest and may be interrupted
         from benchmarks.ppo import PPOArguments, Trained  # here: torch takes seconds to load
 
-        changes = {} if options.ppo_steps is None else {"steps": options.ppo_steps}
+        changes = {"steps": options.ppo_steps} if "ppo_steps" in options else {}
         factories["ppo"] = Trained(
             PPOArguments(**changes), options.policies, retrain=options.retrain, progress=True
         )
     if not factories:
         raise ValueError("--agents, --agent: no controller to run")
+    if not options.scenarios:
+        raise ValueError("--scenarios: none to run")
+    for factory in factories.values():
+        observation(factory)  # complain now, not after the first controllers have run
     return factories
 
 
@@ -150,7 +162,8 @@ class Comparison:
         self._options = options
         self._responses: dict[str, pd.DataFrame] = {}
         self._curves = pd.DataFrame()
-        self._policies: dict[str, str] = {}
+        self._policies: dict[str, Any] = {}
+        self._files: list[str] = []
         self._started = datetime.now(timezone.utc)
         self._clock = time.perf_counter()
 
@@ -158,16 +171,18 @@ class Comparison:
         """Run a controller on every scenario."""
         seeds, scenarios = self._options.seeds, [SCENARIOS[s] for s in self._options.scenarios]
         # Building may take long, as PPO is trained then, and shows a progress bar of its own.
-        built = [build(factory, scenario.parameters, seeds, SEED) for scenario in scenarios]
+        windows = observation(factory)
+        built = [
+            build(factory, Parameters(**scenario.arguments, **windows), seeds, SEED)
+            for scenario in scenarios
+        ]
         if hasattr(factory, "curves"):
-            self._policies[agent] = factory.policy
+            self._policies[agent] = factory.used
             self._curves = factory.curves
 
         cells = list(zip(scenarios, built, strict=True))
         for scenario, controller in tqdm(cells, desc=agent, unit="scenario"):
-            plants = make_plants(
-                seeds, scenario.samples, **scenario.arguments, **observation(factory)
-            )
+            plants = make_plants(seeds, scenario.samples, **scenario.arguments, **windows)
             trajectory = rollout(plants, controller, scenario.samples, SEED)
             plants.close()
             measures = pd.DataFrame(measure(trajectory, scenario.parameters))
@@ -185,22 +200,37 @@ class Comparison:
         """Write the summary and the plots of all that has been run, if anything has."""
         if self.runs.empty:
             return
-        out = self._options.out
-        self._write_runs(complete=complete)
         summary = tables.summarise(self.runs)
-        _write_csv(out / "summary.csv", summary)
-        write_text(out / "summary.md", tables.markdown(summary, self._options.seeds))
-        plots.plot_mae(summary, out / "mae.png")
+        self._write_csv("summary.csv", summary)
+        write_text(self._path("summary.md"), tables.markdown(summary, self._options.seeds))
+        plots.plot_mae(summary, self._path("mae.png"))
         for name, responses in self._responses.items():
-            _write_csv(out / f"{name}.csv", responses)
-            plots.plot_responses(responses, SCENARIOS[name], out / f"{name}.png")
+            self._write_csv(f"{name}.csv", responses)
+            plots.plot_responses(responses, SCENARIOS[name], self._path(f"{name}.png"))
         if not self._curves.empty:
-            _write_csv(out / "learning.csv", self._curves)
-            plots.plot_learning(self._curves, out / "learning.png")
+            self._write_csv("learning.csv", self._curves)
+            plots.plot_learning(self._curves, self._path("learning.png"))
+        self._write_runs(complete=complete)
+
+    def _path(self, name: str) -> Path:
+        """Return where to write a file; the first time, remove what another run left there."""
+        out: Path = self._options.out
+        if not self._files:
+            earlier = out / "provenance.json"
+            if earlier.exists():
+                for stale in json.loads(earlier.read_text(encoding="utf-8")).get("files", []):
+                    (out / Path(stale).name).unlink(missing_ok=True)
+        if name not in self._files:
+            self._files.append(name)
+        return out / name
+
+    def _write_csv(self, name: str, table: pd.DataFrame) -> None:
+        with replacing(self._path(name)) as file:
+            tables.for_csv(table).to_csv(file, index=False)
 
     def _write_runs(self, *, complete: bool) -> None:
-        out = self._options.out
-        _write_csv(out / "runs.csv", self.runs)
+        self._write_csv("runs.csv", self.runs)
+        path = self._path("provenance.json")
         provenance: dict[str, Any] = {
             "complete": complete,
             "started": self._started.isoformat(timespec="seconds"),
@@ -210,17 +240,13 @@ class Comparison:
             "policies": self._policies,
             "versions": versions(),
             "commit": commit(),
+            "files": self._files,
         }
-        write_json(out / "provenance.json", provenance)
+        write_json(path, provenance)
 
 
 def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
-
-
-def _write_csv(path: Path, table: pd.DataFrame) -> None:
-    with replacing(path) as partial:
-        tables.for_csv(table).to_csv(partial, index=False)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tqdm import tqdm
 
@@ -68,7 +67,7 @@ class PPOArguments:
     n_epochs: int = 10
     """How often an update goes through its samples."""
     learning_rate: float = 1e-3
-    """At the start; it falls linearly to zero."""
+    """At the start; it falls linearly, to a twentieth."""
     gamma: float = 0.95
     """Discount a sample."""
     gae_lambda: float = 1.0
@@ -152,8 +151,8 @@ class Trained:
     curves : DataFrame
         The learning curves of the candidates, when trained: a row a point, `candidate` is the
         seed.
-    policy : str
-        The folder of the policy that is used, when trained.
+    used : dict
+        Folder and arguments of the policy that is used, when trained.
     """
 
     def __init__(
@@ -161,7 +160,7 @@ class Trained:
     ) -> None:
         self.observation = arguments.observation
         self.curves = pd.DataFrame()
-        self.policy = ""
+        self.used: dict[str, Any] = {}
         self._arguments = arguments
         self._folder = folder
         self._retrain = retrain
@@ -187,13 +186,18 @@ class Trained:
             curves.append(pd.read_csv(folders[-1] / "learning.csv").assign(candidate=seed))
         best = int(np.argmin([curve["validation_mae"].min() for curve in curves]))
         self.curves = pd.concat(curves, ignore_index=True)
-        self.policy = str(folders[best])
+        used = replace(self._arguments, seed=self._arguments.seed + best)
+        self.used = {"folder": str(folders[best]), "arguments": asdict(used)}
         return models[best]
 
 
 def policy_key(arguments: PPOArguments) -> str:
     """Return a name made of everything that shapes a policy: arguments, versions and code."""
-    sources = [*sorted((ROOT / "mptc_gym").glob("*.py")), Path(__file__)]
+    names = ("metrics.py", "ppo.py", "rollout.py", "scenarios.py")
+    sources = [
+        *sorted((ROOT / "mptc_gym").glob("*.py")),
+        *(ROOT / "benchmarks" / n for n in names),
+    ]
     shaped_by = {
         "arguments": asdict(arguments),
         "versions": versions(),
@@ -227,17 +231,20 @@ def trained_policy(
         policy, to the bit, as training that was not.
     """
     policy, checkpoint = folder / "policy.zip", folder / "checkpoint.pkl"
+    curve_file = folder / "learning.csv"
     if retrain:
         policy.unlink(missing_ok=True)
         checkpoint.unlink(missing_ok=True)
-    if policy.exists():
-        return PPO.load(policy, device="cpu")
-
     torch.set_num_threads(1)  # the network is too small for more
-    if checkpoint.exists():
-        model, curve, best = _resume(checkpoint)
-    else:
-        model, curve, best = _begin(arguments), [], {}
+    try:
+        if policy.exists() and curve_file.exists():
+            return PPO.load(policy, device="cpu")
+        if checkpoint.exists():
+            model, curve, best = _resume(checkpoint)
+        else:
+            model, curve, best = _begin(arguments), [], {}
+    except (EOFError, OSError, ValueError, pickle.UnpicklingError) as error:
+        raise ValueError(f"{folder} is damaged ({error}): remove it, or --retrain") from error
     left = arguments.steps - model.num_timesteps
     bar = tqdm(
         desc=f"training PPO, seed {arguments.seed}",
@@ -252,7 +259,7 @@ def trained_policy(
         model.learn(left, callback=keeper, reset_num_timesteps=False)
         keeper.record()
     model.policy.load_state_dict(keeper.best)
-    with replacing(folder / "learning.csv") as file:
+    with replacing(curve_file) as file:
         pd.DataFrame(keeper.curve).to_csv(file, index=False)
     write_json(folder / "arguments.json", asdict(arguments) | {"versions": versions()})
     with replacing(policy) as file:
@@ -272,7 +279,8 @@ def _begin(arguments: PPOArguments) -> PPO:
     return PPO(
         "MlpPolicy",
         plants,
-        learning_rate=LinearSchedule(arguments.learning_rate, 0.0, 1.0),
+        # The last update comes when no progress remains; it is not to be in vain.
+        learning_rate=lambda remaining: arguments.learning_rate * max(remaining, 0.05),
         n_steps=arguments.n_steps,
         batch_size=arguments.batch_size,
         n_epochs=arguments.n_epochs,

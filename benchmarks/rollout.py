@@ -79,7 +79,12 @@ def rollout(
         trajectory.setpoint[k] = info["setpoint"]
         trajectory.output[k] = info["output"]
         trajectory.noise[k] = info["noise"]
-        observation, _, _, _, info = plants.step(agent.act(observation))
+        actions = np.asarray(agent.act(observation))
+        if actions.shape != (plants.num_envs, 1):
+            raise ValueError(
+                f"act must return actions of shape {(plants.num_envs, 1)}, got {actions.shape}"
+            )
+        observation, _, _, _, info = plants.step(actions)
         # A step reports the command and the applied input of the sample that it starts from.
         trajectory.command[k] = info["command"]
         trajectory.applied[k] = info["applied"]

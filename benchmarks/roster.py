@@ -16,6 +16,7 @@ BUILT_IN: dict[str, str] = {
     "nn": "agents:DirectNNController",
     "pi": "agents:PIController",
 }
+WINDOWS = ("setpoint_window", "error_window", "output_window", "action_window")
 LABELS: dict[str, str] = {"nn": "NN", "pi": "PI", "ppo": "PPO"}
 
 
@@ -29,8 +30,8 @@ def load_factory(location: str) -> Factory:
         that it has: `num_envs` (runs in the batch), `seed` (run i is to use `seed + i`),
         `u_min`, `u_max` (t/h) and `parameters` (all arguments of the environment). It returns
         an object with `reset()` and `act(observations) -> actions`. Its attribute
-        `observation`, if it has one, is a dict of arguments of the environment that give the
-        controller the observation that it wants.
+        `observation`, if it has one, is a dict of the environment's `*_window` arguments, and
+        gives the controller the observation that it wants.
 
     Returns
     -------
@@ -43,6 +44,8 @@ def load_factory(location: str) -> Factory:
         If there is no such module or factory in it.
     """
     module_name, _, name = location.partition(":")
+    if not (module_name and name):
+        raise ValueError(f"{location!r} must be module:factory")
     try:
         factory = getattr(importlib.import_module(module_name), name)
     except (ImportError, AttributeError, ValueError) as error:
@@ -62,12 +65,27 @@ def build(factory: Factory, parameters: Parameters, num_envs: int, seed: int) ->
         "parameters": parameters,
     }
     accepted = inspect.signature(factory).parameters
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in accepted.values()):
+        return factory(**offered)
     return factory(**{name: value for name, value in offered.items() if name in accepted})
 
 
 def observation(factory: Factory) -> dict[str, Any]:
-    """Return the arguments of the environment that give a factory's controllers their input."""
-    return dict(getattr(factory, "observation", {}))
+    """Return the arguments of the environment that give a factory's controllers their input.
+
+    Raises
+    ------
+    ValueError
+        If there are others among them: everyone is to control the same plant.
+    """
+    arguments = dict(getattr(factory, "observation", {}))
+    for name in arguments:
+        if name not in WINDOWS:
+            raise ValueError(
+                f"observation of {factory!r} must have names out of {', '.join(WINDOWS)}, "
+                f"got {name!r}"
+            )
+    return arguments
 
 
 def label(agent: str) -> str:

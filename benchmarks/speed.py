@@ -59,7 +59,8 @@ def main(arguments: list[str] | None = None) -> None:
 
     console = Console()
     title = f"gymnasium.make, random actions, resets included: median of {rounds} rounds"
-    console.print(on_screen(table, title))
+    console.print(title)
+    console.print(on_screen(table))
     console.print(
         f"import gymnasium: {taken['gymnasium'].median():.0f} ms; import mptc_gym: "
         f"{more.median():+.0f} ms ({more.quantile(0.1):+.0f} to {more.quantile(0.9):+.0f})"

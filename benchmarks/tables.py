@@ -130,9 +130,9 @@ def markdown(summary: pd.DataFrame, runs_per_cell: int) -> str:
     )
 
 
-def on_screen(table: pd.DataFrame, title: str) -> Table:
+def on_screen(table: pd.DataFrame) -> Table:
     """Return a table for the terminal."""
-    screen = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
+    screen = Table(box=SIMPLE_HEAD)
     for name in table.columns:
         is_name = name in ("scenario", "agent")
         screen.add_column(name, justify="left" if is_name else "right", no_wrap=is_name)

@@ -122,7 +122,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
     | Argument | Default | Meaning |
     |---|---|---|
-    | `a` | (1, -0.45181, -0.47546) | coefficients of A in (28), from z^0 on; the first is 1 |
+    | `a` | (1, -0.45181, -0.47546) | coefficients of A in (28), from z^0 on; the first is 1. An unstable A is taken as it is: y may grow beyond all floats |
     | `b` | (-0.04560, -0.00404) | coefficients of B in (28), from z^-1 on, degC per t/h |
     | `c` | (1, -0.35740, -0.03392) | coefficients of C in (28), from z^0 on; the first is 1 |
     | `delay` | 18 | transport delay d, samples |
@@ -151,7 +151,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     ## Errors
 
     A bad argument is a `ValueError` from the constructor that names it; a misspelt one a
-    `TypeError`. An action that is not one finite number is a `ValueError` from `step` and leaves
+    `TypeError`, as is a `render_mode`, of which there is none yet. An action that is not one finite number is a `ValueError` from `step` and leaves
     the plant as it was.
 
     ## Version history
@@ -185,7 +185,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = observation_space(parameters)
         # What step uses, in two tuples: unpacking one costs less than as many attributes.
-        self._reward = (
+        self._reward_terms = (
             parameters.error_scale,
             parameters.reward == "quadratic",
             parameters.move_weight,
@@ -201,6 +201,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             parameters.observation_size,
         )
         self._streams: tuple[EpisodeStream, EpisodeStream] | None = None
+        self._root: np.random.Generator | None = None  # what the streams come from
         # (y_d, n) of the samples ahead, the next one last.
         self._ahead: list[tuple[float, float]] = []
 
@@ -225,10 +226,11 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             See the class docstring.
         """
         super().reset(seed=seed)
-        if seed is not None or self._streams is None:
+        if self._streams is None or self._root is not self.np_random:
+            self._root = self.np_random
             # In this order for ever: a later stream must not change these two.
-            root = cast("np.random.SeedSequence", self.np_random.bit_generator.seed_seq)
-            noise_seed, setpoint_seed = root.spawn(2)
+            seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
+            noise_seed, setpoint_seed = seeds.spawn(2)
             self._streams = EpisodeStream(noise_seed), EpisodeStream(setpoint_seed)
         parameters = self.parameters
         noise_stream, setpoint_stream = self._streams
@@ -288,7 +290,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         if not self._ahead:
             self._look_ahead()
         setpoint, noise = self._ahead.pop()
-        error_scale, quadratic, move_weight = self._reward
+        error_scale, quadratic, move_weight = self._reward_terms
         span, error_head, output_head, action_head, size = self._layout
 
         command, applied, output = self._plant.step(a, noise)
@@ -338,7 +340,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
 
 def _limited(value: float, limit: float) -> float:
-    return min(max(value, -limit), limit)
+    return max(-limit, min(limit, value))  # in this order, NaN gives a limit
 
 
 def _scalar(action: Any) -> float:

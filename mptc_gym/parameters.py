@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
@@ -10,6 +9,7 @@ from typing import Any, Final, NoReturn
 
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
+LARGEST: Any = 10**9  # of any argument; beyond, float32 observations and squares lose meaning
 
 
 def _reject(name: str, value: object, allowed: str) -> NoReturn:
@@ -19,27 +19,24 @@ def _reject(name: str, value: object, allowed: str) -> NoReturn:
 def _is_number(value: Any) -> bool:
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer beyond all floats
-        return False
+    return bool(-LARGEST <= value <= LARGEST)
 
 
-def _number(name: str, value: Any, allowed: str = "a finite number") -> float:
+def _number(name: str, value: Any, allowed: str = "a number within +-1e9") -> float:
     if not _is_number(value):
         _reject(name, value, allowed)
     return float(value)
 
 
 def _not_negative(name: str, value: Any) -> float:
-    allowed = "a finite number of at least 0"
+    allowed = "a number from 0 to 1e9"
     if _number(name, value, allowed) < 0:
         _reject(name, value, allowed)
     return float(value)
 
 
 def _positive(name: str, value: Any) -> float:
-    allowed = "a finite number above 0"
+    allowed = "a number above 0, up to 1e9"
     if _number(name, value, allowed) <= 0:
         _reject(name, value, allowed)
     return float(value)
@@ -56,7 +53,7 @@ def _positive_count(name: str, value: Any) -> int:
 
 
 def _numbers(
-    name: str, value: Any, allowed: str = "a list of one or more finite numbers"
+    name: str, value: Any, allowed: str = "a list of one or more numbers within +-1e9"
 ) -> tuple[float, ...]:
     if not isinstance(value, list | tuple) or not value or not all(map(_is_number, value)):
         _reject(name, value, allowed)
@@ -64,7 +61,7 @@ def _numbers(
 
 
 def _polynomial(name: str, value: Any) -> tuple[float, ...]:
-    allowed = "a list of finite numbers, the first of them 1"
+    allowed = "a list of numbers within +-1e9, the first of them 1"
     coefficients = _numbers(name, value, allowed)
     if coefficients[0] != 1.0:
         _reject(name, value, allowed)
@@ -74,7 +71,7 @@ def _polynomial(name: str, value: Any) -> tuple[float, ...]:
 def _setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     if isinstance(value, str) and value in SETPOINTS:
         return value
-    allowed = "'square', 'random', a finite number, or a list of one or more finite numbers"
+    allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
     if isinstance(value, list | tuple):
         return _numbers(name, value, allowed)
     return _number(name, value, allowed)

@@ -7,6 +7,7 @@ part of drawing them one by one, and gives the same numbers.
 from __future__ import annotations
 
 import math
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,15 +28,16 @@ class EpisodeStream:
     """
 
     def __init__(self, seed_sequence: np.random.SeedSequence) -> None:
-        self._bit_generator = np.random.PCG64(seed_sequence)
-        self._generator = np.random.Generator(self._bit_generator)
-        self._origin = self._bit_generator.state
+        self._generator = np.random.Generator(np.random.PCG64(seed_sequence))
+        self._origin: Any = self._generator.bit_generator.state
         self._episode = 0
 
     def next_episode(self) -> np.random.Generator:
         """Move to the start of the next episode and return the generator there."""
-        self._bit_generator.state = self._origin
-        self._bit_generator.advance(self._episode << 64)
+        # Found through the generator, as a copy of it may have a bit generator of its own.
+        bit_generator = cast("np.random.PCG64", self._generator.bit_generator)
+        bit_generator.state = self._origin
+        bit_generator.advance(self._episode << 64)
         self._episode += 1
         return self._generator
 

@@ -384,9 +384,10 @@ class TestCompare:
         assert list(curve["candidate"]) == [0, 1]
         assert (tmp_path / "one/learning.png").exists()
         provenance = json.loads((tmp_path / "one/provenance.json").read_text())
-        used = Path(provenance["policies"]["ppo"])
-        better = curve["validation_mae"].idxmin()
-        assert json.loads((used / "arguments.json").read_text())["seed"] == better
+        used = provenance["policies"]["ppo"]
+        assert used["arguments"]["seed"] == curve["validation_mae"].idxmin()
+        assert used["arguments"]["steps"] == 256
+        assert (Path(used["folder"]) / "policy.zip").exists()
 
         with monkeypatch.context() as patch:
             patch.setattr(ppo.PPO, "learn", None)  # training again would raise
