@@ -75,6 +75,18 @@ def controller(request):
     return request.param()
 
 
+class TestDefaults:
+    def test_gains_and_scales(self):
+        nn, pi = DirectNNController(), PIController()
+        assert (nn.n_inputs, nn.n_hidden, nn.direction) == (6, 3, -1)
+        assert (nn.eta, nn.eta_1, nn.eta_theta, nn.eta_1_theta) == (0.03, 0.1, 0.01, 0.01)
+        assert (nn.input_scale, nn.weight_scale, nn.update_interval) == (0.2, 0.5, 1)
+        assert (pi.kp, pi.ki) == (2.2, 0.3)
+        for controller in (nn, pi):
+            assert (controller.u_min, controller.u_max) == (-10.0, 10.0)
+            assert controller.error_index == 3
+
+
 class TestEveryController:
     def test_action_is_one_of_the_environment(self, controller):
         env = gymnasium.make("MiddlePoint-v0")
@@ -276,7 +288,8 @@ class TestDirectNN:
             ("n_inputs", 0), ("n_hidden", 1.5), ("eta", -0.1), ("eta_1", np.nan),
             ("eta_theta", np.inf), ("eta_1_theta", -1), ("direction", 0), ("direction", 0.5),
             ("input_scale", np.nan), ("weight_scale", -1.0), ("num_envs", 0),
-            ("update_interval", 0), ("seed", -1),
+            ("update_interval", 0), ("seed", -1), ("error_index", -1), ("n_inputs", "6"),
+            ("num_envs", True), ("eta", None),
         ],
     )  # fmt: skip
     def test_bad_arguments_are_named(self, name, value):

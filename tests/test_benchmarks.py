@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,7 +18,7 @@ from agents import PIController
 from benchmarks import compare, ppo, storage, tables
 from benchmarks.metrics import METRICS, measure
 from benchmarks.rollout import Trajectory, make_plants, rollout
-from benchmarks.roster import build, load_factory
+from benchmarks.roster import build, load_factory, observation
 from benchmarks.scenarios import SCENARIOS
 from mptc_gym import Parameters
 
@@ -57,7 +58,7 @@ class TestMeasures:
 
     def test_settling(self):
         # Within 5 % of 10 from the third sample after the change on.
-        assert measured(trajectory([10] * 5, [0, 9.6, 9.4, 9.5, 10.5]))["settling_time"] == 3
+        assert measured(trajectory([10] * 5, [0, 9.6, 9.49, 9.51, 10.5]))["settling_time"] == 3
         # Of two changes the longer counts: 1 sample, then 2.
         two = trajectory([10, 10, 10, 0, 0, 0], [0, 10, 10, 10, 10, 0])
         assert measured(two)["settling_time"] == 2
@@ -110,6 +111,13 @@ class TestScenarios:
         assert all(name == scenario.name for name, scenario in SCENARIOS.items())
 
 
+def test_a_wrong_shape_of_actions_is_named():
+    agent = PIController()
+    agent.act = lambda observation: np.zeros(3)
+    with pytest.raises(ValueError, match=r"shape \(2, 1\), got \(3,\)"):
+        rollout(make_plants(2, 10), agent, 10, seed=0)
+
+
 class Constant:
     """Always the same action."""
 
@@ -159,6 +167,18 @@ class TestRoster:
         assert build(factory, parameters, 3, 7) == (3, 7, parameters, 2)
         assert isinstance(build(PIController, parameters, 3, 7), PIController)
 
+    def test_a_factory_that_takes_anything_gets_everything(self):
+        got = build(lambda **offered: offered, Parameters(), 3, 7)
+        assert set(got) == {"num_envs", "seed", "u_min", "u_max", "parameters"}
+
+    def test_an_observation_cannot_change_the_plant(self):
+        class Cheat:
+            observation = {"dead_zone": 0.0}  # noqa: RUF012
+
+        with pytest.raises(ValueError, match="'dead_zone'"):
+            observation(Cheat)
+        assert observation(PIController) == {}
+
     @pytest.mark.parametrize("location", ["agents", "agents:", "nowhere:x", "agents:__name__"])
     def test_bad_locations(self, location):
         with pytest.raises(ValueError, match=location):
@@ -205,6 +225,15 @@ class TestPPO:
         stamp = (tmp_path / "policy.zip").stat().st_mtime_ns
         train(tmp_path, retrain=True)
         assert (tmp_path / "policy.zip").stat().st_mtime_ns > stamp
+
+    @pytest.mark.parametrize("name", ["policy.zip", "checkpoint.pkl"])
+    def test_a_damaged_file_is_named(self, tmp_path, name):
+        (tmp_path / "learning.csv").write_text("")
+        (tmp_path / name).write_bytes(b"half of it")
+        with pytest.raises(ValueError, match=r"damaged.*--retrain") as error:
+            train(tmp_path)
+        assert str(tmp_path) in str(error.value)
+        train(tmp_path, retrain=True)
 
     def test_learning_curve_is_kept(self, tmp_path):
         train(tmp_path)
@@ -405,7 +434,9 @@ class TestCompare:
             "import numpy as np\n"
             "class Mine:\n"
             "    observation = {'output_window': 1, 'error_window': 0}\n"
-            "    def __init__(self, num_envs): self.num_envs = num_envs\n"
+            "    def __init__(self, num_envs, parameters):\n"
+            "        self.num_envs = num_envs\n"
+            "        assert parameters.observation_size == 4\n"
             "    def reset(self): pass\n"
             "    def act(self, observations):\n"
             "        assert observations.shape == (self.num_envs, 4)\n"
@@ -420,6 +451,31 @@ class TestCompare:
         runs = pd.read_csv(tmp_path / "out/runs.csv")
         assert list(runs["agent"]) == ["pi", "pi", "mine", "mine"]
         assert set(runs[runs.agent == "mine"]["saturation_share"]) == {100.0}
+
+    def test_the_example_of_the_readme(self, tmp_path, monkeypatch):
+        readme = (ROOT / "README.md").read_text(encoding="utf-8")
+        (example,) = re.findall(r"```python\n(from agents import PIC.*?)```", readme, re.DOTALL)
+        (option,) = re.findall(r"--agent (\S+)`", readme)
+        (tmp_path / "my_controllers.py").write_text(example)
+        monkeypatch.syspath_prepend(tmp_path)
+        run_compare(
+            tmp_path / "out", "--agents", "--agent", option, "--scenarios", "constant",
+            "--seeds", 1,
+        )  # fmt: skip
+        runs = pd.read_csv(tmp_path / "out/runs.csv")
+        assert runs["mae"].iloc[0] == pytest.approx(0.289, abs=0.001)  # as the README says
+
+    def test_files_of_an_earlier_run_do_not_stay(self, tmp_path):
+        out = tmp_path / "out"
+        options = ("--agents", "pi", "--seeds", 1, "--scenarios")
+        run_compare(out, *options, "constant", "square")
+        (out / "mine.txt").write_text("not of the comparison")
+        run_compare(out, *options, "constant")
+        names = {path.name for path in out.iterdir()}
+        assert names == {
+            "runs.csv", "summary.csv", "summary.md", "mae.png", "constant.csv", "constant.png",
+            "provenance.json", "mine.txt",
+        }  # fmt: skip
 
     def run_and_stop(self, out, monkeypatch, error, after):
         calls = 0
@@ -445,12 +501,13 @@ class TestCompare:
         assert (out / "summary.md").exists()
         assert (out / "square.png").exists()
 
-    def test_a_failing_controller_costs_only_itself(self, tmp_path, monkeypatch):
+    def test_what_ran_before_a_failing_controller_is_kept(self, tmp_path, monkeypatch):
         out = tmp_path / "out"
         with pytest.raises(ZeroDivisionError):
             self.run_and_stop(out, monkeypatch, ZeroDivisionError, after=2)
         assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
+        assert (out / "summary.md").exists()
 
     def test_interrupted_before_anything_has_finished(self, tmp_path, monkeypatch):
         out = tmp_path / "out"
@@ -465,7 +522,10 @@ class TestCompare:
             (["--agents", "nn", "pid"], "no 'pid'"),
             (["--scenarios", "circle"], "no 'circle'"),
             (["--seeds", "0"], "must be at least 1"),
-            (["--seeds", "many"], "--seeds"),
+            (["--seeds", "many"], "invalid number value"),
+            (["--scenarios", ""], "--scenarios"),
+            (["--agents"], "no controller"),
+            (["--agent", "PI=agents:PIController"], "NEW_NAME"),
             (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
             (["--agent", "pi=agents:PIController"], "NEW_NAME"),
             (["--agent", "x=agents:Nothing"], "agents:Nothing"),

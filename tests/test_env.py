@@ -1,6 +1,7 @@
 """The environment as the contract describes it."""
 
 import copy
+import dataclasses
 import inspect
 import pickle
 import warnings
@@ -81,6 +82,32 @@ def test_registration():
     assert env.action_space == gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     assert env.observation_space.shape == (6,)
     assert env.observation_space.dtype == np.float32
+
+
+def test_defaults_are_those_of_the_contract():
+    assert dataclasses.asdict(MiddlePointEnv().parameters) == {
+        "a": (1.0, -0.45181, -0.47546), "b": (-0.04560, -0.00404),
+        "c": (1.0, -0.35740, -0.03392), "delay": 18, "dead_zone": 5.0, "u_min": -10.0, "u_max": 10.0, "noise_variance": 0.0,
+        "sampling_interval": 8.0, "setpoint": "square", "setpoint_amplitude": 5.0,
+        "setpoint_period": 600, "setpoint_window": 3, "error_window": 3, "output_window": 0,
+        "action_window": 0, "temperature_span": 50.0, "reward": "quadratic", "error_scale": 5.0,
+        "move_weight": 0.0,
+    }  # fmt: skip
+
+
+def test_bounds_of_the_observation():
+    env = MiddlePointEnv(setpoint_window=1, error_window=1, output_window=1, action_window=1)
+    assert list(env.observation_space.high) == [50, 100, 50, 1]
+    assert list(env.observation_space.low) == [-50, -100, -50, -1]
+    beyond = MiddlePointEnv(setpoint=60.0, setpoint_window=1, error_window=1)
+    assert list(beyond.observation_space.high) == [60, 110]
+
+
+def test_an_unstable_plant_stays_in_its_observation_space():
+    env = MiddlePointEnv(a=[1.0, -3.0, 4.0], output_window=1)
+    record = run(env, np.ones(1500))
+    assert not np.isfinite(record["output"][-1])
+    assert all(env.observation_space.contains(each) for each in record["observation"])
 
 
 def test_episode_is_truncated_and_never_terminated():
@@ -257,12 +284,13 @@ def test_later_episodes_differ_and_do_not_depend_on_the_length_of_earlier_ones()
 
 
 def test_a_generator_of_the_user_is_used():
+    env = MiddlePointEnv(noise_variance=0.5)
     noises = []
-    for _ in range(2):
-        env = MiddlePointEnv(noise_variance=0.5)
-        env.np_random = np.random.default_rng(4)
+    for seed in (4, 4, 5):
+        env.np_random = np.random.default_rng(seed)
         noises.append(run(env, np.zeros(5), seed=None)["noise"])
-    np.testing.assert_array_equal(*noises)
+    np.testing.assert_array_equal(noises[0], noises[1])
+    assert not np.array_equal(noises[0], noises[2])
 
 
 def test_global_generator_is_left_alone():
@@ -290,7 +318,7 @@ BAD = [
     ("b", []), ("b", [float("inf")]), ("b", [None]), ("c", [0.9]), ("c", {}),
     ("sampling_interval", 0.0), ("sampling_interval", -8.0),
     ("setpoint", "triangle"), ("setpoint", []), ("setpoint", [1.0, float("nan")]),
-    ("setpoint", float("nan")), ("setpoint", None), ("setpoint", 10**400),
+    ("setpoint", float("nan")), ("setpoint", None), ("setpoint", 10**400), ("setpoint", 1e300),
     ("setpoint_amplitude", -1.0), ("setpoint_period", 0), ("setpoint_period", 2.5),
     ("setpoint_window", -1), ("error_window", 1.0), ("output_window", "2"),
     ("action_window", -3), ("temperature_span", 0.0), ("temperature_span", float("inf")),
