@@ -87,7 +87,8 @@ def test_registration():
 def test_defaults_are_those_of_the_contract():
     assert dataclasses.asdict(MiddlePointEnv().parameters) == {
         "a": (1.0, -0.45181, -0.47546), "b": (-0.04560, -0.00404),
-        "c": (1.0, -0.35740, -0.03392), "delay": 18, "dead_zone": 5.0, "u_min": -10.0, "u_max": 10.0, "noise_variance": 0.0,
+        "c": (1.0, -0.35740, -0.03392), "delay": 18, "dead_zone": 5.0,
+        "u_min": -10.0, "u_max": 10.0, "noise_variance": 0.0,
         "sampling_interval": 8.0, "setpoint": "square", "setpoint_amplitude": 5.0,
         "setpoint_period": 600, "setpoint_window": 3, "error_window": 3, "output_window": 0,
         "action_window": 0, "temperature_span": 50.0, "reward": "quadratic", "error_scale": 5.0,
