@@ -1,18 +1,16 @@
-"""Scenarios, measures, tables, PPO and the comparison, on small budgets."""
+"""Scenarios, measures, tables and the comparison, on small budgets."""
 
 import json
 import math
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 from agents import PIController
 from benchmarks import compare, ppo, storage, tables
@@ -21,10 +19,9 @@ from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.roster import build, load_factory, observation
 from benchmarks.scenarios import SCENARIOS
 from mptc_gym import Parameters
+from tests.test_ppo import SMALL
 
 ROOT = Path(__file__).parent.parent
-
-SMALL = ppo.PPOArguments(n_envs=4, n_steps=32, batch_size=64, n_epochs=2, steps=1024)
 
 
 def trajectory(setpoint, output, command=None, applied=None):
@@ -199,142 +196,6 @@ class TestStorage:
             write_half()
         assert path.read_text() == "old"
         assert list(tmp_path.iterdir()) == [path]
-
-
-def train(folder, arguments=SMALL, *, retrain=False):
-    return ppo.trained_policy(arguments, folder, retrain=retrain, progress=False)
-
-
-def weights(model):
-    return torch.cat([p.detach().flatten() for p in model.policy.parameters()])
-
-
-class TestPPO:
-    @pytest.fixture(autouse=True)
-    def small(self, monkeypatch):
-        monkeypatch.setattr(ppo, "CHECKPOINT_INTERVAL", 256)
-        monkeypatch.setattr(ppo, "PROBE", replace(ppo.PROBE, samples=20))
-        monkeypatch.setattr(ppo, "VALIDATION_SAMPLES", 20)
-
-    def test_a_finished_policy_is_loaded(self, tmp_path, monkeypatch):
-        trained = train(tmp_path)
-        with monkeypatch.context() as patch:
-            patch.setattr(ppo.PPO, "learn", None)  # training again would raise
-            loaded = train(tmp_path)
-        assert torch.equal(weights(loaded), weights(trained))
-        stamp = (tmp_path / "policy.zip").stat().st_mtime_ns
-        train(tmp_path, retrain=True)
-        assert (tmp_path / "policy.zip").stat().st_mtime_ns > stamp
-
-    @pytest.mark.parametrize("name", ["policy.zip", "checkpoint.pkl"])
-    def test_a_damaged_file_is_named(self, tmp_path, name):
-        (tmp_path / "learning.csv").write_text("")
-        (tmp_path / name).write_bytes(b"half of it")
-        with pytest.raises(ValueError, match=r"damaged.*--retrain") as error:
-            train(tmp_path)
-        assert str(tmp_path) in str(error.value)
-        train(tmp_path, retrain=True)
-
-    def test_learning_curve_is_kept(self, tmp_path):
-        train(tmp_path)
-        curve = pd.read_csv(tmp_path / "learning.csv")
-        assert list(curve["steps"]) == [256, 512, 768, 1024]
-        assert (curve[["training_mae", "validation_mae", "square_mae"]] > 0).all(axis=None)
-        assert curve["seconds"].is_monotonic_increasing
-
-    @pytest.mark.parametrize("calls", [65, 100, 140])
-    def test_interrupted_training_resumes_to_the_same_policy(
-        self, tmp_path, monkeypatch, calls
-    ):
-        whole = train(tmp_path / "whole")
-        keep = ppo._Keeper._on_step
-        count = 0
-
-        def interrupt(self):
-            nonlocal count
-            count += 1
-            if count == calls:
-                raise KeyboardInterrupt
-            return keep(self)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(ppo._Keeper, "_on_step", interrupt)
-            with pytest.raises(KeyboardInterrupt):
-                train(tmp_path / "parts")
-        assert [path.name for path in (tmp_path / "parts").iterdir()] == ["checkpoint.pkl"]
-        np.random.seed(0)  # noqa: NPY002 (whatever happens between)
-        torch.manual_seed(0)
-        parts = train(tmp_path / "parts")
-        assert torch.equal(weights(parts), weights(whole))
-        columns = ["steps", "training_mae", "validation_mae", "square_mae"]
-        curves = [
-            pd.read_csv(tmp_path / n / "learning.csv")[columns] for n in ("whole", "parts")
-        ]
-        pd.testing.assert_frame_equal(*curves)
-        assert not (tmp_path / "parts" / "checkpoint.pkl").exists()
-
-    def test_seed_is_honoured(self, tmp_path):
-        first, again, other = (
-            weights(train(tmp_path / name, replace(SMALL, steps=256, seed=seed)))
-            for name, seed in (("first", 3), ("again", 3), ("other", 4))
-        )
-        assert torch.equal(first, again)
-        assert not torch.equal(first, other)
-
-    def test_key_names_all_that_shapes_a_policy(self, monkeypatch):
-        keys = {
-            ppo.policy_key(arguments)
-            for arguments in (
-                SMALL, replace(SMALL, seed=1), replace(SMALL, gamma=0.9),
-                replace(SMALL, noise_variance=0.1),
-            )
-        }  # fmt: skip
-        assert len(keys) == 4
-        assert ppo.policy_key(SMALL) == ppo.policy_key(replace(SMALL))
-        monkeypatch.setattr(ppo, "versions", lambda: {"torch": "another"})
-        assert ppo.policy_key(SMALL) not in keys
-
-    def test_it_is_trained_on_random_set_points_with_past_actions(self):
-        parameters = Parameters(**SMALL.training)
-        assert parameters.setpoint == "random"
-        assert parameters.action_window == parameters.delay + 2
-        assert parameters.noise_variance == SMALL.noise_variance
-
-    def test_the_best_in_validation_is_kept(self, tmp_path, monkeypatch):
-        seen = []
-
-        def scores(keeper, arguments, runs, samples, seed):
-            if seed == ppo.VALIDATION_SEED:
-                seen.append(weights(keeper.model))
-            return [3.0, 1.0, 2.0, 1.5][len(seen) - 1]
-
-        monkeypatch.setattr(ppo._Keeper, "_mae", scores)
-        kept = weights(train(tmp_path))
-        assert len(seen) == 4
-        assert torch.equal(kept, seen[1])
-        assert not torch.equal(kept, seen[3])
-
-    def test_exploration_falls_as_set(self, tmp_path, monkeypatch):
-        spreads = {}
-        record = ppo._Keeper.record
-
-        def spy(keeper):
-            record(keeper)
-            spreads[keeper.num_timesteps] = keeper.model.policy.log_std.item()
-
-        monkeypatch.setattr(ppo._Keeper, "record", spy)
-        train(tmp_path, replace(SMALL, log_std=(-1.0, -3.0), log_std_falls=(0.25, 0.75)))
-        # Recorded after the value for the coming rollout is set, but for the last.
-        assert spreads[256] == pytest.approx(-1.0)
-        assert spreads[512] == pytest.approx(-2.0)
-        assert spreads[768] == pytest.approx(-3.0)
-
-    def test_inputs_are_scaled_by_fixed_numbers(self):
-        model = ppo._begin(SMALL)
-        observation = torch.arange(1.0, 29.0)
-        scaled = model.policy.features_extractor(observation)
-        assert scaled[:8].tolist() == pytest.approx([0.2 * i for i in range(1, 9)])  # degC
-        assert scaled[8:].tolist() == list(range(9, 29))  # actions
 
 
 def run_compare(out, *options):
