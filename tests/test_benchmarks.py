@@ -370,6 +370,19 @@ class TestCompare:
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
         assert (out / "summary.md").exists()
 
+    def test_every_case_is_saved_before_the_next_begins(self, tmp_path, monkeypatch):
+        saved = []
+
+        def watched(*arguments):
+            runs = tmp_path / "out" / "runs.csv"
+            saved.append(len(pd.read_csv(runs)) if runs.exists() else 0)
+            return rollout(*arguments)
+
+        monkeypatch.setattr(compare, "rollout", watched)
+        scenarios = ("constant", "square", "constant-noise")
+        run_compare(tmp_path / "out", "--agents", "pi", "--seeds", 2, "--scenarios", *scenarios)
+        assert saved == [0, 2, 4]
+
     def test_interrupted_before_anything_has_finished(self, tmp_path, monkeypatch):
         out = tmp_path / "out"
         out.mkdir()
