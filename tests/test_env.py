@@ -1,4 +1,4 @@
-"""The environment as the contract describes it."""
+"""The environment as its specification describes it."""
 
 import copy
 import dataclasses
@@ -84,7 +84,7 @@ def test_registration():
     assert env.observation_space.dtype == np.float32
 
 
-def test_defaults_are_those_of_the_contract():
+def test_defaults_are_those_documented():
     assert dataclasses.asdict(MiddlePointEnv().parameters) == {
         "a": (1.0, -0.45181, -0.47546), "b": (-0.04560, -0.00404),
         "c": (1.0, -0.35740, -0.03392), "delay": 18, "dead_zone": 5.0,
