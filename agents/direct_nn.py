@@ -140,6 +140,7 @@ class DirectNNController(Controller):
         self.input_scale = check_number("input_scale", input_scale)
         self.weight_scale = check_number("weight_scale", weight_scale, 0)
         self.num_envs = None if num_envs is None else check_count("num_envs", num_envs, 1)
+        self._batch = () if self.num_envs is None else (self.num_envs,)  # the leading axis
         self.learning = learning
         self.update_interval = check_count("update_interval", update_interval, 1)
         seed = check_count("seed", seed, 0)
@@ -179,13 +180,13 @@ class DirectNNController(Controller):
 
     @weights.setter
     def weights(self, weights: Weights) -> None:
-        batch = () if self.num_envs is None else (self.num_envs,)
         arrays = []
         for name, shape in self._shapes.items():
             array = np.asarray(getattr(weights, name), dtype=np.float64)
-            if array.shape not in (shape, batch + shape):
+            full_shape = self._batch + shape
+            if array.shape not in (shape, full_shape):
                 raise ValueError(
-                    f"weights.{name} must have shape {batch + shape}, got {array.shape}"
+                    f"weights.{name} must have shape {full_shape}, got {array.shape}"
                 )
             if not np.isfinite(array).all():
                 raise ValueError(f"weights.{name} must be finite")
@@ -201,12 +202,10 @@ class DirectNNController(Controller):
         self._sample = 0
 
     def _control(self, observation: Array) -> Values:
-        batch = np.atleast_2d(observation)
-        if batch.shape[0] != (self.num_envs or 1) or (
-            self.num_envs is not None and observation.ndim == 1
-        ):
+        if observation.shape[:-1] != self._batch:
             expected = "(n_obs,)" if self.num_envs is None else f"({self.num_envs}, n_obs)"
             raise ValueError(f"observation must have shape {expected}, got {observation.shape}")
+        batch = np.atleast_2d(observation)
         X = self.input_scale * np.ascontiguousarray(batch[:, : self.n_inputs].T)  # (N, batch)
         e = batch[:, self.error_index]
 

@@ -61,9 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception:
         comparison.finish(complete=False)
         raise
-    comparison.finish(complete=True)
+    summary = comparison.finish(complete=True)
 
-    summary = tables.summarise(comparison.runs)
     title = f"{METRICS['mae']}: median (10th to 90th percentile) of {options.seeds} runs"
     console.print(title)
     console.print(tables.on_screen(tables.mae_table(summary)))
@@ -164,8 +163,14 @@ class Comparison:
         self._curves = pd.DataFrame()
         self._policies: dict[str, Any] = {}
         self._files: list[str] = []
-        self._started = datetime.now(timezone.utc)
         self._clock = time.perf_counter()
+        self._origin = {
+            "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "options": {name: _plain(value) for name, value in vars(options).items()},
+            "seeds": list(range(SEED, SEED + options.seeds)),
+            "versions": versions(),
+            "commit": commit(),
+        }
 
     def run(self, agent: str, factory: Factory) -> None:
         """Run a controller on every scenario."""
@@ -176,7 +181,7 @@ class Comparison:
             build(factory, Parameters(**scenario.arguments, **windows), seeds, SEED)
             for scenario in scenarios
         ]
-        if hasattr(factory, "curves"):
+        if agent == "ppo":  # the only one that learns beforehand
             self._policies[agent] = factory.used
             self._curves = factory.curves
 
@@ -196,10 +201,10 @@ class Comparison:
             )
             self._write_runs(complete=False)
 
-    def finish(self, *, complete: bool) -> None:
-        """Write the summary and the plots of all that has been run, if anything has."""
+    def finish(self, *, complete: bool) -> pd.DataFrame:
+        """Write and return the summary, and plot all that has been run, if anything has."""
         if self.runs.empty:
-            return
+            return pd.DataFrame()
         summary = tables.summarise(self.runs)
         self._write_csv("summary.csv", summary)
         write_text(self._path("summary.md"), tables.markdown(summary, self._options.seeds))
@@ -211,6 +216,7 @@ class Comparison:
             self._write_csv("learning.csv", self._curves)
             plots.plot_learning(self._curves, self._path("learning.png"))
         self._write_runs(complete=complete)
+        return summary
 
     def _path(self, name: str) -> Path:
         """Return where to write a file; the first time, remove what another run left there."""
@@ -233,13 +239,9 @@ class Comparison:
         path = self._path("provenance.json")
         provenance: dict[str, Any] = {
             "complete": complete,
-            "started": self._started.isoformat(timespec="seconds"),
             "seconds": round(time.perf_counter() - self._clock, 1),
-            "options": {name: _plain(value) for name, value in vars(self._options).items()},
-            "seeds": list(range(SEED, SEED + self._options.seeds)),
+            **self._origin,
             "policies": self._policies,
-            "versions": versions(),
-            "commit": commit(),
             "files": self._files,
         }
         write_json(path, provenance)

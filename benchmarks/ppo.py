@@ -174,21 +174,20 @@ class Trained:
         return PolicyController(self._model)
 
     def _best_candidate(self) -> PPO:
-        models, curves, folders = [], [], []
+        best_mae, best_model = math.inf, None
         for seed in range(self._arguments.seed, self._arguments.seed + CANDIDATES):
             arguments = replace(self._arguments, seed=seed)
-            folders.append(self._folder / policy_key(arguments))
-            models.append(
-                trained_policy(
-                    arguments, folders[-1], retrain=self._retrain, progress=self._progress
-                )
+            folder = self._folder / policy_key(arguments)
+            model = trained_policy(
+                arguments, folder, retrain=self._retrain, progress=self._progress
             )
-            curves.append(pd.read_csv(folders[-1] / "learning.csv").assign(candidate=seed))
-        best = int(np.argmin([curve["validation_mae"].min() for curve in curves]))
-        self.curves = pd.concat(curves, ignore_index=True)
-        used = replace(self._arguments, seed=self._arguments.seed + best)
-        self.used = {"folder": str(folders[best]), "arguments": asdict(used)}
-        return models[best]
+            curve = pd.read_csv(folder / "learning.csv").assign(candidate=seed)
+            self.curves = pd.concat([self.curves, curve], ignore_index=True)
+            mae = curve["validation_mae"].min()
+            if mae < best_mae:
+                best_mae, best_model = mae, model
+                self.used = {"folder": str(folder), "arguments": asdict(arguments)}
+        return best_model
 
 
 def policy_key(arguments: PPOArguments) -> str:

@@ -311,10 +311,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         window[error_head] = setpoint - measured
         window[output_head] = measured
         window[action_head] = shown
+        observation = np.fromiter(window, _FLOAT32, size)  # quicker than np.array
         return (
-            np.fromiter(
-                window, _FLOAT32, size
-            ),  # the quickest way from a few floats to an array
+            observation,
             -cost,
             False,
             False,

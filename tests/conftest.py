@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import mptc_gym
-
 
 def run(
     env: gymnasium.Env[Any, Any], actions: NDArray[np.float32], seed: int | None = 0
@@ -32,8 +30,3 @@ def run(
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20261121)
-
-
-@pytest.fixture
-def env() -> mptc_gym.MiddlePointEnv:
-    return mptc_gym.MiddlePointEnv()

@@ -19,7 +19,7 @@ from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.roster import build, load_factory, observation
 from benchmarks.scenarios import SCENARIOS
 from mptc_gym import Parameters
-from tests.test_ppo import SMALL
+from tests.budget import SMALL
 
 ROOT = Path(__file__).parent.parent
 

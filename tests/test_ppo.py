@@ -9,8 +9,7 @@ import torch
 
 from benchmarks import ppo
 from mptc_gym import Parameters
-
-SMALL = ppo.PPOArguments(n_envs=4, n_steps=32, batch_size=64, n_epochs=2, steps=1024)
+from tests.budget import SMALL
 
 
 def train(folder, arguments=SMALL, *, retrain=False):

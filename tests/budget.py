@@ -1,0 +1,5 @@
+"""A training of PPO that takes a second."""
+
+from benchmarks import ppo
+
+SMALL = ppo.PPOArguments(n_envs=4, n_steps=32, batch_size=64, n_epochs=2, steps=1024)
