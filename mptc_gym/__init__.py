@@ -7,13 +7,15 @@ import gymnasium
 
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import Parameters
+from mptc_gym.vector_env import MiddlePointVectorEnv
 
 __version__ = "0.1.0"
-__all__ = ["MiddlePointEnv", "Parameters", "__version__"]
+__all__ = ["MiddlePointEnv", "MiddlePointVectorEnv", "Parameters", "__version__"]
 
 gymnasium.register(
     id="MiddlePoint-v0",
     entry_point="mptc_gym.env:MiddlePointEnv",
+    vector_entry_point="mptc_gym.vector_env:MiddlePointVectorEnv",
     max_episode_steps=1200,
     order_enforce=False,
 )

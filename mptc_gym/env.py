@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from mptc_gym.parameters import Parameters
 from mptc_gym.plant import Plant, action_from_command
-from mptc_gym.signals import EpisodeStream, Noise, SetPoint
+from mptc_gym.signals import BLOCK, Noise, SetPoint, Streams
 
-BLOCK = 256  # samples of set point and noise made at a time
 _FLOAT32 = np.dtype(np.float32)  # quicker to pass on than the type
 
 Observation = NDArray[np.float32]
@@ -190,17 +189,14 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             parameters.reward == "quadratic",
             parameters.move_weight,
         )
-        error_head = parameters.setpoint_window  # where each block of the observation begins
-        output_head = error_head + parameters.error_window
-        action_head = output_head + parameters.output_window
         self._layout = (
             parameters.temperature_span,
-            error_head,
-            output_head,
-            action_head,
+            *parameters.heads,
             parameters.observation_size,
         )
-        self._streams: tuple[EpisodeStream, EpisodeStream] | None = None
+        self._noise = Noise(parameters)
+        self._setpoint = SetPoint(parameters)
+        self._streams: Streams | None = None
         self._root: np.random.Generator | None = None  # what the streams come from
         # (y_d, n) of the samples ahead, the next one last.
         self._ahead: list[tuple[float, float]] = []
@@ -228,14 +224,11 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         super().reset(seed=seed)
         if self._streams is None or self._root is not self.np_random:
             self._root = self.np_random
-            # In this order for ever: a later stream must not change these two.
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
-            noise_seed, setpoint_seed = seeds.spawn(2)
-            self._streams = EpisodeStream(noise_seed), EpisodeStream(setpoint_seed)
+            self._streams = Streams.spawn(seeds)
         parameters = self.parameters
-        noise_stream, setpoint_stream = self._streams
-        self._noise = Noise(parameters, noise_stream)
-        self._setpoint = SetPoint(parameters, setpoint_stream)
+        self._noise.restart(self._streams.noise)
+        self._setpoint.restart(self._streams.setpoint)
         self._plant = Plant(parameters)
 
         # At rest u is 0, whatever action that is.
@@ -246,8 +239,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self._window = [0.0] * (size - actions) + [rest] * (actions + 1)
         self._ahead.clear()
 
-        setpoint = float(self._setpoint.take(1)[0])
-        _, error_head, output_head, action_head, _ = self._layout
+        setpoint = self._setpoint.take(1)[0]
+        error_head, output_head, action_head = parameters.heads
         self._window[0] = setpoint
         self._window[error_head] = setpoint
         self._window[output_head] = 0.0
@@ -333,8 +326,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     def _look_ahead(self) -> None:
         if self._streams is None:
             raise ResetNeeded("call reset before step")
-        setpoints = self._setpoint.take(BLOCK).tolist()
-        noises = self._noise.take(BLOCK).tolist()
+        setpoints, noises = self._setpoint.take(BLOCK), self._noise.take(BLOCK)
         self._ahead = list(zip(setpoints, noises, strict=True))[::-1]
 
 

@@ -173,6 +173,13 @@ class Parameters:
         )
 
     @property
+    def heads(self) -> tuple[int, int, int]:
+        """Where the errors, outputs and actions begin in the observation."""
+        errors = self.setpoint_window
+        outputs = errors + self.error_window
+        return errors, outputs, outputs + self.output_window
+
+    @property
     def largest_setpoint(self) -> float:
         """Largest magnitude that the set point can take, in degC."""
         if isinstance(self.setpoint, str):

@@ -1,10 +1,20 @@
-"""The plant and its actuator: arithmetic on state, input and parameters, nothing else."""
+"""The plant and its actuator: arithmetic on state, input and parameters, nothing else.
+
+It stands here twice, side by side: `Plant` in plain floats, which are fastest for one plant,
+and `Plants` in arrays. Both do the same operations in the same order, and agree to the bit.
+"""
 
 from __future__ import annotations
 
 from collections import deque
+from operator import mul
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mptc_gym.parameters import Parameters
+
+Values = NDArray[np.float64]  # one a plant, shape (n,)
 
 
 def action_from_command(command: float, u_min: float, u_max: float) -> float:
@@ -27,7 +37,8 @@ class Plant:
     """
 
     def __init__(self, parameters: Parameters) -> None:
-        self._limits = parameters.dead_zone, parameters.u_min, parameters.u_max
+        u_min, u_max = parameters.u_min, parameters.u_max
+        self._actuator = parameters.dead_zone, u_min, u_max, (u_max - u_min) / 2.0
         # Each coefficient with its place in the history it is for, and both histories with the
         # newest sample first: y(k), y(k-1), ... and u_a(k), u_a(k-1), ...
         self._alpha = tuple(enumerate(-coefficient for coefficient in parameters.a[1:]))
@@ -54,8 +65,8 @@ class Plant:
         output
             y(k+1), degC.
         """
-        dead_zone, u_min, u_max = self._limits
-        command = u_min + (action + 1.0) / 2.0 * (u_max - u_min)
+        dead_zone, u_min, u_max, half_range = self._actuator
+        command = u_min + (action + 1.0) * half_range  # Section 4, last formula
         applied = command  # (29) from here on
         if -dead_zone < command < dead_zone:
             applied = 0.0
@@ -65,13 +76,98 @@ class Plant:
             applied = u_max
         inputs, outputs = self._inputs, self._outputs
         inputs.appendleft(applied)
-        output = noise  # (28) from here on
-        for lag, alpha in self._alpha:
-            output += alpha * outputs[lag]
+        response = 0.0  # to the input: B of (28)
         for lag, beta in self._beta:
-            output += beta * inputs[lag]
+            response += beta * inputs[lag]
+        output = noise + response
+        for lag, alpha in self._alpha:
+            output += alpha * outputs[lag]  # A of (28)
         outputs.appendleft(output)
         return command, applied, output
+
+
+class Plants:
+    """Many plants side by side, with the same parameters: `Plant` in arrays.
+
+    Parameters
+    ----------
+    parameters
+        Uses `a`, `b`, `delay`, `dead_zone`, `u_min` and `u_max`.
+    num_envs
+        n, number of plants.
+    """
+
+    def __init__(self, parameters: Parameters, num_envs: int) -> None:
+        # An array of one number costs less in arithmetic than a number does. Where arrays are
+        # compared, full ones cost less still.
+        u_min, u_max = parameters.u_min, parameters.u_max
+        self._scaling = tuple(np.array(x) for x in (1.0, (u_max - u_min) / 2.0, u_min))
+        self._limits = np.full(num_envs, u_min), np.full(num_envs, u_max)
+        self._dead_zone = np.array(parameters.dead_zone)
+        self._alpha = tuple(np.array(-coefficient) for coefficient in parameters.a[1:])
+        self._beta = tuple(parameters.b)
+        self._outputs = deque(np.zeros((len(self._alpha), num_envs)), maxlen=len(self._alpha))
+        # Because of the delay d, the response to the inputs of d + 1 samples can be worked out
+        # at once. Inputs lie here with the oldest first; before those of the d + 1 samples come
+        # the older ones that B also needs.
+        self._older = len(self._beta) - 1
+        self._samples = parameters.delay + 1
+        self._inputs = np.zeros((self._older + self._samples, num_envs))
+        self._response = np.zeros((self._samples, num_envs))
+        self._place = self._samples - 1  # of the next input among the d + 1
+
+    def rest(self, which: NDArray[np.intp]) -> None:
+        """Bring some of the plants to rest, given by their indices."""
+        self._inputs[:, which] = 0.0
+        self._response[:, which] = 0.0
+        for outputs in self._outputs:
+            outputs[which] = 0.0
+
+    def step(self, action: Values, noise: Values) -> tuple[Values, Values, Values]:
+        """Move all plants from sample k to k+1.
+
+        Parameters
+        ----------
+        action
+            a(k), shape (n,).
+        noise
+            n(k+1), degC, shape (n,).
+
+        Returns
+        -------
+        command, applied, output
+            u(k) and u_a(k), t/h, and y(k+1), degC; each of shape (n,). The last is kept here
+            and must not be changed.
+        """
+        one, half_range, lowest = self._scaling
+        u_min, u_max = self._limits
+        command = action + one
+        command *= half_range
+        command += lowest
+        applied = np.minimum(command, u_max)  # (29) from here on
+        np.maximum(applied, u_min, out=applied)
+        # A product, as processors are slow at masks, whose bits they cannot foresee.
+        applied *= np.abs(command) >= self._dead_zone
+        place = self._place
+        self._inputs[self._older + place] = applied
+        place += 1
+        if place == self._samples:
+            self._respond()
+            place = 0
+        self._place = place
+        output: Values = noise + self._response[place]
+        for term in map(mul, self._alpha, self._outputs):  # A of (28)
+            output += term
+        self._outputs.appendleft(output)
+        return command, applied, output
+
+    def _respond(self) -> None:
+        """Work out the response to the inputs of d + 1 samples."""
+        inputs, older, samples = self._inputs, self._older, self._samples
+        self._response[:] = 0.0
+        for lag, beta in enumerate(self._beta):  # B of (28)
+            self._response += beta * inputs[older - lag : older - lag + samples]
+        inputs[:older] = inputs[samples:].copy()
 
 
 def _at_rest(samples: int) -> deque[float]:

@@ -1,0 +1,430 @@
+"""Many plants side by side, as a Gymnasium vector environment."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Iterable, Sequence
+from numbers import Integral
+from typing import Any, ClassVar, cast
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from mptc_gym.env import MiddlePointEnv
+from mptc_gym.plant import Plants, action_from_command
+from mptc_gym.signals import BLOCK, FOREVER, Noises, SetPoints, Streams
+
+Infos = dict[str, Any]
+Values = NDArray[np.float64]  # one a plant, shape (num_envs,)
+Indices = NDArray[np.intp]
+
+INFO = ("output", "setpoint", "error", "command", "applied", "noise")
+_FLOAT64 = np.dtype(np.float64)  # quicker to pass on than the type
+_ROOM = 64  # steps until the window of the observations is moved back
+
+
+class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+    """n plants that advance together: `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
+
+    Given the same seed, all that `reset` and `step` return equals, to the bit, what Gymnasium's
+    `SyncVectorEnv` of n `MiddlePointEnv` returns. See there for the plant, the spaces, the
+    reward, the infos and the arguments.
+
+    Parameters
+    ----------
+    num_envs
+        n, number of plants.
+    max_episode_steps
+        Samples after which an episode is truncated; None or -1 for never.
+    autoreset_mode
+        An `AutoresetMode` or its value. "NextStep": the step after the end of an episode resets
+        the plant, and its action is ignored. "SameStep": the step that ends an episode resets
+        the plant, and returns the last observation and info in `final_obs` and `final_info`.
+        "Disabled": whoever steps has to reset, by `reset(options={"reset_mask": mask})`.
+    render_mode
+        None; nothing is drawn yet.
+    **arguments
+        Those of `MiddlePointEnv`, the same for all plants.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range; the message names it.
+
+    Notes
+    -----
+    All plants share one clock, so that a step is array arithmetic alone. Single plants are
+    looked at only where their own generators are: at the start of an episode, once in some 500
+    samples of noise, and when a random set point changes. So a plant needs the same few KiB
+    however long an episode lasts.
+
+    Where `MiddlePointEnv` goes on in silence after y has left the range of floats, as it may
+    with an unstable `a`, NumPy warns here.
+    """
+
+    metadata: dict[str, Any] = MiddlePointEnv.metadata
+
+    __signature__: ClassVar[inspect.Signature] = inspect.Signature(
+        [
+            inspect.Parameter(
+                "num_envs", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=1, annotation="int"
+            ),
+            *MiddlePointEnv.__signature__.parameters.values(),
+            inspect.Parameter(
+                "max_episode_steps",
+                inspect.Parameter.KEYWORD_ONLY,
+                default=None,
+                annotation="int | None",
+            ),
+            inspect.Parameter(
+                "autoreset_mode",
+                inspect.Parameter.KEYWORD_ONLY,
+                default=AutoresetMode.NEXT_STEP,
+                annotation="str | AutoresetMode",
+            ),
+        ]
+    )
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **arguments: Any,
+    ) -> None:
+        single = MiddlePointEnv(render_mode=render_mode, **arguments)
+        self.num_envs = num_envs = _count("num_envs", num_envs)
+        self._limit = FOREVER
+        if max_episode_steps is not None and max_episode_steps != -1:
+            self._limit = min(FOREVER, _count("max_episode_steps", max_episode_steps))
+        try:
+            self._mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            allowed = ", ".join(repr(mode.value) for mode in AutoresetMode)
+            raise ValueError(
+                f"autoreset_mode must be one of {allowed}, got {autoreset_mode!r}"
+            ) from None
+        self.metadata = {**self.metadata, "autoreset_mode": self._mode}
+        self.render_mode = render_mode
+        self.parameters = parameters = single.parameters
+        self.single_action_space = single.action_space
+        self.single_observation_space = single.observation_space
+        self.action_space = batch_space(single.action_space, num_envs)
+        self.observation_space = batch_space(single.observation_space, num_envs)
+
+        self._seeds: list[int | None] = [None] * num_envs
+        self._streams: dict[int, Streams] = {}  # of every plant, once they have been reset
+        self._clock = 0  # samples since the plants were made
+        self._plants = Plants(parameters, num_envs)
+        # Blocks of noise that come out even at the end of an episode.
+        block = math.ceil(self._limit / math.ceil(self._limit / BLOCK))
+        self._noises = Noises(parameters, num_envs, block)
+        self._setpoints = SetPoints(parameters, num_envs)
+        self._ends = np.zeros(num_envs, np.int64)  # by the clock, of the episodes
+        self._first_end = 0
+        self._ended: NDArray[np.bool_] | None = None  # those still to be reset, if any
+        # Arrays in place of numbers, as in `Plants`.
+        span = parameters.temperature_span
+        self._span = np.full(num_envs, -span), np.full(num_envs, span), span * span
+        self._reward_terms = (
+            np.array(parameters.error_scale),
+            np.array(-0.5),
+            parameters.reward == "quadratic",
+            parameters.move_weight,
+        )
+        # Where the newest sample of each block of the observation lies, if there is the block.
+        windows = (
+            parameters.setpoint_window,
+            parameters.error_window,
+            parameters.output_window,
+            parameters.action_window,
+        )
+        self._newest = tuple(
+            np.s_[:, head] if window else None
+            for head, window in zip((0, *parameters.heads), windows, strict=True)
+        )
+        self._rest_action = action_from_command(0.0, parameters.u_min, parameters.u_max)
+        self._actions = np.zeros(num_envs)  # the last ones
+        # The observations of all plants lie in this row, one after the other, from a place on
+        # that moves back by one each step. So all blocks of samples move on by one, and only
+        # their first elements have to be written.
+        self._shape = num_envs, parameters.observation_size
+        self._elements = num_envs * parameters.observation_size
+        self._row = np.zeros(self._elements + _ROOM, np.float32)
+        self._place = _ROOM
+        self._everyone, self._nobody = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+        """The seed of each plant; None before the first reset."""
+        return tuple(self._seeds)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[NDArray[np.float32], Infos]:
+        """Bring all plants, or some, to rest and start an episode of each.
+
+        Parameters
+        ----------
+        seed
+            Starts the random streams anew: those of plant i with seed + i, or with element i of
+            a list. Without it, or where the list says None, the next episode of the present
+            streams begins.
+        options
+            `reset_mask`, an array of bool, shape (num_envs,), says which plants are reset.
+
+        Returns
+        -------
+        observations
+            Shape (num_envs, observation_size), float32;
+            the last one of a plant that was not reset.
+        infos
+            Arrays of shape (num_envs,), and a mask of the plants that were reset with each.
+
+        Raises
+        ------
+        ValueError
+            If `seed` or `reset_mask` does not fit. Nothing is changed then.
+        ResetNeeded
+            If the first reset is not one of all plants.
+        """
+        seeds = self._checked_seeds(seed)
+        mask = self._checked_mask(options)
+        which = np.flatnonzero(mask)
+        if len(which) < self.num_envs and not self._streams:
+            raise ResetNeeded("reset all environments before some of them")
+        self._seed(which, seeds)
+        infos: Infos = {name: np.zeros(self.num_envs) for name in INFO}
+        self._begin(which, infos)
+        if self._ended is not None:
+            ended = self._ended & ~mask
+            self._ended = ended if ended.any() else None
+        return self._window().copy(), infos | {f"_{name}": mask.copy() for name in INFO}
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[
+        NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Infos
+    ]:
+        """Apply normalised actions for one sample.
+
+        Parameters
+        ----------
+        actions
+            a(k) of each plant, shape (num_envs, 1).
+
+        Returns
+        -------
+        observations
+            Shape (num_envs, observation_size), float32.
+        rewards
+            Shape (num_envs,), float64.
+        terminations, truncations
+            Shape (num_envs,), bool.
+        infos
+            Arrays of shape (num_envs,) and their masks. All masks of a step are one array.
+
+        Raises
+        ------
+        ValueError
+            If the actions have another shape, or one is not finite. The plants are untouched
+            then.
+        ResetNeeded
+            If the environments have never been reset, or, with autoreset disabled, if one has
+            ended.
+        """
+        # This is the hot path: for few plants, what counts is the number of calls.
+        a = self._checked_actions(actions)
+        if self._ended is not None and self._ended.all():
+            observations, infos = self.reset()
+            none = self._nobody
+            return observations, np.zeros(self.num_envs), none.copy(), none.copy(), infos
+        self._clock = clock = self._clock + 1
+        if clock >= self._setpoints.next_change:
+            self._setpoints.move(clock)
+        setpoint = self._setpoints.now
+        noise = self._noises.next()
+        command, applied, output = self._plants.step(a, noise)
+
+        error_scale, minus_half, quadratic, move_weight = self._reward_terms
+        error = setpoint - output
+        scaled = error / error_scale
+        if quadratic:
+            rewards = scaled * scaled  # (12)
+            rewards *= minus_half
+        else:
+            rewards = -np.abs(scaled)
+        if move_weight:
+            rewards -= move_weight * np.abs(a - self._actions)
+        self._actions = a
+
+        measured = output
+        lowest, highest, squared = self._span
+        if not output.dot(output) <= squared:  # otherwise no single one can be beyond the span
+            measured = np.fmin(output, highest)  # which takes NaN for the limit
+            np.fmax(measured, lowest, out=measured)
+        if self._place == 0:
+            self._row[_ROOM:] = self._row[:-_ROOM]
+            self._place = _ROOM
+        self._place = place = self._place - 1
+        window = self._row[place : place + self._elements].reshape(self._shape)
+        setpoints, errors, outputs, past_actions = self._newest
+        if setpoints is not None:
+            window[setpoints] = setpoint
+        if errors is not None:
+            window[errors] = setpoint - measured
+        if outputs is not None:
+            window[outputs] = measured
+        if past_actions is not None:
+            window[past_actions] = a.clip(-1.0, 1.0)
+
+        everyone = self._everyone.copy()
+        infos = {
+            "output": output.copy(),
+            "_output": everyone,
+            "setpoint": setpoint.copy(),
+            "_setpoint": everyone,
+            "error": error,
+            "_error": everyone,
+            "command": command,
+            "_command": everyone,
+            "applied": applied,
+            "_applied": everyone,
+            "noise": noise.copy(),
+            "_noise": everyone,
+        }
+        terminations, truncations = self._nobody.copy(), self._nobody.copy()
+        if clock >= self._first_end:
+            truncations = self._end_episodes(rewards, infos)
+        return window.copy(), rewards, terminations, truncations, infos
+
+    def _window(self) -> NDArray[np.float32]:
+        """Return the observations as they lie in the row, shape (num_envs, size)."""
+        return self._row[self._place : self._place + self._elements].reshape(self._shape)
+
+    def _end_episodes(self, rewards: Values, infos: Infos) -> NDArray[np.bool_]:
+        """Do what the end of an episode asks for, and return which have ended."""
+        ended = self._ends <= self._clock
+        if self._mode is AutoresetMode.SAME_STEP:
+            which = np.flatnonzero(ended)
+            final_info = {name: np.where(ended, infos[name], 0.0) for name in INFO}
+            final_obs = np.full(self.num_envs, None, object)
+            for i, observation in zip(which, self._window()[which], strict=True):
+                final_obs[i] = observation
+            self._begin(which, infos)
+            infos |= {
+                "final_obs": final_obs,
+                "_final_obs": ended.copy(),
+                "final_info": final_info | {f"_{name}": ended.copy() for name in final_info},
+                "_final_info": ended.copy(),
+            }
+            return ended
+        if self._ended is not None:  # at the step before this one
+            which = np.flatnonzero(self._ended)
+            rewards[which] = 0.0
+            self._begin(which, infos)
+            ended = self._ends <= self._clock
+        self._ended = ended.copy() if ended.any() else None
+        return ended
+
+    def _begin(self, which: Indices, infos: Infos) -> None:
+        """Begin an episode of some plants, and put their infos of k = 0 in."""
+        self._plants.rest(which)
+        plants = which.tolist()
+        self._noises.restart(which, (self._streams[i].noise for i in plants))
+        streams = (self._streams[i].setpoint for i in plants)
+        self._setpoints.restart(which, streams, self._clock)
+        self._actions[which] = self._rest_action
+        self._ends[which] = self._clock + self._limit
+        self._first_end = int(self._ends.min())
+
+        setpoint = self._setpoints.now[which]
+        rest = np.zeros((len(which), self.parameters.observation_size), np.float32)
+        setpoints, errors, _, _ = self._newest
+        if setpoints is not None:
+            rest[setpoints] = setpoint
+        if errors is not None:
+            rest[errors] = setpoint
+        rest[:, self.parameters.heads[2] :] = min(1.0, max(-1.0, self._rest_action))
+        self._window()[which] = rest
+        for name in INFO:
+            infos[name][which] = setpoint if name in ("setpoint", "error") else 0.0
+
+    def _seed(self, which: Indices, seeds: Sequence[int | None]) -> None:
+        for i in which.tolist():
+            if seeds[i] is not None or i not in self._streams:
+                root = np.random.SeedSequence(seeds[i])
+                self._seeds[i] = cast("int", root.entropy)
+                self._streams[i] = Streams.spawn(root)
+
+    def _checked_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+        n = self.num_envs
+        if seed is None:
+            return [None] * n
+        if isinstance(seed, int | np.integer):
+            seeds: list[int | None] = list(range(int(seed), int(seed) + n))
+        else:
+            seeds = list(seed) if isinstance(seed, Iterable) else []
+        if len(seeds) != n or not all(s is None or _is_count(s, 0) for s in seeds):
+            raise ValueError(
+                f"seed must be an integer of at least 0, or a list of {n} of them or None, got "
+                f"{seed!r}"
+            )
+        return seeds
+
+    def _checked_mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_]:
+        if options is None or "reset_mask" not in options:
+            return np.ones(self.num_envs, np.bool_)
+        mask = options["reset_mask"]
+        if (
+            not isinstance(mask, np.ndarray)
+            or mask.dtype != np.bool_
+            or mask.shape != (self.num_envs,)
+            or not mask.any()
+        ):
+            raise ValueError(
+                f"options['reset_mask'] must be an array of bool, shape ({self.num_envs},), at "
+                f"least one of them True, got {mask!r}"
+            )
+        return mask
+
+    def _checked_actions(self, actions: NDArray[np.float32]) -> Values:
+        """Return the actions as a new array, shape (num_envs,); 0 where they are ignored."""
+        if not self._streams:
+            raise ResetNeeded("call reset before step")
+        n = self.num_envs
+        try:
+            given = np.array(actions, _FLOAT64)
+        except (TypeError, ValueError):
+            given = np.empty(0)
+        if given.shape != (n, 1):
+            raise ValueError(f"actions must be numbers, shape ({n}, 1), got {actions!r}")
+        a = given.ravel()
+        if self._ended is not None:
+            if self._mode is AutoresetMode.DISABLED:
+                ended = np.flatnonzero(self._ended)
+                raise ResetNeeded(f"episodes of environments {ended} have ended: reset them")
+            a[self._ended] = 0.0
+        # One call tells that all are finite, unless some are huge.
+        if not math.isfinite(a.dot(a)) and not np.isfinite(a).all():
+            raise ValueError(f"actions must be finite, got {actions!r}")
+        return a
+
+
+def _is_count(value: Any, least: int) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
+
+
+def _count(name: str, value: Any) -> int:
+    if not _is_count(value, 1):
+        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
+    return int(value)

@@ -1,0 +1,329 @@
+"""The vector environment: equal, to the bit, to one environment after the other."""
+
+import copy
+import inspect
+import pickle
+import tracemalloc
+from unittest.mock import patch
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
+from tests.arguments import valid_arguments
+
+NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
+MODES = [mode.value for mode in AutoresetMode]
+
+
+def make_both(num_envs, mode, limit, **arguments):
+    native = gymnasium.make_vec(
+        "MiddlePoint-v0", num_envs, max_episode_steps=limit, autoreset_mode=mode, **arguments
+    )
+    sync = gymnasium.make_vec(
+        "MiddlePoint-v0", num_envs, max_episode_steps=-1 if limit is None else limit,
+        vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **arguments,
+    )  # fmt: skip
+    assert type(native) is MiddlePointVectorEnv
+    return native, sync
+
+
+def assert_equal(ours, theirs):
+    assert data_equivalence(ours, theirs, exact=True), f"{ours}\n\n{theirs}"
+
+
+def compare(native, sync, *, steps, rng, partial_resets):
+    n = native.num_envs
+    for _ in range(steps):
+        actions = rng.normal(0, 1, (n, 1)).astype(np.float32)
+        actions[rng.random(n) < 0.1] *= 1e6
+        ours, theirs = native.step(actions), sync.step(actions)
+        assert_equal(ours, theirs)
+        mask = rng.random(n) < partial_resets
+        if native.metadata["autoreset_mode"] is AutoresetMode.DISABLED:
+            mask |= ours[3]
+        if mask.any():
+            seeds = [None if rng.random() < 0.5 else int(rng.integers(100)) for _ in range(n)]
+            both = (
+                envs.reset(seed=list(seeds), options={"reset_mask": mask.copy()})
+                for envs in (native, sync)
+            )
+            assert_equal(*both)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    arguments=valid_arguments,
+    num_envs=st.integers(1, 6),
+    mode=st.sampled_from(MODES),
+    limit=st.none() | st.integers(1, 40),
+    partial_resets=st.sampled_from([0.0, 0.05, 0.3]),
+    seed=st.integers(0, 2**40) | st.none(),
+    randomness=st.integers(0, 2**32),
+)
+def test_it_equals_one_environment_after_the_other(
+    arguments, num_envs, mode, limit, partial_resets, seed, randomness
+):
+    rng = np.random.default_rng(randomness)
+    if seed is None:
+        seed = rng.integers(0, 2**40, num_envs).tolist()
+    with (  # so small that many blocks are made and the window is moved back often
+        patch.multiple("mptc_gym.vector_env", BLOCK=7, _ROOM=3),
+        patch.multiple("mptc_gym.signals", _TOGETHER=2),
+    ):
+        native, sync = make_both(num_envs, mode, limit, **arguments)
+        assert_equal(native.reset(seed=seed), sync.reset(seed=seed))
+        compare(native, sync, steps=50, rng=rng, partial_resets=partial_resets)
+        assert_equal(native.reset(), sync.reset())
+        compare(native, sync, steps=10, rng=rng, partial_resets=partial_resets)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_equals_them_over_long_episodes(mode, rng):
+    native, sync = make_both(3, mode, 600, action_window=20, move_weight=0.1, **NOISY)
+    assert_equal(native.reset(seed=5), sync.reset(seed=5))
+    compare(native, sync, steps=1300, rng=rng, partial_resets=0.001)
+
+
+def test_spaces_are_those_of_gymnasium():
+    native, sync = make_both(3, "NextStep", None, setpoint=70.0, output_window=2)
+    for name in ("action_space", "observation_space"):
+        assert getattr(native, name) == getattr(sync, name)
+        assert getattr(native, f"single_{name}") == getattr(sync, f"single_{name}")
+    assert native.metadata == sync.metadata
+
+
+def test_a_plant_beyond_all_floats_equals_the_one_alone():
+    native, sync = make_both(2, "NextStep", None, a=[1.0, -3.0, 4.0], output_window=1)
+    native.reset(seed=0), sync.reset(seed=0)
+    with np.errstate(all="ignore"):
+        for _ in range(1500):
+            ours, theirs = native.step(np.ones((2, 1))), sync.step(np.ones((2, 1)))
+            np.testing.assert_array_equal(ours[0], theirs[0])
+    assert not np.isfinite(ours[4]["output"]).any()
+
+
+def test_time_limit_is_that_of_the_registration_unless_another_is_given():
+    def truncations(**limit):
+        envs = gymnasium.make_vec("MiddlePoint-v0", 2, **limit)
+        envs.reset(seed=0)
+        return [bool(envs.step(np.zeros((2, 1)))[3].all()) for _ in range(1300)]
+
+    assert np.flatnonzero(truncations()) == 1199
+    assert np.flatnonzero(truncations(max_episode_steps=700)) == 699
+    assert not any(truncations(max_episode_steps=None))
+    assert not any(truncations(max_episode_steps=-1))
+
+
+@pytest.mark.parametrize("mode", [*MODES, *AutoresetMode])
+def test_autoreset_mode_is_in_the_metadata(mode):
+    envs = MiddlePointVectorEnv(2, autoreset_mode=mode)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode(mode)
+    assert "autoreset_mode" not in MiddlePointEnv.metadata
+
+
+def test_what_is_returned_can_be_overwritten(rng):
+    arguments = {"autoreset_mode": "SameStep", "action_window": 2, "move_weight": 0.1, **NOISY}
+    native, twin = (
+        MiddlePointVectorEnv(4, max_episode_steps=30, **arguments) for _ in range(2)
+    )
+    returned = native.reset(seed=1)
+    twin.reset(seed=1)
+    for k in range(100):
+        for array in (*returned[:-1], *returned[-1].values()):
+            if isinstance(array, np.ndarray) and array.dtype != object:
+                array.fill(77)
+        actions = rng.normal(0, 1, (4, 1)).astype(np.float32)
+        kept = actions.copy()
+        returned = native.step(actions)
+        np.testing.assert_array_equal(actions, kept)
+        assert_equal(returned, twin.step(actions))
+        if k % 10 == 0:
+            mask = np.array([True, False, False, True])
+            options = {"reset_mask": mask}
+            returned = native.reset(options=options)
+            assert_equal(returned, twin.reset(options=options))
+            assert list(options) == ["reset_mask"]
+            assert list(mask) == [True, False, False, True]
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_copies_in_the_middle_of_an_episode_go_on_alike(copied, mode, rng):
+    envs = gymnasium.make_vec(
+        "MiddlePoint-v0", 3, max_episode_steps=100, autoreset_mode=mode, **NOISY
+    )
+    envs.reset(seed=0)
+    for _ in range(130):
+        envs.step(rng.uniform(-1, 1, (3, 1)))
+    twin = copied(envs)
+    for _ in range(700):
+        actions = rng.uniform(-1, 1, (3, 1))
+        assert_equal(envs.step(actions), twin.step(actions))
+
+
+def test_episode_statistics_of_gymnasium():
+    envs = RecordEpisodeStatistics(
+        gymnasium.make_vec("MiddlePoint-v0", 3, max_episode_steps=5, **NOISY)
+    )
+    envs.reset(seed=0)
+    total = np.zeros(3)
+    for _ in range(5):
+        _, rewards, _, _, infos = envs.step(np.ones((3, 1), np.float32))
+        total += rewards
+    np.testing.assert_allclose(infos["episode"]["r"], total, rtol=1e-6)
+    assert list(infos["episode"]["l"]) == [5, 5, 5]
+    envs.reset(options={"reset_mask": np.array([True, False, True])})
+
+
+def test_seeds_are_told():
+    envs = MiddlePointVectorEnv(3)
+    assert envs.np_random_seed == (None, None, None)
+    envs.reset()
+    first = envs.np_random_seed
+    assert len(set(first)) == 3
+    envs.reset()
+    assert envs.np_random_seed == first
+    envs.reset(seed=[7, None, 9])
+    assert envs.np_random_seed == (7, first[1], 9)
+
+
+def test_unseeded_plants_meet_different_noise():
+    envs = MiddlePointVectorEnv(3, noise_variance=0.5)
+    envs.reset()
+    assert len(set(envs.step(np.zeros((3, 1)))[4]["noise"])) == 3
+
+
+def test_nothing_grows_in_the_long_run():
+    envs = MiddlePointVectorEnv(2, autoreset_mode="SameStep", max_episode_steps=1000, **NOISY)
+    actions = np.full((2, 1), 0.6, np.float32)
+    envs.reset(seed=0)
+    sizes = []
+    for _ in range(2):
+        for _ in range(50_000):
+            envs.step(actions)
+        sizes.append(len(pickle.dumps(envs)))
+    # The counters become longer numbers, no more.
+    assert sizes[1] <= sizes[0] + 100
+
+
+@pytest.mark.parametrize("limit", [1200, 10**6, None])
+def test_a_plant_costs_a_few_kib(limit):
+    plants = 500
+    tracemalloc.start()
+    envs = MiddlePointVectorEnv(plants, max_episode_steps=limit, action_window=20, **NOISY)
+    envs.reset(seed=0)
+    envs.step(np.zeros((plants, 1)))
+    used, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert used / plants < 12 * 1024
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("num_envs", 0), ("num_envs", 2.0), ("num_envs", True), ("max_episode_steps", 0),
+        ("max_episode_steps", 1.5), ("autoreset_mode", "Never"), ("dead_zone", -1.0),
+        ("delay", 1.5),
+    ],
+)  # fmt: skip
+def test_bad_argument_is_named(name, value):
+    arguments = {"num_envs": 2, name: value}
+    with pytest.raises(ValueError, match=name):
+        MiddlePointVectorEnv(**arguments)
+
+
+def test_unknown_argument_and_render_mode_are_refused():
+    with pytest.raises(TypeError, match="deadzone"):
+        MiddlePointVectorEnv(2, deadzone=5.0)
+    with pytest.raises(TypeError, match="render_mode"):
+        MiddlePointVectorEnv(2, render_mode="rgb_array")
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "12", [1], [1, 2, 3], [1, -2], [1, 1.5], [1, "2"]])
+def test_bad_seed_is_refused(seed):
+    with pytest.raises(ValueError, match="seed"):
+        MiddlePointVectorEnv(2).reset(seed=seed)
+
+
+def test_seed_may_be_a_numpy_integer():
+    ours, theirs = (
+        MiddlePointVectorEnv(2, **NOISY).reset(seed=seed) for seed in (np.int64(3), [3, 4])
+    )
+    assert_equal(ours, theirs)
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [[True, False], np.array([1, 0]), np.array([True]), np.array([False, False]), None],
+)
+def test_bad_reset_mask_is_refused(mask):
+    envs = MiddlePointVectorEnv(2)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match="reset_mask"):
+        envs.reset(options={"reset_mask": mask})
+
+
+BAD_ACTIONS = [
+    np.zeros(2), np.zeros((1, 1)), np.zeros((2, 2)), np.array([[np.nan], [0.0]]),
+    np.array([[0.0], [np.inf]]), [["up"], ["down"]], [[0.0], [None]], None,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("actions", BAD_ACTIONS)
+def test_bad_actions_leave_the_plants_untouched(actions):
+    envs, twin = (MiddlePointVectorEnv(2, **NOISY) for _ in range(2))
+    envs.reset(seed=0), twin.reset(seed=0)
+    for _ in range(40):
+        with pytest.raises(ValueError, match="actions"):
+            envs.step(actions)
+        assert_equal(envs.step(np.ones((2, 1))), twin.step(np.ones((2, 1))))
+
+
+def test_huge_actions_are_taken():
+    envs = MiddlePointVectorEnv(2)
+    envs.reset(seed=0)
+    with np.errstate(over="ignore"):
+        infos = envs.step(np.array([[1e200], [-1e200]]))[4]
+    assert list(infos["applied"]) == [10.0, -10.0]
+
+
+def test_the_action_of_a_plant_that_is_reset_is_ignored():
+    envs = MiddlePointVectorEnv(2, max_episode_steps=1)
+    envs.reset(seed=0)
+    envs.reset(options={"reset_mask": np.array([True, False])})
+    assert list(envs.step(np.zeros((2, 1)))[3]) == [True, True]
+    envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.step(np.array([[0.0], [np.nan]]))
+    with pytest.raises(ValueError, match="actions"):
+        envs.step(np.array([[0.0], [np.nan]]))
+
+
+def test_reset_is_asked_for():
+    envs = MiddlePointVectorEnv(2, max_episode_steps=2, autoreset_mode="Disabled")
+    with pytest.raises(ResetNeeded):
+        envs.step(np.zeros((2, 1)))
+    with pytest.raises(ResetNeeded):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.reset(seed=0)
+    envs.step(np.zeros((2, 1)))
+    envs.step(np.zeros((2, 1)))
+    envs.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(ResetNeeded, match=r"\[1\]"):
+        envs.step(np.zeros((2, 1)))
+    envs.reset(options={"reset_mask": np.array([False, True])})
+    envs.step(np.zeros((2, 1)))
+
+
+def test_help_shows_every_argument():
+    names = set(inspect.signature(MiddlePointVectorEnv).parameters)
+    assert names == {"num_envs", "max_episode_steps", "autoreset_mode"} | set(
+        inspect.signature(MiddlePointEnv).parameters
+    )
