@@ -101,9 +101,9 @@ class Plants:
         # An array of one number costs less in arithmetic than a number does. Where arrays are
         # compared, full ones cost less still.
         u_min, u_max = parameters.u_min, parameters.u_max
-        self._scaling = tuple(np.array(x) for x in (1.0, (u_max - u_min) / 2.0, u_min))
-        self._limits = np.full(num_envs, u_min), np.full(num_envs, u_max)
-        self._dead_zone = np.array(parameters.dead_zone)
+        numbers = 0.0, 1.0, (u_max - u_min) / 2.0, u_min, parameters.dead_zone
+        limits = np.full(num_envs, u_min), np.full(num_envs, u_max)
+        self._actuator = (*map(np.array, numbers), *limits)
         self._alpha = tuple(np.array(-coefficient) for coefficient in parameters.a[1:])
         self._beta = tuple(parameters.b)
         self._outputs = deque(np.zeros((len(self._alpha), num_envs)), maxlen=len(self._alpha))
@@ -139,15 +139,16 @@ class Plants:
             u(k) and u_a(k), t/h, and y(k+1), degC; each of shape (n,). The last is kept here
             and must not be changed.
         """
-        one, half_range, lowest = self._scaling
-        u_min, u_max = self._limits
+        zero, one, half_range, lowest, dead_zone, u_min, u_max = self._actuator
         command = action + one
         command *= half_range
         command += lowest
         applied = np.minimum(command, u_max)  # (29) from here on
         np.maximum(applied, u_min, out=applied)
-        # A product, as processors are slow at masks, whose bits they cannot foresee.
-        applied *= np.abs(command) >= self._dead_zone
+        # A product, as processors are slow at masks, whose bits they cannot foresee. It turns
+        # some numbers into -0, which + 0 turns into 0.
+        applied *= np.abs(command) >= dead_zone
+        applied += zero
         place = self._place
         self._inputs[self._older + place] = applied
         place += 1

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from mptc_gym.parameters import Parameters
 
-BLOCK = 512  # samples made at a time
+BLOCK = 600  # samples made at a time
 FOREVER = 1 << 62  # samples
-_TOGETHER = 64  # plants whose noise is made at a time: it stays in the processor's cache
+_TOGETHER = 32  # plants whose noise is made at a time: it stays in the processor's cache
 
 
 class EpisodeStream:

@@ -58,7 +58,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     Notes
     -----
     All plants share one clock, so that a step is array arithmetic alone. Single plants are
-    looked at only where their own generators are: at the start of an episode, once in some 500
+    looked at only where their own generators are: at the start of an episode, once in some 600
     samples of noise, and when a random set point changes. So a plant needs the same few KiB
     however long an episode lasts.
 
@@ -415,7 +415,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
                 raise ResetNeeded(f"episodes of environments {ended} have ended: reset them")
             a[self._ended] = 0.0
         # One call tells that all are finite, unless some are huge.
-        if not math.isfinite(a.dot(a)) and not np.isfinite(a).all():
+        if not a.dot(a) < math.inf and not np.isfinite(a).all():
             raise ValueError(f"actions must be finite, got {actions!r}")
         return a
 

@@ -37,6 +37,9 @@ def make_both(num_envs, mode, limit, **arguments):
 
 def assert_equal(ours, theirs):
     assert data_equivalence(ours, theirs, exact=True), f"{ours}\n\n{theirs}"
+    for name in ("applied", "output"):  # 0 and -0 are equal, but not the same
+        np.testing.assert_array_equal(*(np.signbit(each[-1][name]) for each in (ours, theirs)))
+    np.testing.assert_array_equal(*(np.signbit(each[0]) for each in (ours, theirs)))
 
 
 def compare(native, sync, *, steps, rng, partial_resets):
