@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from benchmarks import plots, tables
 from benchmarks.metrics import METRICS, measure
+from benchmarks.options import number
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.roster import BUILT_IN, Factory, build, load_factory, observation
 from benchmarks.scenarios import SCENARIOS
@@ -106,14 +107,6 @@ def _parser() -> argparse.ArgumentParser:
         help="folder where trained policies are kept",
     )
     return parser
-
-
-def number(text: str) -> int:
-    """Read a number of at least 1; argparse shows this function's name in its complaints."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
-    return value
 
 
 def _known(option: str, given: list[str], known: list[str]) -> list[str]:

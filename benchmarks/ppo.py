@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
 from benchmarks.metrics import measure
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
 from benchmarks.storage import ROOT, replacing, versions, write_json
+from benchmarks.vec_env import GymnasiumVecEnv
 from mptc_gym import Parameters
 
 DELAY = Parameters().delay
@@ -192,7 +193,7 @@ class Trained:
 
 def policy_key(arguments: PPOArguments) -> str:
     """Return a name made of everything that shapes a policy: arguments, versions and code."""
-    names = ("metrics.py", "ppo.py", "rollout.py", "scenarios.py")
+    names = ("metrics.py", "ppo.py", "rollout.py", "scenarios.py", "vec_env.py")
     sources = [
         *sorted((ROOT / "mptc_gym").glob("*.py")),
         *(ROOT / "benchmarks" / n for n in names),
@@ -241,7 +242,7 @@ def trained_policy(
         if checkpoint.exists():
             model, curve, best = _resume(checkpoint)
         else:
-            model, curve, best = _begin(arguments), [], {}
+            model, curve, best = begin(arguments), [], {}
     except (EOFError, OSError, ValueError, pickle.UnpicklingError) as error:
         raise ValueError(f"{folder} is damaged ({error}): remove it, or --retrain") from error
     left = arguments.steps - model.num_timesteps
@@ -254,7 +255,7 @@ def trained_policy(
         disable=not progress,
     )
     with bar:
-        keeper = _Keeper(arguments, checkpoint, curve, best, bar)
+        keeper = Keeper(arguments, checkpoint, curve, best, bar)
         model.learn(left, callback=keeper, reset_num_timesteps=False)
         keeper.record()
     model.policy.load_state_dict(keeper.best)
@@ -267,11 +268,26 @@ def trained_policy(
     return model
 
 
-def _begin(arguments: PPOArguments) -> PPO:
-    def make_plant() -> gymnasium.Env[Any, Any]:
-        return gymnasium.make("MiddlePoint-v0", **arguments.training)
+def begin(arguments: PPOArguments, plants: VecEnv | None = None) -> PPO:
+    """Make a model that has learnt nothing yet.
 
-    plants = DummyVecEnv([make_plant] * arguments.n_envs)
+    Parameters
+    ----------
+    arguments
+        How it is to be trained.
+    plants
+        What to train on, if not a batch of plants that are stepped at once.
+
+    Returns
+    -------
+    PPO
+        The model.
+    """
+    if plants is None:
+        batch = gymnasium.make_vec(
+            "MiddlePoint-v0", arguments.n_envs, autoreset_mode="SameStep", **arguments.training
+        )
+        plants = GymnasiumVecEnv(batch)
     parameters = Parameters(**arguments.training)
     degrees = parameters.observation_size - parameters.action_window
     factors = [1.0 / parameters.error_scale] * degrees + [1.0] * parameters.action_window
@@ -296,8 +312,22 @@ def _begin(arguments: PPOArguments) -> PPO:
     )
 
 
-class _Keeper(BaseCallback):
-    """Records the learning curve and keeps checkpoints, both between two updates."""
+class Keeper(BaseCallback):
+    """Records the learning curve and keeps checkpoints, both between two updates.
+
+    Parameters
+    ----------
+    arguments
+        How the policy is trained.
+    checkpoint
+        Where to keep checkpoints.
+    curve
+        The learning curve up to now; more points are added to it.
+    best
+        The parameters of the policy that did best in validation up to now.
+    bar
+        Shows the progress.
+    """
 
     def __init__(
         self,
@@ -317,8 +347,8 @@ class _Keeper(BaseCallback):
         self._began = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
 
     def _on_step(self) -> bool:
-        self._errors += [abs(info["error"]) for info in self.locals["infos"]]
-        self._bar.update(len(self.locals["infos"]))
+        self._errors.append(float(np.mean(np.abs(self.training_env.infos["error"]))))
+        self._bar.update(self.training_env.num_envs)
         return True
 
     def _on_rollout_start(self) -> None:
@@ -356,7 +386,7 @@ class _Keeper(BaseCallback):
         return float(measure(trajectory, Parameters(**arguments))["mae"].mean())
 
 
-def _save(keeper: _Keeper, path: Path) -> None:
+def _save(keeper: Keeper, path: Path) -> None:
     saved = io.BytesIO()
     keeper.model.save(saved)
     state = {

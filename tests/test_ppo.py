@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks import ppo
+from benchmarks import ppo, training_time
 from mptc_gym import Parameters
 from tests.budget import SMALL
 
@@ -58,7 +58,7 @@ class TestPPO:
         self, tmp_path, monkeypatch, calls
     ):
         whole = train(tmp_path / "whole")
-        keep = ppo._Keeper._on_step
+        keep = ppo.Keeper._on_step
         count = 0
 
         def interrupt(self):
@@ -69,7 +69,7 @@ class TestPPO:
             return keep(self)
 
         with monkeypatch.context() as patch:
-            patch.setattr(ppo._Keeper, "_on_step", interrupt)
+            patch.setattr(ppo.Keeper, "_on_step", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 train(tmp_path / "parts")
         assert [path.name for path in (tmp_path / "parts").iterdir()] == ["checkpoint.pkl"]
@@ -119,7 +119,7 @@ class TestPPO:
                 seen.append(weights(keeper.model))
             return [3.0, 1.0, 2.0, 1.5][len(seen) - 1]
 
-        monkeypatch.setattr(ppo._Keeper, "_mae", scores)
+        monkeypatch.setattr(ppo.Keeper, "_mae", scores)
         kept = weights(train(tmp_path))
         assert len(seen) == 4
         assert torch.equal(kept, seen[1])
@@ -127,13 +127,13 @@ class TestPPO:
 
     def test_exploration_falls_as_set(self, tmp_path, monkeypatch):
         spreads = {}
-        record = ppo._Keeper.record
+        record = ppo.Keeper.record
 
         def spy(keeper):
             record(keeper)
             spreads[keeper.num_timesteps] = keeper.model.policy.log_std.item()
 
-        monkeypatch.setattr(ppo._Keeper, "record", spy)
+        monkeypatch.setattr(ppo.Keeper, "record", spy)
         train(tmp_path, replace(SMALL, log_std=(-1.0, -3.0), log_std_falls=(0.25, 0.75)))
         # Recorded after the value for the coming rollout is set, but for the last.
         assert spreads[256] == pytest.approx(-1.0)
@@ -141,8 +141,45 @@ class TestPPO:
         assert spreads[768] == pytest.approx(-3.0)
 
     def test_inputs_are_scaled_by_fixed_numbers(self):
-        model = ppo._begin(SMALL)
+        model = ppo.begin(SMALL)
         observation = torch.arange(1.0, 29.0)
         scaled = model.policy.features_extractor(observation)
         assert scaled[:8].tolist() == pytest.approx([0.2 * i for i in range(1, 9)])  # degC
         assert scaled[8:].tolist() == list(range(9, 29))  # actions
+
+
+class TestTrainingTime:
+    @pytest.fixture(autouse=True)
+    def small(self, monkeypatch):
+        monkeypatch.setattr(ppo, "CHECKPOINT_INTERVAL", 256)
+        monkeypatch.setattr(ppo, "PROBE", replace(ppo.PROBE, samples=20))
+        monkeypatch.setattr(ppo, "VALIDATION_SAMPLES", 20)
+
+    def test_training_ends_with_the_quality(self, monkeypatch):
+        monkeypatch.setattr(training_time, "QUALITY", 100.0)
+        taken = training_time.train(SMALL, one_by_one=False)
+        assert taken.endswith("(256)")  # at the first point of the learning curve
+
+    def test_a_quality_that_is_not_reached_is_told(self, monkeypatch):
+        monkeypatch.setattr(training_time, "QUALITY", 0.0)
+        assert training_time.train(SMALL, one_by_one=True) == "not in 1,024"
+
+    def test_both_ways_train_the_same_policy(self, monkeypatch):
+        seen = []
+
+        def see(keeper):
+            seen.append(weights(keeper.model))
+            return False
+
+        monkeypatch.setattr(training_time.Until, "reached", property(see))
+        for one_by_one in (True, False):
+            training_time.train(SMALL, one_by_one=one_by_one)
+        assert torch.equal(seen[len(seen) // 2 - 1], seen[-1])
+
+    def test_it_runs(self, monkeypatch, capsys):
+        monkeypatch.setattr(training_time, "QUALITY", 100.0)
+        monkeypatch.setattr(ppo, "PPOArguments", lambda: SMALL)
+        training_time.main(["--seeds", "2", "--batches", "2", "8"])
+        shown = capsys.readouterr().out
+        for words in ("one by one, 4", "at once, 2", "at once, 8", "seed 1", "100.0"):
+            assert words in shown

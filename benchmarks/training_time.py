@@ -1,0 +1,122 @@
+"""How soon PPO reaches a given quality, by how its plants are run.
+
+`python -m benchmarks.training_time` trains until the mean absolute error on the noise-free
+square wave is at most 1.2 degC: with one plant after the other, as Stable-Baselines3 does by
+default, and with a batch of them at once, of several sizes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from tqdm import tqdm
+
+from benchmarks import ppo
+from benchmarks.options import number
+from benchmarks.tables import on_screen
+
+QUALITY = 1.2  # mean |e|, degC
+SEEDS = 3
+BATCHES = (64, 128, 256)
+
+
+class OneByOne(DummyVecEnv):
+    """Plants that are stepped one after the other."""
+
+    @property
+    def infos(self) -> dict[str, Any]:
+        """The last errors, as `GymnasiumVecEnv` gives them."""
+        return {"error": np.array([info["error"] for info in self.buf_infos])}
+
+
+class Until(ppo.Keeper):
+    """Ends the training when the quality is reached."""
+
+    def _on_step(self) -> bool:
+        super()._on_step()
+        return not self.reached
+
+    @property
+    def reached(self) -> bool:
+        """Whether it has been, at the last point of the learning curve."""
+        return bool(self.curve) and self.curve[-1]["square_mae"] <= QUALITY
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Train, and print the times."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.training_time",
+        description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--seeds", type=number, default=SEEDS, help="trainings of each")
+    parser.add_argument(
+        "--batches", type=number, nargs="+", default=BATCHES, help="numbers of plants at once"
+    )
+    options = parser.parse_args(arguments)
+
+    default = ppo.PPOArguments()
+    cases = {f"one by one, {default.n_envs}": (default, True)}
+    cases |= {f"at once, {n}": (replace(default, n_envs=n), False) for n in options.batches}
+    rows: dict[str, list[str]] = {name: [] for name in cases}
+    bar = tqdm(total=options.seeds * len(cases), desc="training")
+    for seed in range(options.seeds):
+        for name, (case, one_by_one) in cases.items():
+            rows[name].append(train(replace(case, seed=seed), one_by_one=one_by_one))
+            bar.update()
+    bar.close()
+
+    table = pd.DataFrame.from_dict(
+        rows, orient="index", columns=[f"seed {seed}" for seed in range(options.seeds)]
+    )
+    console = Console(width=None if sys.stdout.isatty() else 110, highlight=False)
+    console.print(
+        f"Seconds (samples) until mean |e| on the square wave is at most {QUALITY} °C"
+    )
+    console.print(on_screen(table.reset_index(names="case")))
+
+
+def train(arguments: ppo.PPOArguments, *, one_by_one: bool) -> str:
+    """Train until the quality is reached.
+
+    Parameters
+    ----------
+    arguments
+        How to train.
+    one_by_one
+        Whether to step one plant after the other.
+
+    Returns
+    -------
+    str
+        The seconds and, in parentheses, samples of experience that it took; or that the
+        training ended before.
+    """
+    plants: VecEnv | None = None
+    if one_by_one:
+
+        def make_plant() -> gymnasium.Env[Any, Any]:
+            return gymnasium.make("MiddlePoint-v0", **arguments.training)
+
+        plants = OneByOne([make_plant] * arguments.n_envs)
+    model = ppo.begin(arguments, plants)
+    with tempfile.TemporaryDirectory() as folder, tqdm(disable=True) as bar:
+        keeper = Until(arguments, Path(folder) / "checkpoint.pkl", [], {}, bar)
+        model.learn(arguments.steps, callback=keeper, reset_num_timesteps=False)
+    if not keeper.reached:
+        return f"not in {arguments.steps:,}"
+    return f"{keeper.curve[-1]['seconds']:.1f} ({keeper.curve[-1]['steps']:,})"
+
+
+if __name__ == "__main__":
+    main()
