@@ -1,4 +1,4 @@
-"""How fast the environment steps and imports, beside others: `python -m benchmarks.speed`.
+"""How fast everything steps, beside Gymnasium's own environments: `python -m benchmarks.speed`.
 
 What is compared is measured alternately in one run and reported as a ratio, with its spread.
 """
@@ -6,10 +6,14 @@ What is compared is measured alternately in one run and reported as a ratio, wit
 from __future__ import annotations
 
 import argparse
+import copy
+import importlib.util
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+import tracemalloc
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -18,86 +22,243 @@ import pandas as pd
 from rich.console import Console
 from tqdm import tqdm
 
-import mptc_gym  # noqa: F401 (registers the environment)
+from agents import DirectNNController
+from benchmarks.options import number
+from benchmarks.rollout import make_plants, rollout
 from benchmarks.tables import on_screen
+from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
 
 ROUNDS = 15
-STEPS = 20_000
-
+SINGLE_STEPS = 20_000
+EPISODE = 1200
+BATCHES = (1, 8, 64, 1024, 16384)
+LOOPS = (64, 1000)
+MEMORY_PLANTS = 100
+LONG = 100_000  # steps, to see whether memory grows
+NOISE = {"noise_variance": 0.5}
+RANDOM = {**NOISE, "setpoint": "random"}
+WITH_ENVPOOL = importlib.util.find_spec("envpool") is not None  # if it is installed
 REFERENCE = "CartPole-v1"
-ENVIRONMENTS: dict[str, tuple[str, dict[str, Any]]] = {
-    REFERENCE: ("CartPole-v1", {}),
+SINGLE: dict[str, tuple[str, dict[str, Any]]] = {
+    REFERENCE: (REFERENCE, {}),
     "Pendulum-v1": ("Pendulum-v1", {}),
     "MiddlePoint-v0": ("MiddlePoint-v0", {}),
-    "MiddlePoint-v0, R = 0.5": ("MiddlePoint-v0", {"noise_variance": 0.5}),
+    "MiddlePoint-v0, R = 0.5": ("MiddlePoint-v0", NOISE),
     "MiddlePoint-v0, 20 past actions": ("MiddlePoint-v0", {"action_window": 20}),
 }
+
+
+@dataclass(frozen=True)
+class Case:
+    """Something to be timed.
+
+    Attributes
+    ----------
+    name
+        Its row in the table.
+    run
+        What is timed; it returns nothing and may be called again and again.
+    steps
+        Environment steps of a call.
+    """
+
+    name: str
+    run: Callable[[], object]
+    steps: int
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__)
-    parser.add_argument("--rounds", type=int, default=ROUNDS, help="measurements of each")
+    parser.add_argument("--rounds", type=number, default=ROUNDS, help="measurements of each")
     rounds = parser.parse_args(arguments).rounds
+    console = Console(width=None if sys.stdout.isatty() else 110, highlight=False)
 
-    steppers = {name: _stepper(*made) for name, made in ENVIRONMENTS.items()}
-    seconds = _alternately(steppers, rounds, "stepping")
-    table = pd.DataFrame(
-        {
-            "environment": list(steppers),
-            "steps a second": [f"{STEPS / np.median(seconds[name]):,.0f}" for name in steppers],
-            f"ratio to {REFERENCE}": [
-                _ratio(seconds[REFERENCE] / seconds[name]) for name in steppers
-            ],
-        }
+    def show(title: str, table: pd.DataFrame) -> None:
+        console.print(title, on_screen(table), sep="\n")
+
+    cases = [_single(name, *made) for name, made in SINGLE.items()]
+    show("One environment, from gymnasium.make", compare(cases, rounds))
+    cases = [_single(name, *made, bare=True) for name, made in SINGLE.items()]
+    show("One environment, without gymnasium.make's wrappers", compare(cases, rounds))
+    for n in BATCHES:
+        show(f"Vector environments, n = {n}", compare(list(_vector(n)), rounds))
+    show(
+        f"Plants with R = 0.5 and NNs that learn, one each: {EPISODE} samples together",
+        compare([_alone(), *(_closed_loop(n) for n in LOOPS)], rounds),
     )
-    imports = {
-        module: (lambda module=module: _import(module)) for module in ("gymnasium", "mptc_gym")
-    }
-    taken = 1000 * pd.DataFrame(_alternately(imports, rounds, "importing"))
-    more = taken["mptc_gym"] - taken["gymnasium"]
+    show("Memory of a plant, 20 past actions", memory())
 
-    console = Console()
-    title = f"gymnasium.make, random actions, resets included: median of {rounds} rounds"
-    console.print(title)
-    console.print(on_screen(table))
+    imports = [
+        Case(module, lambda module=module: _import(module), 1)
+        for module in ("gymnasium", "mptc_gym")
+    ]
+    taken = 1000 * pd.DataFrame(_alternately(imports, rounds))
+    more = taken["mptc_gym"] - taken["gymnasium"]
     console.print(
         f"import gymnasium: {taken['gymnasium'].median():.0f} ms; import mptc_gym: "
-        f"{more.median():+.0f} ms ({more.quantile(0.1):+.0f} to {more.quantile(0.9):+.0f})"
+        f"{more.median():+.0f} ms ({more.quantile(0.1):+.0f} to {more.quantile(0.9):+.0f})\n"
+        f"Medians of {rounds} rounds; in parentheses, 10th to 90th percentile.",
+        soft_wrap=True,
+    )
+
+
+def compare(cases: list[Case], rounds: int) -> pd.DataFrame:
+    """Time cases alternately.
+
+    Parameters
+    ----------
+    cases
+        What to time; the first is what the others are compared with.
+    rounds
+        How often each is timed.
+
+    Returns
+    -------
+    DataFrame
+        A row a case: its name, environment steps a second, seconds a round, and the ratio of
+        its steps a second to those of the first case in the same round, with its spread.
+    """
+    seconds = _alternately(cases, rounds)
+    rates = {case.name: case.steps / seconds[case.name] for case in cases}
+    first = cases[0].name
+    return pd.DataFrame(
+        {
+            "case": [case.name for case in cases],
+            "steps a second": [f"{np.median(rates[case.name]):,.0f}" for case in cases],
+            "seconds a round": [f"{np.median(seconds[case.name]):.3f}" for case in cases],
+            f"ratio to {first}": [_spread(rates[case.name] / rates[first]) for case in cases],
+        }
+    )
+
+
+def memory() -> pd.DataFrame:
+    """Measure the memory of a plant, in a batch and alone, and whether it grows."""
+    rows = []
+    for name, arguments in (("R = 0", {}), ("R = 0.5, random set point", RANDOM)):
+        batch = MiddlePointVectorEnv(
+            MEMORY_PLANTS, max_episode_steps=EPISODE, action_window=20, **arguments
+        )
+        alone = MiddlePointEnv(action_window=20, **arguments)
+        of_batch = _memory(batch, np.zeros((MEMORY_PLANTS, 1), np.float32), (1, LONG))
+        sizes = [size / MEMORY_PLANTS for size in of_batch]
+        sizes += _memory(alone, np.zeros(1, np.float32), (1, LONG))
+        rows.append([name, *(f"{size / 1024:.1f} KiB" for size in sizes)])
+    where = f"in a batch of {MEMORY_PLANTS:,}", "alone"
+    later = f"after {LONG:,} steps"
+    return pd.DataFrame(
+        rows,
+        columns=["case", where[0], f"{where[0]}, {later}", where[1], f"{where[1]}, {later}"],
+    )
+
+
+def _memory(env: Any, action: Any, moments: Iterable[int]) -> list[int]:
+    """Return the bytes in use after some numbers of steps."""
+    sizes = []
+    tracemalloc.start()
+    env = copy.deepcopy(env)
+    env.reset(seed=0)
+    taken = 0
+    for moment in moments:
+        for _ in range(moment - taken):
+            env.step(action)
+        taken = moment
+        sizes.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    return sizes
+
+
+def _single(name: str, env_id: str, arguments: dict[str, Any], *, bare: bool = False) -> Case:
+    env = gymnasium.make(env_id, **arguments)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(SINGLE_STEPS)]
+    episodes = [actions]
+    if bare:  # nothing else limits an episode then
+        env = env.unwrapped
+        limit = gymnasium.spec(env_id).max_episode_steps or SINGLE_STEPS
+        episodes = [actions[k : k + limit] for k in range(0, SINGLE_STEPS, limit)]
+
+    def step() -> None:
+        for episode in episodes:
+            env.reset(seed=0)
+            for action in episode:
+                _, _, terminated, truncated, _ = env.step(action)
+                if terminated or truncated:
+                    env.reset()
+
+    return Case(name, step, SINGLE_STEPS)
+
+
+def _vector(n: int) -> Iterable[Case]:
+    """Yield vector environments; a call is one of our episodes, with its reset."""
+    made = {
+        REFERENCE: (REFERENCE, {}),
+        "MiddlePoint-v0": ("MiddlePoint-v0", {}),
+        "MiddlePoint-v0, R = 0.5": ("MiddlePoint-v0", NOISE),
+    }
+    for name, (env_id, arguments) in made.items():
+        envs = gymnasium.make_vec(
+            env_id, n, vectorization_mode="vector_entry_point", **arguments
+        )
+        envs.reset(seed=0)
+        envs.action_space.seed(0)
+        actions = [envs.action_space.sample() for _ in range(20)]
+        yield Case(name, _stepper(envs, actions, EPISODE + 1), n * (EPISODE + 1))
+    if WITH_ENVPOOL:
+        import envpool
+
+        envs = envpool.make_gymnasium(REFERENCE, num_envs=n, num_threads=1, seed=0)
+        envs.reset()
+        actions = list(np.random.default_rng(0).integers(0, 2, (20, n), dtype=np.int32))
+        steps = 100  # fewer, as it takes longer
+        yield Case(f"{REFERENCE} of envpool", _stepper(envs, actions, steps), n * steps)
+
+
+def _stepper(envs: Any, actions: list[Any], steps: int) -> Callable[[], None]:
+    def step() -> None:
+        for k in range(steps):
+            envs.step(actions[k % len(actions)])
+
+    return step
+
+
+def _alone() -> Case:
+    env = gymnasium.make("MiddlePoint-v0", **NOISE)
+    controller = DirectNNController()
+
+    def step() -> None:
+        controller.reset()
+        observation, _ = env.reset(seed=0)
+        for _ in range(EPISODE):
+            observation, *_ = env.step(controller.act(observation))
+
+    return Case("one, no batch", step, EPISODE)
+
+
+def _closed_loop(n: int) -> Case:
+    plants = make_plants(n, EPISODE, **NOISE)
+    controller = DirectNNController(num_envs=n)
+    return Case(
+        f"batch of {n:,}", lambda: rollout(plants, controller, EPISODE, seed=0), n * EPISODE
     )
 
 
 def _alternately(
-    measured: dict[str, Callable[[], None]], rounds: int, title: str
+    cases: list[Case], rounds: int
 ) -> dict[str, np.ndarray[Any, np.dtype[np.float64]]]:
     """Time each in turn, round after round, in seconds."""
-    seconds: dict[str, list[float]] = {name: [] for name in measured}
-    for _ in tqdm(range(rounds), desc=title):
-        for name, function in measured.items():
+    seconds: dict[str, list[float]] = {case.name: [] for case in cases}
+    for _ in tqdm(range(rounds), leave=False):
+        for case in cases:
             began = time.perf_counter()
-            function()
-            seconds[name].append(time.perf_counter() - began)
+            case.run()
+            seconds[case.name].append(time.perf_counter() - began)
     return {name: np.array(values) for name, values in seconds.items()}
 
 
-def _ratio(values: np.ndarray[Any, np.dtype[np.float64]]) -> str:
+def _spread(values: np.ndarray[Any, np.dtype[np.float64]]) -> str:
     low, median, high = np.percentile(values, [10, 50, 90])
     return f"{median:.2f} ({low:.2f} to {high:.2f})"
-
-
-def _stepper(name: str, arguments: dict[str, Any]) -> Callable[[], None]:
-    env = gymnasium.make(name, **arguments)
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(STEPS)]
-
-    def step() -> None:
-        for action in actions:
-            _, _, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
-                env.reset()
-
-    return step
 
 
 def _import(module: str) -> None:

@@ -134,7 +134,7 @@ def on_screen(table: pd.DataFrame) -> Table:
     """Return a table for the terminal."""
     screen = Table(box=SIMPLE_HEAD)
     for name in table.columns:
-        is_name = name in ("scenario", "agent")
+        is_name = name in ("scenario", "agent", "case")
         screen.add_column(name, justify="left" if is_name else "right", no_wrap=is_name)
     for row in table.itertuples(index=False):
         screen.add_row(*row)

@@ -1,0 +1,35 @@
+"""The speed benchmark: its arithmetic, and that it runs."""
+
+import pytest
+
+from benchmarks import speed
+
+
+def test_ratios_compare_rounds_with_each_other(monkeypatch):
+    clock = iter([0, 1, 1, 3, 3, 5, 5, 6, 6, 7, 7, 11])  # began and ended, case after case
+    monkeypatch.setattr(speed.time, "perf_counter", lambda: next(clock))
+    cases = [speed.Case("slow", lambda: None, 100), speed.Case("fast", lambda: None, 400)]
+    table = speed.compare(cases, rounds=3)
+    # Seconds: 1, 2, 1 and 2, 1, 4. Ratios of steps a second: 200/100, 400/50, 100/100.
+    assert list(table["steps a second"]) == ["100", "200"]
+    assert list(table["ratio to slow"]) == ["1.00 (1.00 to 1.00)", "2.00 (1.20 to 6.80)"]
+
+
+def test_it_runs(monkeypatch, capsys):
+    small = {
+        "SINGLE_STEPS": 50, "EPISODE": 5, "LONG": 5, "BATCHES": (1, 3), "LOOPS": (2,),
+        "WITH_ENVPOOL": False,
+    }  # fmt: skip
+    for name, value in small.items():
+        monkeypatch.setattr(speed, name, value)
+    speed.main(["--rounds", "1"])
+    shown = capsys.readouterr().out
+    for words in ("n = 3", "Pendulum-v1", "R = 0.5", "batch of 2", "KiB", "import mptc_gym"):
+        assert words in shown
+
+
+@pytest.mark.parametrize("rounds", ["0", "many"])
+def test_bad_rounds_are_named(rounds, capsys):
+    with pytest.raises(SystemExit):
+        speed.main(["--rounds", rounds])
+    assert "--rounds" in capsys.readouterr().err
