@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.vector import SyncVectorEnv
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -25,18 +26,29 @@ def make_both():
     return GymnasiumVecEnv(envs), DummyVecEnv([make] * N)
 
 
-def test_trajectories_equal_those_of_dummy_vec_env(rng):
-    ours, theirs = make_both()
+def make_both_of_episodes_that_terminate():
+    def make():
+        return gymnasium.make("CartPole-v1", max_episode_steps=15)
+
+    envs = SyncVectorEnv([make] * N, autoreset_mode="SameStep")
+    return GymnasiumVecEnv(envs), DummyVecEnv([make] * N)
+
+
+@pytest.mark.parametrize("make", [make_both, make_both_of_episodes_that_terminate])
+def test_trajectories_equal_those_of_dummy_vec_env(make, rng):
+    ours, theirs = make()
     assert ours.num_envs == theirs.num_envs
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
-    ends = 0
+    truncated = []
     for seed in (3, None):
         if seed is not None:
             assert ours.seed(seed) == theirs.seed(seed)
         np.testing.assert_array_equal(ours.reset(), theirs.reset())
         for _ in range(70):
             actions = rng.normal(0, 1, (N, 1)).astype(np.float32)
+            if ours.action_space.shape == ():
+                actions = (actions[:, 0] > 0).astype(int)
             *arrays, infos = ours.step(actions)
             *expected, expected_infos = theirs.step(actions)
             for array, other in zip(arrays, expected, strict=True):
@@ -48,8 +60,8 @@ def test_trajectories_equal_those_of_dummy_vec_env(rng):
                 if done:
                     last = info["terminal_observation"]
                     np.testing.assert_array_equal(last, other["terminal_observation"])
-                    ends += 1
-    assert ends == 2 * 2 * N
+                    truncated.append(info["TimeLimit.truncated"])
+    assert set(truncated) == ({True} if make is make_both else {True, False})
 
 
 def test_training_ends_in_the_same_weights():

@@ -47,6 +47,7 @@ def compare(native, sync, *, steps, rng, partial_resets):
     for _ in range(steps):
         actions = rng.normal(0, 1, (n, 1)).astype(np.float32)
         actions[rng.random(n) < 0.1] *= 1e6
+        actions[rng.random(n) < 0.1] = rng.choice([0.5, -0.5])  # the edge of the dead zone
         ours, theirs = native.step(actions), sync.step(actions)
         assert_equal(ours, theirs)
         mask = rng.random(n) < partial_resets
@@ -132,8 +133,17 @@ def test_autoreset_mode_is_in_the_metadata(mode):
     assert "autoreset_mode" not in MiddlePointEnv.metadata
 
 
-def test_what_is_returned_can_be_overwritten(rng):
-    arguments = {"autoreset_mode": "SameStep", "action_window": 2, "move_weight": 0.1, **NOISY}
+def test_an_actuator_that_does_not_reach_zero_flow(rng):
+    native, sync = make_both(
+        2, "NextStep", 9, u_min=6.0, u_max=8.0, dead_zone=2.0, action_window=3, move_weight=0.5
+    )
+    assert_equal(native.reset(seed=0), sync.reset(seed=0))
+    compare(native, sync, steps=30, rng=rng, partial_resets=0.1)
+
+
+@pytest.mark.parametrize("plant", [NOISY, {"setpoint": 5.0}], ids=["noisy", "calm"])
+def test_what_is_returned_can_be_overwritten(plant, rng):
+    arguments = {"autoreset_mode": "SameStep", "action_window": 2, "move_weight": 0.1, **plant}
     native, twin = (
         MiddlePointVectorEnv(4, max_episode_steps=30, **arguments) for _ in range(2)
     )
@@ -142,7 +152,7 @@ def test_what_is_returned_can_be_overwritten(rng):
     for k in range(100):
         for array in (*returned[:-1], *returned[-1].values()):
             if isinstance(array, np.ndarray) and array.dtype != object:
-                array.fill(77)
+                array[...] = ~array if array.dtype == bool else 77
         actions = rng.normal(0, 1, (4, 1)).astype(np.float32)
         kept = actions.copy()
         returned = native.step(actions)
