@@ -59,8 +59,8 @@ class PPOArguments:
     """Past outputs in the observation."""
     action_window: int = DELAY + 2
     """Past actions in the observation; with delay + 2 the noise-free problem is Markov."""
-    n_envs: int = 128
-    """Plants that are run side by side."""
+    n_envs: int = 96
+    """Plants that are stepped at once."""
     n_steps: int = 64
     """Samples of each plant between two updates."""
     batch_size: int = 2048

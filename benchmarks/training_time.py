@@ -8,6 +8,7 @@ default, and with a batch of them at once, of several sizes.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import tempfile
 from dataclasses import replace
@@ -26,8 +27,9 @@ from benchmarks.options import number
 from benchmarks.tables import on_screen
 
 QUALITY = 1.2  # mean |e|, degC
-SEEDS = 3
-BATCHES = (64, 128, 256)
+SEEDS = 7
+ONE_BY_ONE = (128,)
+AT_ONCE = (32, 64, 96, 128)
 
 
 class OneByOne(DummyVecEnv):
@@ -60,33 +62,35 @@ def main(arguments: list[str] | None = None) -> None:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--seeds", type=number, default=SEEDS, help="trainings of each")
-    parser.add_argument(
-        "--batches", type=number, nargs="+", default=BATCHES, help="numbers of plants at once"
-    )
+    for option, default, how in (
+        ("--one-by-one", ONE_BY_ONE, "one by one"),
+        ("--at-once", AT_ONCE, "at once"),
+    ):
+        text = f"numbers of plants that are stepped {how}"
+        parser.add_argument(option, type=number, nargs="*", default=default, help=text)
     options = parser.parse_args(arguments)
 
-    default = ppo.PPOArguments()
-    cases = {f"one by one, {default.n_envs}": (default, True)}
-    cases |= {f"at once, {n}": (replace(default, n_envs=n), False) for n in options.batches}
-    rows: dict[str, list[str]] = {name: [] for name in cases}
+    cases = {f"one by one, {n}": (n, True) for n in options.one_by_one}
+    cases |= {f"at once, {n}": (n, False) for n in options.at_once}
+    seconds: dict[str, list[float]] = {name: [] for name in cases}
     bar = tqdm(total=options.seeds * len(cases), desc="training")
     for seed in range(options.seeds):
-        for name, (case, one_by_one) in cases.items():
-            rows[name].append(train(replace(case, seed=seed), one_by_one=one_by_one))
+        for name, (n, one_by_one) in cases.items():
+            case = replace(ppo.PPOArguments(), n_envs=n, seed=seed)
+            seconds[name].append(train(case, one_by_one=one_by_one))
             bar.update()
     bar.close()
 
-    table = pd.DataFrame.from_dict(
-        rows, orient="index", columns=[f"seed {seed}" for seed in range(options.seeds)]
-    )
+    table = pd.DataFrame(seconds)
+    table.loc["median"] = table.median()
+    shown = table.map(lambda value: f"{value:.1f}" if value < math.inf else "never")
+    shown.index = [*(f"seed {seed}" for seed in range(options.seeds)), "median"]
     console = Console(width=None if sys.stdout.isatty() else 110, highlight=False)
-    console.print(
-        f"Seconds (samples) until mean |e| on the square wave is at most {QUALITY} °C"
-    )
-    console.print(on_screen(table.reset_index(names="case")))
+    console.print(f"Seconds until mean |e| on the square wave is at most {QUALITY} °C")
+    console.print(on_screen(shown.reset_index(names="case")))
 
 
-def train(arguments: ppo.PPOArguments, *, one_by_one: bool) -> str:
+def train(arguments: ppo.PPOArguments, *, one_by_one: bool) -> float:
     """Train until the quality is reached.
 
     Parameters
@@ -98,9 +102,8 @@ def train(arguments: ppo.PPOArguments, *, one_by_one: bool) -> str:
 
     Returns
     -------
-    str
-        The seconds and, in parentheses, samples of experience that it took; or that the
-        training ended before.
+    float
+        The seconds that it took; infinity if the training ended before.
     """
     plants: VecEnv | None = None
     if one_by_one:
@@ -113,9 +116,7 @@ def train(arguments: ppo.PPOArguments, *, one_by_one: bool) -> str:
     with tempfile.TemporaryDirectory() as folder, tqdm(disable=True) as bar:
         keeper = Until(arguments, Path(folder) / "checkpoint.pkl", [], {}, bar)
         model.learn(arguments.steps, callback=keeper, reset_num_timesteps=False)
-    if not keeper.reached:
-        return f"not in {arguments.steps:,}"
-    return f"{keeper.curve[-1]['seconds']:.1f} ({keeper.curve[-1]['steps']:,})"
+    return float(keeper.curve[-1]["seconds"]) if keeper.reached else math.inf
 
 
 if __name__ == "__main__":

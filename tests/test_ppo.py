@@ -1,5 +1,6 @@
 """Training PPO: resumed, cached, validated, and seeded."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -157,12 +158,21 @@ class TestTrainingTime:
 
     def test_training_ends_with_the_quality(self, monkeypatch):
         monkeypatch.setattr(training_time, "QUALITY", 100.0)
-        taken = training_time.train(SMALL, one_by_one=False)
-        assert taken.endswith("(256)")  # at the first point of the learning curve
-
-    def test_a_quality_that_is_not_reached_is_told(self, monkeypatch):
+        soon = training_time.train(SMALL, one_by_one=False)
         monkeypatch.setattr(training_time, "QUALITY", 0.0)
-        assert training_time.train(SMALL, one_by_one=True) == "not in 1,024"
+        assert 0 < soon < training_time.train(SMALL, one_by_one=True) == math.inf
+
+    def test_training_goes_on_until_then(self, monkeypatch):
+        points = []
+        monkeypatch.setattr(
+            training_time.Until, "reached", property(lambda keeper: len(keeper.curve) == 2)
+        )
+        record = ppo.Keeper.record
+        monkeypatch.setattr(
+            ppo.Keeper, "record", lambda keeper: (record(keeper), points.append(keeper))
+        )
+        training_time.train(SMALL, one_by_one=False)
+        assert [point["steps"] for point in points[-1].curve] == [256, 512]
 
     def test_both_ways_train_the_same_policy(self, monkeypatch):
         seen = []
@@ -179,7 +189,7 @@ class TestTrainingTime:
     def test_it_runs(self, monkeypatch, capsys):
         monkeypatch.setattr(training_time, "QUALITY", 100.0)
         monkeypatch.setattr(ppo, "PPOArguments", lambda: SMALL)
-        training_time.main(["--seeds", "2", "--batches", "2", "8"])
+        training_time.main(["--seeds", "2", "--one-by-one", "4", "--at-once", "2", "8"])
         shown = capsys.readouterr().out
-        for words in ("one by one, 4", "at once, 2", "at once, 8", "seed 1", "100.0"):
+        for words in ("one by one, 4", "at once, 2", "at once, 8", "seed 1", "median"):
             assert words in shown
