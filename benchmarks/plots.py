@@ -117,7 +117,7 @@ def plot_learning(curves: pd.DataFrame, path: Path) -> None:
     """Draw PPO's learning curves: mean |e| over samples of experience, for each candidate."""
     shown = {
         "training_mae": "training: random set points, noise, exploring",
-        "validation_mae": "validation: random set points, noise",
+        "validation_mae": "validation: random set points, half of them with noise",
         "square_mae": "square wave, no noise",
     }
     chosen = curves.loc[curves["validation_mae"].idxmin()]
