@@ -267,11 +267,12 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             rewards -= move_weight * np.abs(a - self._actions)
         self._actions = a
 
-        measured = output
+        measured, measured_error = output, error
         lowest, highest, squared = self._span
         if not output.dot(output) <= squared:  # otherwise no single one can be beyond the span
             measured = np.fmin(output, highest)  # which takes NaN for the limit
             np.fmax(measured, lowest, out=measured)
+            measured_error = setpoint - measured
         if self._place == 0:
             self._row[_ROOM:] = self._row[:-_ROOM]
             self._place = _ROOM
@@ -281,7 +282,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         if setpoints is not None:
             window[setpoints] = setpoint
         if errors is not None:
-            window[errors] = setpoint - measured
+            window[errors] = measured_error
         if outputs is not None:
             window[outputs] = measured
         if past_actions is not None:
