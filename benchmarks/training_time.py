@@ -54,8 +54,19 @@ class Until(ppo.Keeper):
         return bool(self.curve) and self.curve[-1]["square_mae"] <= QUALITY
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Train, and print the times."""
+def main(arguments: list[str] | None = None) -> int:
+    """Train, and print the times.
+
+    Parameters
+    ----------
+    arguments
+        The command line without the program's name.
+
+    Returns
+    -------
+    int
+        0, or 130 if it was interrupted.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.training_time",
         description=__doc__,
@@ -72,22 +83,27 @@ def main(arguments: list[str] | None = None) -> None:
 
     cases = {f"one by one, {n}": (n, True) for n in options.one_by_one}
     cases |= {f"at once, {n}": (n, False) for n in options.at_once}
-    seconds: dict[str, list[float]] = {name: [] for name in cases}
-    bar = tqdm(total=options.seeds * len(cases), desc="training")
-    for seed in range(options.seeds):
-        for name, (n, one_by_one) in cases.items():
-            case = replace(ppo.PPOArguments(), n_envs=n, seed=seed)
-            seconds[name].append(train(case, one_by_one=one_by_one))
-            bar.update()
-    bar.close()
+    seconds: dict[str, dict[str, float]] = {name: {} for name in cases}
+    interrupted = False
+    with tqdm(total=options.seeds * len(cases), desc="training") as bar:
+        try:
+            for seed in range(options.seeds):
+                for name, (n, one_by_one) in cases.items():
+                    case = replace(ppo.PPOArguments(), n_envs=n, seed=seed)
+                    seconds[name][f"seed {seed}"] = train(case, one_by_one=one_by_one)
+                    bar.update()
+        except KeyboardInterrupt:
+            interrupted = True
 
     table = pd.DataFrame(seconds)
     table.loc["median"] = table.median()
-    shown = table.map(lambda value: f"{value:.1f}" if value < math.inf else "never")
-    shown.index = [*(f"seed {seed}" for seed in range(options.seeds)), "median"]
+    shown = table.map("{:.1f}".format).replace({"inf": "never", "nan": ""})
     console = Console(width=None if sys.stdout.isatty() else 110, highlight=False)
+    if interrupted:
+        console.print("Interrupted: what has finished is shown.")
     console.print(f"Seconds until mean |e| on the square wave is at most {QUALITY} °C")
     console.print(on_screen(shown.reset_index(names="case")))
+    return 130 if interrupted else 0
 
 
 def train(arguments: ppo.PPOArguments, *, one_by_one: bool) -> float:
@@ -120,4 +136,4 @@ def train(arguments: ppo.PPOArguments, *, one_by_one: bool) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

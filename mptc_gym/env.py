@@ -50,7 +50,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     and saturates; noise disturbs the temperature. The plant is the one of X. Cui and K. G. Shin,
     "Application of neural networks to temperature control in thermal power plants" (1992);
     numbers in parentheses are its equations. All quantities are deviations from the operating
-    point.
+    point. `MiddlePointVectorEnv` runs many of these plants at once.
 
     ## Plant
 

@@ -13,6 +13,13 @@ from mptc_gym import Parameters
 from tests.budget import SMALL
 
 
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setattr(ppo, "CHECKPOINT_INTERVAL", 256)
+    monkeypatch.setattr(ppo, "PROBE", replace(ppo.PROBE, samples=20))
+    monkeypatch.setattr(ppo, "VALIDATION_SAMPLES", 20)
+
+
 def train(folder, arguments=SMALL, *, retrain=False):
     return ppo.trained_policy(arguments, folder, retrain=retrain, progress=False)
 
@@ -22,12 +29,6 @@ def weights(model):
 
 
 class TestPPO:
-    @pytest.fixture(autouse=True)
-    def small(self, monkeypatch):
-        monkeypatch.setattr(ppo, "CHECKPOINT_INTERVAL", 256)
-        monkeypatch.setattr(ppo, "PROBE", replace(ppo.PROBE, samples=20))
-        monkeypatch.setattr(ppo, "VALIDATION_SAMPLES", 20)
-
     def test_a_finished_policy_is_loaded(self, tmp_path, monkeypatch):
         trained = train(tmp_path)
         with monkeypatch.context() as patch:
@@ -151,12 +152,6 @@ class TestPPO:
 
 
 class TestTrainingTime:
-    @pytest.fixture(autouse=True)
-    def small(self, monkeypatch):
-        monkeypatch.setattr(ppo, "CHECKPOINT_INTERVAL", 256)
-        monkeypatch.setattr(ppo, "PROBE", replace(ppo.PROBE, samples=20))
-        monkeypatch.setattr(ppo, "VALIDATION_SAMPLES", 20)
-
     def test_training_ends_with_the_quality(self, monkeypatch):
         monkeypatch.setattr(training_time, "QUALITY", 100.0)
         soon = training_time.train(SMALL, one_by_one=False)
@@ -194,3 +189,18 @@ class TestTrainingTime:
         shown = capsys.readouterr().out
         for words in ("one by one, 4", "at once, 2", "at once, 8", "seed 1", "median"):
             assert words in shown
+
+    def test_an_interrupted_run_shows_what_has_finished(self, monkeypatch, capsys):
+        times = iter([12.5, math.inf, 14.5])
+
+        def train(arguments, *, one_by_one):
+            for seconds in times:
+                return seconds
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(training_time, "train", train)
+        assert training_time.main(["--one-by-one", "4", "--at-once", "2"]) == 130
+        rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+        assert ["seed", "0", "12.5", "never"] in rows
+        assert ["seed", "1", "14.5"] in rows
+        assert ["median", "13.5", "never"] in rows
