@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pandas as pd
+import torch
 from rich.console import Console
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from tqdm import tqdm
@@ -128,6 +129,7 @@ def train(arguments: ppo.PPOArguments, *, one_by_one: bool) -> float:
             return gymnasium.make("MiddlePoint-v0", **arguments.training)
 
         plants = OneByOne([make_plant] * arguments.n_envs)
+    torch.set_num_threads(1)  # as in any training
     model = ppo.begin(arguments, plants)
     with tempfile.TemporaryDirectory() as folder, tqdm(disable=True) as bar:
         keeper = Until(arguments, Path(folder) / "checkpoint.pkl", [], {}, bar)

@@ -39,9 +39,9 @@ class GymnasiumVecEnv(VecEnv):
     """
 
     def __init__(self, envs: VectorEnv) -> None:
-        mode = envs.metadata["autoreset_mode"]
+        mode = envs.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            raise ValueError(f"envs must have autoreset_mode 'SameStep', got {mode.value!r}")
+            raise ValueError(f"envs must have autoreset_mode 'SameStep', got {mode}")
         self.envs = envs
         self.infos: dict[str, Any] = {}
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)

@@ -149,9 +149,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
     ## Errors
 
-    A bad argument is a `ValueError` from the constructor that names it; a misspelt one a
-    `TypeError`, as is a `render_mode`, of which there is none yet. An action that is not one finite number is a `ValueError` from `step` and leaves
-    the plant as it was.
+    A bad argument is a `ValueError` from the constructor that names it. A misspelt argument is a
+    `TypeError`, and so is any `render_mode`, as there is none yet. An action that is not one
+    finite number is a `ValueError` from `step` and leaves the plant as it was.
 
     ## Version history
 
@@ -337,7 +337,7 @@ def _limited(value: float, limit: float) -> float:
 def _scalar(action: Any) -> float:
     try:
         return float(np.asarray(action).item())
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise _bad_action(action) from None
 
 

@@ -25,7 +25,7 @@ def _is_number(value: Any) -> bool:
 def _number(name: str, value: Any, allowed: str = "a number within +-1e9") -> float:
     if not _is_number(value):
         _reject(name, value, allowed)
-    return float(value)
+    return float(value) + 0.0  # never -0
 
 
 def _not_negative(name: str, value: Any) -> float:

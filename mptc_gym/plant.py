@@ -139,10 +139,10 @@ class Plants:
             u(k) and u_a(k), t/h, and y(k+1), degC; each of shape (n,). The last is kept here
             and must not be changed.
         """
-        zero, one, half_range, lowest, dead_zone, u_min, u_max = self._actuator
+        zero, one, half_range, offset, dead_zone, u_min, u_max = self._actuator
         command = action + one
         command *= half_range
-        command += lowest
+        command += offset
         applied = np.minimum(command, u_max)  # (29) from here on
         np.maximum(applied, u_min, out=applied)
         # A product, as processors are slow at masks, whose bits they cannot foresee. It turns

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from numbers import Integral
 from typing import Any, ClassVar, cast
 
@@ -54,6 +54,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     ------
     ValueError
         If an argument is out of range; the message names it.
+    TypeError
+        If an argument is unknown, or `render_mode` is not None.
 
     Notes
     -----
@@ -63,7 +65,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     however long an episode lasts.
 
     Where `MiddlePointEnv` goes on in silence after y has left the range of floats, as it may
-    with an unstable `a`, NumPy warns here.
+    with an unstable `a`, or with actions beyond 1e154, NumPy warns here.
     """
 
     metadata: dict[str, Any] = MiddlePointEnv.metadata
@@ -100,7 +102,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     ) -> None:
         single = MiddlePointEnv(render_mode=render_mode, **arguments)
         self.num_envs = num_envs = _count("num_envs", num_envs)
-        self._limit = FOREVER
+        self._limit = FOREVER  # samples of an episode
         if max_episode_steps is not None and max_episode_steps != -1:
             self._limit = min(FOREVER, _count("max_episode_steps", max_episode_steps))
         try:
@@ -231,7 +233,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         terminations, truncations
             Shape (num_envs,), bool.
         infos
-            Arrays of shape (num_envs,) and their masks. All masks of a step are one array.
+            Arrays of shape (num_envs,) and their masks, which may be one array.
 
         Raises
         ------
@@ -363,7 +365,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     def _seed(self, which: Indices, seeds: Sequence[int | None]) -> None:
         for i in which.tolist():
             if seeds[i] is not None or i not in self._streams:
-                root = np.random.SeedSequence(seeds[i])
+                seed = seeds[i]
+                root = np.random.SeedSequence(None if seed is None else int(seed))
                 self._seeds[i] = cast("int", root.entropy)
                 self._streams[i] = Streams.spawn(root)
 
@@ -371,10 +374,13 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         n = self.num_envs
         if seed is None:
             return [None] * n
-        if isinstance(seed, int | np.integer):
-            seeds: list[int | None] = list(range(int(seed), int(seed) + n))
-        else:
-            seeds = list(seed) if isinstance(seed, Iterable) else []
+        seeds: list[int | None] = []
+        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+            seeds = list(range(int(seed), int(seed) + n))
+        elif isinstance(seed, list | tuple) or (
+            isinstance(seed, np.ndarray) and seed.ndim == 1
+        ):
+            seeds = list(seed)
         if len(seeds) != n or not all(s is None or _is_count(s, 0) for s in seeds):
             raise ValueError(
                 f"seed must be an integer of at least 0, or a list of {n} of them or None, got "
@@ -405,7 +411,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         n = self.num_envs
         try:
             given = np.array(actions, _FLOAT64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             given = np.empty(0)
         if given.shape != (n, 1):
             raise ValueError(f"actions must be numbers, shape ({n}, 1), got {actions!r}")

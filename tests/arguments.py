@@ -7,7 +7,7 @@ valid_arguments = st.fixed_dictionaries(
     {},
     optional={
         "a": st.lists(coefficients, max_size=3).map(lambda tail: [1.0, *tail]),
-        "b": st.lists(coefficients, min_size=1, max_size=3),
+        "b": st.lists(coefficients, min_size=1, max_size=5),
         "c": st.lists(coefficients, max_size=3).map(lambda tail: [1.0, *tail]),
         "delay": st.integers(0, 30),
         "dead_zone": st.floats(0, 10),
@@ -22,7 +22,7 @@ valid_arguments = st.fixed_dictionaries(
         ),
         "setpoint_amplitude": st.floats(0, 100),
         "setpoint_period": st.integers(1, 1000),
-        "setpoint_window": st.integers(1, 5),
+        "setpoint_window": st.integers(0, 5),
         "error_window": st.integers(0, 5),
         "output_window": st.integers(0, 5),
         "action_window": st.integers(0, 30),
@@ -31,4 +31,12 @@ valid_arguments = st.fixed_dictionaries(
         "error_scale": st.floats(0.1, 20),
         "move_weight": st.floats(0, 2),
     },
-)
+).filter(
+    lambda arguments: any(
+        arguments.get(name, default)
+        for name, default in (
+            ("setpoint_window", 3), ("error_window", 3), ("output_window", 0),
+            ("action_window", 0),
+        )
+    )  # an observation with no element is refused
+)  # fmt: skip

@@ -141,6 +141,13 @@ def test_an_actuator_that_does_not_reach_zero_flow(rng):
     compare(native, sync, steps=30, rng=rng, partial_resets=0.1)
 
 
+def test_limits_of_minus_zero():
+    native, sync = make_both(2, "NextStep", None, u_min=-0.0, dead_zone=0.0)
+    native.reset(seed=0), sync.reset(seed=0)
+    actions = np.array([[-2.0], [0.0]], np.float32)
+    assert_equal(native.step(actions), sync.step(actions))
+
+
 @pytest.mark.parametrize("plant", [NOISY, {"setpoint": 5.0}], ids=["noisy", "calm"])
 def test_what_is_returned_can_be_overwritten(plant, rng):
     arguments = {"autoreset_mode": "SameStep", "action_window": 2, "move_weight": 0.1, **plant}
@@ -260,7 +267,10 @@ def test_unknown_argument_and_render_mode_are_refused():
         MiddlePointVectorEnv(2, render_mode="rgb_array")
 
 
-@pytest.mark.parametrize("seed", [-1, 1.5, "12", [1], [1, 2, 3], [1, -2], [1, 1.5], [1, "2"]])
+@pytest.mark.parametrize(
+    "seed",
+    [-1, 1.5, True, "12", b"12", np.array(3), [1], [1, 2, 3], [1, -2], [1, 1.5], [1, "2"]],
+)
 def test_bad_seed_is_refused(seed):
     with pytest.raises(ValueError, match="seed"):
         MiddlePointVectorEnv(2).reset(seed=seed)
@@ -286,7 +296,7 @@ def test_bad_reset_mask_is_refused(mask):
 
 BAD_ACTIONS = [
     np.zeros(2), np.zeros((1, 1)), np.zeros((2, 2)), np.array([[np.nan], [0.0]]),
-    np.array([[0.0], [np.inf]]), [["up"], ["down"]], [[0.0], [None]], None,
+    np.array([[0.0], [np.inf]]), [[10**400], [0]], [["up"], ["down"]], [[0.0], [None]], None,
 ]  # fmt: skip
 
 
