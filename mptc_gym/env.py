@@ -32,12 +32,7 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
     setpoint_limit = max(span, parameters.largest_setpoint)
     high = np.repeat(
         np.array([setpoint_limit, setpoint_limit + span, span, 1.0]),
-        [
-            parameters.setpoint_window,
-            parameters.error_window,
-            parameters.output_window,
-            parameters.action_window,
-        ],
+        parameters.windows,
     ).astype(np.float32)
     return Box(-high, high, dtype=np.float32)
 

@@ -42,13 +42,19 @@ def _positive(name: str, value: Any) -> float:
     return float(value)
 
 
+def is_count(value: Any, minimum: int = 0) -> bool:
+    """Whether a value is an integer of at least `minimum`."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= minimum
+
+
 def _count(name: str, value: Any, minimum: int = 0) -> int:
-    if not isinstance(value, Integral) or isinstance(value, bool) or value < minimum:
+    if not is_count(value, minimum):
         _reject(name, value, f"an integer of at least {minimum}")
     return int(value)
 
 
-def _positive_count(name: str, value: Any) -> int:
+def positive_count(name: str, value: Any) -> int:
+    """Return a value if it is an integer of at least 1; ValueError, naming it, otherwise."""
     return _count(name, value, minimum=1)
 
 
@@ -136,7 +142,7 @@ class Parameters:
             "sampling_interval": _positive,
             "setpoint": _setpoint,
             "setpoint_amplitude": _not_negative,
-            "setpoint_period": _positive_count,
+            "setpoint_period": positive_count,
             "setpoint_window": _count,
             "error_window": _count,
             "output_window": _count,
@@ -166,18 +172,20 @@ class Parameters:
             )
 
     @property
+    def windows(self) -> tuple[int, int, int, int]:
+        """Sizes of the observation's blocks: set points, errors, outputs, actions."""
+        return self.setpoint_window, self.error_window, self.output_window, self.action_window
+
+    @property
     def observation_size(self) -> int:
         """Number of elements of the observation."""
-        return (
-            self.setpoint_window + self.error_window + self.output_window + self.action_window
-        )
+        return sum(self.windows)
 
     @property
     def heads(self) -> tuple[int, int, int]:
         """Where the errors, outputs and actions begin in the observation."""
-        errors = self.setpoint_window
-        outputs = errors + self.error_window
-        return errors, outputs, outputs + self.output_window
+        setpoints, errors, outputs, _ = self.windows
+        return setpoints, setpoints + errors, setpoints + errors + outputs
 
     @property
     def largest_setpoint(self) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Sequence
-from numbers import Integral
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -15,6 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mptc_gym.env import MiddlePointEnv
+from mptc_gym.parameters import is_count, positive_count
 from mptc_gym.plant import Plants, action_from_command
 from mptc_gym.signals import BLOCK, FOREVER, Noises, SetPoints, Streams
 
@@ -101,10 +101,10 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         **arguments: Any,
     ) -> None:
         single = MiddlePointEnv(render_mode=render_mode, **arguments)
-        self.num_envs = num_envs = _count("num_envs", num_envs)
+        self.num_envs = num_envs = positive_count("num_envs", num_envs)
         self._limit = FOREVER  # samples of an episode
         if max_episode_steps is not None and max_episode_steps != -1:
-            self._limit = min(FOREVER, _count("max_episode_steps", max_episode_steps))
+            self._limit = min(FOREVER, positive_count("max_episode_steps", max_episode_steps))
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -141,15 +141,9 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             parameters.move_weight,
         )
         # Where the newest sample of each block of the observation lies, if there is the block.
-        windows = (
-            parameters.setpoint_window,
-            parameters.error_window,
-            parameters.output_window,
-            parameters.action_window,
-        )
         self._newest = tuple(
             np.s_[:, head] if window else None
-            for head, window in zip((0, *parameters.heads), windows, strict=True)
+            for head, window in zip((0, *parameters.heads), parameters.windows, strict=True)
         )
         self._rest_action = action_from_command(0.0, parameters.u_min, parameters.u_max)
         self._actions = np.zeros(num_envs)  # the last ones
@@ -365,8 +359,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     def _seed(self, which: Indices, seeds: Sequence[int | None]) -> None:
         for i in which.tolist():
             if seeds[i] is not None or i not in self._streams:
-                seed = seeds[i]
-                root = np.random.SeedSequence(None if seed is None else int(seed))
+                root = np.random.SeedSequence(seeds[i])
                 self._seeds[i] = cast("int", root.entropy)
                 self._streams[i] = Streams.spawn(root)
 
@@ -381,12 +374,12 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             isinstance(seed, np.ndarray) and seed.ndim == 1
         ):
             seeds = list(seed)
-        if len(seeds) != n or not all(s is None or _is_count(s, 0) for s in seeds):
+        if len(seeds) != n or not all(s is None or is_count(s) for s in seeds):
             raise ValueError(
                 f"seed must be an integer of at least 0, or a list of {n} of them or None, got "
                 f"{seed!r}"
             )
-        return seeds
+        return [None if s is None else int(s) for s in seeds]
 
     def _checked_mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_]:
         if options is None or "reset_mask" not in options:
@@ -425,13 +418,3 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         if not a.dot(a) < math.inf and not np.isfinite(a).all():
             raise ValueError(f"actions must be finite, got {actions!r}")
         return a
-
-
-def _is_count(value: Any, least: int) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
-
-
-def _count(name: str, value: Any) -> int:
-    if not _is_count(value, 1):
-        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
-    return int(value)
