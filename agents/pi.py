@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 from agents.controller import Controller, Values, check_count, check_number
 
+# From `python -m benchmarks.tune pi`.
+SEARCHED_GAINS = {"kp": 1.34, "ki": 0.0456}
+
 
 class PIController(Controller):
     """u(k) = -Kp e(k) - Ki sum_{i<=k} e(i), as printed in Section 5: without anti-windup.

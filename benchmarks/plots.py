@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -13,6 +18,7 @@ from benchmarks.metrics import METRICS
 from benchmarks.roster import label
 from benchmarks.scenarios import Scenario
 from benchmarks.storage import replacing
+from mptc_gym import Parameters
 
 # Okabe and Ito's colours, which colour-blind readers can tell apart.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#F0E442")
@@ -142,6 +148,158 @@ def plot_learning(curves: pd.DataFrame, path: Path) -> None:
         axes.set_title("PPO's learning curves", loc="left")
         axes.legend()
         _save(figure, path)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One of the paper's figures, as `plot_figures` draws it.
+
+    Attributes
+    ----------
+    title
+        Its heading.
+    curves
+        What `figures.summarise` returns.
+    signals
+        What to draw of it, each on axes of its own: "output", "command" or "noise".
+    parameters
+        The plant's: dead zone and limits are drawn behind the command.
+    """
+
+    title: str
+    curves: pd.DataFrame
+    signals: tuple[str, ...]
+    parameters: Parameters
+
+
+_SIGNALS = {
+    "output": ("temperature y (°C)", _COLOURS[0]),
+    "command": ("command u (t/h)", _COLOURS[2]),
+    "noise": ("noise n (°C)", _COLOURS[3]),
+}
+
+
+def plot_figures(panels: Sequence[Panel], path: Path) -> None:
+    """Draw figures of the paper: one, or a sheet of several in two columns."""
+    axes_of = [(panel, signal) for panel in panels for signal in panel.signals]
+    columns = min(2, len(panels))
+    rows = math.ceil(len(axes_of) / columns)
+    with mpl.rc_context(_STYLE):
+        size = (8, 3 * rows) if columns == 1 else (13, 2.4 * rows)
+        figure = Figure(figsize=size)
+        grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
+        for axes, (panel, signal) in zip(grid.flat, axes_of, strict=False):
+            _draw_signal(axes, panel, signal)
+        used, unused = grid.flat[: len(axes_of)], grid.flat[len(axes_of) :]
+        for axes in used[-columns:]:  # the lowest of each column
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel("time (min)")
+        for axes in unused:
+            axes.set_visible(False)
+        _save(figure, path)
+
+
+def _draw_signal(axes: Axes, panel: Panel, signal: str) -> None:
+    curves, parameters = panel.curves, panel.parameters
+    minutes = curves["time_s"] / 60
+    name, colour = _SIGNALS[signal]
+    axes.fill_between(
+        minutes, curves[f"{signal}_p10"], curves[f"{signal}_p90"], color=colour, alpha=0.25,
+        linewidth=0, label="10th to 90th percentile",
+    )  # fmt: skip
+    axes.plot(
+        minutes, curves[f"{signal}_typical"], color=colour, linewidth=1, label="a typical run"
+    )
+    if signal == "output":
+        axes.step(
+            minutes, curves["setpoint"], "k--", linewidth=1, where="post", label="set point"
+        )
+    if signal == "command":
+        zone = parameters.dead_zone
+        axes.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0, label="dead zone")
+        for limit in (parameters.u_min, parameters.u_max):
+            axes.axhline(limit, color="0.4", linestyle=":", linewidth=1)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
+    axes.set_xlim(0, minutes.max())
+    axes.set_ylabel(name)
+    axes.set_title(panel.title, loc="left", fontsize="medium")
+    axes.legend(loc="upper right", ncols=3, fontsize="small")
+
+
+def plot_convergence(times: pd.DataFrame, path: Path) -> None:
+    """Draw which share of the networks has converged by when, one line for each set point."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(9, 4))
+        axes = figure.subplots()
+        for name, colour in colours(list(times)).items():
+            finite = times[name].replace(math.inf, np.nan).dropna().sort_values()
+            done = 100 * np.arange(1, len(finite) + 1) / len(times)
+            axes.step(finite, done, where="post", color=colour, label=name)
+        axes.axvline(150, color="0.4", linestyle=":", label="the paper's 150 samples")
+        axes.set_xlim(left=0)
+        axes.set_ylim(0, 100)
+        axes.set_xlabel("samples since the start")
+        axes.set_ylabel("weights have converged (% of draws)")
+        axes.legend()
+        _save(figure, path)
+
+
+def plot_pi_gains(errors: pd.DataFrame, path: Path) -> None:
+    """Draw the mean error of PI controllers over Kp, one line for each case."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(9, 4))
+        axes = figure.subplots()
+        for (name, rows), colour in zip(
+            errors.groupby("setpoint", sort=False), _COLOURS, strict=False
+        ):
+            axes.plot(rows["kp"], rows["mean_error"], ".-", color=colour, label=name)
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel("Kp (t/h per °C), with the paper's Ki = 0.3")
+        axes.set_ylabel(METRICS["mae"])
+        axes.legend()
+        _save(figure, path)
+
+
+def plot_other_plants(cells: pd.DataFrame, path: Path) -> None:
+    """Draw maps of the share of networks that settle: over delay and gain, for each case."""
+    cases, time_constants = cells["setpoint"].unique(), cells["time_constant"].unique()
+    with mpl.rc_context(_STYLE | {"axes.grid": False}):
+        figure = Figure(figsize=(10, 2.8 * len(cases)))
+        panels = figure.subplots(len(cases), len(time_constants), sharex=True, squeeze=False)
+        for (i, case), (j, constant) in itertools.product(
+            enumerate(cases), enumerate(time_constants)
+        ):
+            axes = panels[i, j]
+            rows = cells[(cells["setpoint"] == case) & (cells["time_constant"] == constant)]
+            grid = 100 * rows.pivot_table(index="gain", columns="delay", values="settled")
+            image = axes.imshow(
+                grid, cmap="cividis", vmin=0, vmax=100, aspect="auto", origin="lower"
+            )
+            axes.set_xticks(range(len(grid.columns)), grid.columns)
+            axes.set_yticks(range(len(grid.index)), grid.index)
+            axes.set_title(
+                f"{case},\ntime constant x {constant:g}", loc="left", fontsize="medium"
+            )
+            for place in np.ndindex(grid.shape):
+                value = grid.iloc[place]
+                shade = "black" if value > 50 else "white"
+                axes.text(
+                    *reversed(place), f"{value:.0f}", ha="center", va="center", color=shade
+                )
+        for axes in panels[-1]:
+            axes.set_xlabel("delay (samples)")
+        for axes in panels[:, 0]:
+            axes.set_ylabel("gain (of the paper's)")
+        figure.colorbar(image, ax=panels, label="settled (% of draws)")
+        _save(figure, path)
+
+
+CLAIMS = {
+    "convergence": plot_convergence,
+    "pi_gains": plot_pi_gains,
+    "other_plants": plot_other_plants,
+}
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
@@ -51,7 +52,11 @@ def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vect
 
 
 def rollout(
-    plants: gymnasium.vector.VectorEnv, agent: Agent, samples: int, seed: int
+    plants: gymnasium.vector.VectorEnv,
+    agent: Agent,
+    samples: int,
+    seed: int,
+    before: Callable[[int], object] | None = None,
 ) -> Trajectory:
     """Run one episode of every plant in a batch.
 
@@ -65,6 +70,8 @@ def rollout(
         Number of samples, k = 0 to samples - 1. Not more than an episode lasts.
     seed
         Run i meets the noise and the set point of seed `seed + i`.
+    before
+        Called with k before the controller acts at sample k: to watch it, or to damage it.
 
     Returns
     -------
@@ -79,6 +86,8 @@ def rollout(
         trajectory.setpoint[k] = info["setpoint"]
         trajectory.output[k] = info["output"]
         trajectory.noise[k] = info["noise"]
+        if before is not None:
+            before(k)
         actions = np.asarray(agent.act(observation))
         if actions.shape != (plants.num_envs, 1):
             raise ValueError(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from mptc_gym import Parameters
 
 
@@ -58,3 +60,31 @@ SCENARIOS: dict[str, Scenario] = {
     for setpoint, setpoint_title, samples, setpoint_arguments in _SETPOINTS
     for plant, plant_title, plant_arguments in _PLANTS
 }
+
+
+def other_plant(
+    *, delay: int = 18, gain: float = 1.0, time_constant: float = 1.0
+) -> dict[str, Any]:
+    """Return the environment's arguments for a relative of the paper's plant.
+
+    Parameters
+    ----------
+    delay
+        d, samples.
+    gain
+        Steady-state gain, as a multiple of the paper's.
+    time_constant
+        Dominant time constant, as a multiple of the paper's; the gain does not follow it.
+
+    Returns
+    -------
+    dict
+        `a`, `b` and `delay`.
+    """
+    nominal = Parameters()
+    poles = np.roots(nominal.a)  # real, 0.95 and -0.50
+    slow = np.argmax(poles)
+    poles[slow] **= 1.0 / time_constant  # a pole p decays as exp(-k / time constant)
+    a = np.poly(poles)
+    b = np.array(nominal.b) * gain * a.sum() / sum(nominal.a)
+    return {"a": a.tolist(), "b": b.tolist(), "delay": delay}

@@ -135,7 +135,8 @@ def on_screen(table: pd.DataFrame) -> Table:
     screen = Table(box=SIMPLE_HEAD)
     for name in table.columns:
         is_name = name in ("scenario", "agent", "case")
-        screen.add_column(name, justify="left" if is_name else "right", no_wrap=is_name)
+        is_text = is_name or name in ("claim", "verdict")
+        screen.add_column(name, justify="left" if is_text else "right", no_wrap=is_name)
     for row in table.itertuples(index=False):
         screen.add_row(*row)
     return screen

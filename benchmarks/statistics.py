@@ -1,0 +1,103 @@
+"""Estimates from a number of runs, with 95 % confidence intervals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its confidence interval.
+
+    Attributes
+    ----------
+    value
+        The estimate.
+    low, high
+        Ends of the interval.
+    runs
+        How many runs it rests on.
+    """
+
+    value: float
+    low: float
+    high: float
+    runs: int
+
+
+def exact(value: float) -> Estimate:
+    """Return what nothing random has a part in: a single run, an interval without width."""
+    return Estimate(float(value), float(value), float(value), 1)
+
+
+def quantile(values: ArrayLike, probability: float) -> Estimate:
+    """Estimate a quantile over runs.
+
+    The interval is that between two of the ordered values (Conover, "Practical Nonparametric
+    Statistics", 3rd edition, 1999, section 3.2, as `scipy.stats.quantile_test` has it). It
+    supposes nothing of the distribution, and takes infinite values ("never").
+
+    Parameters
+    ----------
+    values
+        Shape (runs,).
+    probability
+        Between 0 and 1, 0.5 for the median.
+
+    Returns
+    -------
+    Estimate
+        An end is infinite where there are too few runs to tell.
+
+    Raises
+    ------
+    ValueError
+        If there is no value, or one that is not a number.
+    """
+    ordered = np.sort(np.asarray(values, dtype=np.float64))
+    if ordered.ndim != 1 or not len(ordered) or np.isnan(ordered).any():
+        raise ValueError(f"values must be numbers, one for each run, got {values!r}")
+    # Of an infinite value nothing can be interpolated: the next higher of the values then.
+    method = "linear" if np.isfinite(ordered).all() else "higher"
+    interval = stats.quantile_test(ordered, p=probability).confidence_interval(CONFIDENCE)
+    low = -np.inf if np.isnan(interval.low) else interval.low
+    high = np.inf if np.isnan(interval.high) else interval.high
+    value = np.quantile(ordered, probability, method=method)
+    return Estimate(float(value), float(low), float(high), len(ordered))
+
+
+def median(values: ArrayLike) -> Estimate:
+    """Estimate the median over runs; see `quantile`."""
+    return quantile(values, 0.5)
+
+
+def share(flags: ArrayLike) -> Estimate:
+    """Estimate how often something happens, with Wilson's interval.
+
+    Parameters
+    ----------
+    flags
+        Shape (runs,): whether it happened.
+
+    Returns
+    -------
+    Estimate
+        A share between 0 and 1.
+
+    Raises
+    ------
+    ValueError
+        If there is no run, or a value that is neither true nor false.
+    """
+    happened = np.asarray(flags)
+    if happened.ndim != 1 or not len(happened) or happened.dtype != np.bool_:
+        raise ValueError(f"flags must be booleans, one for each run, got {flags!r}")
+    count, runs = int(happened.sum()), len(happened)
+    interval = stats.binomtest(count, runs).proportion_ci(CONFIDENCE, method="wilson")
+    return Estimate(count / runs, float(interval.low), float(interval.high), runs)

@@ -1,0 +1,309 @@
+"""Search a controller's gains with Optuna: `python -m benchmarks.tune nn`, or `pi`.
+
+Every controller has the same budget, on set points and seeds that no comparison uses. The
+search is saved after every trial; the same command continues it, to the same end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import pandas as pd
+from optuna.distributions import FloatDistribution
+from rich.console import Console
+from tqdm import tqdm
+
+from agents import DirectNNController, PIController
+from benchmarks.experiments import mean_error, settled, split
+from benchmarks.options import number
+from benchmarks.rollout import make_plants, rollout
+from benchmarks.roster import Factory, build
+from benchmarks.scenarios import Scenario
+from benchmarks.storage import replacing, write_json, write_text
+from benchmarks.tables import on_screen
+
+TRIALS = 800
+DRAWS = 100  # runs of each scenario in a trial, each with noise and initial weights of its own
+SEED = 1  # of the search
+FIRST_RUN = 3_000_000  # runs have seeds from here on, which no comparison uses
+FINALISTS, FINAL_DRAWS, FINAL_RUN = 10, 1000, 4_000_000
+STARTUP = 200  # trials at random, before the sampler learns from them
+DIGITS = 3  # significant, of the gains that are proposed
+
+# Neighbours of the paper's cases, each with its first sample that counts: three that begin with
+# an untrained controller, and two that show what comes after learning.
+SCENARIOS: tuple[tuple[Scenario, int], ...] = (
+    (Scenario("constant", "constant set point", 600, {"setpoint": 4.8}), 0),
+    (
+        Scenario(
+            "dead zone", "square wave, dead zone 6.5 t/h", 1280,
+            {"setpoint_amplitude": 5.1, "setpoint_period": 640, "dead_zone": 6.5},
+        ),
+        0,
+    ),
+    (
+        Scenario(
+            "noise", "square wave, R = 0.4 °C²", 1040,
+            {"setpoint_amplitude": 4.9, "setpoint_period": 520, "noise_variance": 0.4},
+        ),
+        0,
+    ),
+    (
+        Scenario(
+            "learnt", "square wave", 2240, {"setpoint_amplitude": 5.2, "setpoint_period": 560}
+        ),
+        1120,
+    ),
+    (
+        Scenario(
+            "learnt, slow", "square wave", 1920,
+            {"setpoint_amplitude": 5.4, "setpoint_period": 640},
+        ),
+        1280,
+    ),
+)  # fmt: skip
+
+# A run at the constant set point that has not settled at its end has failed to converge. That
+# costs what doing nothing about a set point of 5 degC costs.
+PENALTY = 5.0
+
+SPACES: dict[str, tuple[Factory, dict[str, tuple[float, float]]]] = {
+    "nn": (
+        DirectNNController,
+        {
+            "eta": (1e-3, 10.0),
+            "eta_1": (1e-3, 1.0),
+            "eta_theta": (1e-4, 1.0),
+            "eta_1_theta": (1e-4, 1.0),
+            "input_scale": (0.02, 1.0),
+            "weight_scale": (0.05, 2.0),
+        },
+    ),
+    "pi": (PIController, {"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Search, and write and print what was found.
+
+    Parameters
+    ----------
+    arguments
+        The command line without the program's name.
+
+    Returns
+    -------
+    int
+        0, or 130 if it was interrupted.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.tune",
+        description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = parser.add_argument
+    add("controller", choices=SPACES, help="whose gains to search")
+    add("--trials", type=number, default=TRIALS, help="number of gains to try")
+    add("--draws", type=number, default=DRAWS, help="runs of each scenario in a trial")
+    add("--out", type=Path, default=Path("results/tune"), help="folder to write to")
+    options = parser.parse_args(arguments)
+
+    try:
+        search = Search(options.controller, options.draws, options.out)
+    except ValueError as error:
+        parser.error(f"--out, --draws: {error}")
+    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    try:
+        search.run(options.trials)
+        report = search.report(options.trials)
+    except KeyboardInterrupt:
+        console.print("\nInterrupted: the same command goes on from here.")
+        return 130
+    console.print(f"The best, on {FINAL_DRAWS} new runs")
+    shown = report[[*SPACES[options.controller][1], "objective"]].head(5)
+    console.print(on_screen(shown.map("{:.4g}".format)))
+    console.print(
+        f"All trials are in {search.path}, the best in {search.path.with_suffix('.md')}"
+    )
+    return 0
+
+
+def score(factory: Factory, draws: int, first_run: int) -> dict[str, float]:
+    """Judge a controller on the tuning scenarios.
+
+    Parameters
+    ----------
+    factory
+        Makes the controller, as `roster.build` calls it.
+    draws
+        Runs of each scenario.
+    first_run
+        Seed of the first; every scenario has seeds of its own.
+
+    Returns
+    -------
+    dict
+        For each scenario the median over runs of the mean |e|, degC; `not converged`, the
+        share of runs at the constant set point that failed to; and `objective`: the mean of
+        the medians, plus `PENALTY` degC times that share.
+    """
+    medians: dict[str, float] = {}
+    for i, (scenario, first_sample) in enumerate(SCENARIOS):
+        seed = first_run + i * 100_000
+        controller = build(factory, scenario.parameters, draws, seed)
+        plants = make_plants(draws, scenario.samples, **scenario.arguments)
+        trajectory = rollout(plants, controller, scenario.samples, seed)
+        _, counted = split(trajectory, first_sample)
+        medians[scenario.name] = float(np.median(mean_error(counted)))
+        if scenario.name == "constant":
+            failed = 1.0 - float(settled(trajectory).mean())
+    objective = float(np.mean(list(medians.values()))) + PENALTY * failed
+    return {**medians, "not converged": failed, "objective": objective}
+
+
+class Search:
+    """A search that is saved after every trial.
+
+    Parameters
+    ----------
+    controller
+        A name in `SPACES`.
+    draws
+        Runs of each scenario in a trial.
+    folder
+        Where it is kept, as `<controller>.csv`; what is there is continued.
+
+    Raises
+    ------
+    ValueError
+        If what is there was another search.
+    """
+
+    def __init__(self, controller: str, draws: int, folder: Path) -> None:
+        self.path = folder / f"{controller}.csv"
+        self._draws = draws
+        self._controller = controller
+        self._factory, space = SPACES[controller]
+        self._space = {name: FloatDistribution(*ends, log=True) for name, ends in space.items()}
+        self._study = optuna.create_study()
+        self._rows: list[dict[str, float]] = []
+        # In the form in which JSON gives it back.
+        settings = json.loads(
+            json.dumps(
+                {
+                    "draws": draws,
+                    "seed": SEED,
+                    "first run": FIRST_RUN,
+                    "space": space,
+                    "scenarios": {
+                        s.name: [s.samples, first, s.arguments] for s, first in SCENARIOS
+                    },
+                    "penalty": PENALTY,
+                    "sampler": f"TPE of Optuna {optuna.__version__}, {STARTUP} at random",
+                }
+            )
+        )
+        beside = self.path.with_suffix(".json")
+        if self.path.exists():
+            earlier = json.loads(beside.read_text(encoding="utf-8"))
+            changed = [name for name in settings if settings[name] != earlier.get(name)]
+            if changed:
+                raise ValueError(f"{self.path} is of a search with other {', '.join(changed)}")
+            with self.path.open(encoding="utf-8", newline="") as file:
+                for row in csv.DictReader(file):
+                    self._add({name: float(value) for name, value in row.items()})
+        write_json(beside, settings)
+
+    @property
+    def trials(self) -> pd.DataFrame:
+        """One row a trial: the gains, and what `score` says of them."""
+        return pd.DataFrame(self._rows)
+
+    def _add(self, row: dict[str, float]) -> None:
+        gains = {name: row[name] for name in self._space}
+        self._study.add_trial(
+            optuna.trial.create_trial(
+                params=gains, distributions=self._space, value=row["objective"]
+            )
+        )
+        self._rows.append(row)
+
+    def run(self, trials: int) -> None:
+        """Try gains until `trials` have been tried in all."""
+        with tqdm(total=trials, initial=len(self._rows), desc=self._controller) as bar:
+            while len(self._rows) < trials:
+                self._add(self._try())
+                with replacing(self.path) as file:
+                    self.trials.to_csv(file, index=False)
+                bar.set_postfix(best=f"{self._study.best_value:.3f}")
+                bar.update()
+
+    def _try(self) -> dict[str, float]:
+        # The sampler starts anew from the search's seed and the trial's number, so that a
+        # search that was interrupted goes on as it would have gone.
+        seed = SEED * 1_000_000 + len(self._rows)
+        sampler = optuna.samplers.TPESampler(
+            seed=seed, n_startup_trials=STARTUP, multivariate=True
+        )
+        asking = optuna.create_study(sampler=sampler)
+        asking.add_trials(self._study.trials)
+        gains = asking.ask(self._space).params
+        return {**gains, **score(partial(self._factory, **gains), self._draws, FIRST_RUN)}
+
+    def report(self, trials: int) -> pd.DataFrame:
+        """Judge the best gains again, rounded and on new runs, and write them, best first.
+
+        The gains that did best in a search did so by luck too; new runs tell.
+
+        Parameters
+        ----------
+        trials
+            How many of the trials count.
+        """
+        best = self.trials.head(trials).nsmallest(FINALISTS, "objective")
+        rows: list[dict[str, Any]] = []
+        for _, trial in tqdm(list(best.iterrows()), desc="new runs for the best"):
+            gains = {name: float(f"{trial[name]:.{DIGITS}g}") for name in self._space}
+            again = score(partial(self._factory, **gains), FINAL_DRAWS, FINAL_RUN)
+            rows.append({**gains, **again, "in the search": trial["objective"]})
+        table = pd.DataFrame(rows).sort_values("objective", ignore_index=True)
+        write_text(self.path.with_suffix(".md"), self._page(table, trials))
+        return table
+
+    def _page(self, table: pd.DataFrame, trials: int) -> str:
+        improved = self.trials.head(trials)
+        improved = improved[improved["objective"].cummin().diff().fillna(-1.0) < 0.0]
+        scenarios = pd.DataFrame(
+            [(s.name, s.title, s.samples, first) for s, first in SCENARIOS],
+            columns=["scenario", "what it is", "samples", "first that counts"],
+        )
+        return "\n\n".join(
+            [
+                f"# Gains of {self._factory.__name__}",
+                f"By `python -m benchmarks.tune {self._controller} --trials {trials} "
+                f"--draws {self._draws}`. In each scenario: the median over runs of the mean "
+                f"absolute error, °C. The objective is their mean, plus {PENALTY:g} °C times "
+                "the share of runs at the constant set point that do not settle.",
+                f"## The best {len(table)} of {trials}, on {FINAL_DRAWS} new runs",
+                table.to_markdown(index=False, floatfmt=".4g"),
+                "## The search: every trial that was better than all before",
+                improved.reset_index(names="trial").to_markdown(index=False, floatfmt=".4g"),
+                "## Scenarios",
+                scenarios.to_markdown(index=False),
+                "",
+            ]
+        )
+
+
+if __name__ == "__main__":
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    sys.exit(main())

@@ -1,0 +1,276 @@
+"""Behind the claims: verdicts on made-up numbers, detectors on known sequences."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from agents import DirectNNController
+from benchmarks import claims, evidence, ledger
+from benchmarks.experiments import (
+    Draws,
+    converged_at,
+    fail_node,
+    mean_error,
+    settled,
+    split,
+)
+from benchmarks.ledger import Entry, Finding, Verdict, verdict
+from benchmarks.rollout import Trajectory
+from benchmarks.scenarios import other_plant
+from benchmarks.statistics import Estimate
+from mptc_gym import Parameters
+
+
+def finding(low, high, **bounds):
+    return Finding("a number", Estimate((low + high) / 2, low, high, 1000), **bounds)
+
+
+GOOD, BAD = finding(1.0, 2.0, at_least=1.0), finding(1.0, 2.0, at_least=2.5)
+UNDECIDED = finding(1.0, 2.0, at_least=1.5)
+INFORMATION = finding(5.0, 9.0)
+
+
+class TestVerdicts:
+    @pytest.mark.parametrize(
+        ("bounds", "shown"),
+        [
+            ({"at_least": 0.5}, "yes"),
+            ({"at_least": 1.5}, "undecided"),
+            ({"at_least": 2.5}, "no"),
+            ({"at_most": 2.5}, "yes"),
+            ({"at_most": 1.5}, "undecided"),
+            ({"at_most": 0.5}, "no"),
+            ({"at_least": 0.5, "at_most": 2.5}, "yes"),
+            ({"at_least": 0.5, "at_most": 1.9}, "undecided"),
+            ({"at_least": 0.5, "at_most": 0.9}, "no"),
+            ({}, ""),
+        ],
+    )
+    def test_the_whole_interval_must_keep_the_criterion(self, bounds, shown):
+        assert finding(1.0, 2.0, **bounds).shown == shown
+
+    @pytest.mark.parametrize(
+        ("findings", "expected"),
+        [
+            ([GOOD, GOOD], Verdict.HOLDS),
+            ([GOOD, INFORMATION], Verdict.HOLDS),
+            ([GOOD, BAD], Verdict.IN_PART),
+            ([GOOD, UNDECIDED], Verdict.IN_PART),
+            ([BAD, BAD, INFORMATION], Verdict.FAILS),
+            ([UNDECIDED], Verdict.FAILS),
+            ([INFORMATION], Verdict.UNTESTABLE),
+            ([], Verdict.UNTESTABLE),
+        ],
+    )
+    def test_verdicts(self, findings, expected):
+        assert verdict(findings) is expected
+
+    def test_ledger_by_hand(self):
+        entries = [
+            Entry("good", "Section 1", "It is good", "By looking.", (GOOD, INFORMATION)),
+            Entry("none", "Section 2", "It cannot be", "Not at all.", ()),
+        ]
+        table = ledger.table(entries)
+        assert list(table["claim"]) == ["good", "good", "none"]
+        assert list(table["shown"])[:2] == ["yes", ""]
+        assert list(table["criterion"])[:2] == ["at least 1", ""]
+        page = ledger.markdown(entries, "a command")
+        assert "| It is good   | holds" in page
+        assert "| It cannot be | cannot be tested from the text |" in page
+        assert "| 1.500   | 1.000 to 2.000" in page
+
+    def test_numbers_as_people_read_them(self):
+        numbers = (0.12345, 12.345, 1234.5, math.inf, -math.inf)
+        written = [ledger.write_number(value) for value in numbers]
+        assert written == ["0.123", "12.3", "1,234", "never", "?"]
+
+
+def paths(*distances):
+    """One weight of each run, with these distances to where it ends."""
+    return np.array(distances, dtype=float).T[:, :, np.newaxis]
+
+
+class TestConvergence:
+    def test_known_sequences(self):
+        k = np.arange(400)
+        at = converged_at(
+            paths(
+                np.where(k < 70, 1.0, 0.0),  # a jump
+                0.9**k,  # 0.9^28 = 0.052, 0.9^29 = 0.047
+                np.where(k == 200, 0.06, 0.0) + (k == 0),  # leaves the band once more
+                np.zeros(400),  # nothing to learn
+            )
+        )
+        assert list(at) == [70, 29, 201, 0]
+
+    def test_what_still_moves_has_not_converged(self):
+        k = np.arange(400)
+        ends = 1.0 - k / 399.0  # on its way to wherever
+        swings = np.sin(k / 5.0) - np.sin(399 / 5.0)
+        late = np.where(k < 301, 1.0, 0.0)
+        in_time = np.where(k < 300, 1.0, 0.0)
+        at = converged_at(paths(ends, swings, late, in_time))
+        assert list(at) == [math.inf, math.inf, math.inf, 300]
+
+    def test_all_weights_count_together(self):
+        weights = np.zeros((400, 1, 2))
+        weights[:10] = (30.0, 40.0)  # 50 away
+        weights[10:50] = (2.0, 2.0)  # 2.83, more than 5 %, though each alone is less
+        assert converged_at(weights) == [50]
+
+
+def trajectory(setpoint, output):
+    columns = [np.array(c, dtype=float)[:, np.newaxis] for c in (setpoint, output)]
+    return Trajectory(*columns, *(np.zeros((len(setpoint), 1)) for _ in range(3)))
+
+
+class TestMeasures:
+    @pytest.mark.parametrize(("output", "has"), [(5.2, True), (4.8, True), (5.3, False)])
+    def test_settled(self, output, has):
+        early = [0.0] * 50 + [output] * 50
+        assert settled(trajectory([5.0] * 100, early)) == [has]
+        assert settled(trajectory([-5.0] * 100, [-y for y in early])) == [has]
+
+    def test_settled_looks_at_every_sample_of_the_end(self):
+        late = [0.0] * 51 + [5.0] * 49
+        assert settled(trajectory([5.0] * 100, late)) == [False]
+
+    def test_split(self):
+        before, after = split(trajectory([1, 1, 3], [0, 0, 0]), 2)
+        assert (mean_error(before), mean_error(after)) == (1.0, 3.0)
+
+
+class TestFailure:
+    @pytest.mark.parametrize("num_envs", [None, 4])
+    @pytest.mark.parametrize("stuck_at", [0, 1])
+    def test_a_failed_node_gives_the_same_whatever_it_is_fed(self, stuck_at, num_envs, rng):
+        network = DirectNNController(num_envs=num_envs, eta=0.0, eta_theta=0.0)
+        fail_node(network, stuck_at)
+        W_1 = network.weights.W_1
+        healthy = DirectNNController(num_envs=num_envs, n_hidden=2)
+        weights = network.weights
+        # A network of the other two nodes, with the stuck output in the threshold.
+        healthy.weights = type(weights)(
+            weights.W[..., 1:, :], weights.theta_1[..., 1:], W_1[..., 1:],
+            weights.theta_2 + stuck_at * W_1[..., 0],
+        )  # fmt: skip
+        network.learning = healthy.learning = False
+        for _ in range(5):
+            observation = rng.normal(scale=5, size=(6,) if num_envs is None else (num_envs, 6))
+            network.act(observation)
+            healthy.act(observation)
+            np.testing.assert_allclose(network.command, healthy.command, rtol=1e-12)
+
+    @pytest.mark.parametrize("stuck_at", [0, 1])
+    def test_it_does_not_heal(self, stuck_at):
+        draws = Draws(3)
+        network = draws.network()
+        fail_node(network, stuck_at)
+        before = network.weights
+        draws.run(network, 300, setpoint=5.0)
+        after = network.weights
+        np.testing.assert_allclose(before.W[:, 0], after.W[:, 0], atol=1e-300)
+        np.testing.assert_array_equal(before.theta_1[:, 0], after.theta_1[:, 0])
+        assert np.all(before.W[:, 1] != after.W[:, 1])
+
+
+class TestPlants:
+    def test_the_paper_s_is_one_of_them(self):
+        plant = Parameters(**other_plant())
+        assert np.allclose(plant.a, Parameters().a)
+        assert np.allclose(plant.b, Parameters().b)
+
+    def test_gain_and_time_constant(self):
+        # A held input of 8 t/h, and what comes of it, measured.
+        def response(**changes):
+            class Held:
+                def reset(self):
+                    pass
+
+                def act(self, observation):
+                    return np.full((1, 1), -0.8, np.float32)
+
+            return Draws(1).run(Held(), 1200, **other_plant(**changes)).output[:, 0]
+
+        nominal, other = response(), response(gain=1.3, time_constant=2.0, delay=9)
+        assert other[-1] == pytest.approx(1.3 * nominal[-1], rel=1e-6)
+        assert np.flatnonzero(nominal)[0] - np.flatnonzero(other)[0] == 9
+
+        def decay(y):  # samples in which what is missing falls by e
+            missing = y[-1] - y
+            return 1 / np.log(missing[100] / missing[101])
+
+        assert decay(other) == pytest.approx(2 * decay(nominal), rel=1e-3)
+
+    @pytest.mark.parametrize(("kp", "ki"), [(3.2, 0.05), (3.4, 0.05), (2.8, 0.1), (1.7, 0.15)])
+    def test_poles_of_a_pi_loop(self, kp, ki):
+        # A linear loop's swings grow or die by its largest pole in each sample. This loop is
+        # linear: it has no dead zone and stays far from the limits.
+        y = Draws(1).run_pi(kp, ki, 2000, dead_zone=0.0, setpoint=0.01).output[:, 0]
+        growth = np.ptp(y[-200:]) / np.ptp(y[800:1000])
+        assert growth == pytest.approx(evidence.largest_pole(kp, ki) ** 1000, rel=0.05)
+
+
+def run_claims(out, *options):
+    return claims.main([*map(str, options), "--draws", "8", "--out", str(out)])
+
+
+QUICK = ("direction", "convergence", "figures")
+
+
+class TestCommand:
+    def test_what_it_writes(self, tmp_path, capsys):
+        assert run_claims(tmp_path, *QUICK) == 0
+        table = pd.read_csv(tmp_path / "claims.csv")
+        assert list(table["claim"].unique()) == list(QUICK)
+        wrong = table[table["claim"] == "direction"]
+        assert list(wrong["value"][:2]) == [100.0, 100.0]  # all of them diverge ...
+        assert list(wrong["shown"][:2]) == ["undecided"] * 2  # ... but eight prove little
+        assert len(pd.read_csv(tmp_path / "convergence.csv")) == 8
+        assert (tmp_path / "convergence.png").exists()
+        page = (tmp_path / "claims.md").read_text()
+        for shown in (page, capsys.readouterr().out):
+            assert "cannot be tested from the text" in shown
+
+    def test_same_seed_same_ledger(self, tmp_path):
+        for name in ("one", "two"):
+            run_claims(tmp_path / name, "noise")
+        one, two = ((tmp_path / name / "claims.csv").read_text() for name in ("one", "two"))
+        assert one == two
+        assert "holds" in one or "does not hold" in one
+
+    def test_other_draws_other_numbers(self):
+        first, second = (
+            mean_error(Draws(4, seed).run_nn(200, noise_variance=0.5)) for seed in (0, 4)
+        )
+        assert not set(first) & set(second)
+        networks = [Draws(4, seed).network().weights.theta_2 for seed in (0, 4)]
+        assert not set(networks[0]) & set(networks[1])
+
+    def test_interrupted(self, tmp_path, monkeypatch, capsys):
+        def stop(_):
+            raise KeyboardInterrupt
+
+        interrupted = dict(claims.CLAIMS)
+        interrupted["noise"] = evidence.Claim("noise", "", "", "", stop)
+        monkeypatch.setattr(claims, "CLAIMS", interrupted)
+        assert run_claims(tmp_path, "direction", "noise") == 130
+        assert "Interrupted" in capsys.readouterr().out
+        assert set(pd.read_csv(tmp_path / "claims.csv")["claim"]) == {"direction"}
+
+    def test_an_unknown_claim(self, tmp_path, capsys):
+        with pytest.raises(SystemExit):
+            run_claims(tmp_path, "everything")
+        assert "no 'everything'" in capsys.readouterr().err
+
+    @pytest.mark.parametrize("name", claims.CLAIMS)
+    def test_every_claim_is_examined(self, name):
+        results = claims.CLAIMS[name].examine(Draws(6, 500))
+        assert verdict(results.findings) is Verdict.UNTESTABLE or any(
+            finding.criterion for finding in results.findings
+        )
+        for finding in results.findings:
+            estimate = finding.estimate
+            assert estimate.low <= estimate.value <= estimate.high, finding.quantity

@@ -1,0 +1,64 @@
+"""The paper's figures drawn anew: what is typical, and that there is something to see."""
+
+import matplotlib.image
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchmarks import figures
+from benchmarks.rollout import Trajectory
+
+
+def test_the_typical_run_is_the_median_one():
+    outputs = np.array([[1.0, 9.0, 4.0, 2.0]])  # errors 4, 4, 1, 3 of set point 5
+    still = np.zeros((1, 4))
+    runs = Trajectory(np.full((1, 4), 5.0), outputs, 10 * outputs, still, still)
+    row = figures.summarise(runs).iloc[0]
+    assert (row["setpoint"], row["output_typical"], row["command_typical"]) == (5.0, 2.0, 20.0)
+    assert row["output_p10"] == pytest.approx(1 + 0.3 * (2 - 1))
+    assert row["output_p90"] == pytest.approx(4 + 0.7 * (9 - 4))
+
+
+def test_every_figure_is_drawn(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(figures, "SAMPLES", 120)
+    assert figures.main(["--draws", "3", "--out", str(tmp_path)]) == 0
+    names = [f"figure_{n:02d}.png" for n in range(5, 13)]
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == [*names, "figures.png"]
+    for name in (*names, "figures.png"):
+        picture = matplotlib.image.imread(tmp_path / name)[..., :3]
+        dark_or_coloured = np.mean(picture.min(axis=2) < 0.9)
+        assert 0.01 < dark_or_coloured < 0.5, name
+    data = pd.read_csv(tmp_path / "nn_noise.csv")
+    assert len(data) == 120
+    assert (data["output_p10"] <= data["output_p90"]).all()
+    assert (data["noise_p10"] < data["noise_p90"])[1:].all()  # at k = 0 there is none
+
+
+def test_the_cases_are_the_paper_s():
+    shown = {figure.number: (figure.case, figure.signals) for figure in figures.FIGURES}
+    assert list(shown) == list(range(5, 13))
+    assert shown[7] == ("nn_dead_zone", ("command",))
+    assert shown[9] == ("nn_noise", ("command", "noise"))
+    cases = figures.CASES
+    assert cases["nn_dead_zone"].arguments == {"dead_zone": 7.0}
+    assert cases["nn_six_nodes"].nodes == 6
+    assert {case.nodes for name, case in cases.items() if name.startswith("pi")} == {None}
+
+
+def test_interrupted(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(figures, "SAMPLES", 60)
+    whole = figures.summarise
+    calls = []
+
+    def stop_at_the_third(trajectory):
+        calls.append(0)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return whole(trajectory)
+
+    monkeypatch.setattr(figures, "summarise", stop_at_the_third)
+    assert figures.main(["--draws", "2", "--out", str(tmp_path)]) == 130
+    assert "Interrupted" in capsys.readouterr().out
+    kept = {path.name for path in tmp_path.iterdir()}
+    pictures = {f"figure_{n:02d}.png" for n in (5, 6, 7)}
+    assert kept == pictures | {"nn.csv", "nn_dead_zone.csv"}

@@ -1,0 +1,134 @@
+"""The search for gains, on small budgets."""
+
+from functools import partial
+
+import numpy as np
+import optuna
+import pandas as pd
+import pytest
+
+from agents import DirectNNController, PIController
+from benchmarks import compare, scenarios, tune
+from benchmarks.experiments import Draws
+
+optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Few runs for the finalists, and a sampler that learns soon."""
+    monkeypatch.setattr(tune, "FINALISTS", 2)
+    monkeypatch.setattr(tune, "FINAL_DRAWS", 3)
+    monkeypatch.setattr(tune, "STARTUP", 4)
+
+
+def run_tune(out, controller="pi", trials=6):
+    return tune.main([controller, "--trials", str(trials), "--draws", "2", "--out", str(out)])
+
+
+class TestScore:
+    def test_scenarios_and_seeds_are_met_by_no_comparison(self):
+        compared = [scenario.parameters for scenario in scenarios.SCENARIOS.values()]
+        assert not any(scenario.parameters in compared for scenario, _ in tune.SCENARIOS)
+        assert compare.SEED + 100_000 < tune.FIRST_RUN < tune.FINAL_RUN
+
+    def test_an_idle_controller_pays_for_not_settling(self):
+        score = tune.score(partial(PIController, kp=0.0, ki=0.0), draws=2, first_run=0)
+        assert score["constant"] == pytest.approx(4.8)  # all of the set point, all the time
+        assert score["learnt"] == pytest.approx(5.2)
+        assert score["not converged"] == 1.0
+        medians = [score[scenario.name] for scenario, _ in tune.SCENARIOS]
+        assert score["objective"] == pytest.approx(np.mean(medians) + 5.0)
+
+    def test_what_comes_before_the_first_sample_does_not_count(self):
+        score = tune.score(PIController, draws=1, first_run=0)
+        scenario, first = {s.name: (s, n) for s, n in tune.SCENARIOS}["learnt"]
+        runs = Draws(1).run(PIController(), scenario.samples, **scenario.arguments)
+        error = np.abs(runs.setpoint - runs.output)
+        assert score["learnt"] == pytest.approx(error[first:].mean())
+        assert score["learnt"] != pytest.approx(error.mean())
+
+    def test_the_defaults_converge(self):
+        score = tune.score(DirectNNController, draws=20, first_run=0)
+        assert score["not converged"] == 0.0
+        assert score["objective"] < 1.5
+
+    def test_the_first_run_is_honoured(self):
+        first, again, other = (
+            tune.score(DirectNNController, draws=2, first_run=run) for run in (0, 0, 7)
+        )
+        assert first == again
+        assert first["noise"] != other["noise"]
+
+
+class TestSearch:
+    @pytest.mark.parametrize("controller", tune.SPACES)
+    def test_files(self, controller, tmp_path, capsys):
+        assert run_tune(tmp_path, controller) == 0
+        _, space = tune.SPACES[controller]
+        table = pd.read_csv(tmp_path / f"{controller}.csv")
+        assert len(table) == 6
+        for name, (low, high) in space.items():
+            assert table[name].between(low, high).all()
+        page = (tmp_path / f"{controller}.md").read_text()
+        assert all(name in page for name in space)
+        assert "The best" in capsys.readouterr().out
+
+    def test_finalists_are_judged_rounded_on_new_runs(self, tmp_path):
+        run_tune(tmp_path)
+        search = tune.Search("pi", 2, tmp_path)
+        best = search.report(6).iloc[0]
+        gains = {name: float(f"{best[name]:.3g}") for name in ("kp", "ki")}
+        assert (best["kp"], best["ki"]) == tuple(gains.values())
+        again = tune.score(partial(PIController, **gains), 3, tune.FINAL_RUN)
+        assert best["objective"] == again["objective"]
+        assert best["objective"] != best["in the search"]
+
+    def test_a_stopped_search_ends_where_it_would_have_ended(
+        self, tmp_path, monkeypatch, capsys
+    ):
+        run_tune(tmp_path / "whole")
+        calls, score = [], tune.score
+
+        def stop_at_the_fifth(*arguments):
+            calls.append(0)
+            if len(calls) == 5:
+                raise KeyboardInterrupt
+            return score(*arguments)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(tune, "score", stop_at_the_fifth)
+            assert run_tune(tmp_path / "halves") == 130
+        assert "Interrupted" in capsys.readouterr().out
+        assert len(pd.read_csv(tmp_path / "halves/pi.csv")) == 4
+        assert run_tune(tmp_path / "halves") == 0
+        for name in ("pi.csv", "pi.md"):
+            whole, halves = (
+                (tmp_path / folder / name).read_text() for folder in ("whole", "halves")
+            )
+            assert whole == halves
+
+    def test_it_learns_from_its_trials(self, tmp_path):
+        # Otherwise other scores would bring the same gains.
+        run_tune(tmp_path / "one")
+        table = pd.read_csv(tmp_path / "one/pi.csv")
+        (tmp_path / "two").mkdir()
+        (tmp_path / "two/pi.json").write_text((tmp_path / "one/pi.json").read_text())
+        turned = table.head(5).assign(objective=-table["objective"])
+        turned.to_csv(tmp_path / "two/pi.csv", index=False)
+        run_tune(tmp_path / "two")
+        other = pd.read_csv(tmp_path / "two/pi.csv")
+        assert other["kp"].iloc[5] != pytest.approx(table["kp"].iloc[5])
+
+    def test_another_search_is_not_continued(self, tmp_path, capsys):
+        run_tune(tmp_path)
+        with pytest.raises(SystemExit):
+            tune.main(["pi", "--trials", "6", "--draws", "3", "--out", str(tmp_path)])
+        assert "other draws" in capsys.readouterr().err
+        assert len(pd.read_csv(tmp_path / "pi.csv")) == 6
+
+    def test_defaults_are_in_the_space(self):
+        _, space = tune.SPACES["nn"]
+        controller = DirectNNController()
+        for name, (low, high) in space.items():
+            assert low < getattr(controller, name) < high
