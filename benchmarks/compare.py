@@ -91,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
         help="a controller of your own, beside those of --agents (may be given more than once)",
     )
     add("--scenarios", default=list(SCENARIOS), help="cases", **names)
-    add("--seeds", type=number, default=20, help="number of runs of each case")
+    add("--seeds", type=number, default=100, help="number of runs of each case")
     add(
         "--ppo-steps",
         type=number,

@@ -226,8 +226,8 @@ class TestCommand:
         table = pd.read_csv(tmp_path / "claims.csv")
         assert list(table["claim"].unique()) == list(QUICK)
         wrong = table[table["claim"] == "direction"]
-        assert list(wrong["value"][:2]) == [100.0, 100.0]  # all of them diverge ...
-        assert list(wrong["shown"][:2]) == ["undecided"] * 2  # ... but eight prove little
+        assert wrong["value"].iloc[1] == 100.0  # all of them diverge in the end ...
+        assert wrong["shown"].iloc[1] == "undecided"  # ... but eight prove little
         assert len(pd.read_csv(tmp_path / "convergence.csv")) == 8
         assert (tmp_path / "convergence.png").exists()
         page = (tmp_path / "claims.md").read_text()
