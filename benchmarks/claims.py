@@ -17,7 +17,7 @@ from tqdm import tqdm
 from benchmarks import evidence as examine
 from benchmarks import ledger, plots
 from benchmarks.evidence import PAPER_PI, SEARCHED_PI, Claim
-from benchmarks.experiments import Draws
+from benchmarks.experiments import Draws, hidden_nodes, longer_windows
 from benchmarks.options import number
 from benchmarks.storage import replacing, write_text
 from benchmarks.tables import on_screen
@@ -92,7 +92,7 @@ CLAIMS: dict[str, Claim] = {
             "Six hidden nodes are no better than three",
             "With the same gains, and with gains in proportion: half as large for the weights "
             "and thresholds of hidden nodes. Better: the mean error is smaller by 5 % or more.",
-            examine.against_the_paper([examine.hidden_nodes(6)]),
+            examine.against_the_paper([hidden_nodes(6)]),
         ),
         Claim(
             "more-inputs",
@@ -101,7 +101,7 @@ CLAIMS: dict[str, Claim] = {
             "Six and twenty set points and errors, not three; with the same gains, and with "
             "gains in proportion: for the weights of the inputs smaller by as much as there "
             "are more inputs. Better: as above.",
-            examine.against_the_paper([examine.longer_windows(n) for n in (6, 20)]),
+            examine.against_the_paper([longer_windows(n) for n in (6, 20)]),
         ),
         Claim(
             "reliability",

@@ -12,16 +12,18 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from agents import DirectNNController
 from agents.pi import SEARCHED_GAINS
 from benchmarks.experiments import (
     Draws,
+    Network,
     converged_at,
     fail_node,
     flat,
+    hidden_nodes,
     mean_error,
     settled,
     split,
+    with_gains,
 )
 from benchmarks.ledger import Entry, Finding
 from benchmarks.scenarios import other_plant
@@ -40,6 +42,7 @@ PAPER_PI = (2.2, 0.3)  # Kp, Ki
 KI = PAPER_PI[1]
 SEARCHED_PI = (SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"])
 LEARNING = 600  # samples after which a network is taken to have learnt
+GAINS = {False: "the same gains", True: "gains in proportion"}  # of networks of other shapes
 
 
 @dataclass
@@ -290,54 +293,6 @@ def reachable() -> float:
     return abs(sum(plant.b) / sum(plant.a)) * plant.u_max
 
 
-@dataclass(frozen=True)
-class Network:
-    """A network that is not the paper's.
-
-    Attributes
-    ----------
-    name
-        What sets it apart.
-    controller, windows
-        Arguments of the controller, and of the environment that feeds it.
-    slower
-        Gains that are in proportion: each with a factor to the default. The more terms a sum
-        has, the faster it moves when the weights of all of them learn with the same gain.
-    """
-
-    name: str
-    controller: dict[str, Any]
-    windows: dict[str, Any] = field(default_factory=dict)
-    slower: dict[str, float] = field(default_factory=dict)
-
-
-def hidden_nodes(count: int) -> Network:
-    """Return the paper's network with another number of hidden nodes."""
-    slower = dict.fromkeys(("eta", "eta_1", "eta_theta"), 3 / count)
-    return Network(f"{count} hidden nodes", {"n_hidden": count}, slower=slower)
-
-
-def longer_windows(length: int) -> Network:
-    """Return a network that sees `length` set points and errors."""
-    return Network(
-        f"{length} set points and errors",
-        {"n_inputs": 2 * length, "error_index": length},
-        {"setpoint_window": length, "error_window": length},
-        {"eta": 3 / length},
-    )
-
-
-def with_gains(draws: Draws, network: Network, *, slower: bool) -> DirectNNController:
-    """Return a batch of these networks, with the default gains or with slower ones."""
-    factors = network.slower if slower else {}
-    gains = {name: factor * getattr(_DEFAULT, name) for name, factor in factors.items()}
-    return draws.network(**network.controller, **gains)
-
-
-_DEFAULT = DirectNNController()
-_GAINS = {False: "the same gains", True: "gains in proportion"}
-
-
 def against_the_paper(networks: Sequence[Network]) -> Callable[[Draws], Results]:
     """Return an examination of other networks beside that of the paper."""
 
@@ -349,7 +304,7 @@ def against_the_paper(networks: Sequence[Network]) -> Callable[[Draws], Results]
                 controller = with_gains(draws, network, slower=slower)
                 runs = draws.run(controller, samples, **arguments, **network.windows)
                 results.ask(
-                    f"mean error with {network.name}, {_GAINS[slower]}, as a multiple of that "
+                    f"mean error with {network.name}, {GAINS[slower]}, as a multiple of that "
                     f"of the paper's network, {case}",
                     ratio(mean_error(runs), paper), at_least=1 - NOTABLE,
                 )  # fmt: skip
@@ -373,7 +328,7 @@ def node_failure(draws: Draws) -> Results:
             runs = draws.run(controller, 2 * LEARNING, damage, **CONSTANT)
             before, after = split(runs, LEARNING)
             error[nodes] = mean_error(after)
-            case = f"{nodes} nodes, one stuck at {stuck_at}, {_GAINS[slower]}"
+            case = f"{nodes} nodes, one stuck at {stuck_at}, {GAINS[slower]}"
             if stuck_at == 0:
                 ready = percent(share(settled(before)))
                 results.ask(f"settled before the failure, {case}", ready, "% of draws")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,51 @@ class Draws:
         noisy = arguments.get("noise_variance", 0.0) > 0.0
         draws = self if noisy else Draws(1, self.seed)
         return draws.run(PIController(kp, ki), samples, **arguments)
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network that is not the paper's.
+
+    Attributes
+    ----------
+    name
+        What sets it apart.
+    controller, windows
+        Arguments of the controller, and of the environment that feeds it.
+    slower
+        Gains that are in proportion: each with a factor to the default. The more terms a sum
+        has, the faster it moves when the weights of all of them learn with the same gain.
+    """
+
+    name: str
+    controller: dict[str, Any]
+    windows: dict[str, Any] = field(default_factory=dict)
+    slower: dict[str, float] = field(default_factory=dict)
+
+
+def hidden_nodes(count: int) -> Network:
+    """Return the paper's network with another number of hidden nodes."""
+    slower = dict.fromkeys(("eta", "eta_1", "eta_theta"), 3 / count)
+    return Network(f"{count} hidden nodes", {"n_hidden": count}, slower=slower)
+
+
+def longer_windows(length: int) -> Network:
+    """Return a network that sees `length` set points and errors."""
+    return Network(
+        f"{length} set points and errors",
+        {"n_inputs": 2 * length, "error_index": length},
+        {"setpoint_window": length, "error_window": length},
+        {"eta": 3 / length},
+    )
+
+
+def with_gains(draws: Draws, network: Network, *, slower: bool) -> DirectNNController:
+    """Return a batch of these networks, with the default gains or with slower ones."""
+    default = DirectNNController()
+    factors = network.slower if slower else {}
+    gains = {name: factor * getattr(default, name) for name, factor in factors.items()}
+    return draws.network(**network.controller, **gains)
 
 
 def mean_error(trajectory: Trajectory) -> Array:

@@ -123,7 +123,9 @@ def table(entries: Sequence[Entry]) -> pd.DataFrame:
             "verdict": entry.verdict.value,
         }
         rows += [about | _row(finding) for finding in entry.findings] or [about]
-    return pd.DataFrame(rows)
+    frame = pd.DataFrame(rows)
+    # Whole numbers, though a claim without findings has none.
+    return frame.astype({"runs": "Int64"}) if "runs" in frame else frame
 
 
 def _row(finding: Finding) -> dict[str, object]:
