@@ -3,5 +3,6 @@
 from agents.controller import Controller
 from agents.direct_nn import DirectNNController, Weights
 from agents.pi import PIController
+from agents.smith import SmithPredictor
 
-__all__ = ["Controller", "DirectNNController", "PIController", "Weights"]
+__all__ = ["Controller", "DirectNNController", "PIController", "SmithPredictor", "Weights"]

@@ -1,6 +1,8 @@
-"""The PI controller that the paper compares with (Section 5)."""
+"""PI controllers: the one that the paper compares with (Section 5), and better ones."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ SEARCHED_GAINS = {"kp": 1.34, "ki": 0.0456}
 
 
 class PIController(Controller):
-    """u(k) = -Kp e(k) - Ki sum_{i<=k} e(i), as printed in Section 5: without anti-windup.
+    """u(k) = -Kp e(k) - Ki sum_{i<=k} e(i), as printed in Section 5.
 
     The signs are those of a plant whose output falls when its input rises, D(G) = -1.
 
@@ -22,6 +24,10 @@ class PIController(Controller):
         Kp, t/h per degC.
     ki
         Ki, t/h per degC and sample.
+    anti_windup
+        Whether the sum stands still while the command lies beyond a limit and the error would
+        drive it further (conditional integration; Astrom and Hagglund, "PID Controllers",
+        2nd edition, 1995, section 3.5). The paper's goes on.
     error_index
         Where the observation holds e(k), degC.
     u_min, u_max
@@ -38,6 +44,7 @@ class PIController(Controller):
         kp: float = 2.2,
         ki: float = 0.3,
         *,
+        anti_windup: bool = False,
         error_index: int = 3,
         u_min: float = -10.0,
         u_max: float = 10.0,
@@ -46,7 +53,53 @@ class PIController(Controller):
         super().__init__(n_obs=self.error_index + 1, u_min=u_min, u_max=u_max)
         self.kp = check_number("kp", kp)
         self.ki = check_number("ki", ki)
+        self.anti_windup = anti_windup
         self._sum: Values | None = None  # of all errors so far
+
+    @classmethod
+    def simc(
+        cls,
+        *,
+        gain: float,
+        time_constant: float,
+        delay: float,
+        closed_loop_time_constant: float | None = None,
+        sampling_interval: float = 8.0,
+        **arguments: Any,
+    ) -> PIController:
+        """Return a controller tuned by SIMC's rule, with anti-windup.
+
+        S. Skogestad, "Simple analytic rules for model reduction and PID controller tuning",
+        Journal of Process Control 13, 2003, 291-309, equations (23) and (24).
+
+        Parameters
+        ----------
+        gain
+            Steady-state gain k of the plant, degC per t/h; below zero.
+        time_constant
+            Its time constant tau_1, s.
+        delay
+            Its delay theta, s.
+        closed_loop_time_constant
+            tau_c, s; by default the delay, "tight control with good robustness".
+        sampling_interval
+            s.
+        arguments
+            Of the controller.
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of range; the message names it.
+        """
+        kp, ki = simc_gains(
+            gain=gain,
+            time_constant=time_constant,
+            delay=delay,
+            closed_loop_time_constant=closed_loop_time_constant,
+            sampling_interval=sampling_interval,
+        )
+        return cls(kp, ki, **{"anti_windup": True, **arguments})
 
     def reset(self) -> None:
         """Set the integral to zero."""
@@ -62,5 +115,42 @@ class PIController(Controller):
                 f"observation must be of {np.shape(self._sum)} loops until reset, "
                 f"got {np.shape(error)}"
             )
-        self._sum = self._sum + error
-        return -self.kp * error - self.ki * self._sum  # Section 5
+        total = self._sum + error
+        command = -self.kp * error - self.ki * total  # Section 5
+        if self.anti_windup:
+            outward = (command > self.u_max) & (error < 0) | (command < self.u_min) & (
+                error > 0
+            )
+            total = np.where(outward, self._sum, total)
+            command = -self.kp * error - self.ki * total
+        self._sum = total
+        return command
+
+
+def simc_gains(
+    *,
+    gain: float,
+    time_constant: float,
+    delay: float,
+    closed_loop_time_constant: float | None = None,
+    sampling_interval: float = 8.0,
+) -> tuple[float, float]:
+    """Return Kp, t/h per degC, and Ki, t/h per degC and sample: see `PIController.simc`."""
+    k = check_number("gain", gain)
+    if k >= 0:
+        raise ValueError(f"gain must be below 0, D(G) = -1, got {gain!r}")
+    tau_1 = _positive("time_constant", time_constant)
+    theta = check_number("delay", delay, 0)
+    tau_c = theta if closed_loop_time_constant is None else closed_loop_time_constant
+    tau_c = _positive("closed_loop_time_constant", tau_c)
+    interval = _positive("sampling_interval", sampling_interval)
+    kp = -tau_1 / (k * (tau_c + theta))  # (23)
+    tau_i = min(tau_1, 4 * (tau_c + theta))  # (24)
+    return kp, kp * interval / tau_i
+
+
+def _positive(name: str, value: float) -> float:
+    number = check_number(name, value, 0)
+    if number == 0:
+        raise ValueError(f"{name} must be above 0, got {value!r}")
+    return number

@@ -1,0 +1,95 @@
+"""A Smith predictor: a PI controller that reckons with what is still on its way."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.controller import Values, check_number
+from agents.pi import PIController, simc_gains
+
+Array = NDArray[np.float64]
+
+
+class SmithPredictor(PIController):
+    """A PI controller on the error that a model of the plant, without its delay, foresees.
+
+    The model is of first order with a delay. It runs beside the plant, and its output with the
+    delay and without it tell what the inputs under way will do. The controller acts on the
+    error less that, as if there were no delay, so far as the model is right (O. J. M. Smith,
+    "Closer control of loops with dead time", Chemical Engineering Progress 53, 1957, 217-219).
+    Its gains are SIMC's for the plant without delay; it has anti-windup.
+
+    Parameters
+    ----------
+    gain
+        Steady-state gain of the plant, degC per t/h; below zero.
+    time_constant
+        Its time constant, s.
+    delay
+        Its delay, s; the sample that any input takes to show is part of it.
+    closed_loop_time_constant
+        Of the loop without the delay, s.
+    dead_zone
+        The actuator's, t/h: commands within it are 0 to the model. 0 if it is not known.
+    sampling_interval
+        s.
+    error_index
+        Where the observation holds e(k), degC.
+    u_min, u_max
+        The actuator's limits, t/h: to the model the command stays within them.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range; the message names it.
+    """
+
+    def __init__(
+        self,
+        *,
+        gain: float,
+        time_constant: float,
+        delay: float,
+        closed_loop_time_constant: float,
+        dead_zone: float = 0.0,
+        sampling_interval: float = 8.0,
+        error_index: int = 3,
+        u_min: float = -10.0,
+        u_max: float = 10.0,
+    ) -> None:
+        kp, ki = simc_gains(
+            gain=gain,
+            time_constant=time_constant,
+            delay=0.0,
+            closed_loop_time_constant=closed_loop_time_constant,
+            sampling_interval=sampling_interval,
+        )
+        super().__init__(
+            kp, ki, anti_windup=True, error_index=error_index, u_min=u_min, u_max=u_max
+        )
+        self.dead_zone = check_number("dead_zone", dead_zone, 0)
+        self._pole = math.exp(-sampling_interval / time_constant)
+        self._input_gain = gain * (1.0 - self._pole)
+        self._delay = max(round(check_number("delay", delay, 0) / sampling_interval), 1)
+        self._model: list[Values] = []  # its last outputs without delay, newest last
+
+    def reset(self) -> None:
+        """Set the integral to zero, and the model to rest."""
+        super().reset()
+        self._model = []
+
+    def _control(self, observation: Array) -> Values:
+        if not self._model:
+            rest = np.zeros_like(observation[..., self.error_index])
+            self._model = [rest] * self._delay
+        now, delayed = self._model[-1], self._model[0]
+        foreseen = np.array(observation)
+        foreseen[..., self.error_index] -= now - delayed
+        command = super()._control(foreseen)
+        applied = np.clip(command, self.u_min, self.u_max)
+        applied = np.where(np.abs(applied) < self.dead_zone, 0.0, applied)
+        self._model = [*self._model[1:], self._pole * now + self._input_gain * applied]
+        return command
