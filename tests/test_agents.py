@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import DirectNNController, PIController, Weights
+from agents import DirectNNController, PIController, SmithPredictor, Weights
 from benchmarks.rollout import make_plants, rollout
 
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
@@ -301,3 +301,115 @@ class TestDirectNN:
             DirectNNController(num_envs=3).act(np.zeros(6))
         with pytest.raises(ValueError, match=r"\(n_obs,\)"):
             DirectNNController().act(np.zeros((2, 6)))
+
+
+PLANT = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of first order, nearly
+
+
+class TestAntiWindup:
+    def test_by_hand(self):
+        # Kp 1, Ki 0.5, limits +-4. e = 3: -3 - 1.5 = -4.5 is beyond the limit: the sum stays 0.
+        # e = 1: -1 - 0.5; e = -3: 3 + 0.5 (2) = 4 is not beyond it; e = -1: 1 + 0.5 (3).
+        controller = PIController(1.0, 0.5, anti_windup=True, error_index=0, u_min=-4, u_max=4)
+        commands = []
+        for e in (3.0, 1.0, -3.0, -1.0):
+            controller.act([e])
+            commands.append(controller.command)
+        assert commands == [-3.0, -1.5, 4.0, 2.5]
+
+    def test_an_error_that_leads_back_counts(self):
+        controller = PIController(0.0, 1.0, anti_windup=True, error_index=0, u_min=-4, u_max=4)
+        controller._sum = np.float64(6.0)  # wound up: u = -6
+        controller.act([-1.0])
+        assert controller.command == -5.0
+
+    def test_it_shortens_the_overshoot(self):
+        gains = {"kp": 1.34, "ki": 0.0456}
+        plants = make_plants(1, 300, setpoint=6.5)
+        with_it, without = (
+            rollout(plants, PIController(**gains, anti_windup=flag), 300, seed=0).output
+            for flag in (True, False)
+        )
+        assert with_it.max() < without.max()
+
+
+class TestSimc:
+    def test_by_hand(self):
+        # Kc = tau / (|k| (tau_c + theta)) = 100 / (2 x 50) = 1; tau_I = min(100, 4 x 50) = 100.
+        controller = PIController.simc(
+            gain=-2.0, time_constant=100.0, delay=20.0, closed_loop_time_constant=30.0,
+            sampling_interval=5.0,
+        )  # fmt: skip
+        assert (controller.kp, controller.ki) == pytest.approx((1.0, 1.0 * 5 / 100))
+        assert controller.anti_windup
+        # By default tau_c = theta: 100 / (2 x 20) = 2.5; tau_I = 4 x 20, less than 100.
+        controller = PIController.simc(gain=-2.0, time_constant=100.0, delay=10.0)
+        assert (controller.kp, controller.ki) == pytest.approx((2.5, 2.5 * 8 / 80))
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("gain", 0.6), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
+            ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0),
+        ],
+    )  # fmt: skip
+    def test_bad_numbers_are_named(self, name, value):
+        with pytest.raises(ValueError, match=name):
+            PIController.simc(**{**PLANT, name: value})
+
+    def test_other_arguments_reach_the_controller(self):
+        controller = PIController.simc(**PLANT, u_min=-4.0, u_max=8.0, error_index=1)
+        assert (controller.u_min, controller.u_max, controller.error_index) == (-4.0, 8.0, 1)
+
+
+class TestSmithPredictor:
+    def smith(self, **changes):
+        return SmithPredictor(**{**PLANT, "closed_loop_time_constant": 80.0, **changes})
+
+    def test_with_the_right_model_there_is_no_delay_to_the_loop(self):
+        # On a plant that is its model, the output is that of the loop without delay, later.
+        pole = np.exp(-8 / 161)
+        plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), "dead_zone": 0.0}
+        late = rollout(make_plants(1, 200, setpoint=2.0, **plant), self.smith(), 200, seed=0)
+        prompt = PIController(self.smith().kp, self.smith().ki, anti_windup=True)
+        soon = rollout(make_plants(1, 200, setpoint=2.0, **plant, delay=0), prompt, 200, seed=0)
+        np.testing.assert_allclose(late.output[18:], soon.output[:-18], atol=1e-4)
+
+    def test_it_beats_simc_on_the_paper_s_plant(self):
+        plants = make_plants(1, 600, setpoint=5.0)
+        smith, simc = (
+            np.abs(5.0 - rollout(plants, controller, 600, seed=0).output).mean()
+            for controller in (self.smith(), PIController.simc(**PLANT))
+        )
+        assert smith < 0.9 * simc
+
+    def test_the_model_knows_the_actuator(self):
+        # A command inside the dead zone does nothing to the model either: nothing is foreseen.
+        controller = self.smith(dead_zone=5.0)
+        observation = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+        plain = PIController(controller.kp, controller.ki, anti_windup=True)
+        for _ in range(5):
+            assert controller.act(observation) == plain.act(observation)
+        assert abs(controller.command) < 5.0
+        knows_less = self.smith()
+        for _ in range(5):
+            knows_less.act(observation)
+        assert abs(knows_less.command) < abs(controller.command)
+
+    def test_reset_forgets_the_model(self):
+        controller = self.smith()
+        first = [controller.act([5.0, 5, 5, 5, 5, 5]) for _ in range(30)]
+        controller.reset()
+        assert [controller.act([5.0, 5, 5, 5, 5, 5]) for _ in range(30)] == first
+
+    def test_batch_equals_singles(self, rng):
+        observations = rng.normal(size=(40, 3, 6)).astype(np.float32)
+        batch, singles = self.smith(), [self.smith() for _ in range(3)]
+        for observation in observations:
+            alone = [c.act(row) for c, row in zip(singles, observation, strict=True)]
+            assert np.array_equal(batch.act(observation), alone)
+
+    @pytest.mark.parametrize(("name", "value"), [("delay", -8.0), ("dead_zone", np.nan)])
+    def test_bad_numbers_are_named(self, name, value):
+        with pytest.raises(ValueError, match=name):
+            self.smith(**{name: value})
