@@ -128,6 +128,42 @@ class PolicyController:
         return actions
 
 
+class Policy:
+    """Builds PPO controllers, all with one policy, which is trained at once unless it is kept.
+
+    Parameters
+    ----------
+    arguments
+        How it is trained.
+    folder
+        Where it is kept.
+    retrain
+        Whether to train even where a finished policy is at hand.
+    progress
+        Whether to show a progress bar.
+
+    Attributes
+    ----------
+    observation : dict
+        Arguments of the environment that give the policy its observation.
+    """
+
+    def __init__(
+        self,
+        arguments: PPOArguments,
+        folder: Path,
+        *,
+        retrain: bool = False,
+        progress: bool = False,
+    ) -> None:
+        self.observation = arguments.observation
+        self._model = trained_policy(arguments, folder, retrain=retrain, progress=progress)
+
+    def __call__(self) -> PolicyController:
+        """Return a controller."""
+        return PolicyController(self._model)
+
+
 class Trained:
     """Builds PPO controllers, all with one policy, which is trained when first asked for.
 

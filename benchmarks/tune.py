@@ -1,7 +1,8 @@
-"""Search a controller's gains with Optuna: `python -m benchmarks.tune nn`, or `pi`.
+"""Search a controller's gains with Optuna: `python -m benchmarks.tune nn`, `pi` or `ppo`.
 
-Every controller has the same budget, on set points and seeds that no comparison uses. The
-search is saved after every trial; the same command continues it, to the same end.
+All are judged on the same set points and seeds, which no comparison uses. NN and PI have the
+same number of trials; PPO has fewer, as each is a training. The search is saved after every
+trial; the same command continues it, to the same end.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ import argparse
 import csv
 import json
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,17 +29,16 @@ from agents import DirectNNController, PIController
 from benchmarks.experiments import mean_error, settled, split
 from benchmarks.options import number
 from benchmarks.rollout import make_plants, rollout
-from benchmarks.roster import Factory, build
+from benchmarks.roster import LABELS, Factory, build, observation
 from benchmarks.scenarios import Scenario
 from benchmarks.storage import replacing, write_json, write_text
 from benchmarks.tables import on_screen
+from mptc_gym import Parameters
 
-TRIALS = 800
 DRAWS = 100  # runs of each scenario in a trial, each with noise and initial weights of its own
 SEED = 1  # of the search
 FIRST_RUN = 3_000_000  # runs have seeds from here on, which no comparison uses
-FINALISTS, FINAL_DRAWS, FINAL_RUN = 10, 1000, 4_000_000
-STARTUP = 200  # trials at random, before the sampler learns from them
+FINAL_DRAWS, FINAL_RUN = 1000, 4_000_000  # for the best, judged again
 DIGITS = 3  # significant, of the gains that are proposed
 
 # Neighbours of the paper's cases, each with its first sample that counts: three that begin with
@@ -75,10 +77,63 @@ SCENARIOS: tuple[tuple[Scenario, int], ...] = (
 # A run at the constant set point that has not settled at its end has failed to converge. That
 # costs what doing nothing about a set point of 5 degC costs.
 PENALTY = 5.0
+PPO_STEPS = (
+    400_000  # samples of experience of a trial; the best are trained for as long as usual
+)
+PPO_SEEDS, FINAL_SEEDS = (1000,), (1001, 1002)  # of policies, others than a comparison uses
 
-SPACES: dict[str, tuple[Factory, dict[str, tuple[float, float]]]] = {
-    "nn": (
-        DirectNNController,
+
+@dataclass(frozen=True)
+class Subject:
+    """What can be tuned.
+
+    Attributes
+    ----------
+    make
+        Called with gains by name and `final`, whether they are judged for the last time;
+        returns factories, whose objectives are averaged.
+    space
+        Name of a gain: lowest and highest value. Gains are searched on a logarithmic scale.
+    trials, startup
+        Number of trials, and how many of them are at random before the sampler learns.
+    finalists
+        How many of the best are judged again.
+    penalty
+        For failing to converge, degC.
+    """
+
+    make: Callable[..., list[Factory]]
+    space: dict[str, tuple[float, float]]
+    trials: int = 800
+    startup: int = 200
+    finalists: int = 10
+    penalty: float = PENALTY
+
+
+def _make_nn(*, final: bool, **gains: float) -> list[Factory]:
+    return [partial(DirectNNController, **gains)]
+
+
+def _make_pi(*, final: bool, **gains: float) -> list[Factory]:
+    return [partial(PIController, **gains)]
+
+
+def _make_ppo(*, final: bool, **gains: float) -> list[Factory]:
+    from benchmarks import ppo  # here: torch takes seconds to load
+
+    made = []
+    for seed in FINAL_SEEDS if final else PPO_SEEDS:
+        arguments = ppo.PPOArguments(seed=seed, **gains)
+        if not final:
+            arguments = replace(arguments, steps=min(PPO_STEPS, arguments.steps))
+        with tempfile.TemporaryDirectory() as folder:
+            made.append(ppo.Policy(arguments, Path(folder)))
+    return made
+
+
+SUBJECTS = {
+    "nn": Subject(
+        _make_nn,
         {
             "eta": (1e-3, 10.0),
             "eta_1": (1e-3, 1.0),
@@ -88,7 +143,22 @@ SPACES: dict[str, tuple[Factory, dict[str, tuple[float, float]]]] = {
             "weight_scale": (0.05, 2.0),
         },
     ),
-    "pi": (PIController, {"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}),
+    "pi": Subject(_make_pi, {"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}),
+    # Without integral action a policy does not settle to the last; only its errors count.
+    "ppo": Subject(
+        _make_ppo,
+        {
+            "learning_rate": (5e-4, 4e-3),
+            "gamma": (0.94, 0.99),
+            "noise_variance": (0.01, 1.0),
+            "clip_range": (0.1, 0.4),
+            "setpoint_amplitude": (5.0, 8.0),
+        },
+        trials=40,
+        startup=15,
+        finalists=3,
+        penalty=0.0,
+    ),
 }
 
 
@@ -108,14 +178,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.tune",
         description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
-    add("controller", choices=SPACES, help="whose gains to search")
-    add("--trials", type=number, default=TRIALS, help="number of gains to try")
-    add("--draws", type=number, default=DRAWS, help="runs of each scenario in a trial")
-    add("--out", type=Path, default=Path("results/tune"), help="folder to write to")
+    add("controller", choices=SUBJECTS, help="whose gains to search")
+    trials = ", ".join(f"{subject.trials} for {name}" for name, subject in SUBJECTS.items())
+    add("--trials", type=number, help=f"number of gains to try (default: {trials})")
+    add("--draws", type=number, default=DRAWS, help="runs of each scenario (default: 100)")
+    add("--out", type=Path, default=Path("results/tune"), help="folder (default: results/tune)")
     options = parser.parse_args(arguments)
+    trials = options.trials or SUBJECTS[options.controller].trials
 
     try:
         search = Search(options.controller, options.draws, options.out)
@@ -123,13 +194,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--out, --draws: {error}")
     console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
     try:
-        search.run(options.trials)
-        report = search.report(options.trials)
+        search.run(trials)
+        report = search.report(trials)
     except KeyboardInterrupt:
         console.print("\nInterrupted: the same command goes on from here.")
         return 130
     console.print(f"The best, on {FINAL_DRAWS} new runs")
-    shown = report[[*SPACES[options.controller][1], "objective"]].head(5)
+    shown = report[[*SUBJECTS[options.controller].space, "objective"]].head(5)
     console.print(on_screen(shown.map("{:.4g}".format)))
     console.print(
         f"All trials are in {search.path}, the best in {search.path.with_suffix('.md')}"
@@ -137,7 +208,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def score(factory: Factory, draws: int, first_run: int) -> dict[str, float]:
+def score(
+    factory: Factory, draws: int, first_run: int, penalty: float = PENALTY
+) -> dict[str, float]:
     """Judge a controller on the tuning scenarios.
 
     Parameters
@@ -148,25 +221,28 @@ def score(factory: Factory, draws: int, first_run: int) -> dict[str, float]:
         Runs of each scenario.
     first_run
         Seed of the first; every scenario has seeds of its own.
+    penalty
+        For failing to converge, degC.
 
     Returns
     -------
     dict
         For each scenario the median over runs of the mean |e|, degC; `not converged`, the
         share of runs at the constant set point that failed to; and `objective`: the mean of
-        the medians, plus `PENALTY` degC times that share.
+        the medians, plus the penalty times that share.
     """
     medians: dict[str, float] = {}
     for i, (scenario, first_sample) in enumerate(SCENARIOS):
         seed = first_run + i * 100_000
-        controller = build(factory, scenario.parameters, draws, seed)
-        plants = make_plants(draws, scenario.samples, **scenario.arguments)
+        environment = {**scenario.arguments, **observation(factory)}
+        controller = build(factory, Parameters(**environment), draws, seed)
+        plants = make_plants(draws, scenario.samples, **environment)
         trajectory = rollout(plants, controller, scenario.samples, seed)
         _, counted = split(trajectory, first_sample)
         medians[scenario.name] = float(np.median(mean_error(counted)))
         if scenario.name == "constant":
             failed = 1.0 - float(settled(trajectory).mean())
-    objective = float(np.mean(list(medians.values()))) + PENALTY * failed
+    objective = float(np.mean(list(medians.values()))) + penalty * failed
     return {**medians, "not converged": failed, "objective": objective}
 
 
@@ -176,7 +252,7 @@ class Search:
     Parameters
     ----------
     controller
-        A name in `SPACES`.
+        A name in `SUBJECTS`.
     draws
         Runs of each scenario in a trial.
     folder
@@ -192,7 +268,8 @@ class Search:
         self.path = folder / f"{controller}.csv"
         self._draws = draws
         self._controller = controller
-        self._factory, space = SPACES[controller]
+        self._subject = SUBJECTS[controller]
+        space = self._subject.space
         self._space = {name: FloatDistribution(*ends, log=True) for name, ends in space.items()}
         self._study = optuna.create_study()
         self._rows: list[dict[str, float]] = []
@@ -207,8 +284,9 @@ class Search:
                     "scenarios": {
                         s.name: [s.samples, first, s.arguments] for s, first in SCENARIOS
                     },
-                    "penalty": PENALTY,
-                    "sampler": f"TPE of Optuna {optuna.__version__}, {STARTUP} at random",
+                    "penalty": self._subject.penalty,
+                    "startup": self._subject.startup,
+                    "Optuna": optuna.__version__,
                 }
             )
         )
@@ -252,12 +330,21 @@ class Search:
         # search that was interrupted goes on as it would have gone.
         seed = SEED * 1_000_000 + len(self._rows)
         sampler = optuna.samplers.TPESampler(
-            seed=seed, n_startup_trials=STARTUP, multivariate=True
+            seed=seed, n_startup_trials=self._subject.startup, multivariate=True
         )
         asking = optuna.create_study(sampler=sampler)
         asking.add_trials(self._study.trials)
         gains = asking.ask(self._space).params
-        return {**gains, **score(partial(self._factory, **gains), self._draws, FIRST_RUN)}
+        return {**gains, **self._judge(gains, self._draws, FIRST_RUN, final=False)}
+
+    def _judge(
+        self, gains: dict[str, float], draws: int, first_run: int, *, final: bool
+    ) -> dict[str, float]:
+        scores = [
+            score(factory, draws, first_run, self._subject.penalty)
+            for factory in self._subject.make(**gains, final=final)
+        ]
+        return {name: float(np.mean([s[name] for s in scores])) for name in scores[0]}
 
     def report(self, trials: int) -> pd.DataFrame:
         """Judge the best gains again, rounded and on new runs, and write them, best first.
@@ -269,11 +356,11 @@ class Search:
         trials
             How many of the trials count.
         """
-        best = self.trials.head(trials).nsmallest(FINALISTS, "objective")
+        best = self.trials.head(trials).nsmallest(self._subject.finalists, "objective")
         rows: list[dict[str, Any]] = []
         for _, trial in tqdm(list(best.iterrows()), desc="new runs for the best"):
             gains = {name: float(f"{trial[name]:.{DIGITS}g}") for name in self._space}
-            again = score(partial(self._factory, **gains), FINAL_DRAWS, FINAL_RUN)
+            again = self._judge(gains, FINAL_DRAWS, FINAL_RUN, final=True)
             rows.append({**gains, **again, "in the search": trial["objective"]})
         table = pd.DataFrame(rows).sort_values("objective", ignore_index=True)
         write_text(self.path.with_suffix(".md"), self._page(table, trials))
@@ -288,11 +375,11 @@ class Search:
         )
         return "\n\n".join(
             [
-                f"# Gains of {self._factory.__name__}",
+                f"# Gains: {LABELS[self._controller]}",
                 f"By `python -m benchmarks.tune {self._controller} --trials {trials} "
                 f"--draws {self._draws}`. In each scenario: the median over runs of the mean "
-                f"absolute error, °C. The objective is their mean, plus {PENALTY:g} °C times "
-                "the share of runs at the constant set point that do not settle.",
+                f"absolute error, °C. The objective is their mean, plus "
+                f"{self._subject.penalty:g} °C times the share of runs at the constant set point that do not settle.",
                 f"## The best {len(table)} of {trials}, on {FINAL_DRAWS} new runs",
                 table.to_markdown(index=False, floatfmt=".4g"),
                 "## The search: every trial that was better than all before",

@@ -1,5 +1,6 @@
 """The search for gains, on small budgets."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -8,18 +9,22 @@ import pandas as pd
 import pytest
 
 from agents import DirectNNController, PIController
-from benchmarks import compare, scenarios, tune
+from agents.pi import SEARCHED_GAINS
+from benchmarks import compare, ppo, scenarios, tune
 from benchmarks.experiments import Draws
+from tests.budget import SMALL
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
+PPO_BEGUN = ppo.begin(SMALL)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Few runs for the finalists, and a sampler that learns soon."""
-    monkeypatch.setattr(tune, "FINALISTS", 2)
+    for name, subject in tune.SUBJECTS.items():
+        small = replace(subject, finalists=2, startup=4)
+        monkeypatch.setitem(tune.SUBJECTS, name, small)
     monkeypatch.setattr(tune, "FINAL_DRAWS", 3)
-    monkeypatch.setattr(tune, "STARTUP", 4)
 
 
 def run_tune(out, controller="pi", trials=6):
@@ -62,10 +67,10 @@ class TestScore:
 
 
 class TestSearch:
-    @pytest.mark.parametrize("controller", tune.SPACES)
+    @pytest.mark.parametrize("controller", ["nn", "pi"])
     def test_files(self, controller, tmp_path, capsys):
         assert run_tune(tmp_path, controller) == 0
-        _, space = tune.SPACES[controller]
+        space = tune.SUBJECTS[controller].space
         table = pd.read_csv(tmp_path / f"{controller}.csv")
         assert len(table) == 6
         for name, (low, high) in space.items():
@@ -128,7 +133,29 @@ class TestSearch:
         assert len(pd.read_csv(tmp_path / "pi.csv")) == 6
 
     def test_defaults_are_in_the_space(self):
-        _, space = tune.SPACES["nn"]
-        controller = DirectNNController()
-        for name, (low, high) in space.items():
-            assert low < getattr(controller, name) < high
+        defaults = {"nn": DirectNNController(), "ppo": ppo.PPOArguments()}
+        defaults["pi"] = PIController(**SEARCHED_GAINS)
+        for controller, subject in tune.SUBJECTS.items():
+            for name, (low, high) in subject.space.items():
+                assert low < getattr(defaults[controller], name) < high
+
+    def test_ppo_is_trained_once_a_trial(self, tmp_path, monkeypatch):
+        trained = []
+
+        def train(arguments, folder, **options):
+            trained.append(arguments)
+            return PPO_BEGUN
+
+        monkeypatch.setattr(ppo, "trained_policy", train)
+        monkeypatch.setattr(
+            tune, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
+        )
+        assert run_tune(tmp_path, "ppo", trials=2) == 0
+        seeds = [arguments.seed for arguments in trained]
+        assert seeds == [*tune.PPO_SEEDS * 2, *tune.FINAL_SEEDS * 2]
+        steps = {arguments.seed: arguments.steps for arguments in trained}
+        assert steps == dict.fromkeys(tune.PPO_SEEDS, tune.PPO_STEPS) | dict.fromkeys(
+            tune.FINAL_SEEDS, ppo.PPOArguments().steps
+        )
+        table = pd.read_csv(tmp_path / "ppo.csv")
+        assert list(table["gamma"]) == [arguments.gamma for arguments in trained[:2]]
