@@ -12,19 +12,26 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from joblib import cpu_count
 from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks import plots, tables
-from benchmarks.metrics import METRICS, measure
+from benchmarks.estimates import beaten, estimate
+from benchmarks.experiments import join, mean_error
+from benchmarks.metrics import measure
+from benchmarks.opponents import ACCOUNTS
 from benchmarks.options import number
-from benchmarks.rollout import make_plants, rollout
-from benchmarks.roster import BUILT_IN, Factory, build, load_factory, observation
-from benchmarks.scenarios import SCENARIOS
-from benchmarks.storage import commit, replacing, versions, write_json, write_text
+from benchmarks.report import Section, write_report
+from benchmarks.rollout import Trajectory, make_plants, rollout
+from benchmarks.roster import BUILT_IN, Factory, build, label, load_factory, observation
+from benchmarks.scenarios import SCENARIOS, Scenario
+from benchmarks.storage import commit, replacing, versions, write_json
 from mptc_gym import Parameters
 
 SEED = 0  # run i meets the noise, and starts from the weights, of seed SEED + i
+TWICE = "square"  # every controller runs this scenario a second time, with what it has learnt
+DRAWN = ("nn", "pi", "smith", "ppo")  # responses of these and of the user's own are drawn
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(str(error))
 
     # Wide enough for the tables where nothing says how wide the page is.
-    console = Console(width=None if sys.stdout.isatty() else 140, markup=False)
+    console = Console(width=None if sys.stdout.isatty() else 170, markup=False)
     comparison = Comparison(options)
     try:
         for agent, factory in factories.items():
@@ -62,15 +69,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception:
         comparison.finish(complete=False)
         raise
-    summary = comparison.finish(complete=True)
+    comparison.finish(complete=True)
 
-    title = f"{METRICS['mae']}: median (10th to 90th percentile) of {options.seeds} runs"
-    console.print(title)
-    console.print(tables.on_screen(tables.mae_table(summary)))
-    others = tables.metrics_table(summary, tables.format_median)
-    console.print(f"Other measures: median of {options.seeds} runs")
-    console.print(tables.on_screen(others))
-    console.print(f"Tables, data and plots are in {options.out}/", highlight=False)
+    for section in comparison.sections()[:2]:
+        console.print(section.title, *section.text, sep="\n", highlight=False)
+        console.print(tables.on_screen(section.table))
+    console.print(f"The report, tables, data and plots are in {options.out}/", highlight=False)
     return 0
 
 
@@ -98,6 +102,13 @@ def _parser() -> argparse.ArgumentParser:
         default=argparse.SUPPRESS,
         help="samples of experience of each PPO policy (default: 1000000)",
     )
+    add(
+        "--ppo-policies",
+        type=number,
+        default=argparse.SUPPRESS,
+        help="how many PPO policies to train and compare (default: 5)",
+    )
+    add("--jobs", type=number, default=cpu_count(), help="how many of them to train at once")
     add("--retrain", action="store_true", help="train PPO anew")
     add("--out", type=Path, default=Path("results/compare"), help="folder to write to")
     add(
@@ -125,11 +136,16 @@ def _factories(options: argparse.Namespace) -> dict[str, Factory]:
             raise ValueError(f"--agent must be NEW_NAME=MODULE:FACTORY, got {text!r}")
         factories[name] = load_factory(location)
     if "ppo" in options.agents:  # last, as it takes longest and may be interrupted
-        from benchmarks.ppo import PPOArguments, Trained  # here: torch takes seconds to load
+        from benchmarks import ppo  # here: torch takes seconds to load
 
         changes = {"steps": options.ppo_steps} if "ppo_steps" in options else {}
-        factories["ppo"] = Trained(
-            PPOArguments(**changes), options.policies, retrain=options.retrain, progress=True
+        factories["ppo"] = ppo.Trained(
+            ppo.PPOArguments(**changes),
+            options.policies,
+            policies=getattr(options, "ppo_policies", ppo.POLICIES),
+            jobs=options.jobs,
+            retrain=options.retrain,
+            progress=True,
         )
     if not factories:
         raise ValueError("--agents, --agent: no controller to run")
@@ -138,6 +154,19 @@ def _factories(options: argparse.Namespace) -> dict[str, Factory]:
     for factory in factories.values():
         observation(factory)  # complain now, not after the first controllers have run
     return factories
+
+
+ACCOUNTS_TEXT = [
+    "While learning and after: on the square wave. The NN learns in the run that is compared; "
+    "after is a second run with the weights that it has then, still learning. PPO learns "
+    "before, on random set points with noise, while it explores; after is what is compared. "
+    "The others learn nothing, and do the same twice.",
+    "Training: of one policy, the median. Runs: all scenarios, including what is measured.",
+]
+FAILURES_TEXT = (
+    "One point a run. What the NN makes of unlucky initial weights, and PPO of an unlucky "
+    "training, is to be seen here."
+)
 
 
 class Comparison:
@@ -155,6 +184,8 @@ class Comparison:
         self._responses: dict[str, pd.DataFrame] = {}
         self._curves = pd.DataFrame()
         self._policies: dict[str, Any] = {}
+        self._again: dict[str, float] = {}  # mean |e| in a second run of TWICE
+        self._seconds: dict[str, float] = {}
         self._files: list[str] = []
         self._clock = time.perf_counter()
         self._origin = {
@@ -167,49 +198,147 @@ class Comparison:
 
     def run(self, agent: str, factory: Factory) -> None:
         """Run a controller on every scenario."""
-        seeds, scenarios = self._options.seeds, [SCENARIOS[s] for s in self._options.scenarios]
-        # Building may take long, as PPO is trained then, and shows a progress bar of its own.
-        windows = observation(factory)
-        built = [
-            build(factory, Parameters(**scenario.arguments, **windows), seeds, SEED)
-            for scenario in scenarios
-        ]
-        if agent == "ppo":  # the only one that learns beforehand
+        # PPO's are several policies, which may have to be trained first.
+        members = factory.members() if hasattr(factory, "members") else [factory]
+        if agent == "ppo":
             self._policies[agent] = factory.used
             self._curves = factory.curves
-
-        cells = list(zip(scenarios, built, strict=True))
-        for scenario, controller in tqdm(cells, desc=agent, unit="scenario"):
-            plants = make_plants(seeds, scenario.samples, **scenario.arguments, **windows)
-            trajectory = rollout(plants, controller, scenario.samples, SEED)
-            plants.close()
-            measures = pd.DataFrame(measure(trajectory, scenario.parameters))
-            measures.insert(0, "scenario", scenario.name)
-            measures.insert(1, "agent", agent)
-            measures.insert(2, "seed", range(SEED, SEED + seeds))
-            self.runs = pd.concat([self.runs, measures], ignore_index=True)
-            responses = tables.summarise_responses(trajectory, scenario, agent)
-            self._responses[scenario.name] = pd.concat(
-                [self._responses.get(scenario.name), responses], ignore_index=True
+        windows = observation(factory)
+        began = time.perf_counter()
+        for name in tqdm(self._options.scenarios, desc=agent, unit="scenario"):
+            scenario = SCENARIOS[name]
+            trajectories = []
+            for policy, member in enumerate(members):
+                trajectory, again = self._roll_out(scenario, member, windows)
+                trajectories.append(trajectory)
+                measures = pd.DataFrame(measure(trajectory, scenario.parameters))
+                measures.insert(0, "scenario", name)
+                measures.insert(1, "agent", agent)
+                measures.insert(2, "policy", policy)
+                measures.insert(3, "seed", self._origin["seeds"])
+                self.runs = pd.concat([self.runs, measures], ignore_index=True)
+                if again is not None:
+                    error = float(mean_error(again).mean())
+                    self._again[agent] = self._again.get(agent, 0.0) + error / len(members)
+            responses = tables.summarise_responses(join(trajectories), scenario, agent)
+            self._responses[name] = pd.concat(
+                [self._responses.get(name), responses], ignore_index=True
             )
             self._write_runs(complete=False)
+        self._seconds[agent] = time.perf_counter() - began
 
-    def finish(self, *, complete: bool) -> pd.DataFrame:
-        """Write and return the summary, and plot all that has been run, if anything has."""
+    def _roll_out(
+        self, scenario: Scenario, factory: Factory, windows: dict[str, Any]
+    ) -> tuple[Trajectory, Trajectory | None]:
+        """Run one member; and once more with what it has learnt, if that is of interest."""
+        seeds = self._options.seeds
+        parameters = Parameters(**scenario.arguments, **windows)
+        controller = build(factory, parameters, seeds, SEED)
+        plants = make_plants(seeds, scenario.samples, **scenario.arguments, **windows)
+        first = rollout(plants, controller, scenario.samples, SEED)
+        again = None
+        if scenario.name == TWICE:
+            again = rollout(plants, controller, scenario.samples, SEED)
+        plants.close()
+        return first, again
+
+    def finish(self, *, complete: bool) -> None:
+        """Write tables, plots and the report of all that has been run, if anything has."""
         if self.runs.empty:
-            return pd.DataFrame()
-        summary = tables.summarise(self.runs)
-        self._write_csv("summary.csv", summary)
-        write_text(self._path("summary.md"), tables.markdown(summary, self._options.seeds))
-        plots.plot_mae(summary, self._path("mae.png"))
+            return
+        self._write_csv("summary.csv", tables.summarise(self.runs))
+        self._write_csv("estimates.csv", self._estimates())
+        plots.plot_limits(self._estimates(), self._path("limits.png"))
+        plots.plot_runs(self.runs, self._path("runs.png"))
         for name, responses in self._responses.items():
             self._write_csv(f"{name}.csv", responses)
-            plots.plot_responses(responses, SCENARIOS[name], self._path(f"{name}.png"))
+            drawn = responses[responses["agent"].isin(self._drawn(responses))]
+            plots.plot_responses(drawn, SCENARIOS[name], self._path(f"{name}.png"))
         if not self._curves.empty:
             self._write_csv("learning.csv", self._curves)
             plots.plot_learning(self._curves, self._path("learning.png"))
+        for page in ("report.md", "report.html"):
+            self._path(page)
+        write_report(self._options.out, "Comparison of controllers", self.sections())
         self._write_runs(complete=complete)
-        return summary
+
+    @staticmethod
+    def _drawn(responses: pd.DataFrame) -> list[str]:
+        agents = responses["agent"].unique()
+        chosen = [agent for agent in agents if agent in DRAWN or agent not in ACCOUNTS]
+        return chosen or list(agents)
+
+    def _estimates(self) -> pd.DataFrame:
+        return estimate(self.runs, self.runs["agent"].iloc[0])
+
+    def sections(self) -> list[Section]:
+        """Return the report, the parts of most interest first."""
+        seeds, runs = self._options.seeds, self.runs
+        summary, estimates = tables.summarise(runs), self._estimates()
+        below = beaten(estimates)
+        verdict = "No controller beats a limit, in any scenario."
+        if len(below):
+            cases = ", ".join(f"{row.agent} in {row.scenario}" for row in below.itertuples())
+            verdict = f"Below a limit, which cannot be: {cases}."
+        over = f"{seeds} runs, the same noise for all"
+        sections = [
+            Section(
+                f"Mean absolute error (°C): median (10th to 90th percentile) of {over}",
+                table=tables.mae_table(summary),
+            ),
+            Section(
+                "Mean absolute error as a multiple of the least possible, 95 % interval",
+                [verdict],
+                tables.ratio_table(estimates),
+                ["limits.png"],
+            ),
+            Section("What each costs", ACCOUNTS_TEXT, self._accounts()),
+            Section("Every run", [FAILURES_TEXT], pictures=["runs.png"]),
+            Section(
+                "Other measures: median (10th to 90th percentile)",
+                table=tables.metrics_table(summary),
+            ),
+            Section(
+                "Scenarios",
+                table=pd.DataFrame(
+                    [(name, SCENARIOS[name].title) for name in summary["scenario"].unique()],
+                    columns=["scenario", "what it is"],
+                ),
+                pictures=[f"{name}.png" for name in self._responses],
+            ),
+        ]
+        if not self._curves.empty:
+            sections.append(Section("PPO's training", pictures=["learning.png"]))
+        if runs["agent"].nunique() > 1:
+            title = f"Difference to {label(runs['agent'].iloc[0])} (°C), 95 % interval"
+            text = ["And the share of runs in which the error is smaller, in the same noise."]
+            sections.insert(2, Section(title, text, tables.paired_table(estimates)))
+        return sections
+
+    def _accounts(self) -> pd.DataFrame:
+        rows = []
+        for agent in self.runs["agent"].unique():
+            known = ACCOUNTS.get(agent)
+            cases = self.runs[(self.runs["agent"] == agent) & (self.runs["scenario"] == TWICE)]
+            learning, after = cases["mae"].mean(), self._again.get(agent, float("nan"))
+            seconds = 0.0
+            if agent == "ppo" and not self._curves.empty:
+                learning = self._curves["training_mae"].mean()
+                after = cases["mae"].mean()
+                seconds = float(self._curves.groupby("policy")["seconds"].max().median())
+            rows.append(
+                {
+                    "agent": label(agent),
+                    "told about the plant": known.told if known else "",
+                    "parameters": known.parameters if known else "",
+                    "samples before": known.samples if known else "",
+                    "training (s)": f"{seconds:.0f}" if seconds else "",
+                    "runs (s)": f"{self._seconds.get(agent, 0.0):.1f}",
+                    "mean error while learning": "" if pd.isna(learning) else f"{learning:.3f}",
+                    "after": "" if pd.isna(after) else f"{after:.3f}",
+                }
+            )
+        return pd.DataFrame(rows)
 
     def _path(self, name: str) -> Path:
         """Return where to write a file; the first time, remove what another run left there."""

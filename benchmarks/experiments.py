@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -125,6 +125,12 @@ def split(trajectory: Trajectory, sample: int) -> tuple[Trajectory, Trajectory]:
     """Return what was before a sample, and what came from there on."""
     arrays = vars(trajectory).values()
     return Trajectory(*(a[:sample] for a in arrays)), Trajectory(*(a[sample:] for a in arrays))
+
+
+def join(trajectories: Sequence[Trajectory]) -> Trajectory:
+    """Return the runs of several batches as one."""
+    arrays = zip(*(vars(trajectory).values() for trajectory in trajectories), strict=True)
+    return Trajectory(*(np.hstack(parts) for parts in arrays))
 
 
 def flat(weights: Weights) -> NDArray[np.float32]:

@@ -21,7 +21,7 @@ from benchmarks.storage import replacing
 from mptc_gym import Parameters
 
 # Okabe and Ito's colours, which colour-blind readers can tell apart.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#F0E442")
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 _STYLE = {
     "axes.grid": True,
     "axes.spines.right": False,
@@ -95,57 +95,81 @@ def _band(axes: Axes, rows: pd.DataFrame, signal: str, colour: str, name: str) -
     )  # fmt: skip
 
 
-def plot_mae(summary: pd.DataFrame, path: Path) -> None:
-    """Draw the mean absolute error as bars: the median, with the 10th to 90th percentile."""
-    rows = summary[summary["metric"] == "mae"]
-    scenarios, agents = list(rows["scenario"].unique()), list(rows["agent"].unique())
-    width = 0.8 / len(agents)
+def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
+    """Draw the mean errors as points with 95 % intervals; each axis begins at the limit."""
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(9, 4.5))
-        axes = figure.subplots()
-        for i, (agent, colour) in enumerate(colours(agents).items()):
-            bars = rows[rows["agent"] == agent]
-            places = [scenarios.index(s) + (i + 0.5) * width - 0.4 for s in bars["scenario"]]
-            whiskers = [bars["median"] - bars["p10"], bars["p90"] - bars["median"]]
-            axes.bar(
-                places, bars["median"], 0.92 * width, yerr=whiskers, color=colour, capsize=3,
-                label=label(agent), error_kw={"linewidth": 1},
-            )  # fmt: skip
-        axes.set_xticks(range(len(scenarios)), [s.replace("-", "\n", 1) for s in scenarios])
-        axes.set_ylabel(METRICS["mae"])
-        axes.set_title("Median over runs, 10th to 90th percentile", loc="left")
-        axes.grid(visible=False, axis="x")
-        axes.legend()
+        figure, panels = _scenario_panels(estimates)
+        shades = colours(list(estimates["agent"].unique()))
+        by_scenario = estimates.groupby("scenario", sort=False)
+        for axes, (_, rows) in zip(panels, by_scenario, strict=True):
+            for place, (_, row) in enumerate(rows.iterrows()):
+                ends = [[row["mean"] - row["mean_low"]], [row["mean_high"] - row["mean"]]]
+                colour = shades[row["agent"]]
+                axes.errorbar(row["mean"], place, xerr=ends, fmt="o", capsize=3, color=colour)
+            axes.set_yticks(range(len(rows)), [label(agent) for agent in rows["agent"]])
+            axes.invert_yaxis()
+            limit, worst = rows["limit"].iloc[0], rows["mean_high"].max()
+            # A little to the left of it, so that a point on the limit is whole.
+            axes.axvline(limit, color="0.4", linewidth=1)
+            axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
+            axes.set_xlabel("mean |e| (°C), from the least possible on")
         _save(figure, path)
 
 
+def plot_runs(runs: pd.DataFrame, path: Path) -> None:
+    """Draw the mean error of every single run, so that no failure is averaged away."""
+    generator = np.random.default_rng(0)  # scatters points that would hide each other
+    with mpl.rc_context(_STYLE):
+        figure, panels = _scenario_panels(runs)
+        shades = colours(list(runs["agent"].unique()))
+        for axes, (_, cases) in zip(panels, runs.groupby("scenario", sort=False), strict=True):
+            agents = list(cases["agent"].unique())
+            for place, agent in enumerate(agents):
+                errors = cases.loc[cases["agent"] == agent, "mae"]
+                around = place + generator.uniform(-0.3, 0.3, len(errors))
+                axes.plot(errors, around, ".", markersize=3, alpha=0.4, color=shades[agent])
+            axes.set_yticks(range(len(agents)), [label(agent) for agent in agents])
+            axes.invert_yaxis()
+            axes.set_xlim(left=0)
+            axes.set_xlabel("mean |e| of a run (°C)")
+        _save(figure, path)
+
+
+def _scenario_panels(rows: pd.DataFrame) -> tuple[Figure, list[Axes]]:
+    names = rows["scenario"].unique()
+    columns = min(3, len(names))
+    height = 1.2 + 0.28 * rows["agent"].nunique()
+    lines = math.ceil(len(names) / columns)
+    figure = Figure(figsize=(4.2 * columns, height * lines))
+    panels = list(figure.subplots(lines, columns, squeeze=False).flat)
+    for axes, name in zip(panels, names, strict=False):
+        axes.set_title(name, loc="left")
+    for axes in panels[len(names) :]:
+        axes.set_visible(False)
+    return figure, panels[: len(names)]
+
+
 def plot_learning(curves: pd.DataFrame, path: Path) -> None:
-    """Draw PPO's learning curves: mean |e| over samples of experience, for each candidate."""
+    """Draw PPO's learning curves: mean |e| over samples of experience, for each policy."""
     shown = {
         "training_mae": "training: random set points, noise, exploring",
         "validation_mae": "validation: random set points, half of them with noise",
         "square_mae": "square wave, no noise",
     }
-    chosen = curves.loc[curves["validation_mae"].idxmin()]
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(9, 4.5))
         axes = figure.subplots()
         for (column, name), colour in zip(shown.items(), _COLOURS, strict=False):
-            for candidate, curve in curves.groupby("candidate"):
-                is_chosen = candidate == chosen["candidate"]
+            for i, (_, curve) in enumerate(curves.groupby("policy")):
                 axes.plot(
-                    curve["steps"] / 1000, curve[column], color=colour,
-                    linewidth=1.5 if is_chosen else 0.7, alpha=1.0 if is_chosen else 0.5,
-                    label=name if is_chosen else None,
+                    curve["steps"] / 1000, curve[column], color=colour, linewidth=0.8,
+                    label=None if i else name,
                 )  # fmt: skip
-        axes.axvline(
-            chosen["steps"] / 1000, color="0.4", linestyle=":", label="policy that is used"
-        )
         axes.set_ylim(bottom=0)
         axes.set_xlim(left=0)
         axes.set_xlabel("samples of experience (thousands)")
         axes.set_ylabel(METRICS["mae"])
-        axes.set_title("PPO's learning curves", loc="left")
+        axes.set_title("PPO's learning curves, one line a policy", loc="left")
         axes.legend()
         _save(figure, path)
 

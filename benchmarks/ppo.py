@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 import pandas as pd
 import torch
+from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -33,7 +34,7 @@ from mptc_gym import Parameters
 
 DELAY = Parameters().delay
 CHECKPOINT_INTERVAL = 32_768  # samples of experience between checkpoints
-CANDIDATES = 3  # policies trained, from seeds in sequence; the best in validation is used
+POLICIES = 5  # are trained and compared, from seeds in sequence
 VALIDATION_RUNS, VALIDATION_SAMPLES = 16, 600
 VALIDATION_SEED = 2_000_000  # met neither in training nor by any comparison
 PROBE = SCENARIOS["square"]  # shown in the learning curve, without a part in the training
@@ -165,17 +166,18 @@ class Policy:
 
 
 class Trained:
-    """Builds PPO controllers, all with one policy, which is trained when first asked for.
-
-    Of `CANDIDATES` policies that differ in their seeds, the one that does best in validation is
-    used: now and then training ends in a policy that is much worse than usual.
+    """Several policies that differ in their seeds, trained side by side when first asked for.
 
     Parameters
     ----------
     arguments
-        How to train the first candidate.
+        How to train the first.
     folder
         Where policies are kept, each in a folder of its own.
+    policies
+        How many; their seeds follow that of the first.
+    jobs
+        How many processes train at once.
     retrain
         Whether to train even where a finished policy is at hand.
     progress
@@ -184,47 +186,55 @@ class Trained:
     Attributes
     ----------
     observation : dict
-        Arguments of the environment that give the policy its observation.
+        Arguments of the environment that give the policies their observation.
     curves : DataFrame
-        The learning curves of the candidates, when trained: a row a point, `candidate` is the
-        seed.
-    used : dict
-        Folder and arguments of the policy that is used, when trained.
+        The learning curves, when trained: a row a point, `policy` is the seed.
+    used : list of dict
+        Folder and arguments of each policy, when trained.
     """
 
     def __init__(
-        self, arguments: PPOArguments, folder: Path, *, retrain: bool, progress: bool
+        self,
+        arguments: PPOArguments,
+        folder: Path,
+        *,
+        policies: int,
+        jobs: int,
+        retrain: bool,
+        progress: bool,
     ) -> None:
         self.observation = arguments.observation
         self.curves = pd.DataFrame()
-        self.used: dict[str, Any] = {}
-        self._arguments = arguments
-        self._folder = folder
+        self.used: list[dict[str, Any]] = []
+        seeds = range(arguments.seed, arguments.seed + policies)
+        self._arguments = [replace(arguments, seed=seed) for seed in seeds]
+        self._folders = [folder / policy_key(each) for each in self._arguments]
+        self._jobs = jobs
         self._retrain = retrain
         self._progress = progress
-        self._model: PPO | None = None
 
-    def __call__(self) -> PolicyController:
-        """Return a controller."""
-        if self._model is None:
-            self._model = self._best_candidate()
-        return PolicyController(self._model)
-
-    def _best_candidate(self) -> PPO:
-        best_mae, best_model = math.inf, None
-        for seed in range(self._arguments.seed, self._arguments.seed + CANDIDATES):
-            arguments = replace(self._arguments, seed=seed)
-            folder = self._folder / policy_key(arguments)
-            model = trained_policy(
+    def members(self) -> list[Policy]:
+        """Return the policies as factories of controllers."""
+        trained = Parallel(self._jobs)(
+            delayed(trained_policy)(
                 arguments, folder, retrain=self._retrain, progress=self._progress
             )
-            curve = pd.read_csv(folder / "learning.csv").assign(candidate=seed)
+            for arguments, folder in zip(self._arguments, self._folders, strict=True)
+            if self._retrain or not is_trained(folder)
+        )
+        del trained  # only what lies in the folders counts
+        members = []
+        for arguments, folder in zip(self._arguments, self._folders, strict=True):
+            members.append(Policy(arguments, folder))
+            curve = pd.read_csv(folder / "learning.csv").assign(policy=arguments.seed)
             self.curves = pd.concat([self.curves, curve], ignore_index=True)
-            mae = curve["validation_mae"].min()
-            if mae < best_mae:
-                best_mae, best_model = mae, model
-                self.used = {"folder": str(folder), "arguments": asdict(arguments)}
-        return best_model
+            self.used.append({"folder": str(folder), "arguments": asdict(arguments)})
+        return members
+
+
+def is_trained(folder: Path) -> bool:
+    """Say whether a folder holds a finished policy."""
+    return (folder / "policy.zip").exists() and (folder / "learning.csv").exists()
 
 
 def policy_key(arguments: PPOArguments) -> str:
@@ -273,7 +283,7 @@ def trained_policy(
         checkpoint.unlink(missing_ok=True)
     torch.set_num_threads(1)  # the network is too small for more
     try:
-        if policy.exists() and curve_file.exists():
+        if is_trained(folder):
             return PPO.load(policy, device="cpu")
         if checkpoint.exists():
             model, curve, best = _resume(checkpoint)

@@ -15,9 +15,21 @@ Factory = Callable[..., Agent]
 BUILT_IN: dict[str, str] = {
     "nn": "agents:DirectNNController",
     "pi": "agents:PIController",
+    "pi-simc": "benchmarks.opponents:simc_pi",
+    "pi-searched": "benchmarks.opponents:searched_pi",
+    "smith": "benchmarks.opponents:smith",
+    "mpc": "benchmarks.opponents:mpc",
 }
 WINDOWS = ("setpoint_window", "error_window", "output_window", "action_window")
-LABELS: dict[str, str] = {"nn": "NN", "pi": "PI", "ppo": "PPO"}
+LABELS: dict[str, str] = {
+    "nn": "NN",
+    "pi": "PI",
+    "pi-simc": "PI, SIMC",
+    "pi-searched": "PI, searched",
+    "smith": "Smith",
+    "mpc": "MPC",
+    "ppo": "PPO",
+}
 
 
 def load_factory(location: str) -> Factory:

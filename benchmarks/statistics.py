@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 CONFIDENCE = 0.95
+RESAMPLES = 2000  # of a bootstrap
 
 
 @dataclass(frozen=True)
@@ -101,3 +104,74 @@ def share(flags: ArrayLike) -> Estimate:
     count, runs = int(happened.sum()), len(happened)
     interval = stats.binomtest(count, runs).proportion_ci(CONFIDENCE, method="wilson")
     return Estimate(count / runs, float(interval.low), float(interval.high), runs)
+
+
+def interquartile_mean(values: ArrayLike, axis: int | None = None) -> Any:
+    """Return the mean of the middle half: neither blind to outliers nor led by them."""
+    return stats.trim_mean(values, 0.25, axis=axis)
+
+
+def bootstrap(
+    values: NDArray[np.float64],
+    seed: int,
+    statistic: Callable[..., Any] = np.mean,
+) -> Estimate:
+    """Estimate a statistic over runs, with a percentile bootstrap interval.
+
+    Parameters
+    ----------
+    values
+        Shape (runs,); or (members, runs) for several trained controllers in the same runs. Then
+        members are drawn first and runs of each member after that, so that the interval tells
+        how other trainings would do, too.
+    seed
+        Of the draws.
+    statistic
+        Called with an array and `axis`, the last.
+
+    Returns
+    -------
+    Estimate
+        Of all values together; `runs` counts them.
+
+    Raises
+    ------
+    ValueError
+        If there is no value, or one that is not finite.
+    """
+    table = np.atleast_2d(np.asarray(values, dtype=np.float64))
+    if table.ndim != 2 or not table.size or not np.isfinite(table).all():
+        raise ValueError(f"values must be finite, one for each run, got {values!r}")
+    members, runs = table.shape
+    value = float(statistic(table.reshape(1, -1), axis=-1)[0])
+    if np.all(table == table.flat[0]):  # nothing random had a part in it
+        return Estimate(value, value, value, table.size)
+    generator = np.random.default_rng(seed)
+    member = generator.integers(members, size=(RESAMPLES, members, 1))
+    run = generator.integers(runs, size=(RESAMPLES, members, runs))
+    drawn = statistic(table[member, run].reshape(RESAMPLES, -1), axis=-1)
+    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Estimate(value, float(low), float(high), table.size)
+
+
+def improvement(
+    errors: NDArray[np.float64], reference: NDArray[np.float64], seed: int
+) -> Estimate:
+    """Estimate how probable it is that one controller does better than another in the same run.
+
+    Parameters
+    ----------
+    errors
+        Shape (runs,) or (members, runs), as in `bootstrap`.
+    reference
+        Those of the other, of the same runs: shape (runs,).
+    seed
+        Of the bootstrap.
+
+    Returns
+    -------
+    Estimate
+        A probability; runs in which both do the same count as half.
+    """
+    better = (errors < reference) + 0.5 * (errors == reference)
+    return bootstrap(better, seed)

@@ -84,12 +84,40 @@ def format_median(row: pd.Series) -> str:
 
 
 def mae_table(summary: pd.DataFrame) -> pd.DataFrame:
-    """Return the main table: a row for each scenario, a column for each agent."""
-    rows = []
-    for scenario, group in summary[summary["metric"] == "mae"].groupby("scenario", sort=False):
-        cells = {label(row["agent"]): format_cell(row) for _, row in group.iterrows()}
-        rows.append({"scenario": scenario} | cells)
-    return pd.DataFrame(rows).fillna("")
+    """Return the mean absolute errors: a row for each agent, a column for each scenario."""
+    rows = summary[summary["metric"] == "mae"]
+    return _by_agent(rows, rows.apply(format_cell, axis=1))
+
+
+def ratio_table(estimates: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean errors as multiples of the least possible, and what that is."""
+    table = _by_agent(estimates, estimates.apply(_format_ends, axis=1, name="ratio"))
+    limits = estimates.drop_duplicates("scenario").set_index("scenario")["limit"]
+    least = {"agent": "least possible (°C)"} | limits.map("{:.3f}".format).to_dict()
+    return pd.concat([pd.DataFrame([least]), table], ignore_index=True)
+
+
+def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
+    """Return differences to the reference: a row for each other agent."""
+    others = estimates.dropna(subset=["difference"])
+
+    def cell(row: pd.Series) -> str:
+        better = f"{100 * row['improvement']:.0f} %"
+        return f"{_format_ends(row, 'difference', '+.3f')}; {better}"
+
+    return _by_agent(others, others.apply(cell, axis=1))
+
+
+def _format_ends(row: pd.Series, name: str, form: str = ".2f") -> str:
+    value, low, high = (format(row[n], form) for n in (name, f"{name}_low", f"{name}_high"))
+    return value if low == high else f"{value} ({low} to {high})"
+
+
+def _by_agent(rows: pd.DataFrame, cells: pd.Series) -> pd.DataFrame:
+    table = rows.assign(cell=cells).pivot_table(
+        index="agent", columns="scenario", values="cell", aggfunc="first", sort=False
+    )
+    return table.fillna("").rename(index=label).reset_index().rename_axis(columns=None)
 
 
 def metrics_table(
@@ -104,30 +132,6 @@ def metrics_table(
         cells = {METRICS[row["metric"]]: format_row(row) for _, row in group.iterrows()}
         rows.append({"scenario": scenario, "agent": label(agent)} | cells)
     return pd.DataFrame(rows)
-
-
-def markdown(summary: pd.DataFrame, runs_per_cell: int) -> str:
-    """Return the whole summary as a Markdown page."""
-    scenarios = pd.DataFrame(
-        [
-            {"scenario": name, "what it is": SCENARIOS[name].title}
-            for name in summary["scenario"].unique()
-        ]
-    )
-    return "\n\n".join(
-        [
-            "# Comparison of controllers",
-            f"Median and, in parentheses, 10th to 90th percentile over {runs_per_cell} runs; "
-            "one number where they agree. Every controller meets the same noise.",
-            "## Mean absolute error (°C)",
-            mae_table(summary).to_markdown(index=False),
-            "## Other measures",
-            metrics_table(summary).to_markdown(index=False),
-            "## Scenarios",
-            scenarios.to_markdown(index=False),
-            "",
-        ]
-    )
 
 
 def on_screen(table: pd.DataFrame) -> Table:

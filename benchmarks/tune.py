@@ -373,13 +373,14 @@ class Search:
             [(s.name, s.title, s.samples, first) for s, first in SCENARIOS],
             columns=["scenario", "what it is", "samples", "first that counts"],
         )
+        penalty = self._subject.penalty
         return "\n\n".join(
             [
                 f"# Gains: {LABELS[self._controller]}",
                 f"By `python -m benchmarks.tune {self._controller} --trials {trials} "
                 f"--draws {self._draws}`. In each scenario: the median over runs of the mean "
-                f"absolute error, °C. The objective is their mean, plus "
-                f"{self._subject.penalty:g} °C times the share of runs at the constant set point that do not settle.",
+                f"absolute error, °C. The objective is their mean, plus {penalty:g} °C times "
+                "the share of runs at the constant set point that do not settle.",
                 f"## The best {len(table)} of {trials}, on {FINAL_DRAWS} new runs",
                 table.to_markdown(index=False, floatfmt=".4g"),
                 "## The search: every trial that was better than all before",

@@ -317,11 +317,14 @@ class TestAntiWindup:
             commands.append(controller.command)
         assert commands == [-3.0, -1.5, 4.0, 2.5]
 
-    def test_an_error_that_leads_back_counts(self):
+    @pytest.mark.parametrize("side", [-1.0, 1.0])
+    def test_an_error_that_leads_back_counts(self, side):
         controller = PIController(0.0, 1.0, anti_windup=True, error_index=0, u_min=-4, u_max=4)
-        controller._sum = np.float64(6.0)  # wound up: u = -6
-        controller.act([-1.0])
-        assert controller.command == -5.0
+        controller._sum = np.float64(6.0 * side)  # wound up: u = -6, or 6
+        controller.act([-1.0 * side])
+        assert controller.command == -5.0 * side
+        controller.act([1.0 * side])  # leads further out
+        assert controller.command == -5.0 * side
 
     def test_it_shortens_the_overshoot(self):
         gains = {"kp": 1.34, "ki": 0.0456}

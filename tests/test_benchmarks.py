@@ -13,10 +13,13 @@ import pandas as pd
 import pytest
 
 from agents import PIController
-from benchmarks import compare, ppo, storage, tables
+from benchmarks import compare, opponents, ppo, storage, tables
+from benchmarks.estimates import beaten, estimate
+from benchmarks.limits import scenario_limit
 from benchmarks.metrics import METRICS, measure
+from benchmarks.report import Section, write_report
 from benchmarks.rollout import Trajectory, make_plants, rollout
-from benchmarks.roster import build, load_factory, observation
+from benchmarks.roster import BUILT_IN, build, load_factory, observation
 from benchmarks.scenarios import SCENARIOS
 from mptc_gym import Parameters
 from tests.budget import SMALL
@@ -95,6 +98,90 @@ class TestTables:
     def test_not_settled_is_written_in_words(self):
         table = tables.for_csv(pd.DataFrame({"a": ["x", "y"], "s": [1.5, np.inf]}))
         assert table.to_csv(index=False) == "a,s\nx,1.5\ny,not settled\n"
+
+
+def some_runs(**errors):
+    """Make up runs on the constant set point: errors of agents by policy and seed."""
+    return pd.DataFrame(
+        [
+            {"scenario": "constant", "agent": agent, "policy": p, "seed": i, "mae": error}
+            for agent, policies in errors.items()
+            for p, row in enumerate(policies)
+            for i, error in enumerate(row)
+        ]
+    )
+
+
+class TestEstimates:
+    def test_by_hand(self):
+        limit = scenario_limit(SCENARIOS["constant"]).mae
+        runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
+        nn, ppo_ = estimate(runs, "nn").to_dict("records")
+        assert (nn["mean"], nn["limit"], nn["ratio"]) == (2.0, limit, 2.0 / limit)
+        assert ppo_["mean"] == pytest.approx(1.5)
+        assert ppo_["difference"] == pytest.approx(-0.5)
+        assert ppo_["improvement"] == pytest.approx((1 + 0.5 + 1 + 0 + 0.5 + 1) / 6)
+        assert math.isnan(nn["difference"])
+        assert nn["mean_low"] < nn["mean"] < nn["mean_high"]
+
+    def test_who_beats_a_limit_is_named(self):
+        limit = scenario_limit(SCENARIOS["constant"]).mae
+        runs = some_runs(
+            a=[[limit, limit]], b=[[0.9 * limit] * 2], c=[[0.9 * limit, 1.2 * limit]]
+        )
+        assert list(beaten(estimate(runs, "a"))["agent"]) == ["b"]
+
+    def test_no_controller_does(self, tmp_path):
+        # All runs of all controllers but PPO, which is trained elsewhere.
+        run_compare(tmp_path / "out", "--agents", *BUILT_IN, "--seeds", 20)
+        estimates = pd.read_csv(tmp_path / "out/estimates.csv")
+        assert len(estimates) == len(BUILT_IN) * len(SCENARIOS)
+        assert beaten(estimates).empty
+        best = estimates[estimates["agent"] == "mpc"]
+        assert best["ratio"].between(0.97, 1.05).all()
+        report = (tmp_path / "out/report.md").read_text()
+        assert "No controller beats a limit" in report
+
+
+class TestReport:
+    def test_pages(self, tmp_path):
+        (tmp_path / "picture.png").write_bytes(b"\x89PNG")
+        table = pd.DataFrame({"name": ["a < b"], "value": ["1.0"]})
+        sections = [Section("First", ["Some text."], table, ["picture.png"]), Section("Second")]
+        write_report(tmp_path, "Title", sections)
+        page = (tmp_path / "report.md").read_text()
+        assert page.startswith("# Title\n\n## First\n\nSome text.\n\n| name")
+        assert "![First](picture.png)" in page
+        html = (tmp_path / "report.html").read_text()
+        assert "a &lt; b" in html
+        assert 'src="data:image/png;base64,iVBORw=="' in html
+        assert "http" not in html  # nothing is fetched
+
+
+class TestOpponents:
+    def test_they_are_told_what_a_step_test_shows(self):
+        plant = Parameters()
+        gain = sum(plant.b) / sum(plant.a)
+        pole = max(np.roots(plant.a))
+        assert opponents.STEP_TEST["gain"] == pytest.approx(gain, rel=1e-3)
+        assert opponents.STEP_TEST["time_constant"] == pytest.approx(
+            -8 / np.log(pole), rel=1e-2
+        )
+        assert opponents.STEP_TEST["delay"] == 8 * (plant.delay + 1)
+
+    def test_each_has_an_account(self):
+        assert set(opponents.ACCOUNTS) == {*BUILT_IN, "ppo"}
+
+    @pytest.mark.parametrize("name", BUILT_IN)
+    def test_limits_reach_them(self, name):
+        parameters = Parameters(u_min=-20.0, u_max=12.0)
+        plants = make_plants(2, 30, u_min=-20.0, u_max=12.0)
+        controller = build(load_factory(BUILT_IN[name]), parameters, 2, 0)
+        runs = rollout(plants, controller, 30, 0)
+        if name not in ("nn", "mpc"):  # which keep within them by themselves
+            assert (runs.command[0] < 0).all()
+        expected = getattr(controller, "command", runs.command[-1])
+        np.testing.assert_allclose(runs.command[-1], expected, rtol=1e-5, atol=1e-5)
 
 
 class TestScenarios:
@@ -211,10 +298,10 @@ class TestCompare:
         )
         assert status == 0
         runs = pd.read_csv(out / "runs.csv")
-        assert list(runs.columns) == ["scenario", "agent", "seed", *METRICS]
+        assert list(runs.columns) == ["scenario", "agent", "policy", "seed", *METRICS]
         cells = [(s, a) for a in ("nn", "pi") for s in ("constant", "constant-noise")]
-        expected = [(s, a, i) for s, a in cells for i in range(3)]
-        assert list(runs.iloc[:, :3].itertuples(index=False, name=None)) == expected
+        expected = [(s, a, 0, i) for s, a in cells for i in range(3)]
+        assert list(runs.iloc[:, :4].itertuples(index=False, name=None)) == expected
         # The paper's PI is the same in every run without noise, and never settles.
         pi = runs[(runs.agent == "pi") & (runs.scenario == "constant")]
         assert pi["mae"].nunique() == 1
@@ -227,10 +314,14 @@ class TestCompare:
         assert float(row["median"].iloc[0]) == pytest.approx(nn.median())
         assert float(row["p90"].iloc[0]) == pytest.approx(nn.quantile(0.9))
 
-        text, screen = (out / "summary.md").read_text(), capsys.readouterr().out
-        for shown in (text, screen):
+        limit = scenario_limit(SCENARIOS["constant"]).mae
+        page, screen = (out / "report.md").read_text(), capsys.readouterr().out
+        for shown in (page, (out / "report.html").read_text(), screen):
             assert f"{nn.median():.3f}" in shown
-            assert "not settled" in shown
+            assert f"{limit:.3f}" in shown
+            assert f"{pi['mae'].iloc[0] / limit:.2f}" in shown
+            assert "No controller beats a limit" in shown
+        assert "not settled" in page
 
         provenance = json.loads((out / "provenance.json").read_text())
         assert provenance["complete"] is True
@@ -241,7 +332,7 @@ class TestCompare:
         responses = pd.read_csv(out / "constant.csv")
         assert len(responses) == 2 * 600
         assert (responses["output_p10"] <= responses["output_p90"]).all()
-        for name in ("constant.png", "constant-noise.png", "mae.png"):
+        for name in ("constant.png", "constant-noise.png", "limits.png", "runs.png"):
             picture = matplotlib.image.imread(out / name)
             assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
 
@@ -257,7 +348,7 @@ class TestCompare:
         monkeypatch.setattr(
             ppo.PPOArguments, "__init__", _with_defaults(ppo.PPOArguments.__init__, SMALL)
         )
-        monkeypatch.setattr(ppo, "CANDIDATES", 2)
+        monkeypatch.setattr(ppo, "POLICIES", 2)
         options = (
             "--agents",
             "ppo",
@@ -267,17 +358,21 @@ class TestCompare:
             1,
             "--ppo-steps",
             256,
+            "--jobs",
+            1,
         )
         assert run_compare(tmp_path / "one", *options) == 0
         curve = pd.read_csv(tmp_path / "one/learning.csv")
         assert list(curve["steps"]) == [256, 256]
-        assert list(curve["candidate"]) == [0, 1]
+        assert list(curve["policy"]) == [0, 1]
         assert (tmp_path / "one/learning.png").exists()
         provenance = json.loads((tmp_path / "one/provenance.json").read_text())
-        used = provenance["policies"]["ppo"]
-        assert used["arguments"]["seed"] == curve["validation_mae"].idxmin()
-        assert used["arguments"]["steps"] == 256
-        assert (Path(used["folder"]) / "policy.zip").exists()
+        for seed, used in enumerate(provenance["policies"]["ppo"]):
+            assert used["arguments"]["seed"] == seed
+            assert used["arguments"]["steps"] == 256
+            assert (Path(used["folder"]) / "policy.zip").exists()
+        runs = pd.read_csv(tmp_path / "one/runs.csv")
+        assert list(runs["policy"]) == [0, 1]
 
         with monkeypatch.context() as patch:
             patch.setattr(ppo.PPO, "learn", None)  # training again would raise
@@ -334,8 +429,9 @@ class TestCompare:
         run_compare(out, *options, "constant")
         names = {path.name for path in out.iterdir()}
         assert names == {
-            "runs.csv", "summary.csv", "summary.md", "mae.png", "constant.csv", "constant.png",
-            "provenance.json", "mine.txt",
+            "runs.csv", "summary.csv", "estimates.csv", "report.md", "report.html",
+            "limits.png", "runs.png", "constant.csv", "constant.png", "provenance.json",
+            "mine.txt",
         }  # fmt: skip
 
     def run_and_stop(self, out, monkeypatch, error, after):
@@ -355,20 +451,21 @@ class TestCompare:
 
     def test_an_interrupted_run_keeps_what_it_has(self, tmp_path, monkeypatch, capsys):
         out = tmp_path / "out"
-        assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=2) == 130
+        # The square wave is run twice.
+        assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=3) == 130
         assert "Interrupted" in capsys.readouterr().out
         assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
-        assert (out / "summary.md").exists()
+        assert (out / "report.md").exists()
         assert (out / "square.png").exists()
 
     def test_what_ran_before_a_failing_controller_is_kept(self, tmp_path, monkeypatch):
         out = tmp_path / "out"
         with pytest.raises(ZeroDivisionError):
-            self.run_and_stop(out, monkeypatch, ZeroDivisionError, after=2)
+            self.run_and_stop(out, monkeypatch, ZeroDivisionError, after=3)
         assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
-        assert (out / "summary.md").exists()
+        assert (out / "report.md").exists()
 
     def test_every_case_is_saved_before_the_next_begins(self, tmp_path, monkeypatch):
         saved = []
@@ -381,7 +478,7 @@ class TestCompare:
         monkeypatch.setattr(compare, "rollout", watched)
         scenarios = ("constant", "square", "constant-noise")
         run_compare(tmp_path / "out", "--agents", "pi", "--seeds", 2, "--scenarios", *scenarios)
-        assert saved == [0, 2, 4]
+        assert saved == [0, 2, 2, 4]  # the square wave is run twice
 
     def test_interrupted_before_anything_has_finished(self, tmp_path, monkeypatch):
         out = tmp_path / "out"
@@ -417,7 +514,7 @@ class TestCompare:
         command += ["--scenarios", "constant", "--out", str(tmp_path / "out")]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
         assert "1.62" in done.stdout
-        assert (tmp_path / "out/summary.md").exists()
+        assert (tmp_path / "out/report.md").exists()
 
 
 def _with_defaults(init, defaults):

@@ -12,6 +12,7 @@ from benchmarks.experiments import (
     Draws,
     converged_at,
     fail_node,
+    join,
     mean_error,
     settled,
     split,
@@ -136,6 +137,11 @@ class TestMeasures:
     def test_settled_looks_at_every_sample_of_the_end(self):
         late = [0.0] * 51 + [5.0] * 49
         assert settled(trajectory([5.0] * 100, late)) == [False]
+
+    def test_join(self):
+        joined = join([trajectory([1, 1], [0, 0]), trajectory([1, 3], [0, 1])])
+        assert joined.setpoint.tolist() == [[1, 1], [1, 3]]
+        assert list(mean_error(joined)) == [1.0, 1.5]
 
     def test_split(self):
         before, after = split(trajectory([1, 1, 3], [0, 0, 0]), 2)

@@ -88,6 +88,15 @@ class TestSetPointChanges:
         assert limit.mae == pytest.approx((first[0] + 3 * others[0]) / 1200)
         assert limit.mse == pytest.approx((first[1] + 3 * others[1]) / 1200)
 
+    def test_only_the_first_change_is_from_rest(self):
+        scenario = SCENARIOS["square-noise"]
+        sums = [
+            least_error(scenario.parameters, 0.0, 5.0, 300, from_rest=True),
+            *[least_error(scenario.parameters, 5.0, -5.0, 300, from_rest=False)] * 3,
+        ]
+        limit = limits.scenario_limit(scenario)
+        assert limit.mse == pytest.approx(sum(square for _, square in sums) / 1200, rel=1e-9)
+
     def test_other_scenarios_are_not_taken_for_known_ones(self):
         other = Scenario("square", "", 600, {"setpoint": 4.0})
         assert (
@@ -167,6 +176,13 @@ class TestPredictiveController:
         runs = run_mpc(1, 60, dead_zone=0.0, u_min=-1e3, u_max=1e3, setpoint=5.0)
         assert np.all(runs.output[:19] == 0.0)
         assert runs.output[19:, 0] == pytest.approx(np.full(41, 5.0), abs=1e-3)
+
+    def test_it_is_of_minimum_variance_where_nothing_limits_it(self):
+        plant = {"a": (1.0, -0.9), "b": (-0.5,), "c": (1.0, 0.8, -0.3), "delay": 3}
+        free = {"dead_zone": 0.0, "u_min": -1e3, "u_max": 1e3, "setpoint": 0.0}
+        runs = run_mpc(100, 600, noise_variance=0.5, **plant, **free)
+        least = minimum_variance(Parameters(noise_variance=0.5, **plant))
+        assert runs.output[100:].var() == pytest.approx(least, rel=0.03)
 
     def test_it_holds_what_the_dead_zone_does_not_let_through(self):
         # 2 degC needs 2.9 t/h, inside the dead zone: it switches between 0 and the edge.

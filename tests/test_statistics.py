@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.statistics import exact, median, quantile, share
+from benchmarks.statistics import (
+    bootstrap,
+    exact,
+    improvement,
+    interquartile_mean,
+    median,
+    quantile,
+    share,
+)
 
 
 def test_median_by_hand():
@@ -66,3 +74,81 @@ def test_bad_values(values):
 def test_bad_flags(flags):
     with pytest.raises(ValueError, match="flags must be booleans"):
         share(flags)
+
+
+def test_interquartile_mean_by_hand():
+    assert interquartile_mean([100, 1, 2, 3, 4, 5, 6, -50]) == (2 + 3 + 4 + 5) / 4
+
+
+class TestBootstrap:
+    def test_interval_of_a_mean_is_the_normal_one(self, rng):
+        values = rng.normal(3.0, 2.0, 400)
+        estimate = bootstrap(values, seed=0)
+        assert estimate.value == pytest.approx(values.mean())
+        half = 1.96 * values.std() / 20
+        assert estimate.low == pytest.approx(values.mean() - half, abs=0.03)
+        assert estimate.high == pytest.approx(values.mean() + half, abs=0.03)
+        assert estimate.runs == 400
+
+    def test_seed_is_honoured(self, rng):
+        values = rng.normal(size=50)
+        first, again, other = (bootstrap(values, seed=seed) for seed in (1, 1, 2))
+        assert first == again
+        assert (first.low, first.high) != (other.low, other.high)
+
+    def test_it_leaves_the_global_generator_alone(self):
+        np.random.seed(5)  # noqa: NPY002
+        first = bootstrap(np.arange(9.0), seed=1)
+        np.random.seed(6)  # noqa: NPY002
+        state = np.random.get_state()[1].tolist()  # noqa: NPY002
+        assert bootstrap(np.arange(9.0), seed=1) == first
+        assert np.random.get_state()[1].tolist() == state  # noqa: NPY002
+
+    def test_members_are_drawn_first(self, rng):
+        # Four trainings that differ much, with runs that differ little: what counts is four.
+        level = np.array([[0.0], [1.0], [2.0], [3.0]])
+        values = level + rng.normal(0, 0.01, (4, 100))
+        nested = bootstrap(values, seed=0)
+        flat = bootstrap(values.reshape(-1), seed=0)
+        assert nested.value == flat.value == pytest.approx(1.5, abs=0.01)
+        # The mean of four draws out of 0, 1, 2, 3 has the deviation sqrt(1.25 / 4) = 0.56.
+        assert nested.high - nested.low == pytest.approx(2 * 1.96 * 0.56, rel=0.1)
+        assert flat.high - flat.low < 0.3
+
+    def test_runs_are_drawn_too(self, rng):
+        values = rng.normal(size=100)
+        nested = bootstrap(np.stack([values, values[::-1]]), seed=0)
+        assert nested.high - nested.low == pytest.approx(2 * 1.96 / math.sqrt(200), rel=0.2)
+
+    def test_other_statistics(self):
+        values = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 1000.0])
+        estimate = bootstrap(values, seed=0, statistic=interquartile_mean)
+        assert estimate.value == 4.5
+        assert bootstrap(values, seed=0).high > 100 > estimate.low
+
+    def test_no_width_where_nothing_is_random(self):
+        estimate = bootstrap(np.full((3, 4), 2.5), seed=0)
+        assert (estimate.value, estimate.low, estimate.high, estimate.runs) == (
+            2.5,
+            2.5,
+            2.5,
+            12,
+        )
+
+    @pytest.mark.parametrize("values", [[], [1.0, math.inf], [math.nan], np.zeros((2, 2, 2))])
+    def test_bad_values(self, values):
+        with pytest.raises(ValueError, match="values must be finite"):
+            bootstrap(values, seed=0)
+
+
+class TestImprovement:
+    def test_by_hand(self):
+        reference = np.array([1.0, 2.0, 3.0, 4.0])
+        assert improvement(np.array([0.0, 1.0, 5.0, 4.0]), reference, 0).value == 0.625
+        members = np.array([[0.0, 0.0, 0.0, 0.0], [9.0, 9.0, 9.0, 9.0]])
+        estimate = improvement(members, reference, 0)
+        assert (estimate.value, estimate.low, estimate.high) == (0.5, 0.0, 1.0)
+
+    def test_of_one_that_is_always_better(self):
+        estimate = improvement(np.zeros(10), np.ones(10), 0)
+        assert (estimate.value, estimate.low, estimate.high) == (1.0, 1.0, 1.0)
