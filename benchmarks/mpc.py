@@ -26,6 +26,9 @@ class PredictiveController:
     staying as it is, with commands within the limits. A first command inside the dead zone
     becomes 0 or the edge, whichever the rest of a plan makes better.
 
+    The roots of C must lie within the unit circle, as the paper's do; else xi cannot be told
+    from what is measured.
+
     Parameters
     ----------
     parameters

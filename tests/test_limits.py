@@ -178,7 +178,7 @@ class TestPredictiveController:
         assert runs.output[19:, 0] == pytest.approx(np.full(41, 5.0), abs=1e-3)
 
     def test_it_is_of_minimum_variance_where_nothing_limits_it(self):
-        plant = {"a": (1.0, -0.9), "b": (-0.5,), "c": (1.0, 0.8, -0.3), "delay": 3}
+        plant = {"a": (1.0, -0.9), "b": (-0.5,), "c": (1.0, 0.8, 0.15), "delay": 3}
         free = {"dead_zone": 0.0, "u_min": -1e3, "u_max": 1e3, "setpoint": 0.0}
         runs = run_mpc(100, 600, noise_variance=0.5, **plant, **free)
         least = minimum_variance(Parameters(noise_variance=0.5, **plant))
