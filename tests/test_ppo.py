@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -149,6 +150,36 @@ class TestPPO:
         scaled = model.policy.features_extractor(observation)
         assert scaled[:8].tolist() == pytest.approx([0.2 * i for i in range(1, 9)])  # degC
         assert scaled[8:].tolist() == list(range(9, 29))  # actions
+
+
+class TestTrained:
+    def members(self, folder, jobs, *, retrain=False):
+        trained = ppo.Trained(
+            SMALL, folder, policies=2, jobs=jobs, retrain=retrain, progress=False
+        )
+        return trained, trained.members()
+
+    def test_side_by_side_is_one_after_the_other(self, tmp_path, monkeypatch):
+        monkeypatch.undo()  # other processes would not know of it
+        one, ones = self.members(tmp_path / "one", jobs=1)
+        _, twos = self.members(tmp_path / "two", jobs=2)
+        for first, second in zip(ones, twos, strict=True):
+            assert torch.equal(weights(first._model), weights(second._model))
+        assert not torch.equal(weights(ones[0]._model), weights(ones[1]._model))
+        assert [used["arguments"]["seed"] for used in one.used] == [0, 1]
+        assert set(one.curves["policy"]) == {0, 1}
+
+    def test_only_what_is_missing_is_trained(self, tmp_path, monkeypatch):
+        one, _ = self.members(tmp_path, jobs=1)
+        folders = [Path(used["folder"]) for used in one.used]
+        stamps = [(folder / "policy.zip").stat().st_mtime_ns for folder in folders]
+        (folders[1] / "policy.zip").unlink()
+        self.members(tmp_path, jobs=1)
+        again = [(folder / "policy.zip").stat().st_mtime_ns for folder in folders]
+        assert again[0] == stamps[0]
+        assert again[1] > stamps[1]
+        self.members(tmp_path, jobs=1, retrain=True)
+        assert (folders[0] / "policy.zip").stat().st_mtime_ns > stamps[0]
 
 
 class TestTrainingTime:
