@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import optuna
 import pandas as pd
+from joblib import cpu_count
 from optuna.distributions import FloatDistribution
 from rich.console import Console
 from tqdm import tqdm
@@ -80,7 +81,8 @@ PENALTY = 5.0
 PPO_STEPS = (
     400_000  # samples of experience of a trial; the best are trained for as long as usual
 )
-PPO_SEEDS, FINAL_SEEDS = (1000,), (1001, 1002)  # of policies, others than a comparison uses
+PPO_POLICIES, FINAL_POLICIES = 2, 4  # of a trial, and of one of the best
+PPO_SEED, FINAL_SEED = 1000, 2000  # of the first of them, others than a comparison uses
 
 
 @dataclass(frozen=True)
@@ -121,14 +123,19 @@ def _make_pi(*, final: bool, **gains: float) -> list[Factory]:
 def _make_ppo(*, final: bool, **gains: float) -> list[Factory]:
     from benchmarks import ppo  # here: torch takes seconds to load
 
-    made = []
-    for seed in FINAL_SEEDS if final else PPO_SEEDS:
-        arguments = ppo.PPOArguments(seed=seed, **gains)
-        if not final:
-            arguments = replace(arguments, steps=min(PPO_STEPS, arguments.steps))
-        with tempfile.TemporaryDirectory() as folder:
-            made.append(ppo.Policy(arguments, Path(folder)))
-    return made
+    arguments = ppo.PPOArguments(seed=FINAL_SEED if final else PPO_SEED, **gains)
+    if not final:
+        arguments = replace(arguments, steps=min(PPO_STEPS, arguments.steps))
+    with tempfile.TemporaryDirectory() as folder:
+        trained = ppo.Trained(
+            arguments,
+            Path(folder),
+            policies=FINAL_POLICIES if final else PPO_POLICIES,
+            jobs=cpu_count(),
+            retrain=False,
+            progress=False,
+        )
+        return list(trained.members())
 
 
 SUBJECTS = {
@@ -148,15 +155,15 @@ SUBJECTS = {
     "ppo": Subject(
         _make_ppo,
         {
-            "learning_rate": (5e-4, 4e-3),
-            "gamma": (0.94, 0.99),
-            "noise_variance": (0.01, 1.0),
-            "clip_range": (0.1, 0.4),
+            "learning_rate": (5e-4, 2e-3),
+            "gamma": (0.95, 0.985),
+            "noise_variance": (0.05, 1.0),
+            "clip_range": (0.1, 0.3),
             "setpoint_amplitude": (5.0, 8.0),
         },
-        trials=40,
-        startup=15,
-        finalists=3,
+        trials=20,
+        startup=8,
+        finalists=2,
         penalty=0.0,
     ),
 }

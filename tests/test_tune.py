@@ -15,7 +15,6 @@ from benchmarks.experiments import Draws
 from tests.budget import SMALL
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
-PPO_BEGUN = ppo.begin(SMALL)
 
 
 @pytest.fixture(autouse=True)
@@ -142,20 +141,27 @@ class TestSearch:
     def test_ppo_is_trained_once_a_trial(self, tmp_path, monkeypatch):
         trained = []
 
-        def train(arguments, folder, **options):
-            trained.append(arguments)
-            return PPO_BEGUN
+        class Trained:
+            def __init__(self, arguments, folder, *, policies, **options):
+                self.made = [
+                    replace(arguments, seed=arguments.seed + i) for i in range(policies)
+                ]
+                trained.extend(self.made)
 
-        monkeypatch.setattr(ppo, "trained_policy", train)
+            def members(self):
+                for arguments in self.made:
+                    member = partial(ppo.PolicyController, ppo.begin(SMALL))
+                    member.observation = arguments.observation
+                    yield member
+
+        monkeypatch.setattr(ppo, "Trained", Trained)
         monkeypatch.setattr(
             tune, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
         )
         assert run_tune(tmp_path, "ppo", trials=2) == 0
-        seeds = [arguments.seed for arguments in trained]
-        assert seeds == [*tune.PPO_SEEDS * 2, *tune.FINAL_SEEDS * 2]
-        steps = {arguments.seed: arguments.steps for arguments in trained}
-        assert steps == dict.fromkeys(tune.PPO_SEEDS, tune.PPO_STEPS) | dict.fromkeys(
-            tune.FINAL_SEEDS, ppo.PPOArguments().steps
-        )
+        whole = ppo.PPOArguments().steps
+        search = [(tune.PPO_SEED + i, tune.PPO_STEPS) for i in range(tune.PPO_POLICIES)]
+        final = [(tune.FINAL_SEED + i, whole) for i in range(tune.FINAL_POLICIES)]
+        assert [(a.seed, a.steps) for a in trained] == [*search * 2, *final * 2]
         table = pd.read_csv(tmp_path / "ppo.csv")
-        assert list(table["gamma"]) == [arguments.gamma for arguments in trained[:2]]
+        assert list(table["gamma"]) == [trained[0].gamma, trained[tune.PPO_POLICIES].gamma]
