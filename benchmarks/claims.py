@@ -5,20 +5,17 @@ The verdicts go to `claims.md` and all numbers to `claims.csv`; what is drawn li
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-from rich.console import Console
 from tqdm import tqdm
 
+from benchmarks import command_line, ledger, plots
 from benchmarks import evidence as examine
-from benchmarks import ledger, plots
 from benchmarks.evidence import PAPER_PI, SEARCHED_PI, Claim
 from benchmarks.experiments import Draws, hidden_nodes, longer_windows
-from benchmarks.options import number
 from benchmarks.storage import replacing, write_text
 from benchmarks.tables import on_screen
 
@@ -154,21 +151,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         0, or 130 if it was interrupted.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.claims",
-        description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
+    parser = command_line.parser("claims", __doc__)
     add = parser.add_argument
     add("claims", nargs="*", default=list(CLAIMS), metavar="CLAIM", help="which ones")
-    add("--draws", type=number, default=DRAWS, help="runs of each case")
+    add("--draws", type=command_line.number, default=DRAWS, help="runs of each case")
     add("--out", type=Path, default=Path("results/claims"), help="folder to write to")
     options = parser.parse_args(arguments)
     for name in options.claims:
         if name not in CLAIMS:
             parser.error(f"no {name!r} among the claims; there are {', '.join(CLAIMS)}")
 
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    console = command_line.console(120)
     command = f"python -m benchmarks.claims --draws {options.draws}"
     draws = Draws(options.draws, SEED)
     entries: list[ledger.Entry] = []

@@ -13,15 +13,13 @@ from typing import Any
 
 import pandas as pd
 from joblib import cpu_count
-from rich.console import Console
 from tqdm import tqdm
 
-from benchmarks import plots, tables
+from benchmarks import command_line, plots, tables
 from benchmarks.estimates import beaten, estimate
 from benchmarks.experiments import join, mean_error
 from benchmarks.metrics import measure
 from benchmarks.opponents import ACCOUNTS
-from benchmarks.options import number
 from benchmarks.report import Section, write_report
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.roster import BUILT_IN, Factory, build, label, load_factory, observation
@@ -57,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(str(error))
 
     # Wide enough for the tables where nothing says how wide the page is.
-    console = Console(width=None if sys.stdout.isatty() else 170, markup=False)
+    console = command_line.console(170)
     comparison = Comparison(options)
     try:
         for agent, factory in factories.items():
@@ -72,17 +70,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     comparison.finish(complete=True)
 
     for section in comparison.sections()[:2]:
-        console.print(section.title, *section.text, sep="\n", highlight=False)
+        console.print(section.title, *section.text, sep="\n")
         console.print(tables.on_screen(section.table))
-    console.print(f"The report, tables, data and plots are in {options.out}/", highlight=False)
+    console.print(f"The report, tables, data and plots are in {options.out}/")
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.compare",
-        description="Compare controllers on the paper's cases, all of them on the same noise.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    parser = command_line.parser(
+        "compare", "Compare controllers on the paper's cases, all of them on the same noise."
     )
     add = parser.add_argument
     names = {"nargs": "*", "metavar": "NAME"}
@@ -95,20 +91,25 @@ def _parser() -> argparse.ArgumentParser:
         help="a controller of your own, beside those of --agents (may be given more than once)",
     )
     add("--scenarios", default=list(SCENARIOS), help="cases", **names)
-    add("--seeds", type=number, default=100, help="number of runs of each case")
+    add("--seeds", type=command_line.number, default=100, help="number of runs of each case")
     add(
         "--ppo-steps",
-        type=number,
+        type=command_line.number,
         default=argparse.SUPPRESS,
         help="samples of experience of each PPO policy (default: 1000000)",
     )
     add(
         "--ppo-policies",
-        type=number,
+        type=command_line.number,
         default=argparse.SUPPRESS,
         help="how many PPO policies to train and compare (default: 5)",
     )
-    add("--jobs", type=number, default=cpu_count(), help="how many of them to train at once")
+    add(
+        "--jobs",
+        type=command_line.number,
+        default=cpu_count(),
+        help="how many of them to train at once",
+    )
     add("--retrain", action="store_true", help="train PPO anew")
     add("--out", type=Path, default=Path("results/compare"), help="folder to write to")
     add(

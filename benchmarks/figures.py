@@ -7,7 +7,6 @@ all runs. Each figure becomes a picture, all together one sheet; what is drawn i
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,13 +15,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 from tqdm import tqdm
 
 from agents import PIController
-from benchmarks import plots
+from benchmarks import command_line, plots
 from benchmarks.experiments import Draws, mean_error
-from benchmarks.options import number
 from benchmarks.rollout import Trajectory
 from benchmarks.storage import replacing
 from benchmarks.tables import percentiles
@@ -115,17 +112,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         0, or 130 if it was interrupted.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.figures",
-        description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
+    parser = command_line.parser("figures", __doc__)
     add = parser.add_argument
-    add("--draws", type=number, default=DRAWS, help="runs of each case")
+    add("--draws", type=command_line.number, default=DRAWS, help="runs of each case")
     add("--out", type=Path, default=Path("results/figures"), help="folder to write to")
     options = parser.parse_args(arguments)
 
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    console = command_line.console(120)
     curves: dict[str, pd.DataFrame] = {}
     try:
         for name in tqdm(CASES, unit="case"):

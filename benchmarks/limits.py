@@ -8,7 +8,6 @@ within it is needed, as `benchmarks.mpc` shows.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import sys
 from dataclasses import dataclass
@@ -17,11 +16,11 @@ from functools import cache
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from rich.console import Console
 from scipy import optimize, signal, sparse, stats
 from tqdm import tqdm
 
 from agents import PIController
+from benchmarks import command_line
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import SCENARIOS, Scenario
 from benchmarks.tables import on_screen
@@ -62,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
     int
         0.
     """
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.limits", description=__doc__)
+    parser = command_line.parser("limits", __doc__)
     parser.parse_args(arguments)
     rows = []
     for name, scenario in tqdm(SCENARIOS.items(), unit="scenario"):
@@ -76,7 +75,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         rows.append(row)
     columns = ["scenario", "mean |e| (°C)", "rms e (°C)", "rms e, set point held (°C)"]
-    console = Console(width=None if sys.stdout.isatty() else 110, highlight=False)
+    console = command_line.console(110)
     console.print("No controller can do better on average:")
     console.print(on_screen(pd.DataFrame(rows, columns=columns)))
     return 0

@@ -5,7 +5,6 @@ What is compared is measured alternately in one run and reported as a ratio, wit
 
 from __future__ import annotations
 
-import argparse
 import copy
 import importlib.util
 import subprocess
@@ -19,11 +18,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pandas as pd
-from rich.console import Console
 from tqdm import tqdm
 
 from agents import DirectNNController
-from benchmarks.options import number
+from benchmarks import command_line
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.tables import on_screen
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
@@ -69,10 +67,12 @@ class Case:
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__)
-    parser.add_argument("--rounds", type=number, default=ROUNDS, help="measurements of each")
+    parser = command_line.parser("speed", __doc__)
+    parser.add_argument(
+        "--rounds", type=command_line.number, default=ROUNDS, help="measurements of each"
+    )
     rounds = parser.parse_args(arguments).rounds
-    console = Console(width=None if sys.stdout.isatty() else 110, highlight=False)
+    console = command_line.console(110)
 
     def show(title: str, table: pd.DataFrame) -> None:
         console.print(title, on_screen(table), sep="\n")

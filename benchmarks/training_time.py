@@ -7,7 +7,6 @@ default, and with a batch of them at once, of several sizes.
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import tempfile
@@ -19,12 +18,10 @@ import gymnasium
 import numpy as np
 import pandas as pd
 import torch
-from rich.console import Console
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from tqdm import tqdm
 
-from benchmarks import ppo
-from benchmarks.options import number
+from benchmarks import command_line, ppo
 from benchmarks.tables import on_screen
 
 QUALITY = 1.2  # mean |e|, degC
@@ -68,18 +65,18 @@ def main(arguments: list[str] | None = None) -> int:
     int
         0, or 130 if it was interrupted.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.training_time",
-        description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    parser = command_line.parser("training_time", __doc__)
+    parser.add_argument(
+        "--seeds", type=command_line.number, default=SEEDS, help="trainings of each"
     )
-    parser.add_argument("--seeds", type=number, default=SEEDS, help="trainings of each")
     for option, default, how in (
         ("--one-by-one", ONE_BY_ONE, "one by one"),
         ("--at-once", AT_ONCE, "at once"),
     ):
         text = f"numbers of plants that are stepped {how}"
-        parser.add_argument(option, type=number, nargs="*", default=default, help=text)
+        parser.add_argument(
+            option, type=command_line.number, nargs="*", default=default, help=text
+        )
     options = parser.parse_args(arguments)
 
     cases = {f"one by one, {n}": (n, True) for n in options.one_by_one}
@@ -99,7 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
     table = pd.DataFrame(seconds)
     table.loc["median"] = table.median()
     shown = table.map("{:.1f}".format).replace({"inf": "never", "nan": ""})
-    console = Console(width=None if sys.stdout.isatty() else 110, highlight=False)
+    console = command_line.console(110)
     if interrupted:
         console.print("Interrupted: what has finished is shown.")
     console.print(f"Seconds until mean |e| on the square wave is at most {QUALITY} °C")

@@ -23,12 +23,11 @@ import optuna
 import pandas as pd
 from joblib import cpu_count
 from optuna.distributions import FloatDistribution
-from rich.console import Console
 from tqdm import tqdm
 
 from agents import DirectNNController, PIController
+from benchmarks import command_line
 from benchmarks.experiments import mean_error, settled, split
-from benchmarks.options import number
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.roster import LABELS, Factory, build, observation
 from benchmarks.scenarios import Scenario
@@ -182,24 +181,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         0, or 130 if it was interrupted.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.tune",
-        description=__doc__,
-    )
+    parser = command_line.parser("tune", __doc__)
     add = parser.add_argument
     add("controller", choices=SUBJECTS, help="whose gains to search")
     trials = ", ".join(f"{subject.trials} for {name}" for name, subject in SUBJECTS.items())
-    add("--trials", type=number, help=f"number of gains to try (default: {trials})")
-    add("--draws", type=number, default=DRAWS, help="runs of each scenario (default: 100)")
-    add("--out", type=Path, default=Path("results/tune"), help="folder (default: results/tune)")
+    add(
+        "--trials",
+        type=command_line.number,
+        default=argparse.SUPPRESS,
+        help=f"how many gains to try (default: {trials})",
+    )
+    add("--draws", type=command_line.number, default=DRAWS, help="runs of each scenario")
+    add("--out", type=Path, default=Path("results/tune"), help="folder to write to")
     options = parser.parse_args(arguments)
-    trials = options.trials or SUBJECTS[options.controller].trials
+    trials = getattr(options, "trials", SUBJECTS[options.controller].trials)
 
     try:
         search = Search(options.controller, options.draws, options.out)
     except ValueError as error:
         parser.error(f"--out, --draws: {error}")
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    console = command_line.console(120)
     try:
         search.run(trials)
         report = search.report(trials)
