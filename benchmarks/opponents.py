@@ -75,6 +75,6 @@ ACCOUNTS: dict[str, Account] = {
     "ppo": Account(
         "delay, by the past actions it sees",
         "6,081 weights a policy",
-        "1 M a policy, 22 M (search)",
+        "1 M a policy",
     ),
 }

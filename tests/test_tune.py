@@ -159,9 +159,8 @@ class TestSearch:
             tune, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
         )
         assert run_tune(tmp_path, "ppo", trials=2) == 0
-        whole = ppo.PPOArguments().steps
-        search = [(tune.PPO_SEED + i, tune.PPO_STEPS) for i in range(tune.PPO_POLICIES)]
-        final = [(tune.FINAL_SEED + i, whole) for i in range(tune.FINAL_POLICIES)]
-        assert [(a.seed, a.steps) for a in trained] == [*search * 2, *final * 2]
+        search = [tune.PPO_SEED + i for i in range(tune.PPO_POLICIES)]
+        final = [tune.FINAL_SEED + i for i in range(tune.FINAL_POLICIES)]
+        assert [arguments.seed for arguments in trained] == [*search * 2, *final * 2]
         table = pd.read_csv(tmp_path / "ppo.csv")
         assert list(table["gamma"]) == [trained[0].gamma, trained[tune.PPO_POLICIES].gamma]
