@@ -30,7 +30,7 @@ from benchmarks.scenarios import other_plant
 from benchmarks.statistics import Estimate, exact, median, quantile, share
 from mptc_gym import Parameters
 
-# What words are taken to mean: fixed before the numbers were known, the same for all claims.
+# What words are taken to mean: set before the numbers were known, the same for all claims.
 OFTEN = 0.9  # "works", "converges": in at least this share of the draws
 NOTABLE = 0.05  # an error that changes by less has not changed notably
 MUCH = 0.2  # "much better", "seriously worse": an error that differs by this share or more

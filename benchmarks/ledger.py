@@ -188,9 +188,8 @@ def markdown(entries: Sequence[Entry], command: str) -> str:
         [
             "# The paper's claims",
             f"By `{command}`. Every number rests on independent draws of initial weights and "
-            "noise. What a claim asks of it was fixed before; it counts as shown if the whole "
-            "95 % interval keeps it. A claim holds if all that it asks is shown, and in part "
-            "if some of it is.",
+            "noise. What a claim asks of a number counts as shown if the whole 95 % interval "
+            "keeps it. A claim holds if all that it asks is shown, and in part if some is.",
             overview(entries).drop(columns="name").to_markdown(index=False),
             *(_section(entry) for entry in entries),
             "",
