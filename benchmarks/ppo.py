@@ -71,7 +71,7 @@ class PPOArguments:
     """How often an update goes through its samples."""
     learning_rate: float = 1e-3
     """At the start; it falls linearly, to a twentieth."""
-    gamma: float = 0.97
+    gamma: float = 0.95
     """Discount a sample."""
     gae_lambda: float = 1.0
     """Below 1, advantages lean on the value function, also for what the delay still hides."""
