@@ -150,7 +150,7 @@ SUBJECTS = {
         _make_ppo,
         {
             "learning_rate": (7e-4, 2e-3),
-            "gamma": (0.94, 0.985),
+            "gamma": (0.96, 0.985),
             "noise_variance": (0.1, 0.8),
             "setpoint_amplitude": (5.0, 7.0),
         },
