@@ -67,9 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception:
         comparison.finish(complete=False)
         raise
-    comparison.finish(complete=True)
+    report = comparison.finish(complete=True)
 
-    for section in comparison.sections()[:2]:
+    for section in report[:2]:
         console.print(section.title, *section.text, sep="\n")
         console.print(tables.on_screen(section.table))
     console.print(f"The report, tables, data and plots are in {options.out}/")
@@ -243,13 +243,16 @@ class Comparison:
         plants.close()
         return first, again
 
-    def finish(self, *, complete: bool) -> None:
-        """Write tables, plots and the report of all that has been run, if anything has."""
+    def finish(self, *, complete: bool) -> list[Section]:
+        """Write and return the report of all that has been run, with its tables and plots."""
         if self.runs.empty:
-            return
-        self._write_csv("summary.csv", tables.summarise(self.runs))
-        self._write_csv("estimates.csv", self._estimates())
-        plots.plot_limits(self._estimates(), self._path("limits.png"))
+            return []
+        summary = tables.summarise(self.runs)
+        estimates = estimate(self.runs, reference=self.runs["agent"].iloc[0])
+        sections = self._sections(summary, estimates)
+        self._write_csv("summary.csv", summary)
+        self._write_csv("estimates.csv", estimates)
+        plots.plot_limits(estimates, self._path("limits.png"))
         plots.plot_runs(self.runs, self._path("runs.png"))
         for name, responses in self._responses.items():
             self._write_csv(f"{name}.csv", responses)
@@ -260,8 +263,9 @@ class Comparison:
             plots.plot_learning(self._curves, self._path("learning.png"))
         for page in ("report.md", "report.html"):
             self._path(page)
-        write_report(self._options.out, "Comparison of controllers", self.sections())
+        write_report(self._options.out, "Comparison of controllers", sections)
         self._write_runs(complete=complete)
+        return sections
 
     @staticmethod
     def _drawn(responses: pd.DataFrame) -> list[str]:
@@ -269,13 +273,9 @@ class Comparison:
         chosen = [agent for agent in agents if agent in DRAWN or agent not in ACCOUNTS]
         return chosen or list(agents)
 
-    def _estimates(self) -> pd.DataFrame:
-        return estimate(self.runs, self.runs["agent"].iloc[0])
-
-    def sections(self) -> list[Section]:
+    def _sections(self, summary: pd.DataFrame, estimates: pd.DataFrame) -> list[Section]:
         """Return the report, the parts of most interest first."""
         seeds, runs = self._options.seeds, self.runs
-        summary, estimates = tables.summarise(runs), self._estimates()
         below = beaten(estimates)
         verdict = "No controller beats a limit, in any scenario."
         if len(below):

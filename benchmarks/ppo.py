@@ -139,10 +139,6 @@ class Policy:
         How it is trained.
     folder
         Where it is kept.
-    retrain
-        Whether to train even where a finished policy is at hand.
-    progress
-        Whether to show a progress bar.
 
     Attributes
     ----------
@@ -150,16 +146,9 @@ class Policy:
         Arguments of the environment that give the policy its observation.
     """
 
-    def __init__(
-        self,
-        arguments: PPOArguments,
-        folder: Path,
-        *,
-        retrain: bool = False,
-        progress: bool = False,
-    ) -> None:
+    def __init__(self, arguments: PPOArguments, folder: Path) -> None:
         self.observation = arguments.observation
-        self._model = trained_policy(arguments, folder, retrain=retrain, progress=progress)
+        self._model = trained_policy(arguments, folder, retrain=False, progress=False)
 
     def __call__(self) -> PolicyController:
         """Return a controller."""
@@ -216,14 +205,13 @@ class Trained:
 
     def members(self) -> list[Policy]:
         """Return the policies as factories of controllers."""
-        trained = Parallel(self._jobs)(
+        Parallel(self._jobs)(  # what is trained lies in the folders then
             delayed(trained_policy)(
                 arguments, folder, retrain=self._retrain, progress=self._progress
             )
             for arguments, folder in zip(self._arguments, self._folders, strict=True)
             if self._retrain or not is_trained(folder)
         )
-        del trained  # only what lies in the folders counts
         members = []
         for arguments, folder in zip(self._arguments, self._folders, strict=True):
             members.append(Policy(arguments, folder))
