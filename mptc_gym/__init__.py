@@ -7,10 +7,11 @@ import gymnasium
 
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import Parameters
+from mptc_gym.presets import PRESETS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
 __version__ = "0.1.0"
-__all__ = ["MiddlePointEnv", "MiddlePointVectorEnv", "Parameters", "__version__"]
+__all__ = ["PRESETS", "MiddlePointEnv", "MiddlePointVectorEnv", "Parameters", "__version__"]
 
 gymnasium.register(
     id="MiddlePoint-v0",

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from mptc_gym.parameters import Parameters
 from mptc_gym.plant import Plant, action_from_command
-from mptc_gym.signals import BLOCK, Noise, SetPoint, Streams
+from mptc_gym.ranges import Ranges
+from mptc_gym.signals import BLOCK, Disturbance, Noise, SetPoint, Streams
 
 _FLOAT32 = np.dtype(np.float32)  # quicker to pass on than the type
 
@@ -61,6 +62,23 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     the plant from sample k to k+1 and returns the observation at k+1 and the reward of e(k+1).
     So u(0) first shows in y(19).
 
+    Section 1 of the paper names more that makes the loop hard and is not in (28). It is off by
+    default, and `mptc_gym.PRESETS` has variants with it:
+
+    - Noise of the transmitter: the observation shows y + v, v ~ N(0, measurement_noise_variance),
+      white, from k = 1 on. Reward and `info["output"]` are those of the true y.
+    - A load disturbance w, as when the feedwater's temperature, the coal or the fire's position
+      changes: A(1) w(k) is added to (28), so that y comes to w if w stays. It starts at 0 and
+      changes every 10 samples. It is the sum of steps, each to a level uniform within
+      +-`disturbance_amplitude`, at random times, `disturbance_interval` samples apart on
+      average; and of a random walk that gains `disturbance_walk_variance` a sample.
+    - Other dynamics: `gain_factor` times the steady-state gain, `time_constant_factor` times the
+      dominant time constant. With p the slowest pole (0.9515), A = (1 - p z^-1) Q(z^-1),
+      and the time constant is 1 / (1 - p) = 20.6 samples. For t times the time constant and g times the
+      gain, 1 - p is divided by t, Q stays, and B is multiplied by g / t.
+    - Fouling: over `drift_samples` samples gain and time constant drift, linearly, to `gain_drift`
+      and `time_constant_drift` times what they were at k = 0. They change every 10 samples.
+
     ## Action space
 
     `Box(-1, 1, (1,), float32)`: u = u_min + (a + 1) / 2 * (u_max - u_min).
@@ -102,9 +120,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     ## Starting state
 
     Before k = 0 the plant has been at rest: y, y_d, e, u, u_a and xi are all 0, so y(0) = 0.
-    Noise and set point are drawn from the seed alone, in separate streams, so that every
-    controller meets the same ones. The j-th episode after a seed is the same however long the
-    episodes before it were. `reset` knows no options.
+    All that is drawn is drawn from the seed alone, in separate streams, so that every
+    controller meets the same noise, set point, disturbance and plant. The j-th episode after a
+    seed is the same however long the episodes before it were. `reset` knows no options.
 
     ## Episode end
 
@@ -112,17 +130,28 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
     ## Arguments
 
-    All are keyword-only and can be given to `gymnasium.make`.
+    All are keyword-only and can be given to `gymnasium.make`. Where the default is marked with an
+    asterisk, the argument can also be a range [low, high], from which `reset` draws a number,
+    uniformly (an integer where the argument is one).
 
     | Argument | Default | Meaning |
     |---|---|---|
     | `a` | (1, -0.45181, -0.47546) | coefficients of A in (28), from z^0 on; the first is 1. An unstable A is taken as it is: y may grow beyond all floats |
     | `b` | (-0.04560, -0.00404) | coefficients of B in (28), from z^-1 on, degC per t/h |
     | `c` | (1, -0.35740, -0.03392) | coefficients of C in (28), from z^0 on; the first is 1 |
-    | `delay` | 18 | transport delay d, samples |
-    | `dead_zone` | 5.0 | half width of the dead zone, t/h |
-    | `u_min`, `u_max` | -10.0, 10.0 | the actuator's limits, t/h |
-    | `noise_variance` | 0.0 | R, the variance of xi, degC^2 |
+    | `delay` | 18* | transport delay d, samples |
+    | `dead_zone` | 5.0* | half width of the dead zone, t/h |
+    | `u_min`, `u_max` | -10.0*, 10.0* | the actuator's limits, t/h |
+    | `noise_variance` | 0.0* | R, the variance of xi, degC^2 |
+    | `measurement_noise_variance` | 0.0* | variance of the transmitter's noise, degC^2 |
+    | `disturbance_amplitude` | 0.0* | of the steps of the load disturbance, degC |
+    | `disturbance_interval` | 150.0* | mean interval between these steps, samples; below 10 it is 10 |
+    | `disturbance_walk_variance` | 0.0* | that the random walk of the load disturbance gains a sample, degC^2 |
+    | `gain_factor` | 1.0* | steady-state gain, as a multiple of that of `a` and `b` |
+    | `time_constant_factor` | 1.0* | dominant time constant, as a multiple of that of `a` |
+    | `gain_drift` | 1.0* | by which factor the gain has changed after `drift_samples` |
+    | `time_constant_drift` | 1.0* | by which factor the time constant has |
+    | `drift_samples` | 1200 | how long they drift, samples |
     | `sampling_interval` | 8.0 | s; the scale of the time axis, without effect on the dynamics |
     | `setpoint` | "square" | "square", "random", a number (constant), or a list of numbers (one a sample, the last one held) |
     | `setpoint_amplitude` | 5.0 | A, degC. "square": A for the first half period, then -A. "random": levels uniform in [-A, A] |
@@ -141,6 +170,10 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     (y_d, degC), `error` (y_d - y, degC), `command` (u, t/h), `applied` (u_a, t/h) and `noise`
     (n, degC). After a step `command` and `applied` are those of the step, the others those of
     the sample it leads to. At reset `command`, `applied` and `noise` are 0.
+
+    With a load disturbance there is also `disturbance` (w, degC), and with a drift `gain_factor`
+    and `time_constant_factor`, both as they are now. The dict of `reset` also has, under its name,
+    each number that was drawn.
 
     ## Errors
 
@@ -189,12 +222,16 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             *parameters.heads,
             parameters.observation_size,
         )
-        self._noise = Noise(parameters)
+        self._ranges = Ranges(parameters)
+        self._noise = Noise(parameters.c, parameters.range_of("noise_variance"))
+        self._transmitter = Noise([1.0], parameters.range_of("measurement_noise_variance"))
+        self._disturbance = Disturbance(parameters)
         self._setpoint = SetPoint(parameters)
+        self._tells_more = parameters.is_disturbed or parameters.drifts
         self._streams: Streams | None = None
         self._root: np.random.Generator | None = None  # what the streams come from
-        # (y_d, n) of the samples ahead, the next one last.
-        self._ahead: list[tuple[float, float]] = []
+        # y_d, n, w and the transmitter's noise of the samples ahead, the next one last.
+        self._ahead: list[tuple[float, float, float, float]] = []
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -222,12 +259,22 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
             self._streams = Streams.spawn(seeds)
         parameters = self.parameters
-        self._noise.restart(self._streams.noise)
+        numbers, drawn = self._ranges.given, {}
+        if self._ranges.names or parameters.is_disturbed:
+            generator = self._streams.plant.next_episode()
+            draws = self._ranges.draw([generator], 1)
+            drawn = {name: float(draw[0]) for name, draw in draws.items()}
+            numbers = {**numbers, **drawn}
+            self._disturbance.restart(generator, numbers)
+        self._noise.restart(self._streams.noise, numbers["noise_variance"])
+        self._transmitter.restart(
+            self._streams.transmitter, numbers["measurement_noise_variance"]
+        )
         self._setpoint.restart(self._streams.setpoint)
-        self._plant = Plant(parameters)
+        self._plant = Plant(parameters, numbers)
 
         # At rest u is 0, whatever action that is.
-        self._action = action_from_command(0.0, parameters.u_min, parameters.u_max)
+        self._action = action_from_command(0.0, numbers["u_min"], numbers["u_max"])
         rest = _limited(self._action, 1.0)
         size, actions = parameters.observation_size, parameters.action_window
         # One element to spare at the end: see step.
@@ -235,12 +282,13 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self._ahead.clear()
 
         setpoint = self._setpoint.take(1)[0]
+        self._disturbance.take(1)  # 0, that of k = 0
         error_head, output_head, action_head = parameters.heads
         self._window[0] = setpoint
         self._window[error_head] = setpoint
         self._window[output_head] = 0.0
         self._window[action_head] = rest
-        return np.fromiter(self._window, _FLOAT32, size), {
+        info = {
             "output": 0.0,
             "setpoint": setpoint,
             "error": setpoint,
@@ -248,6 +296,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             "applied": 0.0,
             "noise": 0.0,
         }
+        if self._tells_more:
+            self._tell_more(info, 0.0)
+        return np.fromiter(self._window, _FLOAT32, size), info | drawn
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
         """Apply a normalised action for one sample.
@@ -277,11 +328,11 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         shown = a if -1.0 <= a <= 1.0 else _beyond_the_box(a)
         if not self._ahead:
             self._look_ahead()
-        setpoint, noise = self._ahead.pop()
+        setpoint, noise, load, transmitter_noise = self._ahead.pop()
         error_scale, quadratic, move_weight = self._reward_terms
         span, error_head, output_head, action_head, size = self._layout
 
-        command, applied, output = self._plant.step(a, noise)
+        command, applied, output = self._plant.step(a, noise, load)
         error = setpoint - output
         scaled = error / error_scale
         cost = scaled * scaled / 2.0 if quadratic else abs(scaled)  # (12)
@@ -292,7 +343,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         # All blocks move by one at once; what crosses into the next block is overwritten there.
         # An empty block begins where the next one does, which is written after it, or at the
         # spare element at the end.
-        measured = output if -span <= output <= span else _limited(output, span)
+        measured = output + transmitter_noise
+        if not -span <= measured <= span:
+            measured = _limited(measured, span)
         window = self._window
         window.insert(0, setpoint)
         window.pop()
@@ -300,20 +353,17 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         window[output_head] = measured
         window[action_head] = shown
         observation = np.fromiter(window, _FLOAT32, size)  # quicker than np.array
-        return (
-            observation,
-            -cost,
-            False,
-            False,
-            {
-                "output": output,
-                "setpoint": setpoint,
-                "error": error,
-                "command": command,
-                "applied": applied,
-                "noise": noise,
-            },
-        )
+        info = {
+            "output": output,
+            "setpoint": setpoint,
+            "error": error,
+            "command": command,
+            "applied": applied,
+            "noise": noise,
+        }
+        if self._tells_more:
+            self._tell_more(info, load)
+        return observation, -cost, False, False, info
 
     def render(self) -> None:
         """Do nothing: there is no render mode yet."""
@@ -321,8 +371,15 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     def _look_ahead(self) -> None:
         if self._streams is None:
             raise ResetNeeded("call reset before step")
-        setpoints, noises = self._setpoint.take(BLOCK), self._noise.take(BLOCK)
-        self._ahead = list(zip(setpoints, noises, strict=True))[::-1]
+        signals = self._setpoint, self._noise, self._disturbance, self._transmitter
+        self._ahead = list(zip(*(signal.take(BLOCK) for signal in signals), strict=True))[::-1]
+
+    def _tell_more(self, info: dict[str, float], load: float) -> None:
+        """Add to the info what belongs to arguments that are off by default."""
+        if self.parameters.is_disturbed:
+            info["disturbance"] = load
+        if self.parameters.drifts:
+            info["gain_factor"], info["time_constant_factor"] = self._plant.factors
 
 
 def _limited(value: float, limit: float) -> float:

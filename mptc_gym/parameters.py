@@ -2,14 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any, Final, NoReturn
 
+import numpy as np
+
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
 LARGEST: Any = 10**9  # of any argument; beyond, float32 observations and squares lose meaning
+
+# The arguments that can be a range, in the order of their draws: a new one comes last.
+PLANT_NUMBERS: Final = (
+    "delay",
+    "dead_zone",
+    "u_min",
+    "u_max",
+    "noise_variance",
+    "measurement_noise_variance",
+    "disturbance_amplitude",
+    "disturbance_interval",
+    "disturbance_walk_variance",
+    "gain_factor",
+    "time_constant_factor",
+    "gain_drift",
+    "time_constant_drift",
+)
+SLOW: Final = 10  # samples between two changes of the load disturbance and of the dynamics
+Number = float | Sequence[float]  # or a range, [low, high]
 
 
 def _reject(name: str, value: object, allowed: str) -> NoReturn:
@@ -58,6 +80,29 @@ def positive_count(name: str, value: Any) -> int:
     return _count(name, value, minimum=1)
 
 
+def _at_least_1(name: str, value: Any) -> float:
+    allowed = "a number from 1 to 1e9"
+    if _number(name, value, allowed) < 1:
+        _reject(name, value, allowed)
+    return float(value)
+
+
+def _or_range(check: Callable[[str, Any], float]) -> Callable[[str, Any], Number]:
+    """Return a check that takes a range [low, high] as well, of what `check` takes."""
+
+    def checked(name: str, value: Any) -> Number:
+        if not isinstance(value, list | tuple):
+            return check(name, value)
+        if len(value) != 2:
+            _reject(name, value, "one number, or a range [low, high]")
+        low, high = check(name, value[0]), check(name, value[1])
+        if low > high:
+            _reject(name, value, "one number, or a range [low, high] with low <= high")
+        return low, high
+
+    return checked
+
+
 def _numbers(
     name: str, value: Any, allowed: str = "a list of one or more numbers within +-1e9"
 ) -> tuple[float, ...]:
@@ -89,12 +134,27 @@ def _reward(name: str, value: Any) -> str:
     return value
 
 
+def slowest_pole(a: Sequence[float]) -> float:
+    """Return the largest pole of 1 / A, NaN if it is none or not real."""
+    poles = np.roots(a)
+    slowest = poles[np.argmax(np.abs(poles))] if len(poles) else np.nan
+    return float(slowest.real) if np.isreal(slowest) else math.nan
+
+
+def _least_magnitude(low: float, high: float) -> float:
+    return max(low, -high, 0.0)
+
+
+def _shown(number: Number) -> str:
+    return f"{number:g}" if isinstance(number, float | int) else f"{list(number)}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
     """The arguments of `MiddlePoint-v0`, checked and brought to plain Python types.
 
     The defaults are the first case of the paper (Section 5, Fig. 5). All quantities are
-    deviations from the operating point.
+    deviations from the operating point. Those named in `PLANT_NUMBERS` can be a range.
 
     Raises
     ------
@@ -107,12 +167,22 @@ class Parameters:
     a: Sequence[float] = (1.0, -0.45181, -0.47546)  # A, from z^0 on; the first is 1
     b: Sequence[float] = (-0.04560, -0.00404)  # B, from z^-1 on; degC per t/h
     c: Sequence[float] = (1.0, -0.35740, -0.03392)  # C, from z^0 on; the first is 1
-    delay: int = 18  # d, samples
+    delay: Number = 18  # d, samples
     # The actuator, (29).
-    dead_zone: float = 5.0  # t/h
-    u_min: float = -10.0  # U_min, t/h
-    u_max: float = 10.0  # U_max, t/h
-    noise_variance: float = 0.0  # R, the variance of xi, degC^2
+    dead_zone: Number = 5.0  # t/h
+    u_min: Number = -10.0  # U_min, t/h
+    u_max: Number = 10.0  # U_max, t/h
+    noise_variance: Number = 0.0  # R, the variance of xi, degC^2
+    # What the paper names in Section 1, beside delay and actuator, and leaves out of (28).
+    measurement_noise_variance: Number = 0.0  # white, degC^2
+    disturbance_amplitude: Number = 0.0  # of its steps, degC
+    disturbance_interval: Number = 150.0  # between steps, on average, samples
+    disturbance_walk_variance: Number = 0.0  # that its random walk gains a sample, degC^2
+    gain_factor: Number = 1.0  # steady-state gain, in multiples of that of B / A
+    time_constant_factor: Number = 1.0  # dominant time constant, in multiples of that of A
+    gain_drift: Number = 1.0  # by which factor the gain has changed after drift_samples
+    time_constant_drift: Number = 1.0  # by which the time constant has
+    drift_samples: int = 1200
     sampling_interval: float = 8.0  # s (Section 5)
     # The set point y_d. The paper plots it and does not state it.
     setpoint: str | float | Sequence[float] = "square"
@@ -134,11 +204,20 @@ class Parameters:
             "a": _polynomial,
             "b": _numbers,
             "c": _polynomial,
-            "delay": _count,
-            "dead_zone": _not_negative,
-            "u_min": _number,
-            "u_max": _number,
-            "noise_variance": _not_negative,
+            "delay": _or_range(_count),
+            "dead_zone": _or_range(_not_negative),
+            "u_min": _or_range(_number),
+            "u_max": _or_range(_number),
+            "noise_variance": _or_range(_not_negative),
+            "measurement_noise_variance": _or_range(_not_negative),
+            "disturbance_amplitude": _or_range(_not_negative),
+            "disturbance_interval": _or_range(_at_least_1),
+            "disturbance_walk_variance": _or_range(_not_negative),
+            "gain_factor": _or_range(_positive),
+            "time_constant_factor": _or_range(_positive),
+            "gain_drift": _or_range(_positive),
+            "time_constant_drift": _or_range(_positive),
+            "drift_samples": positive_count,
             "sampling_interval": _positive,
             "setpoint": _setpoint,
             "setpoint_amplitude": _not_negative,
@@ -155,21 +234,84 @@ class Parameters:
         for name, check in checks.items():
             object.__setattr__(self, name, check(name, getattr(self, name)))
 
-        if self.u_min >= self.u_max:
-            _reject("u_min", self.u_min, f"below u_max = {self.u_max:g}")
-        if self.dead_zone > max(abs(self.u_min), abs(self.u_max)):
-            _reject(
-                "dead_zone",
-                self.dead_zone,
-                "small enough to leave some command effective, at most max(|u_min|, |u_max|) = "
-                f"{max(abs(self.u_min), abs(self.u_max)):g}",
-            )
+        self._check_actuator()
+        self._check_dynamics()
         if self.observation_size == 0:
             _reject(
                 "setpoint_window, error_window, output_window, action_window",
                 (0, 0, 0, 0),
                 "such that the observation has at least one element",
             )
+
+    def _check_actuator(self) -> None:
+        """Refuse limits and a dead zone that do not fit together, whatever is drawn."""
+        (lowest, low), (high, highest) = self.range_of("u_min"), self.range_of("u_max")
+        if low >= high:
+            _reject("u_min", self.u_min, f"below u_max = {_shown(self.u_max)}")
+        # The draw that leaves least of both limits.
+        reach = max(_least_magnitude(lowest, low), _least_magnitude(high, highest))
+        if self.range_of("dead_zone")[1] > reach:
+            _reject(
+                "dead_zone",
+                self.dead_zone,
+                "small enough to leave some command effective, at most max(|u_min|, |u_max|) = "
+                f"{reach:g}",
+            )
+
+    def _check_dynamics(self) -> None:
+        """Refuse a change of dynamics that A has no meaning for."""
+        name = "time_constant_factor"
+        drift = self.range_of("time_constant_drift")[0]
+        if self.changes_time_constant:
+            pole = slowest_pole(self.a)
+            if not 0.0 < pole < 1.0:
+                _reject(
+                    f"{name}, time_constant_drift",
+                    (getattr(self, name), self.time_constant_drift),
+                    f"1 for this a, whose slowest pole, {pole:g}, is not between 0 and 1",
+                )
+            if self.range_of(name)[0] * min(drift, 1.0) < 1.0 - pole:
+                _reject(
+                    f"{name}, time_constant_drift",
+                    (getattr(self, name), self.time_constant_drift),
+                    f"such that the factor is never below {1.0 - pole:g}, where the slowest "
+                    "pole comes to 0",
+                )
+        if self.is_disturbed and not np.all(np.abs(np.roots(self.a)) < 1.0):
+            _reject(
+                "disturbance_amplitude, disturbance_walk_variance",
+                (self.disturbance_amplitude, self.disturbance_walk_variance),
+                "0 for this a, which is not stable and has no steady state",
+            )
+
+    def range_of(self, name: str) -> tuple[float, float]:
+        """Return the lowest and the highest value that a plant number can take."""
+        value = getattr(self, name)
+        return value if isinstance(value, tuple) else (value, value)
+
+    @property
+    def ranges(self) -> tuple[str, ...]:
+        """Names of the plant numbers that are drawn at each reset."""
+        return tuple(name for name in PLANT_NUMBERS if isinstance(getattr(self, name), tuple))
+
+    @property
+    def is_disturbed(self) -> bool:
+        """Whether there is a load disturbance."""
+        names = "disturbance_amplitude", "disturbance_walk_variance"
+        return any(self.range_of(name)[1] > 0.0 for name in names)
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the dynamics change within an episode."""
+        return any(
+            self.range_of(n) != (1.0, 1.0) for n in ("gain_drift", "time_constant_drift")
+        )
+
+    @property
+    def changes_time_constant(self) -> bool:
+        """Whether the time constant is, or may come to be, another than that of A."""
+        names = "time_constant_factor", "time_constant_drift"
+        return any(self.range_of(name) != (1.0, 1.0) for name in names)
 
     @property
     def windows(self) -> tuple[int, int, int, int]:

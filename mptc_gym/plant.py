@@ -7,19 +7,86 @@ and `Plants` in arrays. Both do the same operations in the same order, and agree
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from operator import mul
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import Parameters
+from mptc_gym.parameters import PLANT_NUMBERS, SLOW, Parameters, slowest_pole
 
 Values = NDArray[np.float64]  # one a plant, shape (n,)
 
 
-def action_from_command(command: float, u_min: float, u_max: float) -> float:
+def action_from_command(command: float, u_min: Any, u_max: Any) -> Any:
     """Scale a command (t/h) to a normalised action: -1 at `u_min`, 1 at `u_max`."""
     return 2.0 * (command - u_min) / (u_max - u_min) - 1.0
+
+
+class Dynamics:
+    """How A and B of (28) follow from the steady-state gain and the dominant time constant.
+
+    With p the slowest pole, A = (1 - p z^-1) Q(z^-1). The time constant of p is 1 / (1 - p)
+    samples: the area above the step response of 1 / (1 - p z^-1), scaled to end at 1. With t
+    times the time constant, 1 - p is divided by t, and Q stays. As A(1) = (1 - p) Q(1) is then
+    divided by t as well, the steady-state gain B(1) / A(1) is g times the given one if B is
+    multiplied by g / t. Drifts take g and t from their factors to `gain_drift` and
+    `time_constant_drift` times those, linearly over `drift_samples`.
+
+    Parameters
+    ----------
+    parameters
+        Uses `a`, `drift_samples` and which factors and drifts are not 1.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._samples = parameters.drift_samples
+        self._alpha = tuple(-coefficient for coefficient in parameters.a[1:])
+        self._sum = sum(parameters.a)
+        self._quotient: tuple[float, ...] | None = None
+        if parameters.changes_time_constant:
+            pole = slowest_pole(parameters.a)
+            self._rate = 1.0 - pole
+            quotient = [1.0]  # Q, by Horner's scheme
+            for coefficient in parameters.a[1:-1]:
+                quotient.append(coefficient + pole * quotient[-1])
+            self._quotient = (*quotient, 0.0)
+
+    def factors(self, numbers: Mapping[str, Any], age: Any) -> tuple[Any, Any]:
+        """Return g and t.
+
+        Parameters
+        ----------
+        numbers
+            The plant numbers, floats, or arrays for many plants.
+        age
+            k, one number, or an array.
+        """
+        share = np.minimum(age / self._samples, 1.0)
+        gain, time_constant = numbers["gain_factor"], numbers["time_constant_factor"]
+        return (
+            gain + gain * (numbers["gain_drift"] - 1.0) * share,
+            time_constant + time_constant * (numbers["time_constant_drift"] - 1.0) * share,
+        )
+
+    def coefficients(self, gain: Any, time_constant: Any) -> tuple[list[Any], Any, Any]:
+        """Return what (28) has for g and t.
+
+        Returns
+        -------
+        list, Any, Any
+            The coefficients of A from z^-1 on with their signs changed; what B is multiplied
+            with; and A(1).
+        """
+        alpha: list[Any] = list(self._alpha)
+        if self._quotient is not None:
+            pole = 1.0 - self._rate / time_constant
+            alpha = [
+                pole * before - here
+                for before, here in zip(self._quotient, self._quotient[1:], strict=False)
+            ]
+        return alpha, gain / time_constant, self._sum / time_constant
 
 
 class Plant:
@@ -33,20 +100,32 @@ class Plant:
     Parameters
     ----------
     parameters
-        Uses `a`, `b`, `delay`, `dead_zone`, `u_min` and `u_max`.
+        Uses `b`, and what `Dynamics` does.
+    numbers
+        The plant numbers of the episode.
+
+    Attributes
+    ----------
+    factors : tuple of float
+        Gain and time constant, as multiples of those that A and B have.
     """
 
-    def __init__(self, parameters: Parameters) -> None:
-        u_min, u_max = parameters.u_min, parameters.u_max
-        self._actuator = parameters.dead_zone, u_min, u_max, (u_max - u_min) / 2.0
+    def __init__(self, parameters: Parameters, numbers: Mapping[str, float]) -> None:
+        u_min, u_max = numbers["u_min"], numbers["u_max"]
+        self._actuator = numbers["dead_zone"], u_min, u_max, (u_max - u_min) / 2.0
+        self._numbers = numbers
+        self._drifts = parameters.drifts
+        self._age = 0
+        self._dynamics = Dynamics(parameters)
+        self._foul()
         # Each coefficient with its place in the history it is for, and both histories with the
         # newest sample first: y(k), y(k-1), ... and u_a(k), u_a(k-1), ...
-        self._alpha = tuple(enumerate(-coefficient for coefficient in parameters.a[1:]))
-        self._beta = tuple(enumerate(parameters.b, start=parameters.delay))
+        delay = int(numbers["delay"])
+        self._beta = tuple(enumerate(parameters.b, start=delay))
         self._outputs = _at_rest(len(self._alpha))
-        self._inputs = _at_rest(parameters.delay + len(self._beta))
+        self._inputs = _at_rest(delay + len(self._beta))
 
-    def step(self, action: float, noise: float) -> tuple[float, float, float]:
+    def step(self, action: float, noise: float, load: float) -> tuple[float, float, float]:
         """Move from sample k to k+1.
 
         Parameters
@@ -55,6 +134,8 @@ class Plant:
             a(k), normalised: -1 at U_min and 1 at U_max. An action beyond is a command beyond.
         noise
             n(k+1), degC.
+        load
+            w(k+1), the load disturbance, degC: what y would come to if it stayed.
 
         Returns
         -------
@@ -65,6 +146,10 @@ class Plant:
         output
             y(k+1), degC.
         """
+        if self._drifts:
+            self._age += 1
+            if self._age % SLOW == 0:
+                self._foul()
         dead_zone, u_min, u_max, half_range = self._actuator
         command = u_min + (action + 1.0) * half_range  # Section 4, last formula
         applied = command  # (29) from here on
@@ -79,51 +164,114 @@ class Plant:
         response = 0.0  # to the input: B of (28)
         for lag, beta in self._beta:
             response += beta * inputs[lag]
-        output = noise + response
+        if load:
+            noise += self._load_gain * load
+        output = noise + self._scale * response
         for lag, alpha in self._alpha:
             output += alpha * outputs[lag]  # A of (28)
         outputs.appendleft(output)
         return command, applied, output
 
+    def _foul(self) -> None:
+        """Bring the dynamics to the plant's age."""
+        gain, time_constant = map(float, self._dynamics.factors(self._numbers, self._age))
+        alpha, self._scale, self._load_gain = self._dynamics.coefficients(gain, time_constant)
+        self._alpha = tuple(enumerate(alpha))
+        self.factors = gain, time_constant
+
 
 class Plants:
-    """Many plants side by side, with the same parameters: `Plant` in arrays.
+    """Many plants side by side: `Plant` in arrays.
 
     Parameters
     ----------
     parameters
-        Uses `a`, `b`, `delay`, `dead_zone`, `u_min` and `u_max`.
+        Uses `b`, the plant numbers, and what `Dynamics` does.
     num_envs
         n, number of plants.
+
+    Attributes
+    ----------
+    factors : tuple of ndarray
+        As those of `Plant`; shape (n,) if they drift or are drawn, otherwise ().
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         # An array of one number costs less in arithmetic than a number does. Where arrays are
         # compared, full ones cost less still.
-        u_min, u_max = parameters.u_min, parameters.u_max
-        numbers = 0.0, 1.0, (u_max - u_min) / 2.0, u_min, parameters.dead_zone
-        limits = np.full(num_envs, u_min), np.full(num_envs, u_max)
-        self._actuator = (*map(np.array, numbers), *limits)
-        self._alpha = tuple(np.array(-coefficient) for coefficient in parameters.a[1:])
-        self._beta = tuple(parameters.b)
-        self._outputs = deque(np.zeros((len(self._alpha), num_envs)), maxlen=len(self._alpha))
+        self._numbers = {
+            name: np.full(num_envs if name in parameters.ranges else (), low, np.float64)
+            for name in PLANT_NUMBERS
+            for low in parameters.range_of(name)[:1]
+        }
+        zero, one = np.array(0.0), np.array(1.0)
+        u_min, u_max = self._numbers["u_min"], self._numbers["u_max"]
+        self._half_range = np.array((u_max - u_min) / 2.0)
+        self._limits = np.full(num_envs, u_min), np.full(num_envs, u_max)
+        dead_zone = self._numbers["dead_zone"]
+        self._actuator = zero, one, self._half_range, u_min, dead_zone, *self._limits
+
+        self._dynamics = Dynamics(parameters)
+        self._drifts = parameters.drifts
+        # Whether (28) may have other coefficients than it was given.
+        own = ("gain_factor", "time_constant_factor")
+        self._fouls = self._drifts or any(parameters.range_of(n) != (1.0, 1.0) for n in own)
+        self._clock = self._next_fouling = 0
+        self._starts = np.zeros(num_envs if self._drifts else (), np.int64)
+        self._foul()
+        order = len(self._alpha)
+        self._outputs = deque(np.zeros((order, num_envs)), maxlen=order)
+
         # Because of the delay d, the response to the inputs of d + 1 samples can be worked out
-        # at once. Inputs lie here with the oldest first; before those of the d + 1 samples come
-        # the older ones that B also needs.
+        # at once, d being the shortest that can be drawn. Inputs lie here with the oldest
+        # first; before those of the d + 1 samples come the older ones that B also needs.
+        shortest, longest = map(int, parameters.range_of("delay"))
+        self._beta = tuple(parameters.b)
         self._older = len(self._beta) - 1
-        self._samples = parameters.delay + 1
+        self._samples = shortest + 1
         self._inputs = np.zeros((self._older + self._samples, num_envs))
         self._response = np.zeros((self._samples, num_envs))
         self._place = self._samples - 1  # of the next input among the d + 1
+        # Plants with a longer delay take their response from rows of earlier responses.
+        self._shortest, self._longer = shortest, longest - shortest
+        self._earlier = np.zeros((self._longer + self._samples, num_envs))
+        self._taken = np.arange(self._samples * num_envs).reshape(self._response.shape)
 
-    def rest(self, which: NDArray[np.intp]) -> None:
-        """Bring some of the plants to rest, given by their indices."""
+    def rest(self, which: NDArray[np.intp], drawn: Mapping[str, Values]) -> None:
+        """Bring some of the plants to rest.
+
+        Parameters
+        ----------
+        which
+            Their indices.
+        drawn
+            What is drawn of their plant numbers, each of shape (len(which),).
+        """
         self._inputs[:, which] = 0.0
         self._response[:, which] = 0.0
         for outputs in self._outputs:
             outputs[which] = 0.0
+        for name, values in drawn.items():
+            self._numbers[name][which] = values
+        numbers = self._numbers
+        if "u_min" in drawn or "u_max" in drawn:
+            u_min, u_max = numbers["u_min"], numbers["u_max"]
+            for limit, values in zip(self._limits, (u_min, u_max), strict=True):
+                limit[:] = values
+            self._half_range[:] = (u_max - u_min) / 2.0
+        if self._longer:
+            self._earlier[:, which] = 0.0
+            rows = np.arange(self._samples)[:, np.newaxis] + self._longer + self._shortest
+            rows = rows - numbers["delay"][which].astype(np.intp)
+            self._taken[:, which] = rows * self._inputs.shape[1] + which
+        if self._fouls:
+            if self._drifts:
+                self._starts[which] = self._clock
+            self._foul()
 
-    def step(self, action: Values, noise: Values) -> tuple[Values, Values, Values]:
+    def step(
+        self, action: Values, noise: Values, load: Values | None = None
+    ) -> tuple[Values, Values, Values]:
         """Move all plants from sample k to k+1.
 
         Parameters
@@ -132,6 +280,8 @@ class Plants:
             a(k), shape (n,).
         noise
             n(k+1), degC, shape (n,).
+        load
+            w(k+1), degC, shape (n,), if there is any.
 
         Returns
         -------
@@ -139,6 +289,10 @@ class Plants:
             u(k) and u_a(k), t/h, and y(k+1), degC; each of shape (n,). The last is kept here
             and must not be changed.
         """
+        if self._drifts:
+            self._clock += 1
+            if self._clock >= self._next_fouling:
+                self._foul()
         zero, one, half_range, offset, dead_zone, u_min, u_max = self._actuator
         command = action + one
         command *= half_range
@@ -156,7 +310,12 @@ class Plants:
             self._respond()
             place = 0
         self._place = place
-        output: Values = noise + self._response[place]
+        response = self._response[place]
+        if self._fouls:
+            response = self._scale * response
+        if load is not None:
+            noise = noise + self._load_gain * load
+        output: Values = noise + response
         for term in map(mul, self._alpha, self._outputs):  # A of (28)
             output += term
         self._outputs.appendleft(output)
@@ -169,6 +328,19 @@ class Plants:
         for lag, beta in enumerate(self._beta):  # B of (28)
             self._response += beta * inputs[older - lag : older - lag + samples]
         inputs[:older] = inputs[samples:].copy()
+        if self._longer:
+            self._earlier[: self._longer] = self._earlier[samples:].copy()
+            self._earlier[self._longer :] = self._response
+            self._earlier.take(self._taken, out=self._response, mode="clip")
+
+    def _foul(self) -> None:
+        """Bring the dynamics to the plants' ages."""
+        ages = self._clock - self._starts
+        slow = ages // SLOW * SLOW
+        self.factors = self._dynamics.factors(self._numbers, slow)
+        alpha, self._scale, self._load_gain = self._dynamics.coefficients(*self.factors)
+        self._alpha = tuple(map(np.asarray, alpha))
+        self._next_fouling = self._clock + int((slow + SLOW - ages).min())
 
 
 def _at_rest(samples: int) -> deque[float]:

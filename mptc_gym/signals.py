@@ -1,24 +1,25 @@
-"""What comes from outside during an episode: set point, noise, and the draws they are made of.
+"""What comes from outside during an episode: set point, noise, disturbance, and their draws.
 
-One plant and many side by side have classes of their own, which share how a signal goes on. The
-noise is made a block of samples at a time: drawing many numbers in one call costs a small part
-of drawing them one by one, and gives the same numbers.
+One plant and many side by side have classes of their own, which share how a signal goes on.
+Noise and disturbance are made a block of samples at a time: drawing many numbers in one call
+costs a small part of drawing them one by one, and gives the same numbers.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import Parameters
+from mptc_gym.parameters import SLOW, Parameters
 
 BLOCK = 600  # samples made at a time
 FOREVER = 1 << 62  # samples
 _TOGETHER = 32  # plants whose noise is made at a time: it stays in the processor's cache
+_CHANGES = 60  # of a disturbance made at a time
 
 
 class EpisodeStream:
@@ -57,6 +58,8 @@ class Streams(NamedTuple):
 
     noise: EpisodeStream
     setpoint: EpisodeStream
+    plant: EpisodeStream  # first the plant numbers, then the disturbance
+    transmitter: EpisodeStream
 
     @classmethod
     def spawn(cls, seeds: np.random.SeedSequence) -> Streams:
@@ -65,25 +68,29 @@ class Streams(NamedTuple):
 
 
 class Noise:
-    """The process noise n(k) = C(z^-1) xi(k) of (28), from k = 1 on; xi is 0 before.
+    """Coloured noise, from k = 1 on: C(z^-1) xi(k) of (28), where xi is 0 before.
 
     Parameters
     ----------
-    parameters
-        Uses `c` and `noise_variance`.
+    c
+        Coefficients of C, from z^0 on.
+    variances
+        The lowest and the highest that xi can have, degC^2.
     """
 
-    def __init__(self, parameters: Parameters) -> None:
-        self._colour = _colour(parameters)
-        self._silent = parameters.noise_variance == 0.0
+    def __init__(self, c: Sequence[float], variances: tuple[float, float]) -> None:
+        self._c = c
+        self._silent = variances[1] == 0.0
 
-    def restart(self, stream: EpisodeStream) -> None:
+    def restart(self, stream: EpisodeStream, variance: float) -> None:
         """Begin an episode, with one draw a sample; without noise the stream is untouched."""
         self._generator = None if self._silent else stream.next_episode()
-        self._past = np.zeros(len(self._colour) - 1)  # draws, oldest first
+        deviation = math.sqrt(variance)
+        self._colour = [deviation * coefficient for coefficient in self._c]
+        self._past = np.zeros(len(self._c) - 1)  # draws, oldest first
 
     def take(self, samples: int) -> list[float]:
-        """Return the next values of n, degC."""
+        """Return the next values, degC."""
         if self._generator is None:
             return [0.0] * samples
         draws = np.concatenate((self._past, self._generator.standard_normal(samples)))
@@ -97,28 +104,57 @@ class Noises:
 
     Parameters
     ----------
-    parameters
-        Uses `c` and `noise_variance`.
+    c
+        Coefficients of C, from z^0 on.
+    variances
+        The lowest and the highest that xi can have, degC^2.
     num_envs
         Number of plants.
     block
         Samples made at a time.
+
+    Attributes
+    ----------
+    silent : bool
+        Whether there is never any noise.
     """
 
-    def __init__(self, parameters: Parameters, num_envs: int, block: int) -> None:
-        self._colour = _colour(parameters)
-        self._silent = parameters.noise_variance == 0.0
+    def __init__(
+        self, c: Sequence[float], variances: tuple[float, float], num_envs: int, block: int
+    ) -> None:
+        low, high = variances
+        self.silent = high == 0.0
+        self._c = np.array(c)[:, np.newaxis, np.newaxis]
+        # C times the deviation of xi: [lag, plant, 0], all plants in one if they are alike.
+        self._colour = np.repeat(math.sqrt(low) * self._c, num_envs if low < high else 1, 1)
         self._silence = np.zeros(num_envs)
-        self._past = np.zeros((num_envs, len(self._colour) - 1))
+        self._past = np.zeros((num_envs, len(c) - 1))
         self._generators: dict[int, np.random.Generator] = {}
         # A row a sample: what all plants need at a time lies together.
-        self._block = np.zeros((0 if self._silent else block, num_envs))
+        self._block = np.zeros((0 if self.silent else block, num_envs))
         self._row = 0  # the next one
 
-    def restart(self, which: NDArray[np.intp], streams: Iterable[EpisodeStream]) -> None:
-        """Begin an episode of some plants, of sorted indices, with a stream for each."""
-        if self._silent:
+    def restart(
+        self,
+        which: NDArray[np.intp],
+        streams: Iterable[EpisodeStream],
+        variances: NDArray[np.float64] | None,
+    ) -> None:
+        """Begin an episode of some plants.
+
+        Parameters
+        ----------
+        which
+            Their indices, sorted.
+        streams
+            One for each.
+        variances
+            Of their xi, shape (len(which),), if it is drawn.
+        """
+        if self.silent:
             return
+        if variances is not None:
+            self._colour[:, which] = np.sqrt(variances)[:, np.newaxis] * self._c
         self._past[which] = 0.0
         for i, stream in zip(which.tolist(), streams, strict=True):
             self._generators[i] = stream.next_episode()
@@ -128,8 +164,8 @@ class Noises:
             self._fill(which, self._row)
 
     def next(self) -> NDArray[np.float64]:
-        """Return the next n of all plants, degC, shape (num_envs,); only to be read."""
-        if self._silent:
+        """Return the next values of all plants, degC, shape (num_envs,); only to be read."""
+        if self.silent:
             return self._silence
         if self._row == len(self._block):
             self._fill(np.arange(len(self._past)), 0)
@@ -140,8 +176,9 @@ class Noises:
 
     def _fill(self, which: NDArray[np.intp], first_row: int) -> None:
         """Make the noise of some plants, from a row on to the end of the block."""
-        order = len(self._colour) - 1
+        order = len(self._c) - 1
         samples = len(self._block) - first_row
+        alike = self._colour.shape[1] == 1
         for start in range(0, len(which), _TOGETHER):
             plants = which[start : start + _TOGETHER]
             draws = np.empty((len(plants), order + samples))
@@ -152,16 +189,13 @@ class Noises:
             # A slice, if there are no gaps, is much faster.
             gaps = plants[-1] - plants[0] >= len(plants)
             columns = plants if gaps else slice(plants[0], plants[-1] + 1)
-            self._block[first_row:, columns] = _coloured(self._colour, draws).T
+            colour = self._colour if alike else self._colour[:, plants]
+            self._block[first_row:, columns] = _coloured(colour, draws).T
 
 
-def _colour(parameters: Parameters) -> list[float]:
-    """Return C of (28), made for draws of variance 1."""
-    deviation = math.sqrt(parameters.noise_variance)
-    return [deviation * coefficient for coefficient in parameters.c]
-
-
-def _coloured(colour: Sequence[float], draws: NDArray[np.float64]) -> NDArray[np.float64]:
+def _coloured(
+    colour: Sequence[float] | NDArray[np.float64], draws: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Filter draws along the last axis, of which the first len(colour) - 1 are past ones."""
     order = len(colour) - 1
     noise: NDArray[np.float64] = colour[0] * draws[..., order:]
@@ -302,3 +336,149 @@ class SetPoints:
             self._changes[which] += self._lengths[places]
             self._places[which] = (places + 1) % len(self._values)
         self.next_change = int(self._changes.min())
+
+
+class Disturbance:
+    """The load disturbance w(k), from k = 0 on: steps and a random walk, both from 0.
+
+    It changes every `SLOW` samples. Then the walk takes a step, uniform and as wide as the
+    variance asks for, as the sum of many is normal all the same; and with a probability of
+    `SLOW / disturbance_interval` the other part jumps to a new level, uniform within
+    +-`disturbance_amplitude`.
+
+    Parameters
+    ----------
+    parameters
+        Whether there is any.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._silent = not parameters.is_disturbed
+
+    def restart(self, generator: np.random.Generator, numbers: Mapping[str, float]) -> None:
+        """Begin an episode; draws go on from where the generator is.
+
+        Parameters
+        ----------
+        generator
+            Where the draws come from.
+        numbers
+            The plant numbers.
+        """
+        self._generator = generator
+        self._shape = np.array([_shape(numbers)])
+        self._last = np.zeros((1, 2))
+        self._ahead = [0.0] * SLOW
+
+    def take(self, samples: int) -> list[float]:
+        """Return the next values of w, degC."""
+        if self._silent:
+            return [0.0] * samples
+        while len(self._ahead) < samples:
+            draws = self._generator.random((1, _CHANGES, 3))
+            levels, self._last = _disturbance(draws, self._shape, self._last)
+            self._ahead += np.repeat(levels[0], SLOW).tolist()
+        values, self._ahead = self._ahead[:samples], self._ahead[samples:]
+        return values
+
+
+class Disturbances:
+    """`Disturbance` for many plants, each to the bit what it is alone.
+
+    Its clock counts samples since all plants began; each plant has its own k.
+
+    Parameters
+    ----------
+    num_envs
+        Number of plants.
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        self._generators: dict[int, np.random.Generator] = {}
+        self._shapes = np.zeros((num_envs, 3))
+        self._last = np.zeros((num_envs, 2))
+        self._levels = np.zeros((num_envs, _CHANGES))  # those ahead
+        self._ends = (
+            np.arange(1, num_envs + 1) * _CHANGES
+        )  # of each plant's, when all lie in a row
+        self._places = self._ends.copy()  # of the next level, there
+        self._now = np.zeros(num_envs)
+        self._changes = np.zeros(num_envs, np.int64)  # by the clock, of the next level
+        self._next_change = 0
+
+    def restart(
+        self,
+        which: NDArray[np.intp],
+        generators: Iterable[np.random.Generator],
+        numbers: Mapping[str, NDArray[np.float64]],
+        clock: int,
+    ) -> None:
+        """Begin an episode of some plants, with a generator and plant numbers for each."""
+        self._generators |= zip(which.tolist(), generators, strict=True)
+        self._shapes[which] = np.stack(_shape(numbers), axis=-1)
+        self._last[which] = 0.0
+        self._now[which] = 0.0
+        self._places[which] = self._ends[which]
+        self._changes[which] = clock + SLOW
+        self._next_change = int(self._changes.min())
+
+    def at(self, clock: int) -> NDArray[np.float64]:
+        """Return w of all plants at the next sample of the clock, degC; only to be read."""
+        if clock >= self._next_change:
+            due = self._changes <= clock
+            self._refill(np.flatnonzero(due & (self._places == self._ends)))
+            np.copyto(self._now, self._levels.take(self._places, mode="clip"), where=due)
+            self._places += due
+            self._changes += SLOW * due
+            self._next_change = int(self._changes.min())
+        return self._now
+
+    def _refill(self, which: NDArray[np.intp]) -> None:
+        """Make the next levels of some plants."""
+        if not len(which):
+            return
+        draws = np.empty((len(which), _CHANGES, 3))
+        for i, row in zip(which.tolist(), draws, strict=True):
+            self._generators[i].random(out=row)
+        self._levels[which], self._last[which] = _disturbance(
+            draws, self._shapes[which], self._last[which]
+        )
+        self._places[which] = self._ends[which] - _CHANGES
+
+
+def _shape(numbers: Mapping[str, Any]) -> tuple[Any, Any, Any]:
+    """Return amplitude, probability of a jump and half width of the walk's steps."""
+    return (
+        numbers["disturbance_amplitude"],
+        SLOW / numbers["disturbance_interval"],
+        # Uniform within +-h, a step has the variance h^2 / 3.
+        np.sqrt(3.0 * SLOW * numbers["disturbance_walk_variance"]),
+    )
+
+
+def _disturbance(
+    draws: NDArray[np.float64], shapes: NDArray[np.float64], last: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Make disturbances of uniform draws.
+
+    Parameters
+    ----------
+    draws
+        Shape (plants, changes, 3).
+    shapes
+        As of `_shape`, shape (plants, 3).
+    last
+        The levels before, of the steps and of the walk, shape (plants, 2).
+
+    Returns
+    -------
+    ndarray, ndarray
+        w, shape (plants, changes), and the last levels of its two parts, shape (plants, 2).
+    """
+    amplitude, probability, width = (shapes[:, [i]] for i in range(3))
+    walk = np.hstack((last[:, 1:], (2.0 * draws[..., 0] - 1.0) * width)).cumsum(axis=1)[:, 1:]
+    jumps = draws[..., 1] < probability
+    levels = np.hstack((last[:, :1], (2.0 * draws[..., 2] - 1.0) * amplitude))
+    latest = np.maximum.accumulate(np.where(jumps, np.arange(1, jumps.shape[1] + 1), 0), axis=1)
+    steps = np.take_along_axis(levels, latest, axis=1)
+    return steps + walk, np.stack((steps[:, -1], walk[:, -1]), axis=1)

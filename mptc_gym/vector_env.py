@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import is_count, positive_count
 from mptc_gym.plant import Plants, action_from_command
-from mptc_gym.signals import BLOCK, FOREVER, Noises, SetPoints, Streams
+from mptc_gym.ranges import Ranges
+from mptc_gym.signals import BLOCK, FOREVER, Disturbances, Noises, SetPoints, Streams
 
 Infos = dict[str, Any]
 Values = NDArray[np.float64]  # one a plant, shape (num_envs,)
@@ -126,7 +127,17 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         self._plants = Plants(parameters, num_envs)
         # Blocks of noise that come out even at the end of an episode.
         block = math.ceil(self._limit / math.ceil(self._limit / BLOCK))
-        self._noises = Noises(parameters, num_envs, block)
+        self._noises = Noises(
+            parameters.c, parameters.range_of("noise_variance"), num_envs, block
+        )
+        self._transmitters = Noises(
+            [1.0], parameters.range_of("measurement_noise_variance"), num_envs, block
+        )
+        self._ranges = Ranges(parameters)
+        self._disturbances = Disturbances(num_envs) if parameters.is_disturbed else None
+        self._factors = ("gain_factor", "time_constant_factor") if parameters.drifts else ()
+        load = ("disturbance",) if self._disturbances is not None else ()
+        self._names = (*INFO, *load, *self._factors)  # of what infos hold
         self._setpoints = SetPoints(parameters, num_envs)
         self._ends = np.zeros(num_envs, np.int64)  # by the clock, of the episodes
         self._first_end = 0
@@ -145,7 +156,9 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             np.s_[:, head] if window else None
             for head, window in zip((0, *parameters.heads), parameters.windows, strict=True)
         )
-        self._rest_action = action_from_command(0.0, parameters.u_min, parameters.u_max)
+        self._rest_action = action_from_command(
+            0.0, self._ranges.given["u_min"], self._ranges.given["u_max"]
+        )
         self._actions = np.zeros(num_envs)  # the last ones
         # The observations of all plants lie in this row, one after the other, from a place on
         # that moves back by one each step. So all blocks of samples move on by one, and only
@@ -199,12 +212,14 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         if len(which) < self.num_envs and not self._streams:
             raise ResetNeeded("reset all environments before some of them")
         self._seed(which, seeds)
-        infos: Infos = {name: np.zeros(self.num_envs) for name in INFO}
+        infos: Infos = {
+            name: np.zeros(self.num_envs) for name in {*self._names, *self._ranges.names}
+        }
         self._begin(which, infos)
         if self._ended is not None:
             ended = self._ended & ~mask
             self._ended = ended if ended.any() else None
-        return self._window().copy(), infos | {f"_{name}": mask.copy() for name in INFO}
+        return self._window().copy(), infos | {f"_{name}": mask.copy() for name in infos}
 
     def step(
         self, actions: NDArray[np.float32]
@@ -249,7 +264,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             self._setpoints.move(clock)
         setpoint = self._setpoints.now
         noise = self._noises.next()
-        command, applied, output = self._plants.step(a, noise)
+        load = self._disturbances.at(clock) if self._disturbances is not None else None
+        command, applied, output = self._plants.step(a, noise, load)
 
         error_scale, minus_half, quadratic, move_weight = self._reward_terms
         error = setpoint - output
@@ -264,9 +280,13 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         self._actions = a
 
         measured, measured_error = output, error
+        if not self._transmitters.silent:
+            measured = output + self._transmitters.next()
+            measured_error = setpoint - measured
         lowest, highest, squared = self._span
-        if not output.dot(output) <= squared:  # otherwise no single one can be beyond the span
-            measured = np.fmin(output, highest)  # which takes NaN for the limit
+        # Otherwise no single one can be beyond the span.
+        if not measured.dot(measured) <= squared:
+            measured = np.fmin(measured, highest)  # which takes NaN for the limit
             np.fmax(measured, lowest, out=measured)
             measured_error = setpoint - measured
         if self._place == 0:
@@ -299,6 +319,10 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             "noise": noise.copy(),
             "_noise": everyone,
         }
+        if load is not None:
+            infos["disturbance"], infos["_disturbance"] = load.copy(), everyone
+        for name, factors in zip(self._factors, self._plants.factors, strict=False):
+            infos[name], infos[f"_{name}"] = factors.copy(), everyone
         terminations, truncations = self._nobody.copy(), self._nobody.copy()
         if clock >= self._first_end:
             truncations = self._end_episodes(rewards, infos)
@@ -313,11 +337,11 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         ended = self._ends <= self._clock
         if self._mode is AutoresetMode.SAME_STEP:
             which = np.flatnonzero(ended)
-            final_info = {name: np.where(ended, infos[name], 0.0) for name in INFO}
+            final_info = {name: np.where(ended, infos[name], 0.0) for name in self._names}
             final_obs = np.full(self.num_envs, None, object)
             for i, observation in zip(which, self._window()[which], strict=True):
                 final_obs[i] = observation
-            self._begin(which, infos)
+            self._restart(ended, infos)
             infos |= {
                 "final_obs": final_obs,
                 "_final_obs": ended.copy(),
@@ -326,21 +350,49 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             }
             return ended
         if self._ended is not None:  # at the step before this one
-            which = np.flatnonzero(self._ended)
-            rewards[which] = 0.0
-            self._begin(which, infos)
+            rewards[self._ended] = 0.0
+            self._restart(self._ended, infos)
             ended = self._ends <= self._clock
         self._ended = ended.copy() if ended.any() else None
         return ended
 
+    def _restart(self, ended: NDArray[np.bool_], infos: Infos) -> None:
+        """Begin an episode of those that have ended, within the infos of a step."""
+        for name in self._ranges.names:
+            if name not in self._names:
+                infos[name], infos[f"_{name}"] = np.zeros(self.num_envs), ended.copy()
+        self._begin(np.flatnonzero(ended), infos)
+
     def _begin(self, which: Indices, infos: Infos) -> None:
         """Begin an episode of some plants, and put their infos of k = 0 in."""
-        self._plants.rest(which)
-        plants = which.tolist()
-        self._noises.restart(which, (self._streams[i].noise for i in plants))
-        streams = (self._streams[i].setpoint for i in plants)
-        self._setpoints.restart(which, streams, self._clock)
-        self._actions[which] = self._rest_action
+        streams = [self._streams[i] for i in which.tolist()]
+        drawn: dict[str, Values] = {}
+        if self._ranges.names or self._disturbances is not None:
+            generators = [each.plant.next_episode() for each in streams]
+            drawn = self._ranges.draw(generators, len(which))
+            if self._disturbances is not None:
+                numbers = {
+                    name: drawn.get(name, np.full(len(which), value))
+                    for name, value in self._ranges.given.items()
+                }
+                self._disturbances.restart(which, generators, numbers, self._clock)
+        self._plants.rest(which, drawn)
+        self._noises.restart(
+            which, (each.noise for each in streams), drawn.get("noise_variance")
+        )
+        self._transmitters.restart(
+            which,
+            (each.transmitter for each in streams),
+            drawn.get("measurement_noise_variance"),
+        )
+        self._setpoints.restart(which, (each.setpoint for each in streams), self._clock)
+        rest_action = self._rest_action
+        if "u_min" in drawn or "u_max" in drawn:
+            u_min, u_max = (
+                drawn.get(name, self._ranges.given[name]) for name in ("u_min", "u_max")
+            )
+            rest_action = action_from_command(0.0, u_min, u_max)
+        self._actions[which] = rest_action
         self._ends[which] = self._clock + self._limit
         self._first_end = int(self._ends.min())
 
@@ -351,10 +403,16 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             rest[setpoints] = setpoint
         if errors is not None:
             rest[errors] = setpoint
-        rest[:, self.parameters.heads[2] :] = min(1.0, max(-1.0, self._rest_action))
+        rest[:, self.parameters.heads[2] :] = np.reshape(
+            np.clip(rest_action, -1.0, 1.0), (-1, 1)
+        )
         self._window()[which] = rest
-        for name in INFO:
+        for name in self._names:
             infos[name][which] = setpoint if name in ("setpoint", "error") else 0.0
+        for name, factors in zip(self._factors, self._plants.factors, strict=False):
+            infos[name][which] = factors[which]
+        for name, values in drawn.items():
+            infos[name][which] = values
 
     def _seed(self, which: Indices, seeds: Sequence[int | None]) -> None:
         for i in which.tolist():

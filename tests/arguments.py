@@ -3,17 +3,43 @@
 from hypothesis import strategies as st
 
 coefficients = st.floats(-0.3, 0.3)
-valid_arguments = st.fixed_dictionaries(
+
+
+def or_range(numbers):
+    """Return a strategy for numbers, and for ranges of them."""
+    return numbers | st.lists(numbers, min_size=2, max_size=2).map(sorted)
+
+
+# Another A, or other time constants of the paper's A: not every A has one to change.
+dynamics = st.fixed_dictionaries(
     {},
     optional={
         "a": st.lists(coefficients, max_size=3).map(lambda tail: [1.0, *tail]),
+    },
+) | st.fixed_dictionaries(
+    {},
+    optional={
+        "time_constant_factor": or_range(st.floats(0.5, 4)),
+        "time_constant_drift": or_range(st.floats(0.2, 4)),
+    },
+)
+valid_arguments = st.fixed_dictionaries(
+    {},
+    optional={
         "b": st.lists(coefficients, min_size=1, max_size=5),
         "c": st.lists(coefficients, max_size=3).map(lambda tail: [1.0, *tail]),
-        "delay": st.integers(0, 30),
-        "dead_zone": st.floats(0, 10),
-        "u_min": st.floats(-20, -10),
-        "u_max": st.floats(0, 20),
-        "noise_variance": st.floats(0, 4),
+        "delay": or_range(st.integers(0, 30)),
+        "dead_zone": or_range(st.floats(0, 10)),
+        "u_min": or_range(st.floats(-20, -10)),
+        "u_max": or_range(st.floats(0, 20)),
+        "noise_variance": or_range(st.floats(0, 4)),
+        "measurement_noise_variance": or_range(st.floats(0, 4)),
+        "disturbance_amplitude": or_range(st.floats(0, 10)),
+        "disturbance_interval": or_range(st.floats(1, 100)),
+        "disturbance_walk_variance": or_range(st.floats(0, 1)),
+        "gain_factor": or_range(st.floats(0.1, 10)),
+        "gain_drift": or_range(st.floats(0.1, 10)),
+        "drift_samples": st.integers(1, 100),
         "sampling_interval": st.floats(0.1, 60),
         "setpoint": st.one_of(
             st.sampled_from(["square", "random"]),
@@ -31,7 +57,7 @@ valid_arguments = st.fixed_dictionaries(
         "error_scale": st.floats(0.1, 20),
         "move_weight": st.floats(0, 2),
     },
-).filter(
+).flatmap(lambda others: dynamics.map(lambda changed: changed | others)).filter(
     lambda arguments: any(
         arguments.get(name, default)
         for name, default in (

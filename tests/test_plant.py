@@ -7,6 +7,7 @@ from scipy.signal import lfilter
 
 import mptc_gym
 from mptc_gym.plant import Plant, action_from_command
+from mptc_gym.ranges import Ranges
 from tests.conftest import run
 
 A = [1, -0.45181, -0.47546]
@@ -16,7 +17,8 @@ DELAY = 18
 
 
 def step(action: float, **arguments: float) -> tuple[float, float, float]:
-    return Plant(mptc_gym.Parameters(**arguments)).step(action, 0.0)
+    parameters = mptc_gym.Parameters(**arguments)
+    return Plant(parameters, Ranges(parameters).given).step(action, 0.0, 0.0)
 
 
 def applied(

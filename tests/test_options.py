@@ -1,0 +1,256 @@
+"""What is off by default: transmitter noise, disturbance, other dynamics, fouling, ranges."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from scipy.signal import lfilter
+
+from mptc_gym import PRESETS, MiddlePointEnv, presets
+from tests.conftest import run
+
+A = np.array([1, -0.45181, -0.47546])
+GAIN = -0.04964 / 0.07273  # B(1) / A(1), degC per t/h
+POLE = 0.45181 / 2 + np.sqrt(0.45181**2 / 4 + 0.47546)  # of z^2 - 0.45181 z - 0.47546
+EVERYTHING = {
+    "noise_variance": [0.2, 0.8], "measurement_noise_variance": [0.1, 0.2],
+    "disturbance_amplitude": [1.0, 3.0], "disturbance_interval": [20, 60],
+    "disturbance_walk_variance": [0.001, 0.01], "gain_factor": [0.7, 1.4],
+    "time_constant_factor": [0.7, 1.4], "gain_drift": [0.7, 1.4],
+    "time_constant_drift": [0.7, 1.4], "drift_samples": 300, "delay": [3, 25],
+    "dead_zone": [3, 7], "u_min": [-12, -9], "u_max": [9, 12], "setpoint": "random",
+    "output_window": 2, "action_window": 2,
+}  # fmt: skip
+
+
+class TestTransmitter:
+    def test_the_observation_sees_its_noise_and_nothing_else_does(self, rng):
+        actions = rng.uniform(-1, 1, 20_000)
+        true = run(MiddlePointEnv(noise_variance=0.5, output_window=1), actions)
+        seen = run(
+            MiddlePointEnv(
+                noise_variance=0.5, output_window=1, measurement_noise_variance=0.09
+            ),
+            actions,
+        )
+        for name in ("output", "error", "reward", "noise"):
+            np.testing.assert_array_equal(seen[name], true[name])
+        noise = seen["observation"][:, -1] - seen["output"]
+        assert noise[0] == 0.0  # at rest
+        assert noise.var() == pytest.approx(0.09, rel=0.04)
+        assert abs(noise.mean()) < 0.01
+        assert abs(np.corrcoef(noise[2:], noise[1:-1])[0, 1]) < 0.03  # white
+        assert abs(np.corrcoef(noise[1:], seen["noise"][1:])[0, 1]) < 0.03
+        # The error that is shown is that of the reading.
+        np.testing.assert_allclose(
+            seen["observation"][:, 3], seen["setpoint"] - seen["observation"][:, -1], atol=1e-5
+        )
+
+    def test_the_reading_saturates(self):
+        env = MiddlePointEnv(
+            measurement_noise_variance=100.0, output_window=1, temperature_span=5.0
+        )
+        reading = run(env, np.zeros(300))["observation"][:, -1]
+        assert np.abs(reading).max() == 5.0
+
+
+class TestDisturbance:
+    def test_it_passes_through_the_dynamics_with_a_gain_of_1(self):
+        env = MiddlePointEnv(disturbance_amplitude=4.0, disturbance_walk_variance=0.01)
+        record = run(env, np.zeros(1000))
+        load = record["disturbance"]
+        assert np.ptp(load) > 4.0
+        np.testing.assert_allclose(
+            record["output"], lfilter([A.sum()], A, load), rtol=0, atol=1e-12
+        )
+
+    def test_steps(self):
+        env = MiddlePointEnv(disturbance_amplitude=4.0, disturbance_interval=50)
+        load = np.array([run(env, np.zeros(400), seed)["disturbance"] for seed in range(200)])
+        assert np.all(load[:, :10] == 0.0)  # begins at rest
+        changes = np.flatnonzero((np.diff(load) != 0).any(axis=0)) + 1
+        assert set(changes) == set(range(10, 401, 10))
+        # A change at one tick in five: 40 ticks of 200 runs, deviation 0.4 / sqrt(8000).
+        jumps = (np.diff(load[:, ::10]) != 0).mean()
+        assert jumps == pytest.approx(10 / 50, abs=0.02)
+        late = load[:, -1]
+        assert np.abs(load).max() <= 4.0
+        assert late.var() == pytest.approx(4.0**2 / 3, rel=0.2)  # uniform
+        assert len(np.unique(late)) > 190
+
+    def test_walk(self):
+        env = MiddlePointEnv(disturbance_walk_variance=0.02)
+        load = np.array([run(env, np.zeros(200), seed)["disturbance"] for seed in range(400)])
+        # Variance 0.02 a sample; a sample variance of 400 has a deviation of 7 %.
+        assert load[:, 200].var() == pytest.approx(0.02 * 200, rel=0.25)
+        assert load[:, 50].var() == pytest.approx(0.02 * 50, rel=0.25)
+        # Increments of different times have nothing to do with one another.
+        first, second = load[:, 100], load[:, 200] - load[:, 100]
+        assert abs(np.corrcoef(first, second)[0, 1]) < 0.15
+
+    def test_it_changes_neither_noise_nor_set_point(self):
+        arguments = {"noise_variance": 0.5, "setpoint": "random"}
+        with_it = run(MiddlePointEnv(disturbance_amplitude=4.0, **arguments), np.zeros(700))
+        without = run(MiddlePointEnv(**arguments), np.zeros(700))
+        np.testing.assert_array_equal(with_it["noise"], without["noise"])
+        np.testing.assert_array_equal(with_it["setpoint"], without["setpoint"])
+        assert "disturbance" not in without
+
+
+class TestDynamics:
+    @pytest.mark.parametrize("gain", [0.5, 1.0, 2.0])
+    @pytest.mark.parametrize("time_constant", [0.5, 1.0, 3.0])
+    def test_gain_and_time_constant(self, gain, time_constant):
+        env = MiddlePointEnv(gain_factor=gain, time_constant_factor=time_constant)
+        output = run(env, np.ones(3000))["output"]
+        assert output[-1] == pytest.approx(10 * gain * GAIN, rel=1e-9)
+        # What is left decays by the slow pole, the other one (-0.5) having died out long ago.
+        left = output[-1] - output[60:90]
+        pole = (left[1:] / left[:-1]).mean()
+        assert 1 / (1 - pole) == pytest.approx(time_constant / (1 - POLE), rel=1e-4)
+
+    def test_drift_ends_at_the_plant_that_factors_give(self):
+        drifting = MiddlePointEnv(
+            gain_factor=0.8, gain_drift=1.5, time_constant_drift=2.0, drift_samples=200
+        )
+        record = run(drifting, np.ones(3000))
+        k = np.arange(3001)
+        share = np.minimum(k // 10 * 10 / 200, 1.0)  # linear, every 10 samples
+        np.testing.assert_allclose(record["gain_factor"], 0.8 * (1 + 0.5 * share), rtol=1e-12)
+        np.testing.assert_allclose(record["time_constant_factor"], 1 + share, rtol=1e-12)
+        assert record["output"][-1] == pytest.approx(10 * 0.8 * 1.5 * GAIN, rel=1e-9)
+
+    def test_drift_follows_a_steady_plant_when_it_is_slow(self):
+        env = MiddlePointEnv(gain_drift=2.0, drift_samples=100_000)
+        record = run(env, np.ones(20_000))
+        steady = 10 * record["gain_factor"] * GAIN
+        # It lags by 20 samples, and by up to 10 for the steps; 6.8 degC are gained in 100,000.
+        np.testing.assert_allclose(record["output"][1000:], steady[1000:], atol=0.003)
+        assert record["output"][-1] < record["output"][1000] - 1.0
+
+    def test_noise_of_a_slower_plant_is_filtered_by_its_pole(self):
+        record = run(
+            MiddlePointEnv(time_constant_factor=2.0, noise_variance=0.5), np.zeros(500)
+        )
+        slow = 1 - (1 - POLE) / 2
+        a = np.convolve([1, -slow], [1, POLE - 0.45181])  # the other pole is 0.45181 - POLE
+        np.testing.assert_allclose(
+            record["output"], lfilter([1], a, record["noise"]), atol=1e-10
+        )
+
+
+class TestRanges:
+    def test_a_drawn_plant_is_the_plant_with_these_numbers_to_the_bit(self, rng):
+        drawn_plant = MiddlePointEnv(**EVERYTHING)
+        actions = rng.uniform(-1.2, 1.2, 700)
+        for seed in range(5):
+            _, info = drawn_plant.reset(seed=seed)
+            ranges = {name for name, value in EVERYTHING.items() if isinstance(value, list)}
+            assert ranges <= set(info)
+            drawn = {name: info[name] for name in ranges}
+            assert drawn["delay"].is_integer()
+            numbers = {**EVERYTHING, **drawn, "delay": int(drawn["delay"])}
+            ours = run(drawn_plant, actions, seed)
+            theirs = run(MiddlePointEnv(**numbers), actions, seed)
+            assert set(ours) == set(theirs)
+            for name in ours:
+                np.testing.assert_array_equal(ours[name], theirs[name])
+
+    def test_draws_are_uniform_and_whole_where_they_must_be(self):
+        env = MiddlePointEnv(delay=[3, 6], gain_factor=[0.5, 1.5])
+        env.reset(seed=1)
+        infos = [env.reset()[1] for _ in range(2000)]
+        delays, counts = np.unique([info["delay"] for info in infos], return_counts=True)
+        assert delays.tolist() == [3, 4, 5, 6]
+        assert np.all(np.abs(counts - 500) < 5 * np.sqrt(2000 * 0.25 * 0.75))
+        gains = np.sort([info["gain_factor"] for info in infos])
+        # Kolmogorov and Smirnov: 1.95 / sqrt(n) is passed once in a thousand times.
+        deviation = np.abs(gains - np.linspace(0.5, 1.5, 2000)).max()
+        assert deviation < 1.95 / np.sqrt(2000)
+        pairs = [(info["delay"], info["gain_factor"]) for info in infos]
+        assert abs(np.corrcoef(pairs, rowvar=False)[0, 1]) < 0.1
+
+    def test_one_more_range_leaves_the_other_draws_as_they_were(self):
+        one = MiddlePointEnv(gain_factor=[0.5, 1.5])
+        two = MiddlePointEnv(gain_factor=[0.5, 1.5], delay=[3, 9], noise_variance=[0, 1])
+        for seed in range(5):
+            drawn = [env.reset(seed=seed)[1]["gain_factor"] for env in (one, two)]
+            assert drawn[0] == drawn[1]
+
+    def test_draws_come_from_the_seed_and_the_episode_alone(self):
+        first, second = (MiddlePointEnv(**EVERYTHING) for _ in range(2))
+        run(first, np.ones(10), seed=5)
+        run(second, -np.ones(300), seed=5)
+        assert first.reset()[1] == second.reset()[1]
+        assert first.reset(seed=5)[1] != first.reset(seed=6)[1]
+
+    def test_a_range_of_one_value_is_that_value(self, rng):
+        actions = rng.uniform(-1, 1, 100)
+        ours = run(MiddlePointEnv(dead_zone=[7, 7], delay=[5, 5]), actions)
+        theirs = run(MiddlePointEnv(dead_zone=7, delay=5), actions)
+        np.testing.assert_array_equal(ours["output"], theirs["output"])
+
+    def test_the_vector_environment_draws_a_plant_each(self):
+        envs = gymnasium.make_vec("MiddlePoint-v0", 50, delay=[3, 6], gain_factor=[0.5, 1.5])
+        _, infos = envs.reset(seed=0)
+        assert set(infos["delay"]) == {3, 4, 5, 6}
+        assert len(np.unique(infos["gain_factor"])) == 50
+        assert infos["_delay"].all()
+        *_, infos = envs.step(np.zeros((50, 1), np.float32))
+        assert "delay" not in infos
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"delay": [3, 2]}, "delay must be .* low <= high"),
+        ({"delay": [3.5, 4]}, "delay must be an integer"),
+        ({"dead_zone": [1, 2, 3]}, r"dead_zone must be one number, or a range \[low, high\]"),
+        ({"dead_zone": []}, "dead_zone must be one number, or a range"),
+        ({"dead_zone": [0, 11]}, "dead_zone must be small enough"),
+        ({"dead_zone": 8, "u_min": [-9, -7], "u_max": [7, 9]}, "dead_zone must be small"),
+        ({"u_min": [-10, 10]}, "u_min must be below"),
+        ({"u_min": -5, "u_max": [-6, 10]}, "u_min must be below"),
+        ({"noise_variance": [-1, 1]}, "noise_variance must be a number from 0"),
+        ({"measurement_noise_variance": -1}, "measurement_noise_variance must be"),
+        ({"disturbance_amplitude": -1}, "disturbance_amplitude must be"),
+        ({"disturbance_interval": 0}, "disturbance_interval must be a number from 1"),
+        ({"disturbance_walk_variance": [0, float("nan")]}, "disturbance_walk_variance must"),
+        ({"gain_factor": 0}, "gain_factor must be a number above 0"),
+        ({"gain_drift": -1}, "gain_drift must be a number above 0"),
+        ({"time_constant_factor": 0.01}, "time_constant_factor, .* never below 0.048"),
+        ({"time_constant_drift": 0.01}, "time_constant_factor, time_constant_drift must be"),
+        ({"time_constant_factor": 2, "a": [1.0]}, "slowest pole"),
+        ({"time_constant_factor": 2, "a": [1.0, 0.0, 0.5]}, "slowest pole"),
+        ({"time_constant_factor": 2, "a": [1.0, -1.0]}, "slowest pole"),
+        ({"disturbance_amplitude": 1, "a": [1.0, -1.0]}, "not stable"),
+        ({"drift_samples": 0}, "drift_samples must be an integer of at least 1"),
+        ({"setpoint_period": [1, 2]}, "setpoint_period must be an integer"),
+    ],
+)  # fmt: skip
+def test_bad_options_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        MiddlePointEnv(**arguments)
+    with pytest.raises(ValueError, match=message):
+        gymnasium.make_vec("MiddlePoint-v0", 2, **arguments)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets(name, rng):
+    env = gymnasium.make("MiddlePoint-v0", **PRESETS[name])
+    check_env(env.unwrapped, skip_render_check=True)
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.parameters == env.unwrapped.parameters
+    actions = rng.uniform(-1, 1, 100)
+    ours, theirs = (run(each, actions)["output"] for each in (env, again))
+    np.testing.assert_array_equal(ours, theirs)
+    default = run(MiddlePointEnv(), actions)["output"]
+    assert (name == "paper") == np.array_equal(ours, default)
+    gymnasium.make_vec("MiddlePoint-v0", 2, **PRESETS[name]).reset(seed=0)
+
+
+def test_every_preset_is_documented():
+    source = Path(presets.__file__).read_text()
+    assert all(f"| `{name}` |" in source for name in PRESETS)
