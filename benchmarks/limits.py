@@ -22,7 +22,7 @@ from tqdm import tqdm
 from agents import PIController
 from benchmarks import command_line
 from benchmarks.rollout import Trajectory, make_plants, rollout
-from benchmarks.scenarios import SCENARIOS, Scenario
+from benchmarks.scenarios import SCENARIOS, Scenario, plain
 from benchmarks.tables import on_screen
 from mptc_gym import Parameters
 
@@ -130,6 +130,11 @@ def scenario_limit(scenario: Scenario) -> Limit:
 
     Every change starts from the steady state of the set point before it, as the controller does
     not know beforehand that it will come; the first starts from rest.
+
+    Raises
+    ------
+    ValueError
+        If the scenario has what the derivations do not: see `benchmarks.scenarios.plain`.
     """
     if SCENARIOS.get(scenario.name) == scenario:
         return _scenario_limit(scenario.name)
@@ -137,7 +142,7 @@ def scenario_limit(scenario: Scenario) -> Limit:
 
 
 def _limit(scenario: Scenario) -> Limit:
-    parameters = scenario.parameters
+    parameters = plain(scenario.parameters)
     plants = make_plants(1, scenario.samples, **scenario.arguments)
     setpoint = rollout(plants, PIController(0.0, 0.0), scenario.samples, seed=0).setpoint[:, 0]
     totals = np.zeros(2)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import action_from_command
+from benchmarks.scenarios import plain
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
@@ -35,10 +36,15 @@ class PredictiveController:
         All arguments of the environment.
     num_envs
         Number of loops.
+
+    Raises
+    ------
+    ValueError
+        If the plant has what (28) and (29) have not: see `benchmarks.scenarios.plain`.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
-        self._p = parameters
+        self._p = parameters = plain(parameters)
         self._num_envs = num_envs
         self._predict = _prediction(parameters)
         self._one_step = _one_step(parameters)

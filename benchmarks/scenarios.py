@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from mptc_gym import Parameters
+from mptc_gym.plant import Dynamics
 
 
 @dataclass(frozen=True)
@@ -62,29 +61,31 @@ SCENARIOS: dict[str, Scenario] = {
 }
 
 
-def other_plant(
-    *, delay: int = 18, gain: float = 1.0, time_constant: float = 1.0
-) -> dict[str, Any]:
-    """Return the environment's arguments for a relative of the paper's plant.
+def plain(parameters: Parameters) -> Parameters:
+    """Return the same plant with its gain and time-constant factors worked into A and B.
 
-    Parameters
-    ----------
-    delay
-        d, samples.
-    gain
-        Steady-state gain, as a multiple of the paper's.
-    time_constant
-        Dominant time constant, as a multiple of the paper's; the gain does not follow it.
-
-    Returns
-    -------
-    dict
-        `a`, `b` and `delay`.
+    Raises
+    ------
+    ValueError
+        If it is more than (28) and (29) with other numbers: if it has a range, a drift, a load
+        disturbance or a noisy transmitter.
     """
-    nominal = Parameters()
-    poles = np.roots(nominal.a)  # real, 0.95 and -0.50
-    slow = np.argmax(poles)
-    poles[slow] **= 1.0 / time_constant  # a pole p decays as exp(-k / time constant)
-    a = np.poly(poles)
-    b = np.array(nominal.b) * gain * a.sum() / sum(nominal.a)
-    return {"a": a.tolist(), "b": b.tolist(), "delay": delay}
+    more = {
+        "a range": bool(parameters.ranges),
+        "a drift": parameters.drifts,
+        "a load disturbance": parameters.is_disturbed,
+        "a noisy transmitter": parameters.range_of("measurement_noise_variance")[1] > 0.0,
+    }
+    for what, has in more.items():
+        if has:
+            raise ValueError(f"parameters must be of a plant without {what}, got {parameters}")
+    alpha, scale, _ = Dynamics(parameters).coefficients(
+        parameters.gain_factor, parameters.time_constant_factor
+    )
+    return replace(
+        parameters,
+        a=[1.0, *(-coefficient for coefficient in alpha)],
+        b=[scale * coefficient for coefficient in parameters.b],
+        gain_factor=1.0,
+        time_constant_factor=1.0,
+    )

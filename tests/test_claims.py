@@ -19,9 +19,7 @@ from benchmarks.experiments import (
 )
 from benchmarks.ledger import Entry, Finding, Verdict, verdict
 from benchmarks.rollout import Trajectory
-from benchmarks.scenarios import other_plant
 from benchmarks.statistics import Estimate
-from mptc_gym import Parameters
 
 
 def finding(low, high, **bounds):
@@ -183,33 +181,6 @@ class TestFailure:
 
 
 class TestPlants:
-    def test_the_paper_s_is_one_of_them(self):
-        plant = Parameters(**other_plant())
-        assert np.allclose(plant.a, Parameters().a)
-        assert np.allclose(plant.b, Parameters().b)
-
-    def test_gain_and_time_constant(self):
-        # A held input of 8 t/h, and what comes of it, measured.
-        def response(**changes):
-            class Held:
-                def reset(self):
-                    pass
-
-                def act(self, observation):
-                    return np.full((1, 1), -0.8, np.float32)
-
-            return Draws(1).run(Held(), 1200, **other_plant(**changes)).output[:, 0]
-
-        nominal, other = response(), response(gain=1.3, time_constant=2.0, delay=9)
-        assert other[-1] == pytest.approx(1.3 * nominal[-1], rel=1e-6)
-        assert np.flatnonzero(nominal)[0] - np.flatnonzero(other)[0] == 9
-
-        def decay(y):  # samples in which what is missing falls by e
-            missing = y[-1] - y
-            return 1 / np.log(missing[100] / missing[101])
-
-        assert decay(other) == pytest.approx(2 * decay(nominal), rel=1e-3)
-
     @pytest.mark.parametrize(("kp", "ki"), [(3.2, 0.05), (3.4, 0.05), (2.8, 0.1), (1.7, 0.15)])
     def test_poles_of_a_pi_loop(self, kp, ki):
         # A linear loop's swings grow or die by its largest pole in each sample. This loop is

@@ -1,6 +1,7 @@
 """The limits against independent computations, and the controller that nearly reaches them."""
 
 import itertools
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -8,11 +9,13 @@ from scipy import integrate, stats
 
 from agents import PIController
 from benchmarks import limits
-from benchmarks.limits import least_error, minimum_variance
+from benchmarks.experiments import mean_error
+from benchmarks.limits import least_error, minimum_variance, scenario_limit
 from benchmarks.mpc import PredictiveController
 from benchmarks.rollout import Trajectory, make_plants, rollout
-from benchmarks.scenarios import SCENARIOS, Scenario
-from mptc_gym import Parameters
+from benchmarks.scenarios import SCENARIOS, Scenario, plain
+from mptc_gym import MiddlePointEnv, Parameters
+from tests.conftest import run
 
 CALM = Parameters()
 
@@ -202,3 +205,38 @@ def test_command(capsys):
     for name in SCENARIOS:
         assert name in shown
     assert f"{limits.scenario_limit(SCENARIOS['square']).mae:.4f}" in shown
+
+
+class TestOtherDynamics:
+    def test_factors_are_worked_into_a_and_b(self, rng):
+        given = Parameters(gain_factor=1.3, time_constant_factor=2.0, delay=9)
+        worked_in = plain(given)
+        assert worked_in.gain_factor == worked_in.time_constant_factor == 1.0
+        actions = rng.uniform(-1, 1, 500)
+        ours, theirs = (
+            run(MiddlePointEnv(**asdict(parameters)), actions)["output"]
+            for parameters in (given, worked_in)
+        )
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12)
+        assert np.ptp(ours) > 1.0
+
+    def test_the_bound_of_a_stronger_plant_is_attained_too(self):
+        arguments = {"setpoint": 5.0, "gain_factor": 1.3, "time_constant_factor": 0.8}
+        scenario = Scenario("stronger", "", 600, arguments)
+        plants = make_plants(1, 600, **arguments)
+        controller = PredictiveController(Parameters(**arguments), 1)
+        error = mean_error(rollout(plants, controller, 600, seed=0))[0]
+        assert 1.0 <= error / scenario_limit(scenario).mae < 1.02
+
+    @pytest.mark.parametrize(
+        "more",
+        [
+            {"delay": [3, 4]},
+            {"gain_drift": 2.0},
+            {"disturbance_amplitude": 1.0},
+            {"measurement_noise_variance": 0.1},
+        ],
+    )
+    def test_there_is_no_limit_for_what_is_not_derived(self, more):
+        with pytest.raises(ValueError, match="parameters must be of a plant without"):
+            scenario_limit(Scenario("more", "", 600, more))
