@@ -12,6 +12,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
+from mptc_gym import rendering
 from mptc_gym.parameters import Parameters
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.ranges import Ranges
@@ -162,7 +163,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     | `reward` | "quadratic" | "quadratic" or "absolute" |
     | `error_scale` | 5.0 | degC; the error that costs 1/2 ("quadratic") or 1 ("absolute") a step |
     | `move_weight` | 0.0 | cost of a unit change of the normalised action |
-    | `render_mode` | None | None |
+    | `render_mode` | None | None, "human", "rgb_array" or "ansi"; see Rendering |
 
     ## Info
 
@@ -175,18 +176,35 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     and `time_constant_factor`, both as they are now. The dict of `reset` also has, under its name,
     each number that was drawn.
 
+    ## Rendering
+
+    | `render_mode` | `render` |
+    |---|---|
+    | "rgb_array" | returns a picture, shape (540, 960, 3), uint8 |
+    | "human" | shows it in a window; so do `reset` and `step`, `metadata["render_fps"]` times a second at most |
+    | "ansi" | returns a picture in text |
+
+    All show a strip chart of the last 200 samples, or of more if the delay is long: set point
+    and true temperature; commanded and applied flow, with the dead zone, the limits and that
+    part of the applied flow which is still on its way to the middle point. Pictures but those
+    in text need pygame: `pip install "mptc_gym[render]"`.
+
     ## Errors
 
-    A bad argument is a `ValueError` from the constructor that names it. A misspelt argument is a
-    `TypeError`, and so is any `render_mode`, as there is none yet. An action that is not one
-    finite number is a `ValueError` from `step` and leaves the plant as it was.
+    A bad argument, or an unknown `render_mode`, is a `ValueError` from the constructor that
+    names it. A misspelt argument is a `TypeError`. An action that is not one finite number is a
+    `ValueError` from `step` and leaves the plant as it was. Without pygame, the first picture
+    is a `DependencyNotInstalled`.
 
     ## Version history
 
     * v0: first version.
     """  # noqa: E501 (the tables)
 
-    metadata: dict[str, Any] = {"render_modes": [], "render_fps": 30}  # noqa: RUF012 (as in Env)
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as in Env)
+        "render_modes": ["human", "rgb_array", "ansi"],
+        "render_fps": 30,
+    }
 
     # One list of arguments, that of `Parameters`; help() and editors see it spelt out here.
     __signature__: ClassVar[inspect.Signature] = inspect.Signature(
@@ -203,12 +221,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         self.parameters = parameters = Parameters(**arguments)
-        if render_mode is not None:
-            # Not a ValueError: after a TypeError, Stable-Baselines3 tries again without a mode.
-            raise TypeError(
-                f"render_mode must be None, got {render_mode!r}: nothing is drawn yet"
-            )
+        rendering.check_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
+        self._record: rendering.Record | None = None  # for pictures; None if there are none
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = observation_space(parameters)
         # What step uses, in two tuples: unpacking one costs less than as many attributes.
@@ -288,6 +303,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self._window[error_head] = setpoint
         self._window[output_head] = 0.0
         self._window[action_head] = rest
+        if self.render_mode is not None:
+            self._record = rendering.begin(numbers, parameters.sampling_interval, setpoint)
+            self._show()
         info = {
             "output": 0.0,
             "setpoint": setpoint,
@@ -363,10 +381,41 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         }
         if self._tells_more:
             self._tell_more(info, load)
+        if self._record is not None:
+            self._record.add(setpoint, output, command, applied)
+            self._show()
         return observation, -cost, False, False, info
 
-    def render(self) -> None:
-        """Do nothing: there is no render mode yet."""
+    def render(self) -> rendering.Frame | str | None:
+        """Draw the last minutes of the episode.
+
+        Returns
+        -------
+        ndarray, str or None
+            With "rgb_array" a picture, shape (540, 960, 3), uint8; with "ansi" one in text.
+            None with "human", which shows it, and, after a warning, without a mode.
+
+        Raises
+        ------
+        ResetNeeded
+            If the environment has never been reset.
+        DependencyNotInstalled
+            If there is no pygame, for any mode but "ansi".
+        """
+        if self.render_mode is None:
+            rendering.warn_no_mode()
+            return None
+        return rendering.render(self.render_mode, self._record, self.metadata["render_fps"])
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self.render_mode == "human" and self._record is not None:
+            rendering.close_window()
+        self._record = None
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.render()
 
     def _look_ahead(self) -> None:
         if self._streams is None:

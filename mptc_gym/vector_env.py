@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from mptc_gym import rendering
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import is_count, positive_count
 from mptc_gym.plant import Plants, action_from_command
@@ -47,7 +48,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         the plant, and returns the last observation and info in `final_obs` and `final_info`.
         "Disabled": whoever steps has to reset, by `reset(options={"reset_mask": mask})`.
     render_mode
-        None; nothing is drawn yet.
+        None, or "rgb_array": `render` returns a picture of each plant.
     **arguments
         Those of `MiddlePointEnv`, the same for all plants.
 
@@ -56,7 +57,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     ValueError
         If an argument is out of range; the message names it.
     TypeError
-        If an argument is unknown, or `render_mode` is not None.
+        If an argument is unknown.
 
     Notes
     -----
@@ -69,7 +70,10 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     with an unstable `a`, or with actions beyond 1e154, NumPy warns here.
     """
 
-    metadata: dict[str, Any] = MiddlePointEnv.metadata
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as in VectorEnv)
+        **MiddlePointEnv.metadata,
+        "render_modes": ["rgb_array"],
+    }
 
     __signature__: ClassVar[inspect.Signature] = inspect.Signature(
         [
@@ -101,7 +105,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         render_mode: str | None = None,
         **arguments: Any,
     ) -> None:
-        single = MiddlePointEnv(render_mode=render_mode, **arguments)
+        rendering.check_mode(render_mode, self.metadata["render_modes"])
+        single = MiddlePointEnv(**arguments)
         self.num_envs = num_envs = positive_count("num_envs", num_envs)
         self._limit = FOREVER  # samples of an episode
         if max_episode_steps is not None and max_episode_steps != -1:
@@ -115,6 +120,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             ) from None
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.render_mode = render_mode
+        self._records: dict[int, rendering.Record] = {}  # of every plant, for pictures
         self.parameters = parameters = single.parameters
         self.single_action_space = single.action_space
         self.single_observation_space = single.observation_space
@@ -304,6 +310,11 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         if past_actions is not None:
             window[past_actions] = a.clip(-1.0, 1.0)
 
+        if self._records:
+            columns = (values.tolist() for values in (setpoint, output, command, applied))
+            for i, numbers in enumerate(zip(*columns, strict=True)):
+                self._records[i].add(*numbers)
+
         everyone = self._everyone.copy()
         infos = {
             "output": output.copy(),
@@ -327,6 +338,29 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         if clock >= self._first_end:
             truncations = self._end_episodes(rewards, infos)
         return window.copy(), rewards, terminations, truncations, infos
+
+    def render(self) -> tuple[rendering.Frame, ...] | None:
+        """Draw the last minutes of each plant's episode.
+
+        Returns
+        -------
+        tuple of ndarray, or None
+            A picture of each plant, shape (540, 960, 3), uint8. None, after a warning, without
+            a render mode.
+
+        Raises
+        ------
+        ResetNeeded
+            If the environments have never been reset.
+        DependencyNotInstalled
+            If there is no pygame.
+        """
+        if self.render_mode is None:
+            rendering.warn_no_mode()
+            return None
+        if not self._records:
+            raise ResetNeeded("call reset before render")
+        return tuple(rendering.frame(self._records[i]) for i in range(self.num_envs))
 
     def _window(self) -> NDArray[np.float32]:
         """Return the observations as they lie in the row, shape (num_envs, size)."""
@@ -413,6 +447,12 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             infos[name][which] = factors[which]
         for name, values in drawn.items():
             infos[name][which] = values
+        if self.render_mode is not None:
+            for j, (i, first) in enumerate(zip(which.tolist(), setpoint.tolist(), strict=True)):
+                own = {name: float(values[j]) for name, values in drawn.items()}
+                numbers = self._ranges.given | own
+                interval = self.parameters.sampling_interval
+                self._records[i] = rendering.begin(numbers, interval, first)
 
     def _seed(self, which: Indices, seeds: Sequence[int | None]) -> None:
         for i in which.tolist():

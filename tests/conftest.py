@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
+os.environ["SDL_VIDEODRIVER"] = "dummy"  # windows that nobody sees
 
 
 def run(

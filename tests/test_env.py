@@ -104,8 +104,6 @@ def test_make_vec_runs_many():
     assert list(infos["noise"]) == alone
 
 
-# Its make_vec_env asks for pictures first, and does without where there are none.
-@pytest.mark.filterwarnings("ignore:.*render_mode='rgb_array':UserWarning")
 def test_stable_baselines3_makes_it():
     envs = make_vec_env("MiddlePoint-v0", n_envs=2, seed=0)
     assert envs.reset().shape == (2, 6)
@@ -317,11 +315,6 @@ def test_an_observation_with_no_element_is_refused():
 def test_misspelt_argument_is_refused():
     with pytest.raises(TypeError, match="dead_zon"):
         gymnasium.make("MiddlePoint-v0", dead_zon=5.0)
-
-
-def test_render_mode_is_refused():
-    with pytest.raises(TypeError, match="render_mode must be None, got 'human'"):
-        MiddlePointEnv(render_mode="human")
 
 
 def test_numpy_scalars_are_taken():

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 STDLIB = set(sys.stdlib_module_names)
 ALLOWED = {
-    "mptc_gym": {"mptc_gym", "gymnasium", "numpy"},
+    "mptc_gym": {"mptc_gym", "gymnasium", "numpy", "pygame"},  # the last one when it is used
     "agents": {"agents", "numpy"},
 }
 
@@ -64,7 +64,6 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=range(len(EXAMPLES)))
-@pytest.mark.filterwarnings("ignore:.*render_mode='rgb_array':UserWarning")
 def test_examples_of_the_readme_run(example, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     # A short time will do to see that it runs.

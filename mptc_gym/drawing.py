@@ -1,0 +1,338 @@
+"""Pictures in pixels of a record of the loop, by pygame: a strip chart, and a window for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from functools import cache, lru_cache
+from itertools import islice
+
+import numpy as np
+import pygame
+
+from mptc_gym.rendering import Axis, Frame, Record
+
+Colour = tuple[int, int, int]
+Point = tuple[float, float]
+
+SIZE = 960, 540
+# The lines are of Okabe and Ito's colours, which all eyes can tell apart.
+TEMPERATURE: Colour = (0, 114, 178)
+SETPOINT: Colour = (213, 94, 0)
+APPLIED: Colour = (0, 158, 115)
+COMMAND: Colour = (40, 40, 40)
+DEAD_ZONE: Colour = (228, 228, 228)
+IN_TRANSIT: Colour = (214, 234, 248)
+LIMIT: Colour = (130, 130, 130)
+_STILL_TO_COME: Colour = (150, 210, 192)  # a lighter APPLIED
+_PAGE: Colour = (243, 244, 246)
+_PANEL: Colour = (255, 255, 255)
+_GRID: Colour = (232, 233, 236)
+_FRAME: Colour = (160, 164, 170)
+_FAINT: Colour = (95, 100, 108)
+_INK: Colour = (25, 28, 32)
+
+_LEFT, _RIGHT = 72, 842  # of both panels; what is right of them is for the lines' names
+_SMALL, _NORMAL, _LARGE = 18, 20, 32  # of letters
+_FINER = 4  # times as large as it is shown, words are drawn
+
+
+class Panel:
+    """A part of the picture with axes of its own, in pixels.
+
+    Parameters
+    ----------
+    top, bottom
+        Where it is.
+    record
+        What is drawn, and the time axis.
+    axis
+        From bottom to top.
+    """
+
+    def __init__(self, top: int, bottom: int, record: Record, axis: Axis) -> None:
+        self.top, self.bottom = top, bottom
+        self.record, self.axis = record, axis
+        self.rect = pygame.Rect(_LEFT, top, _RIGHT - _LEFT + 1, bottom - top + 1)
+        self._first = record.first
+        self._sample = (_RIGHT - _LEFT) / record.span
+        # Samples k, k = first on, and the place where the next one will be.
+        self.xs = [self.x(k) for k in range(record.first, record.k + 2)]
+
+    def x(self, k: float) -> float:
+        """Return where sample k lies."""
+        return _LEFT + (k - self._first) * self._sample
+
+    def y(self, value: float) -> float:
+        """Return where a value lies."""
+        return self.bottom - self.axis.share(value) * (self.bottom - self.top)
+
+    def ys(self, values: Iterable[float]) -> list[float]:
+        """Return where values lie."""
+        low, bottom = self.axis.low, float(self.bottom)
+        scale = (bottom - self.top) / (self.axis.high - low)
+        # What lies beyond is drawn at the edge, inside the frame, and so is, in this order of
+        # min and max, what is not a number.
+        least, most = self.top + 2.0, bottom - 2.0
+        return [max(least, min(most, bottom - (value - low) * scale)) for value in values]
+
+
+def frame(record: Record) -> Frame:
+    """Return a picture, shape (540, 960, 3)."""
+    return np.array(pygame.surfarray.pixels3d(draw(record)).swapaxes(0, 1), order="C")
+
+
+def show(record: Record, fps: float) -> None:
+    """Show a picture in the window, which is opened if need be.
+
+    Parameters
+    ----------
+    record
+        What to draw.
+    fps
+        Waits so long that there are no more pictures a second than this.
+    """
+    pygame.display.init()
+    screen = pygame.display.get_surface()
+    if screen is None or screen.get_size() != SIZE:
+        screen = pygame.display.set_mode(SIZE)
+        pygame.display.set_caption("MiddlePoint-v0")
+    screen.blit(draw(record), (0, 0))
+    pygame.event.pump()
+    _clock().tick(fps)
+    pygame.display.flip()
+
+
+def close_window() -> None:
+    """Close the window, if it is open."""
+    pygame.display.quit()
+
+
+@cache
+def _clock() -> pygame.time.Clock:
+    return pygame.time.Clock()
+
+
+def draw(record: Record) -> pygame.Surface:
+    """Return a picture; the next one is drawn over it."""
+    surface = _paper()
+    surface.fill(_PAGE)
+    _header(surface, record)
+    top = Panel(86, 304, record, record.temperatures)
+    bottom = Panel(346, 496, record, record.flows)
+    _temperatures(surface, top)
+    _flows(surface, bottom)
+    _time_axis(surface, bottom)
+    return surface
+
+
+@cache
+def _paper() -> pygame.Surface:
+    # Three bytes a pixel, in the order in which arrays have them: to turn it into an array is
+    # no more than a copy.
+    return pygame.Surface(SIZE, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
+
+
+def _header(surface: pygame.Surface, record: Record) -> None:
+    colours = {
+        "set point": SETPOINT,
+        "temperature": TEMPERATURE,
+        "command": COMMAND,
+        "applied": APPLIED,
+    }
+    pygame.draw.rect(surface, _PANEL, (0, 0, SIZE[0], 66))
+    pygame.draw.line(surface, _FRAME, (0, 66), (SIZE[0], 66))
+    for i, (name, value) in enumerate(record.numbers.items()):
+        x = 24 + 156 * i
+        _write(surface, name, _SMALL, _FAINT, topleft=(x, 12))
+        for character in value:  # one by one: what changes is made of pictures that are kept
+            image = _words(character, _LARGE, colours.get(name, _INK))
+            surface.blit(image, (x, 32))
+            x += image.get_width()
+
+
+def _temperatures(surface: pygame.Surface, panel: Panel) -> None:
+    _ground(surface, panel, "temperature, °C")
+    record = panel.record
+    setpoints = panel.ys(sample[0] for sample in record.samples)
+    outputs = panel.ys(sample[1] for sample in record.samples)
+    surface.set_clip(panel.rect)
+    _dashes(surface, SETPOINT, panel, setpoints[:-1])
+    _curve(surface, TEMPERATURE, list(zip(panel.xs, outputs, strict=False)))
+    surface.set_clip(None)
+    _edge(surface, panel)
+    dot = _dot(TEMPERATURE)
+    surface.blit(dot, dot.get_rect(center=_pixel((panel.x(record.k), outputs[-1]))))
+    _names(
+        surface,
+        panel,
+        ("set point", SETPOINT, setpoints[-1]),
+        ("temperature", TEMPERATURE, outputs[-1]),
+    )
+
+
+def _flows(surface: pygame.Surface, panel: Panel) -> None:
+    record, plate = panel.record, panel.record.plate
+    now, departed = panel.x(record.k), max(_LEFT, panel.x(record.k - record.in_transit))
+    zero = panel.y(0.0)
+    _ground(surface, panel, "feedwater, t/h")
+    surface.set_clip(panel.rect)
+    if plate.dead_zone > 0.0:
+        upper, lower = panel.y(plate.dead_zone), panel.y(-plate.dead_zone)
+        surface.fill(DEAD_ZONE, (_LEFT, upper, _RIGHT - _LEFT, lower - upper + 1))
+        _write(surface, "dead zone", _SMALL, _FAINT, topleft=(_LEFT + 8, upper + 4))
+    if record.in_transit:
+        surface.fill(
+            IN_TRANSIT,
+            (departed, panel.top, now - departed, panel.bottom - panel.top),
+            pygame.BLEND_RGB_MULT,
+        )
+    for limit, side in ((plate.u_max, "bottomleft"), (plate.u_min, "topleft")):
+        y = panel.y(limit)
+        for x in range(_LEFT, _RIGHT, 8):
+            pygame.draw.line(surface, LIMIT, (x, y), (x + 3, y))
+        _write(surface, "limit", _SMALL, _FAINT, **{side: (_LEFT + 8, y + 1)})
+    pygame.draw.line(surface, _FRAME, (_LEFT, zero), (_RIGHT, zero))
+
+    # An input is held from its sample to the next. The first entry is of before the episode.
+    commands = panel.ys(sample[2] for sample in islice(record.samples, 1, None))
+    applied = panel.ys(sample[3] for sample in islice(record.samples, 1, None))
+    if applied:
+        if record.in_transit:
+            still = _steps(panel, applied[-record.in_transit :])
+            pygame.draw.polygon(
+                surface, _STILL_TO_COME, [(departed, zero), *still, (now, zero)]
+            )
+        pygame.draw.lines(surface, APPLIED, False, _steps(panel, applied), 3)
+        pygame.draw.lines(surface, COMMAND, False, _steps(panel, commands))
+    surface.set_clip(None)
+    _edge(surface, panel)
+    if record.in_transit:
+        _bracket(surface, panel, departed, now)
+    if applied:
+        ends = ("command", COMMAND, commands[-1]), ("applied", APPLIED, applied[-1])
+        _names(surface, panel, *ends)
+
+
+def _ground(surface: pygame.Surface, panel: Panel, title: str) -> None:
+    """Draw what lies behind the lines: the panel, its grid and its tick labels."""
+    surface.fill(_PANEL, panel.rect)
+    record = panel.record
+    per_minute = 60.0 / record.plate.sampling_interval
+    for minute in record.minutes.ticks():
+        x = panel.x(minute * per_minute)
+        pygame.draw.line(surface, _GRID, (x, panel.top), (x, panel.bottom))
+    for value in panel.axis.ticks():
+        y = panel.y(value)
+        pygame.draw.line(surface, _GRID, (_LEFT, y), (_RIGHT, y))
+        _write(surface, f"{value:.6g}", _SMALL, _FAINT, midright=(_LEFT - 8, y))
+    upright = pygame.transform.rotate(_words(title, _SMALL, _INK), 90)
+    surface.blit(upright, upright.get_rect(center=(13, (panel.top + panel.bottom) // 2)))
+
+
+def _edge(surface: pygame.Surface, panel: Panel) -> None:
+    """Draw the panel's frame, and a line where the present is."""
+    now = panel.x(panel.record.k)
+    pygame.draw.line(surface, _FRAME, (now, panel.top), (now, panel.bottom))
+    pygame.draw.rect(surface, _FRAME, panel.rect, 1)
+
+
+def _bracket(surface: pygame.Surface, panel: Panel, left: float, right: float) -> None:
+    """Say, above the panel, what is on its way."""
+    y = panel.top - 5
+    pygame.draw.line(surface, _FAINT, (left, y), (right, y))
+    for x in (left, right):
+        pygame.draw.line(surface, _FAINT, (x, y - 3), (x, y + 3))
+    words = _words("in transit", _SMALL, _FAINT)
+    place = words.get_rect(midbottom=_pixel(((left + right) / 2, y - 4)))
+    surface.blit(words, place.clamp(pygame.Rect(_LEFT, 0, SIZE[0] - _LEFT, SIZE[1])))
+
+
+def _time_axis(surface: pygame.Surface, panel: Panel) -> None:
+    record = panel.record
+    per_minute = 60.0 / record.plate.sampling_interval
+    for minute in record.minutes.ticks():
+        x, y = panel.x(minute * per_minute), panel.bottom
+        pygame.draw.line(surface, _FRAME, (x, y), (x, y + 5))
+        _write(surface, f"{minute:.6g}", _SMALL, _FAINT, midtop=(x, y + 9))
+    _write(surface, "time, min", _SMALL, _INK, topleft=(_RIGHT + 24, panel.bottom + 9))
+
+
+def _curve(surface: pygame.Surface, colour: Colour, points: Sequence[Point]) -> None:
+    """Draw a smooth line some three pixels wide: smooth ones come in one width alone."""
+    if len(points) < 2:
+        return
+    for dx, dy in ((0.0, -0.8), (0.0, 0.0), (0.0, 0.8), (0.6, 0.0)):
+        pygame.draw.aalines(surface, colour, False, [(x + dx, y + dy) for x, y in points])
+
+
+def _dashes(
+    surface: pygame.Surface, colour: Colour, panel: Panel, heights: Sequence[float]
+) -> None:
+    """Draw a value that is held from sample to sample, in dashes that move with it."""
+    record = panel.record
+    period = max(2, round(14 * record.span / (_RIGHT - _LEFT)))  # samples
+    for i, y in enumerate(heights):
+        if (record.first + i) % period < 0.6 * period:
+            ends = (panel.xs[i], y), (panel.xs[i + 1], y)
+            pygame.draw.line(surface, colour, *ends, 2)
+
+
+def _steps(panel: Panel, heights: Sequence[float]) -> list[Point]:
+    """Return the line of a value that is held from each of the latest samples to the next."""
+    points: list[Point] = []
+    before = len(panel.xs) - 2 - len(heights)  # the last two: the present, and the next one
+    for i, y in enumerate(heights, start=before):
+        points += [(panel.xs[i], y), (panel.xs[i + 1], y)]
+    return points
+
+
+def _names(surface: pygame.Surface, panel: Panel, *lines: tuple[str, Colour, float]) -> None:
+    """Write the name of two lines beside their ends, one above the other."""
+    x = panel.x(panel.record.k) + 10
+    (_, _, upper), (_, _, lower) = lines = tuple(sorted(lines, key=lambda line: line[2]))
+    middle = (upper + lower) / 2
+    apart = max((lower - upper) / 2, 8.0)
+    middle = min(max(middle, panel.top + apart), panel.bottom - apart)
+    for (name, colour, _), y in zip(lines, (middle - apart, middle + apart), strict=True):
+        for dx, dy in ((-2, 0), (2, 0), (0, -2), (0, 2)):  # so that no grid runs through it
+            _write(surface, name, _NORMAL, _PANEL, midleft=(x + dx, y + dy))
+        _write(surface, name, _NORMAL, colour, midleft=(x, y))
+
+
+def _write(
+    surface: pygame.Surface, words: str, size: int, colour: Colour, **place: Point
+) -> None:
+    """Write words, and put a place of theirs, such as `topleft`, at a point."""
+    image = _words(words, size, colour)
+    surface.blit(image, image.get_rect(**{side: _pixel(at) for side, at in place.items()}))
+
+
+def _pixel(point: Point) -> tuple[int, int]:
+    return round(point[0]), round(point[1])
+
+
+@lru_cache(1024)
+def _words(words: str, size: int, colour: Colour) -> pygame.Surface:
+    # With the font that comes with pygame, so that pictures are the same everywhere. It is
+    # opened for each picture of words, as it would not outlive another's pygame.quit(). At its
+    # final size its letters would stand on whole pixels, unevenly.
+    pygame.font.init()
+    font = pygame.font.Font(None, size * _FINER)
+    return _reduced(font.render(words.replace("-", "\N{MINUS SIGN}"), True, colour))
+
+
+@cache
+def _dot(colour: Colour) -> pygame.Surface:
+    size = 9 * _FINER
+    image = pygame.Surface((size, size), pygame.SRCALPHA)
+    image.fill((*colour, 0))
+    pygame.draw.circle(image, colour, (size / 2, size / 2), size / 2)
+    return _reduced(image)
+
+
+def _reduced(image: pygame.Surface) -> pygame.Surface:
+    width, height = image.get_size()
+    return pygame.transform.smoothscale(
+        image, (math.ceil(width / _FINER), math.ceil(height / _FINER))
+    )

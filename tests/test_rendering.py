@@ -1,0 +1,365 @@
+"""Pictures: that they show what happens, in every mode, and change nothing about it."""
+
+import copy
+import math
+import pickle
+import sys
+
+import gymnasium
+import numpy as np
+import pygame
+import pytest
+from gymnasium.error import DependencyNotInstalled, ResetNeeded
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import RecordVideo
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from moviepy import VideoFileClip
+from stable_baselines3.common.env_util import make_vec_env
+
+from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, drawing, rendering
+from mptc_gym.rendering import Nameplate, Record
+from tests.conftest import run
+
+NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
+SHAPE = (540, 960, 3)
+UP = np.ones(1, np.float32)
+
+
+def record(*samples, setpoint=0.0, **plate):
+    """Return a record of samples (y_d, y, u, u_a) of the paper's plant, or one unlike it."""
+    known = {"delay": 18, "dead_zone": 5.0, "u_min": -10.0, "u_max": 10.0}
+    made = Record(Nameplate(**{**known, "sampling_interval": 8.0, **plate}), setpoint)
+    for sample in samples:
+        made.add(*sample)
+    return made
+
+
+def places(picture, colour, tolerance=0):
+    """Return the rows and the columns where a colour is."""
+    return np.nonzero((np.abs(picture.astype(int) - colour) <= tolerance).all(axis=2))
+
+
+def height(picture, colour, k, *, top):
+    """Return the middle row of a line between samples k and k + 1, below a row."""
+    rows, columns = places(picture[top:], colour, tolerance=60)
+    return top + rows[columns == round(column(k + 0.5))].mean()
+
+
+def column(k):
+    """Return where sample k lies, as long as the picture has not begun to move."""
+    return 72 + k / 200 * 770
+
+
+def test_the_line_of_the_temperature_is_where_the_temperature_is():
+    levels = (12.0,) * 60 + (0.0,) * 60 + (-12.0,) * 60
+    picture = rendering.frame(record(*[(level / 2, level, 0.0, 0.0) for level in levels]))
+    rows = [height(picture, drawing.TEMPERATURE, k, top=80) for k in (30, 90, 150)]
+    # From -12 - 5 % of the range to 12 + 5 %, on to full 2 degC, in a panel of 218 pixels.
+    assert np.diff(rows) == pytest.approx([12 / 28 * 218] * 2, abs=1)
+    setpoint, _ = places(picture[:, round(column(20)) : round(column(40))], drawing.SETPOINT)
+    assert np.mean(setpoint[setpoint > 80]) == pytest.approx(np.mean(rows[:2]), abs=1.5)
+
+
+def test_the_lines_of_the_flows_are_where_the_flows_are():
+    inside, beyond = (0.0, 0.0, 4.0, 0.0), (0.0, 0.0, 100.0, 10.0)
+    picture = rendering.frame(record(*[inside] * 50, *[beyond] * 100))
+    zero, limit = (height(picture, drawing.APPLIED, k, top=342) for k in (25, 100))
+    assert zero - limit == pytest.approx(10 / 24.8 * 150, abs=1)
+    command = height(picture, drawing.COMMAND, 25, top=342)
+    assert zero - command == pytest.approx(4 / 24.8 * 150, abs=1)
+    assert height(picture, drawing.COMMAND, 100, top=342) < limit - 5  # at the edge
+
+
+@pytest.mark.parametrize("dead_zone", [0.0, 2.0, 4.0, 8.0])
+def test_the_shade_of_the_dead_zone_is_as_high_as_it_is_wide(dead_zone):
+    _, columns = places(rendering.frame(record(dead_zone=dead_zone)), drawing.DEAD_ZONE)
+    shaded = np.count_nonzero(columns == 800)  # where nothing else is drawn
+    # The panel of 150 pixels shows 24.8 t/h; the line of no flow takes one row.
+    assert shaded == pytest.approx(2 * dead_zone / 24.8 * 150, abs=2)
+
+
+def test_the_limits_are_marked():
+    rows = {}
+    for u_max in (5.0, 10.0):
+        picture = rendering.frame(record(u_max=u_max, dead_zone=0.0))
+        rows[u_max], _ = places(picture[:, 800:801], drawing.LIMIT)  # where there is a dash
+    # Of 150 pixels, from -10 - 12 % of the range to u_max + 12 %.
+    assert np.diff(rows[10.0]) == pytest.approx([20 / 24.8 * 150], abs=1)
+    assert np.diff(rows[5.0]) == pytest.approx([15 / 18.6 * 150], abs=1)
+
+
+@pytest.mark.parametrize(("k", "delay", "expected"), [
+    (10, 18, 10), (18, 18, 18), (60, 18, 18), (60, 40, 40), (60, 0, 0),
+])  # fmt: skip
+def test_what_is_in_transit_is_shaded(k, delay, expected):
+    made = record(*[(0.0, 0.0, 0.0, 0.0)] * k, delay=delay, dead_zone=0.0)
+    _, columns = places(rendering.frame(made), drawing.IN_TRANSIT)
+    width = np.ptp(columns) + 1 if len(columns) else 0
+    assert width == pytest.approx(expected / 200 * 770, abs=3)
+    if expected:
+        assert columns.max() == pytest.approx(column(k), abs=2)  # up to now
+    marks = rendering.text(made).splitlines()[-2]
+    assert marks.count("^") == pytest.approx(expected / 200 * 71, abs=1)
+
+
+def test_the_numbers_of_the_text():
+    made = record(*[(5.0, 4.875, -7.25, -7.25)] * 30, (5.0, 4.25, -4.5, 0.0), setpoint=5.0)
+    shown = rendering.text(made)
+    for words in (
+        "time 4.1 min", "set point 5.00 °C", "temperature 4.25 °C", "error 0.75 °C",
+        "command -4.50 t/h", "applied 0.00 t/h",
+    ):  # fmt: skip
+        assert words in shown
+    assert max(map(len, shown.splitlines())) <= 82
+
+
+def test_the_lines_of_the_text():
+    lines = rendering.text(record(*[(10.0, -10.0, 4.0, 0.0)] * 200)).splitlines()
+    top = next(i for i, line in enumerate(lines) if line.count("-") > 60)
+    bottom = next(i for i, line in enumerate(lines) if line.count("*") > 60)
+    command = next(i for i, line in enumerate(lines) if line.count("+") > 60)
+    applied = next(i for i, line in enumerate(lines) if line.count("#") > 60)
+    assert top < bottom < command < applied
+    assert lines[applied].startswith("      0 |")
+    assert sum("::::" in line for line in lines) == 1  # of three rows, two are hidden
+
+
+def test_frames_do_not_change_afterwards():
+    env = MiddlePointEnv(render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    kept = first.copy()
+    env.step(UP)
+    assert first.shape == SHAPE
+    assert first.dtype == np.uint8
+    assert not np.array_equal(first, env.render())
+    np.testing.assert_array_equal(first, kept)
+
+
+def frames(env, actions, seed=0):
+    env.reset(seed=seed)
+    yield env.render()
+    for action in actions:
+        env.step(np.array([action], np.float32))
+        yield env.render()
+
+
+@pytest.mark.parametrize("mode", ["rgb_array", "ansi"])
+def test_same_seed_same_pictures(mode, rng):
+    actions = rng.uniform(-1, 1, 25)
+    env = MiddlePointEnv(render_mode=mode, **NOISY)
+    first, second, other = (list(frames(env, actions, seed)) for seed in (3, 3, 4))
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    assert not any(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
+
+
+@pytest.mark.parametrize("mode", ["rgb_array", "ansi", "human"])
+def test_nothing_else_changes(mode, rng):
+    actions = rng.uniform(-1.5, 1.5, 40)
+    plain = run(MiddlePointEnv(**NOISY), actions)
+    env = MiddlePointEnv(render_mode=mode, **NOISY)
+    env.metadata = {**env.metadata, "render_fps": 1000}
+    drawn = run(env, actions)
+    env.close()
+    assert data_equivalence(plain, drawn, exact=True)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_copies_in_the_middle_of_an_episode_draw_alike(copied, rng):
+    env = gymnasium.make("MiddlePoint-v0", render_mode="rgb_array", **NOISY)
+    list(frames(env, rng.uniform(-1, 1, 20)))
+    twin = copied(env)
+    before = twin.render()
+    for action in rng.uniform(-1, 1, (20, 1)).astype(np.float32):
+        env.step(action)
+    np.testing.assert_array_equal(twin.render(), before)  # a record of its own
+    env.reset(seed=1)
+    twin.reset(seed=1)
+    for action in rng.uniform(-1, 1, (5, 1)).astype(np.float32):
+        env.step(action)
+        twin.step(action)
+        np.testing.assert_array_equal(env.render(), twin.render())
+
+
+@pytest.mark.parametrize("mode", [mode.value for mode in AutoresetMode])
+def test_frames_of_a_batch_are_those_of_one_after_the_other(mode, rng):
+    made = {"max_episode_steps": 12, "render_mode": "rgb_array", **NOISY}
+    native = gymnasium.make_vec("MiddlePoint-v0", 2, autoreset_mode=mode, **made)
+    sync = gymnasium.make_vec(
+        "MiddlePoint-v0", 2, vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": mode}, **made,
+    )  # fmt: skip
+    for envs in (native, sync):
+        envs.reset(seed=5)
+    for k in range(30):
+        actions = rng.uniform(-1, 1, (2, 1)).astype(np.float32)
+        _, _, _, ended, _ = native.step(actions)
+        sync.step(actions)
+        ours, theirs = native.render(), sync.render()
+        assert type(ours) is tuple
+        np.testing.assert_array_equal(ours, theirs)
+        mask = ended if mode == "Disabled" else np.array([k == 4, False])
+        if mask.any():  # one of them starts before the other
+            for envs in (native, sync):
+                envs.reset(options={"reset_mask": mask.copy()})
+
+
+def test_a_window_shows_what_a_frame_does_at_reset_and_at_each_step():
+    env = gymnasium.make("MiddlePoint-v0", render_mode="human", **NOISY)
+    twin = gymnasium.make("MiddlePoint-v0", render_mode="rgb_array", **NOISY)
+    for each in (env, twin):
+        each.reset(seed=0)
+    for _ in range(3):
+        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        np.testing.assert_array_equal(shown, twin.render())
+        env.step(UP)
+        twin.step(UP)
+    assert env.render() is None
+    env.close()
+    assert not pygame.display.get_init()
+    env.close()
+
+
+def test_a_window_keeps_time(monkeypatch):
+    paces = []
+
+    class Clock:
+        def tick(self, fps):
+            paces.append(fps)
+
+    monkeypatch.setattr(drawing, "_clock", Clock)
+    env = MiddlePointEnv(render_mode="human")
+    env.reset(seed=0)
+    env.metadata = {**env.metadata, "render_fps": 7}
+    env.step(UP)
+    env.close()
+    assert paces == [30, 7]
+
+
+def test_what_has_no_window_closes_nobodys():
+    env = MiddlePointEnv(render_mode="human")
+    env.reset(seed=0)
+    for mode in (None, "rgb_array", "ansi", "human"):
+        MiddlePointEnv(render_mode=mode).close()
+    assert pygame.display.get_init()
+    env.close()
+
+
+def test_without_a_mode_there_is_a_warning():
+    for env in (MiddlePointEnv(), MiddlePointVectorEnv(2)):
+        env.reset(seed=0)
+        with pytest.warns(UserWarning, match="render mode"):
+            assert env.render() is None
+
+
+@pytest.mark.parametrize(
+    ("made", "allowed"),
+    [
+        (MiddlePointEnv, ["human", "rgb_array", "ansi"]),
+        (MiddlePointVectorEnv, ["rgb_array"]),
+    ],
+)
+def test_unknown_modes_are_named(made, allowed):
+    assert made.metadata["render_modes"] == allowed
+    for mode in {"human", "ansi", "depth_array", "", 3} - set(allowed):
+        with pytest.raises(
+            ValueError, match=rf"render_mode must be .*'rgb_array'.*, got {mode!r}"
+        ):
+            made(render_mode=mode)
+
+
+@pytest.mark.parametrize("made", [MiddlePointEnv, MiddlePointVectorEnv])
+def test_before_reset_there_is_nothing_to_draw(made):
+    with pytest.raises(ResetNeeded, match="before render"):
+        made(render_mode="rgb_array").render()
+
+
+def test_without_pygame_only_text_is_drawn(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    env = MiddlePointEnv(render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(UP)
+    envs = MiddlePointVectorEnv(2, render_mode="rgb_array")
+    envs.reset(seed=0)
+    window = MiddlePointEnv(render_mode="human")
+    for draw in (env.render, envs.render, window.reset):
+        with pytest.raises(DependencyNotInstalled, match=r'pip install "mptc_gym\[render\]"'):
+            draw()
+    env.close()
+    text = MiddlePointEnv(render_mode="ansi")
+    text.reset(seed=0)
+    assert "set point" in text.render()
+
+
+def test_fonts_outlive_another_s_end_of_pygame():
+    before = rendering.frame(record())
+    pygame.quit()
+    pygame.init()
+    drawing._words.cache_clear()
+    np.testing.assert_array_equal(rendering.frame(record()), before)
+
+
+def test_videos_can_be_recorded(tmp_path):
+    env = gymnasium.make("MiddlePoint-v0", render_mode="rgb_array", max_episode_steps=8)
+    env = RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda _: True)
+    list(frames(env, np.zeros(8)))
+    env.close()
+    (film,) = (tmp_path / "films").glob("*.mp4")
+    with VideoFileClip(str(film)) as clip:
+        assert clip.size == [960, 540]
+        assert clip.n_frames == 9
+
+
+def test_lists_of_frames():
+    env = gymnasium.make("MiddlePoint-v0", render_mode="rgb_array_list")
+    env.reset(seed=0)
+    env.step(UP)
+    assert [picture.shape for picture in env.render()] == [SHAPE] * 2
+
+
+def test_stable_baselines3_draws_all_of_its_environments():
+    envs = make_vec_env("MiddlePoint-v0", n_envs=2, seed=0)
+    envs.reset()
+    assert envs.render().shape == (2 * 540, 960, 3)
+
+
+anything = st.floats() | st.floats(-20, 20)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    samples=st.lists(st.tuples(anything, anything, anything, anything), max_size=12),
+    delay=st.integers(0, 10) | st.sampled_from([10**3, 10**9]),
+    dead_zone=st.floats(0, 10),
+    limits=st.lists(st.floats(-1e9, 1e9), min_size=2, max_size=2, unique=True).map(sorted),
+    sampling_interval=st.floats(1e-3, 1e9),
+)
+def test_anything_can_be_drawn(samples, delay, dead_zone, limits, sampling_interval):
+    low, high = limits
+    if high - low < 1e-6:
+        high = low + 1.0
+    made = record(
+        *samples, delay=delay, dead_zone=dead_zone, u_min=low, u_max=high,
+        sampling_interval=sampling_interval,
+    )  # fmt: skip
+    assert rendering.frame(made).shape == SHAPE
+    assert "temperature" in rendering.text(made)
+    for axis in (made.minutes, made.temperatures, made.flows):
+        assert 2 <= len(list(axis.ticks())) <= 12
+
+
+def test_a_record_stays_small():
+    made = record(*[(0.0, 0.0, 0.0, 0.0)] * 5000, delay=100)
+    assert len(made.samples) == 401
+    assert (made.first, made.k) == (4600, 5000)
+    assert record(delay=10**9).span == 2000
+
+
+def test_the_axis_holds_all_of_the_episode():
+    made = record((30.0, 0.0, 0.0, 0.0), (0.0, -12.0, 0.0, 0.0), *[(0.0,) * 4] * 500)
+    axis = made.temperatures
+    assert axis.low < -12.0
+    assert axis.high > 30.0
+    assert all(math.isclose(tick % axis.step, 0.0) for tick in axis.ticks())
