@@ -70,6 +70,10 @@ class GymnasiumVecEnv(VecEnv):
             }
         return observations, rewards.astype(np.float32), dones, infos
 
+    def get_images(self) -> list[NDArray[np.uint8]]:
+        """Return a picture of each environment, if the batch has the mode "rgb_array"."""
+        return list(self.envs.render() or [])
+
     def close(self) -> None:
         """Close the batch."""
         self.envs.close()

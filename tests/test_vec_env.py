@@ -83,6 +83,16 @@ def test_infos_of_the_batch_are_at_hand():
     assert list(ours.infos["command"]) == [10.0] * N
 
 
+def test_pictures_are_those_of_the_batch():
+    envs = gymnasium.make_vec(
+        "MiddlePoint-v0", 2, autoreset_mode="SameStep", render_mode="rgb_array"
+    )
+    ours = GymnasiumVecEnv(envs)
+    ours.reset()
+    np.testing.assert_array_equal(ours.get_images(), envs.render())
+    assert ours.render().shape == (2 * 540, 960, 3)
+
+
 def test_another_autoreset_mode_is_refused():
     with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
         GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", N))
