@@ -16,6 +16,14 @@ def number(text: str) -> int:
     return value
 
 
+def seed(text: str) -> int:
+    """Read a number of at least 0, as `number` does."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"must be at least 0, got {value}")
+    return value
+
+
 def parser(name: str, description: str | None) -> argparse.ArgumentParser:
     """Return a parser for `python -m benchmarks.<name>` that shows defaults in its help."""
     return argparse.ArgumentParser(
