@@ -28,6 +28,7 @@ from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
 
 ROUNDS = 15
 SINGLE_STEPS = 20_000
+FRAMES = 400  # with a chart that is full for half of them
 EPISODE = 1200
 BATCHES = (1, 8, 64, 1024, 16384)
 LOOPS = (64, 1000)
@@ -81,6 +82,8 @@ def main(arguments: list[str] | None = None) -> None:
     show("One environment, from gymnasium.make", compare(cases, rounds))
     cases = [_single(name, *made, bare=True) for name, made in SINGLE.items()]
     show("One environment, without gymnasium.make's wrappers", compare(cases, rounds))
+    cases = [_drawn(name) for name in (REFERENCE, "MiddlePoint-v0")]
+    show('Steps with a picture of each, render_mode="rgb_array"', compare(cases, rounds))
     for n in BATCHES:
         show(f"Vector environments, n = {n}", compare(list(_vector(n)), rounds))
     show(
@@ -187,6 +190,22 @@ def _single(name: str, env_id: str, arguments: dict[str, Any], *, bare: bool = F
                     env.reset()
 
     return Case(name, step, SINGLE_STEPS)
+
+
+def _drawn(name: str) -> Case:
+    env = gymnasium.make(name, render_mode="rgb_array")
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(FRAMES)]
+
+    def draw() -> None:
+        env.reset(seed=0)
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+            env.render()
+
+    return Case(name, draw, FRAMES)
 
 
 def _vector(n: int) -> Iterable[Case]:

@@ -17,14 +17,14 @@ def test_ratios_compare_rounds_with_each_other(monkeypatch):
 
 def test_it_runs(monkeypatch, capsys):
     small = {
-        "SINGLE_STEPS": 50, "EPISODE": 5, "LONG": 5, "BATCHES": (1, 3), "LOOPS": (2,),
-        "WITH_ENVPOOL": False,
+        "SINGLE_STEPS": 50, "FRAMES": 3, "EPISODE": 5, "LONG": 5, "BATCHES": (1, 3),
+        "LOOPS": (2,), "WITH_ENVPOOL": False,
     }  # fmt: skip
     for name, value in small.items():
         monkeypatch.setattr(speed, name, value)
     speed.main(["--rounds", "1"])
     shown = capsys.readouterr().out
-    for words in ("n = 3", "Pendulum-v1", "R = 0.5", "batch of 2", "KiB", "import mptc_gym"):
+    for words in ("n = 3", "Pendulum-v1", "picture", "batch of 2", "KiB", "import mptc_gym"):
         assert words in shown
 
 
