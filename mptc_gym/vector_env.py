@@ -450,9 +450,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         if self.render_mode is not None:
             for j, (i, first) in enumerate(zip(which.tolist(), setpoint.tolist(), strict=True)):
                 own = {name: float(values[j]) for name, values in drawn.items()}
-                numbers = self._ranges.given | own
                 interval = self.parameters.sampling_interval
-                self._records[i] = rendering.begin(numbers, interval, first)
+                self._records[i] = rendering.begin(self._ranges.given | own, interval, first)
 
     def _seed(self, which: Indices, seeds: Sequence[int | None]) -> None:
         for i in which.tolist():
