@@ -7,6 +7,8 @@ import sys
 
 from rich.console import Console
 
+from benchmarks.fan_out import BACKENDS, FanOut
+
 
 def number(text: str) -> int:
     """Read a number of at least 1; argparse shows this function's name in its complaints."""
@@ -36,3 +38,24 @@ def parser(name: str, description: str | None) -> argparse.ArgumentParser:
 def console(width: int = 120) -> Console:
     """Return a console as wide as the terminal, or as given where nothing says how wide."""
     return Console(width=None if sys.stdout.isatty() else width, highlight=False, markup=False)
+
+
+def add_fan_out(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add the options that say where and how many at once; `what` names what is run."""
+    parser.add_argument(
+        "--jobs",
+        type=number,
+        default=argparse.SUPPRESS,
+        help=f"how many {what} to run at once (default: as many as there are cores)",
+    )
+    parser.add_argument(
+        "--backend",
+        choices=BACKENDS,
+        default=BACKENDS[0],
+        help=f"where to run {what}: loky, on this machine; ray, on a Ray cluster",
+    )
+
+
+def fan_out(options: argparse.Namespace) -> FanOut:
+    """Return the fan-out that the options of `add_fan_out` ask for, or raise ValueError."""
+    return FanOut(getattr(options, "jobs", None), options.backend)

@@ -1,0 +1,49 @@
+"""Cells for the tests of the fan-out; other processes import them from here."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+
+Rows = list[dict[str, float]]
+
+
+def draw(seed: int, calls: Path | None = None, seconds: float = 0.0) -> Rows:
+    """Return random numbers of a seed, and leave a file for each call."""
+    if calls is not None:
+        (calls / f"{seed} {time.time_ns()} {os.getpid()}").touch()
+    time.sleep(seconds)
+    rng = np.random.default_rng(seed)
+    product = rng.normal(size=(9, 9)) @ rng.normal(size=9)
+    return [{"seed": seed, "sum": float(product.sum())}]
+
+
+def die_once(seed: int, flag: Path, calls: Path | None = None) -> Rows:
+    """Kill the own process, but not a second time."""
+    if not flag.exists():
+        flag.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return draw(seed, calls)
+
+
+def die(seed: int) -> Rows:
+    """Kill the own process, each time."""
+    os._exit(seed + 1)
+
+
+def fail(seed: int) -> Rows:
+    """Raise an exception that cannot be pickled."""
+
+    class LocalError(Exception):
+        pass
+
+    raise LocalError(f"no such plant as {seed}")
+
+
+def unfit(seed: int) -> object:
+    """Return what JSON cannot hold."""
+    return {seed}

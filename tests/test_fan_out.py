@@ -1,0 +1,259 @@
+"""Fan-out: nothing depends on where and when cells run, and nothing that is done is lost."""
+
+import importlib.util
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from benchmarks import command_line, fan_out
+from benchmarks.fan_out import CellsFailedError, FanOut
+from tests import cells
+
+ROOT = Path(__file__).parent.parent
+
+
+def work(n, calls=None, seconds=0.0):
+    return {f"plant {seed}": partial(cells.draw, seed, calls, seconds) for seed in range(n)}
+
+
+def run(cells_, folder=None, jobs=2):
+    return FanOut(jobs).run(cells_, folder, progress=False)
+
+
+def counted(calls):
+    """Return how often each seed was drawn."""
+    return Counter(int(path.name.partition(" ")[0]) for path in calls.iterdir())
+
+
+@pytest.fixture
+def calls(tmp_path):
+    folder = tmp_path / "calls"
+    folder.mkdir()
+    return folder
+
+
+class TestNumbers:
+    def test_jobs_and_order_do_not_matter(self):
+        there = work(7)
+        there["plant 0"] = partial(cells.draw, 0, None, 0.3)  # the first is not ready first
+        back = dict(reversed(there.items()))
+        one = run(there, jobs=1)
+        assert one == {f"plant {seed}": cells.draw(seed) for seed in range(7)}
+        assert list(one) == list(there)
+        for given, jobs in ((there, 2), (back, 2), (back, 1)):
+            results = run(given, jobs=jobs)
+            assert results == one
+            assert list(results) == list(given)
+
+    def test_with_one_job_cells_run_here(self):
+        assert run({"pid": os.getpid}, jobs=1) == {"pid": os.getpid()}
+        assert run({"pid": os.getpid}) != {"pid": os.getpid()}
+
+    def test_what_is_read_is_what_was_returned(self, tmp_path):
+        values = {"numbers": (1, 0.1, float("inf")), "text": "°C"}
+        fresh = run({"a/b: c": partial(dict, values)}, tmp_path)
+        assert fresh == run({"a/b: c": partial(dict, values)}, tmp_path)
+        assert [path.name for path in tmp_path.iterdir()] == ["a%2Fb%3A c.json"]
+        assert fresh["a/b: c"] == {"numbers": [1, 0.1, float("inf")], "text": "°C"}
+
+
+class TestResume:
+    def test_only_what_is_missing_runs(self, tmp_path, calls):
+        first = run(work(4, calls), tmp_path / "out")
+        again = run(work(6, calls), tmp_path / "out")
+        assert counted(calls) == Counter(range(6))
+        assert {key: again[key] for key in first} == first
+
+    def test_nothing_is_saved_without_a_folder(self, calls):
+        assert run(work(2, calls)) == run(work(2, calls))
+        assert set(counted(calls).values()) == {2}
+
+    @pytest.mark.parametrize("name", ["plant 1.json", ".plant 1.1234.partial.json"])
+    def test_half_a_file_is_no_result(self, tmp_path, calls, name):
+        whole = run(work(3), tmp_path / "out")
+        file = tmp_path / "out" / "plant 1.json"
+        text = file.read_text()
+        file.unlink()
+        file.with_name(name).write_text(text[: len(text) // 2])
+        assert run(work(3, calls), tmp_path / "out") == whole
+        assert counted(calls) == Counter([1])
+
+    def test_a_killed_run_goes_on_where_it_was(self, tmp_path, calls):
+        program = (
+            "import sys; from functools import partial; from pathlib import Path\n"
+            "from benchmarks.fan_out import FanOut; from tests import cells\n"
+            "out, calls = map(Path, sys.argv[1:])\n"
+            "work = {f'plant {i}': partial(cells.draw, i, calls, 0.2) for i in range(40)}\n"
+            "FanOut(2).run(work, out, progress=False)"
+        )
+        command = [sys.executable, "-c", program, str(tmp_path / "out"), str(calls)]
+        with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE) as process:
+            until(lambda: len(list((tmp_path / "out").glob("[!.]*.json"))) >= 4)
+            process.kill()
+        time.sleep(1.0)  # what its workers have begun they finish
+        done = {path.stem for path in (tmp_path / "out").glob("[!.]*.json")}
+        assert 4 <= len(done) < 40
+        for path in calls.iterdir():
+            path.unlink()
+        results = run(work(40, calls), tmp_path / "out")
+        missing = {seed for seed in range(40) if f"plant {seed}" not in done}
+        assert counted(calls) == Counter(missing)
+        assert results == run(work(40))
+
+
+class TestFailures:
+    def test_a_lost_worker_costs_what_it_was_at(self, tmp_path, calls):
+        lossy = work(20, calls, 0.05)
+        lossy["plant 8"] = partial(cells.die_once, 8, tmp_path / "died", calls)
+        assert run(lossy, tmp_path / "out") == run(work(20))
+        assert (tmp_path / "died").exists()
+        times = counted(calls)
+        assert set(times) == set(range(20))
+        # At most two cells were handed out for each of the two workers.
+        assert sum(times.values()) - 20 <= 4
+
+    def test_a_cell_that_always_loses_its_worker_is_named(self, tmp_path):
+        lossy = {**work(8), "the killer": partial(cells.die, 0)}
+        with pytest.raises(CellsFailedError, match="the killer") as error:
+            run(lossy, tmp_path)
+        assert list(error.value.errors) == ["the killer"]
+        assert len(list(tmp_path.glob("plant *.json"))) == 8
+
+    def test_a_fault_of_all_cells_is_soon_given_up(self, monkeypatch):
+        monkeypatch.setattr(fan_out, "GIVE_UP", 2)
+        with pytest.raises(CellsFailedError, match="Not run") as error:
+            run({f"plant {seed}": partial(cells.die, seed) for seed in range(8)})
+        assert len(error.value.errors) == 8
+
+    @pytest.mark.parametrize("jobs", [1, 2])
+    def test_an_exception_names_its_cell_and_spares_the_others(self, tmp_path, calls, jobs):
+        faulty = {"the fault": partial(cells.fail, 3), **work(4, calls)}
+        with pytest.raises(CellsFailedError, match="no such plant as 3") as error:
+            run(faulty, tmp_path / "out", jobs)
+        assert list(error.value.errors) == ["the fault"]
+        assert "1 of 5 cells failed" in str(error.value)
+        mended = {**faulty, "the fault": partial(cells.draw, 3)}
+        assert run(mended, tmp_path / "out", jobs)["the fault"] == cells.draw(3)
+        assert counted(calls) == Counter(range(4))
+
+    def test_a_result_that_cannot_be_saved_names_its_cell(self):
+        with pytest.raises(CellsFailedError, match=r"unfit: TypeError.*set"):
+            run({"unfit": partial(cells.unfit, 3)})
+
+    def test_a_stop_by_the_user_is_not_a_failure(self, tmp_path):
+        def stop():
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            run({**work(2), "stop": stop}, tmp_path, jobs=1)
+        assert len(list(tmp_path.iterdir())) == 2
+
+
+class TestOptions:
+    def parse(self, *options):
+        parser = command_line.parser("x", None)
+        command_line.add_fan_out(parser, "cells")
+        return command_line.fan_out(parser.parse_args(options))
+
+    def test_of_the_command_line(self):
+        assert (self.parse("--jobs", "3").jobs, self.parse().backend) == (3, "loky")
+        assert self.parse().jobs >= 1
+        for wrong in (("--jobs", "0"), ("--backend", "dask")):
+            with pytest.raises(SystemExit):
+                self.parse(*wrong)
+
+    def test_without_ray_it_says_how_to_install_it(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "ray", None)
+        with pytest.raises(ValueError, match=r"pip install .*ray"):
+            self.parse("--backend", "ray")
+
+    def test_an_unknown_backend_is_refused(self):
+        with pytest.raises(ValueError, match="loky, ray, got 'dask'"):
+            FanOut(1, "dask")
+
+
+def until(condition, seconds=30.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.05)
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("ray") is None,
+    reason="Ray is not installed: it is an extra, and there are not wheels for every Python",
+)
+class TestRay:
+    """In processes of their own: Ray logs, warns and leaves threads behind."""
+
+    def environment(self, port):
+        return os.environ | {"RAY_ADDRESS": f"127.0.0.1:{port}", "RAY_USAGE_STATS_ENABLED": "0"}
+
+    @pytest.fixture
+    def cluster(self):
+        """Two cores; yields the environment of its users."""
+        port = free_port()
+        environment = self.environment(port)
+        with tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True) as folder:
+            command = [
+                *(sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block"),
+                *("--node-ip-address", "127.0.0.1", "--port", str(port), "--num-cpus", "2"),
+                *("--temp-dir", folder, "--include-dashboard", "false"),
+                *("--object-store-memory", "100000000"),
+            ]
+            with (Path(folder) / "log").open("w") as log:
+                head = subprocess.Popen(
+                    command, env=environment, cwd=ROOT, stdout=log, stderr=log,
+                    start_new_session=True,
+                )  # fmt: skip
+            try:
+                until(lambda: "Ray runtime started" in (Path(folder) / "log").read_text())
+                yield environment
+            finally:
+                head.terminate()
+                try:
+                    head.wait(15)
+                finally:
+                    if head.poll() is None:
+                        os.killpg(head.pid, signal.SIGKILL)
+
+    def test_a_lost_worker_loses_nothing(self, cluster, tmp_path, calls):
+        done = subprocess.run(
+            [sys.executable, "-m", "tests.ray_run", str(tmp_path)],
+            env=cluster, cwd=ROOT, timeout=60, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        out = json.loads((tmp_path / "out.json").read_text())
+        assert (tmp_path / "died").exists()
+        assert out["results"] == run(work(24))
+        assert list(out["results"]) == list(work(24))
+        # The cluster makes up for the worker: nothing that had finished runs again.
+        assert counted(calls) == Counter(range(24))
+        assert len({path.name.split()[2] for path in calls.iterdir()}) == 3  # two and a new one
+        assert out["jobs"] == 2  # all the cores that there are
+        assert list(out["errors"]) == ["the fault"]
+        assert "no such plant as 1" in out["errors"]["the fault"]
+
+    def test_without_a_cluster_it_says_how_to_start_one(self):
+        program = "from benchmarks.fan_out import FanOut; FanOut(2, 'ray')"
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            env=self.environment(free_port()), cwd=ROOT, timeout=60, capture_output=True,
+            text=True,
+        )  # fmt: skip
+        assert "ValueError: No Ray cluster found: start one with `ray start" in done.stderr
