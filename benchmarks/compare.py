@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from joblib import cpu_count
 from tqdm import tqdm
 
 from benchmarks import command_line, plots, tables
@@ -104,12 +103,7 @@ def _parser() -> argparse.ArgumentParser:
         default=argparse.SUPPRESS,
         help="how many PPO policies to train and compare (default: 5)",
     )
-    add(
-        "--jobs",
-        type=command_line.number,
-        default=cpu_count(),
-        help="how many of them to train at once",
-    )
+    command_line.add_fan_out(parser, "trainings")
     add("--retrain", action="store_true", help="train PPO anew")
     add("--out", type=Path, default=Path("results/compare"), help="folder to write to")
     add(
@@ -144,7 +138,7 @@ def _factories(options: argparse.Namespace) -> dict[str, Factory]:
             ppo.PPOArguments(**changes),
             options.policies,
             policies=getattr(options, "ppo_policies", ppo.POLICIES),
-            jobs=options.jobs,
+            fan_out=command_line.fan_out(options),
             retrain=options.retrain,
             progress=True,
         )

@@ -10,6 +10,7 @@ import math
 import pickle
 import time
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ import gymnasium
 import numpy as np
 import pandas as pd
 import torch
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -25,6 +25,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
+from benchmarks.fan_out import FanOut
 from benchmarks.metrics import measure
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
@@ -166,8 +167,8 @@ class Trained:
         Where policies are kept, each in a folder of its own.
     policies
         How many; their seeds follow that of the first.
-    jobs
-        How many processes train at once.
+    fan_out
+        Runs the trainings.
     retrain
         Whether to train even where a finished policy is at hand.
     progress
@@ -189,7 +190,7 @@ class Trained:
         folder: Path,
         *,
         policies: int,
-        jobs: int,
+        fan_out: FanOut,
         retrain: bool,
         progress: bool,
     ) -> None:
@@ -199,26 +200,38 @@ class Trained:
         seeds = range(arguments.seed, arguments.seed + policies)
         self._arguments = [replace(arguments, seed=seed) for seed in seeds]
         self._folders = [folder / policy_key(each) for each in self._arguments]
-        self._jobs = jobs
+        self._fan_out = fan_out
         self._retrain = retrain
         self._progress = progress
 
     def members(self) -> list[Policy]:
         """Return the policies as factories of controllers."""
-        Parallel(self._jobs)(  # what is trained lies in the folders then
-            delayed(trained_policy)(
-                arguments, folder, retrain=self._retrain, progress=self._progress
-            )
+        # A bar for each training; those of other machines do not come here.
+        bars = self._progress and self._fan_out.backend == "loky"
+        cells = {
+            f"PPO, seed {arguments.seed}": partial(
+                _train, arguments, folder.absolute(), retrain=self._retrain, progress=bars
+            )  # absolute, as workers may have been started elsewhere
             for arguments, folder in zip(self._arguments, self._folders, strict=True)
             if self._retrain or not is_trained(folder)
-        )
+        }
+        self._fan_out.run(cells, title="training PPO", progress=self._progress and not bars)
         members = []
         for arguments, folder in zip(self._arguments, self._folders, strict=True):
+            if not is_trained(folder):
+                raise FileNotFoundError(
+                    f"trained, but not here: the machines of a cluster must share {folder}"
+                )
             members.append(Policy(arguments, folder))
             curve = pd.read_csv(folder / "learning.csv").assign(policy=arguments.seed)
             self.curves = pd.concat([self.curves, curve], ignore_index=True)
             self.used.append({"folder": str(folder), "arguments": asdict(arguments)})
         return members
+
+
+def _train(arguments: PPOArguments, folder: Path, *, retrain: bool, progress: bool) -> None:
+    """Train a policy, which lies in its folder then."""
+    trained_policy(arguments, folder, retrain=retrain, progress=progress)
 
 
 def is_trained(folder: Path) -> bool:

@@ -15,6 +15,7 @@ import pytest
 from agents import PIController
 from benchmarks import compare, opponents, ppo, storage, tables
 from benchmarks.estimates import beaten, estimate
+from benchmarks.fan_out import CellsFailedError
 from benchmarks.limits import scenario_limit
 from benchmarks.metrics import METRICS, measure
 from benchmarks.report import Section, write_report
@@ -382,7 +383,7 @@ class TestCompare:
         ).read_text()
         with monkeypatch.context() as patch:
             patch.setattr(ppo.PPO, "learn", None)
-            with pytest.raises(TypeError):
+            with pytest.raises(CellsFailedError, match="seed 0: TypeError"):
                 run_compare(tmp_path / "three", *options, "--retrain")
 
     def test_a_controller_of_the_user(self, tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from benchmarks import ppo, training_time
+from benchmarks.fan_out import FanOut
 from mptc_gym import Parameters
 from tests.budget import SMALL
 
@@ -155,7 +156,7 @@ class TestPPO:
 class TestTrained:
     def members(self, folder, jobs, *, retrain=False):
         trained = ppo.Trained(
-            SMALL, folder, policies=2, jobs=jobs, retrain=retrain, progress=False
+            SMALL, folder, policies=2, fan_out=FanOut(jobs), retrain=retrain, progress=False
         )
         return trained, trained.members()
 
@@ -180,6 +181,13 @@ class TestTrained:
         assert again[1] > stamps[1]
         self.members(tmp_path, jobs=1, retrain=True)
         assert (folders[0] / "policy.zip").stat().st_mtime_ns > stamps[0]
+
+    def test_policies_that_were_trained_elsewhere_are_missed(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(
+            ppo, "_train", lambda *_, **options: None
+        )  # as on a machine with folders of its own
+        with pytest.raises(FileNotFoundError, match="must share"):
+            self.members(tmp_path, jobs=1)
 
 
 class TestTrainingTime:
