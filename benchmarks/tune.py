@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 import optuna
 import pandas as pd
-from joblib import cpu_count
 from optuna.distributions import FloatDistribution
 from tqdm import tqdm
 
 from agents import DirectNNController, PIController
 from benchmarks import command_line
 from benchmarks.experiments import mean_error, settled, split
+from benchmarks.fan_out import FanOut
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.roster import LABELS, Factory, build, observation
 from benchmarks.scenarios import Scenario
@@ -88,8 +88,8 @@ class Subject:
     Attributes
     ----------
     make
-        Called with gains by name and `final`, whether they are judged for the last time;
-        returns factories, whose objectives are averaged.
+        Called with gains by name, `final`, whether they are judged for the last time, and the
+        number of the member; returns a factory.
     space
         Name of a gain: lowest and highest value. Gains are searched on a logarithmic scale.
     trials, startup
@@ -98,38 +98,34 @@ class Subject:
         How many of the best are judged again.
     penalty
         For failing to converge, degC.
+    members
+        How many factories are made of the same gains, in the search and at last. Their
+        objectives are averaged.
     """
 
-    make: Callable[..., list[Factory]]
+    make: Callable[..., Factory]
     space: dict[str, tuple[float, float]]
     trials: int = 800
     startup: int = 200
     finalists: int = 10
     penalty: float = PENALTY
+    members: tuple[int, int] = (1, 1)
 
 
-def _make_nn(*, final: bool, **gains: float) -> list[Factory]:
-    return [partial(DirectNNController, **gains)]
+def _make_nn(*, final: bool, member: int, **gains: float) -> Factory:
+    return partial(DirectNNController, **gains)
 
 
-def _make_pi(*, final: bool, **gains: float) -> list[Factory]:
-    return [partial(PIController, **gains)]
+def _make_pi(*, final: bool, member: int, **gains: float) -> Factory:
+    return partial(PIController, **gains)
 
 
-def _make_ppo(*, final: bool, **gains: float) -> list[Factory]:
+def _make_ppo(*, final: bool, member: int, **gains: float) -> Factory:
     from benchmarks import ppo  # here: torch takes seconds to load
 
-    arguments = ppo.PPOArguments(seed=FINAL_SEED if final else PPO_SEED, **gains)
+    first = FINAL_SEED if final else PPO_SEED
     with tempfile.TemporaryDirectory() as folder:
-        trained = ppo.Trained(
-            arguments,
-            Path(folder),
-            policies=FINAL_POLICIES if final else PPO_POLICIES,
-            jobs=cpu_count(),
-            retrain=False,
-            progress=False,
-        )
-        return list(trained.members())
+        return ppo.Policy(ppo.PPOArguments(seed=first + member, **gains), Path(folder))
 
 
 SUBJECTS = {
@@ -158,6 +154,7 @@ SUBJECTS = {
         startup=5,
         finalists=2,
         penalty=0.0,
+        members=(PPO_POLICIES, FINAL_POLICIES),
     ),
 }
 
@@ -187,11 +184,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     add("--draws", type=command_line.number, default=DRAWS, help="runs of each scenario")
     add("--out", type=Path, default=Path("results/tune"), help="folder to write to")
+    command_line.add_fan_out(parser, "runs and trainings")
     options = parser.parse_args(arguments)
     trials = getattr(options, "trials", SUBJECTS[options.controller].trials)
 
     try:
-        search = Search(options.controller, options.draws, options.out)
+        fan_out = command_line.fan_out(options)
+    except ValueError as error:
+        parser.error(f"--backend: {error}")
+    try:
+        search = Search(options.controller, options.draws, options.out, fan_out)
     except ValueError as error:
         parser.error(f"--out, --draws: {error}")
     console = command_line.console(120)
@@ -248,6 +250,19 @@ def score(
     return {**medians, "not converged": failed, "objective": objective}
 
 
+def _score(
+    subject: Subject,
+    gains: dict[str, float],
+    draws: int,
+    first_run: int,
+    *,
+    final: bool,
+    member: int,
+) -> dict[str, float]:
+    factory = subject.make(**gains, final=final, member=member)
+    return score(factory, draws, first_run, subject.penalty)
+
+
 class Search:
     """A search that is saved after every trial.
 
@@ -259,6 +274,8 @@ class Search:
         Runs of each scenario in a trial.
     folder
         Where it is kept, as `<controller>.csv`; what is there is continued.
+    fan_out
+        Runs what does not depend on each other: the members of a trial, and the finalists.
 
     Raises
     ------
@@ -266,10 +283,11 @@ class Search:
         If what is there was another search.
     """
 
-    def __init__(self, controller: str, draws: int, folder: Path) -> None:
+    def __init__(self, controller: str, draws: int, folder: Path, fan_out: FanOut) -> None:
         self.path = folder / f"{controller}.csv"
         self._draws = draws
         self._controller = controller
+        self._fan_out = fan_out
         self._subject = SUBJECTS[controller]
         space = self._subject.space
         self._space = {name: FloatDistribution(*ends, log=True) for name, ends in space.items()}
@@ -337,16 +355,26 @@ class Search:
         asking = optuna.create_study(sampler=sampler)
         asking.add_trials(self._study.trials)
         gains = asking.ask(self._space).params
-        return {**gains, **self._judge(gains, self._draws, FIRST_RUN, final=False)}
+        return {**gains, **self._judge([gains], self._draws, FIRST_RUN, final=False)[0]}
 
     def _judge(
-        self, gains: dict[str, float], draws: int, first_run: int, *, final: bool
-    ) -> dict[str, float]:
-        scores = [
-            score(factory, draws, first_run, self._subject.penalty)
-            for factory in self._subject.make(**gains, final=final)
-        ]
-        return {name: float(np.mean([s[name] for s in scores])) for name in scores[0]}
+        self, candidates: list[dict[str, float]], draws: int, first_run: int, *, final: bool
+    ) -> list[dict[str, float]]:
+        """Return, for each of the candidates, the mean of its members' scores."""
+        members = self._subject.members[final]
+        cells = {
+            f"candidate {i}, member {member}": partial(
+                _score, self._subject, gains, draws, first_run, final=final, member=member
+            )
+            for i, gains in enumerate(candidates)
+            for member in range(members)
+        }
+        # One alone gains nothing from another process, which takes seconds to start.
+        fan_out = self._fan_out if len(cells) > 1 else FanOut(jobs=1)
+        answers = fan_out.run(cells, title="new runs for the best", progress=final)
+        scores = pd.DataFrame(list(answers.values()))
+        groups = [scores.iloc[i : i + members] for i in range(0, len(scores), members)]
+        return [{name: float(np.mean(group[name])) for name in group} for group in groups]
 
     def report(self, trials: int) -> pd.DataFrame:
         """Judge the best gains again, rounded and on new runs, and write them, best first.
@@ -359,11 +387,17 @@ class Search:
             How many of the trials count.
         """
         best = self.trials.head(trials).nsmallest(self._subject.finalists, "objective")
-        rows: list[dict[str, Any]] = []
-        for _, trial in tqdm(list(best.iterrows()), desc="new runs for the best"):
-            gains = {name: float(f"{trial[name]:.{DIGITS}g}") for name in self._space}
-            again = self._judge(gains, FINAL_DRAWS, FINAL_RUN, final=True)
-            rows.append({**gains, **again, "in the search": trial["objective"]})
+        candidates = [
+            {name: float(f"{trial[name]:.{DIGITS}g}") for name in self._space}
+            for _, trial in best.iterrows()
+        ]
+        again = self._judge(candidates, FINAL_DRAWS, FINAL_RUN, final=True)
+        rows: list[dict[str, Any]] = [
+            {**gains, **judged, "in the search": objective}
+            for gains, judged, objective in zip(
+                candidates, again, best["objective"], strict=True
+            )
+        ]
         table = pd.DataFrame(rows).sort_values("objective", ignore_index=True)
         write_text(self.path.with_suffix(".md"), self._page(table, trials))
         return table

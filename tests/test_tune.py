@@ -12,6 +12,7 @@ from agents import DirectNNController, PIController
 from agents.pi import SEARCHED_GAINS
 from benchmarks import compare, ppo, scenarios, tune
 from benchmarks.experiments import Draws
+from benchmarks.fan_out import FanOut
 from tests.budget import SMALL
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -26,8 +27,9 @@ def small(monkeypatch):
     monkeypatch.setattr(tune, "FINAL_DRAWS", 3)
 
 
-def run_tune(out, controller="pi", trials=6):
-    return tune.main([controller, "--trials", str(trials), "--draws", "2", "--out", str(out)])
+def run_tune(out, controller="pi", trials=6, jobs=1):
+    options = ["--trials", str(trials), "--draws", "2", "--out", str(out), "--jobs", str(jobs)]
+    return tune.main([controller, *options])
 
 
 class TestScore:
@@ -80,13 +82,15 @@ class TestSearch:
 
     def test_finalists_are_judged_rounded_on_new_runs(self, tmp_path):
         run_tune(tmp_path)
-        search = tune.Search("pi", 2, tmp_path)
-        best = search.report(6).iloc[0]
-        gains = {name: float(f"{best[name]:.3g}") for name in ("kp", "ki")}
-        assert (best["kp"], best["ki"]) == tuple(gains.values())
-        again = tune.score(partial(PIController, **gains), 3, tune.FINAL_RUN)
-        assert best["objective"] == again["objective"]
-        assert best["objective"] != best["in the search"]
+        search = tune.Search("pi", 2, tmp_path, FanOut(1))
+        report = search.report(6)
+        assert len(report) == 2
+        for _, best in report.iterrows():
+            gains = {name: float(f"{best[name]:.3g}") for name in ("kp", "ki")}
+            assert (best["kp"], best["ki"]) == tuple(gains.values())
+            again = tune.score(partial(PIController, **gains), 3, tune.FINAL_RUN)
+            assert best["objective"] == again["objective"]
+            assert best["objective"] != best["in the search"]
 
     def test_a_stopped_search_ends_where_it_would_have_ended(
         self, tmp_path, monkeypatch, capsys
@@ -111,6 +115,13 @@ class TestSearch:
                 (tmp_path / folder / name).read_text() for folder in ("whole", "halves")
             )
             assert whole == halves
+
+    def test_side_by_side_is_one_after_the_other(self, tmp_path):
+        for jobs in (1, 2):
+            run_tune(tmp_path / str(jobs), jobs=jobs)
+        for name in ("pi.csv", "pi.md"):
+            one, two = ((tmp_path / str(jobs) / name).read_text() for jobs in (1, 2))
+            assert one == two
 
     def test_it_learns_from_its_trials(self, tmp_path):
         # Otherwise other scores would bring the same gains.
@@ -141,20 +152,13 @@ class TestSearch:
     def test_ppo_is_trained_once_a_trial(self, tmp_path, monkeypatch):
         trained = []
 
-        class Trained:
-            def __init__(self, arguments, folder, *, policies, **options):
-                self.made = [
-                    replace(arguments, seed=arguments.seed + i) for i in range(policies)
-                ]
-                trained.extend(self.made)
+        def policy(arguments, folder):
+            trained.append(arguments)
+            member = partial(ppo.PolicyController, ppo.begin(SMALL))
+            member.observation = arguments.observation
+            return member
 
-            def members(self):
-                for arguments in self.made:
-                    member = partial(ppo.PolicyController, ppo.begin(SMALL))
-                    member.observation = arguments.observation
-                    yield member
-
-        monkeypatch.setattr(ppo, "Trained", Trained)
+        monkeypatch.setattr(ppo, "Policy", policy)
         monkeypatch.setattr(
             tune, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
         )
