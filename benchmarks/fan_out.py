@@ -30,7 +30,9 @@ GIVE_UP = 10  # when so many cells were to blame, there is another fault
 NAMED = 10  # failed cells in a message
 
 INSTALL_RAY = 'Ray is not installed: pip install -e ".[bench,ray]"'
-START_RAY = "No Ray cluster found: start one with `ray start --head`, or set RAY_ADDRESS"
+START_RAY = (
+    "No Ray cluster can be reached: start one with `ray start --head`, or set RAY_ADDRESS"
+)
 
 
 class CellsFailedError(RuntimeError):

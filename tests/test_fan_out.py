@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -202,7 +203,13 @@ class TestRay:
     """In processes of their own: Ray logs, warns and leaves threads behind."""
 
     def environment(self, port):
-        return os.environ | {"RAY_ADDRESS": f"127.0.0.1:{port}", "RAY_USAGE_STATS_ENABLED": "0"}
+        # A token of its own keeps the cluster private, whatever this machine's settings are.
+        return os.environ | {
+            "RAY_ADDRESS": f"127.0.0.1:{port}",
+            "RAY_AUTH_MODE": "token",
+            "RAY_AUTH_TOKEN": secrets.token_hex(16),
+            "RAY_USAGE_STATS_ENABLED": "0",
+        }
 
     @pytest.fixture
     def cluster(self):
@@ -212,7 +219,7 @@ class TestRay:
         with tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True) as folder:
             command = [
                 *(sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block"),
-                *("--node-ip-address", "127.0.0.1", "--port", str(port), "--num-cpus", "2"),
+                *("--port", str(port), "--num-cpus", "2"),
                 *("--temp-dir", folder, "--include-dashboard", "false"),
                 *("--object-store-memory", "100000000"),
             ]
@@ -256,4 +263,7 @@ class TestRay:
             env=self.environment(free_port()), cwd=ROOT, timeout=60, capture_output=True,
             text=True,
         )  # fmt: skip
-        assert "ValueError: No Ray cluster found: start one with `ray start" in done.stderr
+        assert (
+            "ValueError: No Ray cluster can be reached: start one with `ray start"
+            in done.stderr
+        )
