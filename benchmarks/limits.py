@@ -106,9 +106,7 @@ def harris_index(trajectory: Trajectory, parameters: Parameters) -> Array:
     Steady is the second half of the time that a set point is held (T. J. Harris, "Assessment of
     control loop performance", Canadian Journal of Chemical Engineering 67, 1989, 856-861).
     """
-    steady = np.zeros(len(trajectory.setpoint), dtype=bool)
-    for start, stop in held(trajectory.setpoint[:, 0]):
-        steady[(start + stop) // 2 : stop] = True
+    steady = steady_stretches(trajectory.setpoint[:, 0])
     error = (trajectory.setpoint - trajectory.output)[steady]
     index: Array = minimum_variance(parameters) / np.square(error).mean(axis=0)
     return index
@@ -118,6 +116,14 @@ def held(setpoint: Array) -> list[tuple[int, int]]:
     """Return the first sample of each stretch of constant set point, and the one after it."""
     changes = np.flatnonzero(np.diff(setpoint)) + 1
     return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
+
+
+def steady_stretches(setpoint: Array) -> NDArray[np.bool_]:
+    """Return which samples lie in the second half of the time that a set point is held."""
+    steady = np.zeros(len(setpoint), dtype=bool)
+    for start, stop in held(setpoint):
+        steady[(start + stop) // 2 : stop] = True
+    return steady
 
 
 @cache
@@ -149,7 +155,11 @@ def _limit(scenario: Scenario) -> Limit:
     before = 0.0
     for start, stop in held(setpoint):
         after = float(setpoint[start])
-        totals += least_error(parameters, before, after, stop - start, from_rest=start == 0)
+        # With limits of the same size, down is as hard as up, and need not be worked out again.
+        up = -1.0 if parameters.u_min == -parameters.u_max and after < before else 1.0
+        totals += least_error(
+            parameters, up * before, up * after, stop - start, from_rest=start == 0
+        )
         before = after
     mae, mse = totals / len(setpoint)
     return Limit(float(mae), float(mse))

@@ -22,7 +22,7 @@ from mptc_gym import Parameters
 
 # Okabe and Ito's colours, which colour-blind readers can tell apart.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-_STYLE = {
+STYLE = {
     "axes.grid": True,
     "axes.spines.right": False,
     "axes.spines.top": False,
@@ -52,7 +52,7 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
     """
     parameters = scenario.parameters
     palette = colours(list(responses["agent"].unique()))
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9, 6))
         above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
         for agent, rows in responses.groupby("agent", sort=False):
@@ -78,7 +78,7 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
         below.set_ylabel("applied flow u_a (t/h)")
         below.set_xlabel("time (min)")
         below.set_xlim(0, minutes.max())
-        _save(figure, path)
+        save(figure, path)
 
 
 def _band(axes: Axes, rows: pd.DataFrame, signal: str, colour: str, name: str) -> None:
@@ -97,7 +97,7 @@ def _band(axes: Axes, rows: pd.DataFrame, signal: str, colour: str, name: str) -
 
 def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
     """Draw the mean errors as points with 95 % intervals; each axis begins at the limit."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure, panels = _scenario_panels(estimates)
         shades = colours(list(estimates["agent"].unique()))
         by_scenario = estimates.groupby("scenario", sort=False)
@@ -113,13 +113,13 @@ def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
             axes.axvline(limit, color="0.4", linewidth=1)
             axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
             axes.set_xlabel("mean |e| (°C), from the least possible on")
-        _save(figure, path)
+        save(figure, path)
 
 
 def plot_runs(runs: pd.DataFrame, path: Path) -> None:
     """Draw the mean error of every single run, so that no failure is averaged away."""
     generator = np.random.default_rng(0)  # scatters points that would hide each other
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure, panels = _scenario_panels(runs)
         shades = colours(list(runs["agent"].unique()))
         for axes, (_, cases) in zip(panels, runs.groupby("scenario", sort=False), strict=True):
@@ -132,7 +132,7 @@ def plot_runs(runs: pd.DataFrame, path: Path) -> None:
             axes.invert_yaxis()
             axes.set_xlim(left=0)
             axes.set_xlabel("mean |e| of a run (°C)")
-        _save(figure, path)
+        save(figure, path)
 
 
 def _scenario_panels(rows: pd.DataFrame) -> tuple[Figure, list[Axes]]:
@@ -156,7 +156,7 @@ def plot_learning(curves: pd.DataFrame, path: Path) -> None:
         "validation_mae": "validation: random set points, half of them with noise",
         "square_mae": "square wave, no noise",
     }
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9, 4.5))
         axes = figure.subplots()
         for (column, name), colour in zip(shown.items(), _COLOURS, strict=False):
@@ -171,7 +171,7 @@ def plot_learning(curves: pd.DataFrame, path: Path) -> None:
         axes.set_ylabel(METRICS["mae"])
         axes.set_title("PPO's learning curves, one line a policy", loc="left")
         axes.legend()
-        _save(figure, path)
+        save(figure, path)
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ def plot_figures(panels: Sequence[Panel], path: Path) -> None:
     axes_of = [(panel, signal) for panel in panels for signal in panel.signals]
     columns = min(2, len(panels))
     rows = math.ceil(len(axes_of) / columns)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         size = (8, 3 * rows) if columns == 1 else (13, 2.4 * rows)
         figure = Figure(figsize=size)
         grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
@@ -220,7 +220,7 @@ def plot_figures(panels: Sequence[Panel], path: Path) -> None:
             axes.set_xlabel("time (min)")
         for axes in unused:
             axes.set_visible(False)
-        _save(figure, path)
+        save(figure, path)
 
 
 def _draw_signal(axes: Axes, panel: Panel, signal: str) -> None:
@@ -253,7 +253,7 @@ def _draw_signal(axes: Axes, panel: Panel, signal: str) -> None:
 
 def plot_convergence(times: pd.DataFrame, path: Path) -> None:
     """Draw which share of the networks has converged by when, one line for each set point."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9, 4))
         axes = figure.subplots()
         for name, colour in colours(list(times)).items():
@@ -266,12 +266,12 @@ def plot_convergence(times: pd.DataFrame, path: Path) -> None:
         axes.set_xlabel("samples since the start")
         axes.set_ylabel("weights have converged (% of draws)")
         axes.legend()
-        _save(figure, path)
+        save(figure, path)
 
 
 def plot_pi_gains(errors: pd.DataFrame, path: Path) -> None:
     """Draw the mean error of PI controllers over Kp, one line for each case."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9, 4))
         axes = figure.subplots()
         for (name, rows), colour in zip(
@@ -282,13 +282,13 @@ def plot_pi_gains(errors: pd.DataFrame, path: Path) -> None:
         axes.set_xlabel("Kp (t/h per °C), with the paper's Ki = 0.3")
         axes.set_ylabel(METRICS["mae"])
         axes.legend()
-        _save(figure, path)
+        save(figure, path)
 
 
 def plot_other_plants(cells: pd.DataFrame, path: Path) -> None:
     """Draw maps of the share of networks that settle: over delay and gain, for each case."""
     cases, time_constants = cells["setpoint"].unique(), cells["time_constant"].unique()
-    with mpl.rc_context(_STYLE | {"axes.grid": False}):
+    with mpl.rc_context(STYLE | {"axes.grid": False}):
         figure = Figure(figsize=(10, 2.8 * len(cases)))
         panels = figure.subplots(len(cases), len(time_constants), sharex=True, squeeze=False)
         for (i, case), (j, constant) in itertools.product(
@@ -316,7 +316,7 @@ def plot_other_plants(cells: pd.DataFrame, path: Path) -> None:
         for axes in panels[:, 0]:
             axes.set_ylabel("gain (of the paper's)")
         figure.colorbar(image, ax=panels, label="settled (% of draws)")
-        _save(figure, path)
+        save(figure, path)
 
 
 CLAIMS = {
@@ -326,6 +326,7 @@ CLAIMS = {
 }
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure, whole or not at all."""
     with replacing(path) as partial:
         figure.savefig(partial)

@@ -9,8 +9,8 @@ import json
 import math
 import pickle
 import time
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 from benchmarks.fan_out import FanOut
 from benchmarks.metrics import measure
+from benchmarks.robustness import SPANS
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
 from benchmarks.storage import ROOT, replacing, versions, write_json
@@ -34,6 +35,7 @@ from benchmarks.vec_env import GymnasiumVecEnv
 from mptc_gym import Parameters
 
 DELAY = Parameters().delay
+DEGREES = 5.0  # what temperatures are divided by before they enter a network
 CHECKPOINT_INTERVAL = 32_768  # samples of experience between checkpoints
 POLICIES = 5  # are trained and compared, from seeds in sequence
 VALIDATION_RUNS, VALIDATION_SAMPLES = 16, 600
@@ -52,12 +54,19 @@ class PPOArguments:
     steps: int = 1_000_000
     """Samples of experience, all plants together."""
     noise_variance: float = 0.5
-    """R of the plant trained on, degC^2. A policy trained with noise steers less nervously, and
-    does better even without noise or with another dead zone than one trained on that plant."""
+    """R of the plants trained on, degC^2. A policy trained with noise steers less nervously,
+    and does better with another dead zone than one trained on that plant."""
+    calm: float = 0.5
+    """Share of the plants that have no noise. In noise, small offsets hardly cost anything."""
+    plant: dict[str, Any] = field(default_factory=dict)
+    """Arguments of the environment trained on, where it is not the nominal plant."""
     setpoint_amplitude: float = 6.0
     """Random set points are uniform within this, degC."""
     reward: str = "absolute"
     """The environment's; "absolute" is what the comparison measures."""
+    error_scale: float = 50.0
+    """The environment's, degC. It makes returns about 1 in size, which a value function learns
+    much sooner than large ones."""
     output_window: int = 2
     """Past outputs in the observation."""
     action_window: int = DELAY + 2
@@ -97,11 +106,20 @@ class PPOArguments:
         """Arguments of the environment trained on."""
         return {
             **self.observation,
+            **self.plant,
             "noise_variance": self.noise_variance,
             "reward": self.reward,
+            "error_scale": self.error_scale,
             "setpoint": "random",
             "setpoint_amplitude": self.setpoint_amplitude,
         }
+
+
+# What makes a policy one for many plants, those of a random design.
+RANDOMISED: dict[str, Any] = {
+    "plant": {name: list(span) for name, span in SPANS.items() if name != "noise_variance"},
+    "action_window": 38,
+}
 
 
 class FixedScaling(BaseFeaturesExtractor):
@@ -154,6 +172,15 @@ class Policy:
     def __call__(self) -> PolicyController:
         """Return a controller."""
         return PolicyController(self._model)
+
+
+@cache
+def kept_policy(folder: Path) -> Policy:
+    """Return the finished policy that a folder holds."""
+    kept = json.loads((folder / "arguments.json").read_text(encoding="utf-8"))
+    names = {each.name for each in fields(PPOArguments)}
+    arguments = {name: value for name, value in kept.items() if name in names}
+    return Policy(PPOArguments(**arguments), folder)
 
 
 class Trained:
@@ -332,13 +359,22 @@ def begin(arguments: PPOArguments, plants: VecEnv | None = None) -> PPO:
         The model.
     """
     if plants is None:
-        batch = gymnasium.make_vec(
-            "MiddlePoint-v0", arguments.n_envs, autoreset_mode="SameStep", **arguments.training
+        calm = round(arguments.calm * arguments.n_envs)
+        plants = GymnasiumVecEnv(
+            *(
+                gymnasium.make_vec(
+                    "MiddlePoint-v0", count, autoreset_mode="SameStep", **training
+                )
+                for count, training in (
+                    (arguments.n_envs - calm, arguments.training),
+                    (calm, {**arguments.training, "noise_variance": 0.0}),
+                )
+                if count
+            )
         )
-        plants = GymnasiumVecEnv(batch)
     parameters = Parameters(**arguments.training)
     degrees = parameters.observation_size - parameters.action_window
-    factors = [1.0 / parameters.error_scale] * degrees + [1.0] * parameters.action_window
+    factors = [1.0 / DEGREES] * degrees + [1.0] * parameters.action_window
     return PPO(
         "MlpPolicy",
         plants,

@@ -29,6 +29,8 @@ LABELS: dict[str, str] = {
     "smith": "Smith",
     "mpc": "MPC",
     "ppo": "PPO",
+    "ppo-randomised": "PPO, randomised",
+    "nn-frozen": "NN, frozen",
 }
 
 

@@ -34,7 +34,24 @@ def make_both_of_episodes_that_terminate():
     return GymnasiumVecEnv(envs), DummyVecEnv([make] * N)
 
 
-@pytest.mark.parametrize("make", [make_both, make_both_of_episodes_that_terminate])
+def make_both_of_two_batches():
+    calm = {**ARGUMENTS, "noise_variance": 0.0}
+    parts = [(3, ARGUMENTS), (1, calm)]
+    batches = [
+        gymnasium.make_vec("MiddlePoint-v0", count, autoreset_mode="SameStep", **arguments)
+        for count, arguments in parts
+    ]
+    single = [
+        lambda arguments=arguments: gymnasium.make("MiddlePoint-v0", **arguments)
+        for count, arguments in parts
+        for _ in range(count)
+    ]
+    return GymnasiumVecEnv(*batches), DummyVecEnv(single)
+
+
+@pytest.mark.parametrize(
+    "make", [make_both, make_both_of_two_batches, make_both_of_episodes_that_terminate]
+)
 def test_trajectories_equal_those_of_dummy_vec_env(make, rng):
     ours, theirs = make()
     assert ours.num_envs == theirs.num_envs
@@ -61,7 +78,8 @@ def test_trajectories_equal_those_of_dummy_vec_env(make, rng):
                     last = info["terminal_observation"]
                     np.testing.assert_array_equal(last, other["terminal_observation"])
                     truncated.append(info["TimeLimit.truncated"])
-    assert set(truncated) == ({True} if make is make_both else {True, False})
+    terminate = make is make_both_of_episodes_that_terminate
+    assert set(truncated) == ({True, False} if terminate else {True})
 
 
 def test_training_ends_in_the_same_weights():
@@ -96,6 +114,25 @@ def test_pictures_are_those_of_the_batch():
 def test_another_autoreset_mode_is_refused():
     with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
         GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", N))
+
+
+def test_batches_of_other_spaces_are_refused():
+    batches = [
+        gymnasium.make_vec("MiddlePoint-v0", 2, autoreset_mode="SameStep", action_window=window)
+        for window in (0, 1)
+    ]
+    with pytest.raises(ValueError, match="same spaces"):
+        GymnasiumVecEnv(*batches)
+
+
+def test_infos_and_attributes_of_two_batches():
+    ours, _ = make_both_of_two_batches()
+    ours.reset()
+    ours.step(np.ones((N, 1), np.float32))
+    assert list(ours.infos["command"]) == [10.0] * N
+    assert np.all(ours.infos["noise"][:3] != 0.0)
+    assert ours.infos["noise"][3] == 0.0
+    assert [p.noise_variance for p in ours.get_attr("parameters")] == [0.5, 0.5, 0.5, 0.0]
 
 
 def test_attributes_are_those_of_the_batch():

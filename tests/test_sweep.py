@@ -1,0 +1,178 @@
+"""The robustness study: its plants, its cells, and what it makes of them."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchmarks import robustness, sweep
+from benchmarks.robustness import SPANS, agent_cell, grid, limit_cell, random_design
+from mptc_gym import Parameters
+
+NOMINAL = {"delay": 18}
+
+
+class TestDesigns:
+    def test_the_grid_has_200_plants_that_can_reach_the_set_point(self):
+        plants = grid()
+        assert len({tuple(plant.values()) for plant in plants}) == len(plants) == 200
+        for plant in plants:
+            reach = 10 * plant["gain_factor"] * 0.04964 / 0.07273
+            assert reach > 5.0
+            Parameters(**plant)
+
+    def test_a_random_design_fills_its_spans_and_half_of_it_drifts(self):
+        plants = random_design(100, 0, 600)
+        for name, (low, high) in SPANS.items():
+            values = np.array([plant[name] for plant in plants])
+            assert values.min() >= low
+            assert values.max() <= high
+            # A hypercube has one value in each hundredth.
+            assert np.histogram(values, 10, (low, high))[0].min() >= 6
+        assert [("gain_drift" in plant) for plant in plants] == [False] * 50 + [True] * 50
+        for plant in plants[50:]:
+            for name in ("gain", "time_constant"):
+                end = plant[f"{name}_factor"] * plant[f"{name}_drift"]
+                low, high = SPANS[f"{name}_factor"]
+                assert low - 1e-6 <= end <= high + 1e-6
+            assert plant["drift_samples"] == 600
+        assert all(Parameters(**plant).delay == plant["delay"] for plant in plants)
+
+    def test_a_seed_gives_a_design(self):
+        assert random_design(20, 3, 600) == random_design(20, 3, 600)
+        assert random_design(20, 3, 600) != random_design(20, 4, 600)
+
+
+class TestCells:
+    def test_no_control_leaves_the_error_at_the_set_point(self):
+        cell = agent_cell("nothing", NOMINAL, 1200, 2, 0)
+        assert cell["mae"] == cell["late"] == [5.0, 5.0]
+        assert cell["swing"] == [0.0, 0.0]
+
+    def test_swing_is_the_deviation_within_stretches_by_hand(self):
+        # Two stretches, of 1, 3 and of 10, 10, 10, 16: variances 1 and 6.75.
+        error = np.array([[9.0], [1.0], [3.0], [9.0], [10.0], [10.0], [10.0], [16.0], [9.0]])
+        steady = np.array([0, 1, 1, 0, 1, 1, 1, 1, 0], dtype=bool)
+        assert robustness._swing(error, steady) == pytest.approx([np.sqrt(7.75 / 2)])
+
+    def test_the_limit_is_that_of_the_plant_and_none_for_one_that_drifts(self):
+        nominal = limit_cell(NOMINAL, 1200)["mae"]
+        assert nominal == pytest.approx(0.907, abs=0.001)
+        assert limit_cell({"delay": 30}, 1200)["mae"] > nominal
+        assert limit_cell({"gain_drift": 1.2}, 1200) == {"mae": None}
+
+    def test_a_frozen_network_does_not_learn_and_starts_from_what_was_learnt(self):
+        learning = robustness.network(3, 0, learning=True)
+        frozen = robustness.network(3, 0, learning=False)
+        np.testing.assert_array_equal(learning.weights.W, frozen.weights.W)
+        before = frozen.weights.W.copy()
+        for each in (learning, frozen):
+            for k in range(50):
+                each.act(np.full((3, 6), 1.0 + k, np.float32))
+        np.testing.assert_array_equal(frozen.weights.W, before)
+        assert not np.array_equal(learning.weights.W, before)
+        # Commissioned, it knows the plant: better than one that begins to learn.
+        commissioned = agent_cell("nn-frozen", NOMINAL, 1200, 3, 0)["mae"]
+        assert np.median(commissioned) < 1.6
+
+    def test_a_loop_with_too_much_delay_oscillates(self):
+        slow = agent_cell("pi", {"delay": 40}, 1200, 1, 0)
+        assert slow["swing"][0] > 2.0
+        calm = agent_cell("pi-simc", NOMINAL, 1200, 1, 0)
+        assert calm["swing"][0] < 0.2
+
+
+def run_sweep(out, *options):
+    arguments = ["--agents", "nn", "nn-frozen", "pi-simc", "--runs", "2", "--samples", "700"]
+    return sweep.main([*arguments, "--jobs", "1", "--out", str(out), *map(str, options)])
+
+
+class TestSweep:
+    def test_random_design(self, tmp_path, capsys):
+        assert run_sweep(tmp_path, "--design", "random", "--plants", 6) == 0
+        runs = pd.read_csv(tmp_path / "runs.csv")
+        assert len(runs) == 3 * 6 * 2
+        known = runs["plant"] < 3
+        assert runs["limit"].notna().equals(known)
+        np.testing.assert_allclose(
+            runs["ratio"][known], runs["mae"][known] / runs["limit"][known]
+        )
+        assert (runs["ratio"][known] >= 1.0).all()
+        for name in ("plants.png", "drift.png", "report.html", "report.md"):
+            assert (tmp_path / name).stat().st_size > 1000
+        assert "Does learning help when the plant drifts?" in capsys.readouterr().out
+        assert json.loads((tmp_path / "provenance.json").read_text())["seconds"] > 0
+
+        # Again: nothing is run, and nothing changes.
+        saved = {file: file.stat().st_mtime_ns for file in (tmp_path / "cells").rglob("*.json")}
+        assert len(saved) == 6 * (3 + 2)
+        assert run_sweep(tmp_path, "--design", "random", "--plants", 6) == 0
+        assert {file: file.stat().st_mtime_ns for file in saved} == saved
+        pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "runs.csv"), runs)
+
+    def test_grid(self, tmp_path, monkeypatch):
+        monkeypatch.setitem(robustness.GRID, "delay", range(10, 22, 10))
+        monkeypatch.setitem(robustness.GRID, "gain_factor", np.array([1.0, 1.2]))
+        assert run_sweep(tmp_path, "--design", "grid") == 0
+        runs = pd.read_csv(tmp_path / "runs.csv")
+        assert set(zip(runs["delay"], runs["gain_factor"], strict=True)) == {
+            (10, 1.0), (20, 1.0), (10, 1.2), (20, 1.2),
+        }  # fmt: skip
+        assert (tmp_path / "map.png").stat().st_size > 1000
+
+    def test_unknown_controller(self, tmp_path, capsys):
+        with pytest.raises(SystemExit):
+            sweep.main(["--agents", "nobody", "--out", str(tmp_path)])
+        assert "no 'nobody'; there are nothing, nn" in capsys.readouterr().err
+
+    def test_a_failed_cell_is_named_and_the_others_are_kept(
+        self, tmp_path, capsys, monkeypatch
+    ):
+        monkeypatch.setattr(sweep, "agent_cell", _fails_on_pi)
+        assert run_sweep(tmp_path, "--design", "random", "--plants", 2) == 1
+        assert "pi-simc 0" in capsys.readouterr().out
+        assert len(list((tmp_path / "cells").rglob("nn *.json"))) == 2
+
+
+def _fails_on_pi(agent, *arguments, **others):
+    if agent == "pi-simc":
+        raise RuntimeError("no luck")
+    return agent_cell(agent, *arguments, **others)
+
+
+class TestFindings:
+    """What the tables say, from runs made up so that the answer is known."""
+
+    @staticmethod
+    def runs():
+        rows = []
+        for plant in range(20):
+            drift = None if plant < 10 else (0.5 if plant < 15 else 2.0)
+            for agent, late in (("nn", 1.0), ("nn-frozen", 2.0), ("pi-simc", 1.5)):
+                for run in range(3):
+                    better = agent == "nn" and drift == 2.0
+                    rows.append(
+                        {
+                            "agent": agent, "plant": plant, "run": run, "gain_drift": drift,
+                            "late": late + 2.0 * better, "mae": late, "ratio": late,
+                            "oscillates": plant == 0, "useless": False, "delay": 18,
+                        }
+                    )  # fmt: skip
+        return pd.DataFrame(rows)
+
+    def test_differences(self):
+        table = sweep._differences(self.runs()).set_index("plants")
+        pair = "NN - PI, SIMC"
+        assert table.loc["no drift", pair] == "-0.500 [-0.500, -0.500] (100 %)"
+        assert table.loc["gain falls to less than 0.8 times", pair].startswith("-0.500")
+        assert table.loc["gain rises to more than 1.25 times", pair].startswith("+1.500")
+        assert table.loc["gain rises to more than 1.25 times", pair].endswith("(0 %)")
+        assert table.loc["all that drift", pair].startswith("+0.500")
+        assert table.loc["all that drift", "number"] == "10"
+        assert table.loc["gain stays within 0.8 to 1.25 times", pair] == ""
+
+    def test_overview(self):
+        table = sweep._overview(self.runs()).set_index("controller")
+        assert table.loc["NN, frozen", "ratio, median"] == "2.00"
+        assert table.loc["NN", "oscillates (%)"] == "5.0"
