@@ -86,7 +86,7 @@ def plot_plants(runs: pd.DataFrame, path: Path) -> None:
             for drifts, marker in ((False, "s"), (True, "^")):
                 some = rows[rows["gain_drift"].notna() == drifts]
                 image = axes.scatter(
-                    some["delay"], some["largest"], 34, some["mae"], marker, **_COLOURS
+                    some["delay"], some["largest"], 34, some["mae"], marker=marker, **_COLOURS
                 )
             for name, mark in _MARKS.items():
                 marked = rows[rows[name] >= _OFTEN]

@@ -126,7 +126,8 @@ class Noises:
         self.silent = high == 0.0
         self._c = np.array(c)[:, np.newaxis, np.newaxis]
         # C times the deviation of xi: [lag, plant, 0], all plants in one if they are alike.
-        self._colour = np.repeat(math.sqrt(low) * self._c, num_envs if low < high else 1, 1)
+        self._alike = low == high
+        self._colour = np.repeat(math.sqrt(low) * self._c, 1 if self._alike else num_envs, 1)
         self._silence = np.zeros(num_envs)
         self._past = np.zeros((num_envs, len(c) - 1))
         self._generators: dict[int, np.random.Generator] = {}
@@ -153,7 +154,7 @@ class Noises:
         """
         if self.silent:
             return
-        if variances is not None:
+        if variances is not None and not self._alike:
             self._colour[:, which] = np.sqrt(variances)[:, np.newaxis] * self._c
         self._past[which] = 0.0
         for i, stream in zip(which.tolist(), streams, strict=True):
@@ -178,7 +179,6 @@ class Noises:
         """Make the noise of some plants, from a row on to the end of the block."""
         order = len(self._c) - 1
         samples = len(self._block) - first_row
-        alike = self._colour.shape[1] == 1
         for start in range(0, len(which), _TOGETHER):
             plants = which[start : start + _TOGETHER]
             draws = np.empty((len(plants), order + samples))
@@ -189,7 +189,7 @@ class Noises:
             # A slice, if there are no gaps, is much faster.
             gaps = plants[-1] - plants[0] >= len(plants)
             columns = plants if gaps else slice(plants[0], plants[-1] + 1)
-            colour = self._colour if alike else self._colour[:, plants]
+            colour = self._colour if self._alike else self._colour[:, plants]
             self._block[first_row:, columns] = _coloured(colour, draws).T
 
 

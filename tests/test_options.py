@@ -57,6 +57,14 @@ class TestTransmitter:
 
 
 class TestDisturbance:
+    def test_its_gain_is_1_whatever_the_time_constant(self):
+        calm = MiddlePointEnv(time_constant_factor=2.0, disturbance_amplitude=4.0)
+        record = run(calm, np.zeros(1000))
+        slow = 1 - (1 - POLE) / 2
+        a = np.convolve([1, -slow], [1, POLE - 0.45181])
+        expected = lfilter([a.sum()], a, record["disturbance"])
+        np.testing.assert_allclose(record["output"], expected, rtol=0, atol=1e-10)
+
     def test_it_passes_through_the_dynamics_with_a_gain_of_1(self):
         env = MiddlePointEnv(disturbance_amplitude=4.0, disturbance_walk_variance=0.01)
         record = run(env, np.zeros(1000))
@@ -191,6 +199,15 @@ class TestRanges:
         ours = run(MiddlePointEnv(dead_zone=[7, 7], delay=[5, 5]), actions)
         theirs = run(MiddlePointEnv(dead_zone=7, delay=5), actions)
         np.testing.assert_array_equal(ours["output"], theirs["output"])
+
+    def test_so_it_is_for_many_plants(self):
+        both = []
+        for variance in ([1.0, 1.0], 1.0):
+            envs = gymnasium.make_vec("MiddlePoint-v0", 3, noise_variance=variance)
+            envs.reset(seed=0)
+            both.append(envs.step(np.ones((3, 1), np.float32))[-1]["noise"])
+        np.testing.assert_array_equal(*both)
+        assert np.all(both[0] != 0.0)
 
     def test_the_vector_environment_draws_a_plant_each(self):
         envs = gymnasium.make_vec("MiddlePoint-v0", 50, delay=[3, 6], gain_factor=[0.5, 1.5])
