@@ -3,7 +3,6 @@
 import gymnasium
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -148,6 +147,9 @@ class TestDirectNN:
     def test_updates_are_the_gradient_that_autograd_finds(
         self, n_inputs, n_hidden, direction, seed
     ):
+        torch = pytest.importorskip(
+            "torch", reason="the controllers need no PyTorch, and it is not installed"
+        )
         gains = {"eta": 0.3, "eta_1": 0.7, "eta_theta": 0.2, "eta_1_theta": 0.9}
         nn = DirectNNController(
             n_inputs=n_inputs, n_hidden=n_hidden, error_index=0, direction=direction, seed=seed,

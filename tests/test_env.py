@@ -12,8 +12,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3.common.env_checker import check_env as check_env_sb3
-from stable_baselines3.common.env_util import make_vec_env
 
 import mptc_gym
 from mptc_gym import MiddlePointEnv
@@ -21,15 +19,24 @@ from tests.arguments import valid_arguments
 from tests.conftest import run
 
 INFO = {"output", "setpoint", "error", "command", "applied", "noise"}
+WITHOUT_SB3 = "the environment needs no Stable-Baselines3, and it is not installed"
 
 
 @settings(max_examples=60, deadline=None)
 @given(arguments=valid_arguments)
-def test_both_checkers_are_content_with_any_valid_arguments(arguments):
+def test_the_checker_of_gymnasium_is_content_with_any_valid_arguments(arguments):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(gymnasium.make("MiddlePoint-v0", **arguments).unwrapped)
-        check_env_sb3(gymnasium.make("MiddlePoint-v0", **arguments).unwrapped)
+
+
+@settings(max_examples=60, deadline=None)
+@given(arguments=valid_arguments)
+def test_the_checker_of_stable_baselines3_is_content_with_any_valid_arguments(arguments):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason=WITHOUT_SB3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(gymnasium.make("MiddlePoint-v0", **arguments).unwrapped)
 
 
 @settings(max_examples=60, deadline=None)
@@ -105,7 +112,8 @@ def test_make_vec_runs_many():
 
 
 def test_stable_baselines3_makes_it():
-    envs = make_vec_env("MiddlePoint-v0", n_envs=2, seed=0)
+    util = pytest.importorskip("stable_baselines3.common.env_util", reason=WITHOUT_SB3)
+    envs = util.make_vec_env("MiddlePoint-v0", n_envs=2, seed=0)
     assert envs.reset().shape == (2, 6)
 
 
