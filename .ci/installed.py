@@ -1,0 +1,51 @@
+"""Check an installed mptc_gym: what came with it, what did not, and that it runs."""
+
+import sys
+import warnings
+from importlib.metadata import distribution
+from importlib.util import find_spec
+from pathlib import Path
+
+import gymnasium
+from gymnasium.utils.env_checker import check_env
+
+# Those of a checkout and of the extras: none comes with the package.
+ABSENT = (
+    "agents", "benchmarks", "tests", "torch", "stable_baselines3", "matplotlib", "scipy",
+    "pandas", "pygame",
+)  # fmt: skip
+warnings.simplefilter("error")
+
+installed = distribution("mptc_gym")
+files = {file.as_posix() for file in installed.files or ()}
+info = f"mptc_gym-{installed.version}.dist-info"
+assert {file.partition("/")[0] for file in files} == {"mptc_gym", info}, sorted(files)
+assert {"mptc_gym/py.typed", f"{info}/licenses/LICENSE"} <= files, sorted(files)
+present = [name for name in ABSENT if find_spec(name)]
+assert not present, present
+
+about = installed.metadata
+assert about["License-Expression"] == "MIT"
+assert about["Description-Content-Type"] == "text/markdown"
+assert "MiddlePoint-v0" in str(about.get_payload())  # the README
+needed = [each for each in installed.requires or () if "extra ==" not in each]
+assert sorted(each.partition(">=")[0] for each in needed) == ["gymnasium", "numpy"], needed
+
+env = gymnasium.make("mptc_gym:MiddlePoint-v0", noise_variance=0.5)
+check_env(env.unwrapped)
+env.action_space.seed(0)
+env.reset(seed=0)
+for _ in range(1000):
+    env.step(env.action_space.sample())
+
+envs = gymnasium.make_vec("MiddlePoint-v0", num_envs=8, noise_variance=0.5)
+envs.action_space.seed(0)
+envs.reset(seed=0)
+for _ in range(1000):
+    envs.step(envs.action_space.sample())
+
+import mptc_gym  # noqa: E402 (last, since the id above must do without it)
+
+assert Path(mptc_gym.__file__).is_relative_to(sys.prefix), mptc_gym.__file__
+assert mptc_gym.__version__ == installed.version
+print(f"mptc_gym {installed.version} is complete and runs, with nothing but {needed}")
