@@ -78,7 +78,7 @@ class TestCells:
 
     def test_a_loop_with_too_much_delay_oscillates(self):
         slow = agent_cell("pi", {"delay": 40}, 1200, 1, 0)
-        assert slow["swing"][0] > 2.0
+        assert slow["swing"][0] > sweep.OSCILLATES
         calm = agent_cell("pi-simc", NOMINAL, 1200, 1, 0)
         assert calm["swing"][0] < 0.2
 
@@ -98,7 +98,9 @@ class TestSweep:
         np.testing.assert_allclose(
             runs["ratio"][known], runs["mae"][known] / runs["limit"][known]
         )
-        assert (runs["ratio"][known] >= 1.0).all()
+        # The limit is one of the mean over all noise; single runs may have luck.
+        assert (runs["ratio"][known] > 0.8).all()
+        assert runs["ratio"][known].mean() > 1.1
         for name in ("plants.png", "drift.png", "report.html", "report.md"):
             assert (tmp_path / name).stat().st_size > 1000
         assert "Does learning help when the plant drifts?" in capsys.readouterr().out
