@@ -23,11 +23,18 @@ _COLOURS = {"cmap": "cividis_r", "norm": LogNorm(1.0, 4.0)}
 _OFTEN = 0.5  # of the runs on a plant, from which on it is marked
 _MARKS = {
     name: Line2D(
-        [], [], linestyle="", marker=marker, color=colour, markeredgecolor=edge, label=text
+        [],
+        [],
+        linestyle="",
+        marker=marker,
+        markersize=size,
+        color=colour,
+        markeredgecolor=edge,
+        label=text,
     )
-    for name, marker, colour, edge, text in (
-        ("oscillates", "o", "white", "black", "oscillates"),
-        ("useless", "X", "red", "white", "no better than no control"),
+    for name, marker, size, colour, edge, text in (
+        ("oscillates", "o", 3.5, "white", "black", "oscillates"),
+        ("useless", "X", 8, "red", "white", "no better than no control"),
     )
 }
 

@@ -24,7 +24,7 @@ from agents import DirectNNController
 from benchmarks import command_line
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.tables import on_screen
-from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
+from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv
 
 ROUNDS = 15
 SINGLE_STEPS = 20_000
@@ -214,6 +214,7 @@ def _vector(n: int) -> Iterable[Case]:
         REFERENCE: (REFERENCE, {}),
         "MiddlePoint-v0": ("MiddlePoint-v0", {}),
         "MiddlePoint-v0, R = 0.5": ("MiddlePoint-v0", NOISE),
+        "MiddlePoint-v0, hard": ("MiddlePoint-v0", PRESETS["hard"]),  # everything is on
     }
     for name, (env_id, arguments) in made.items():
         envs = gymnasium.make_vec(

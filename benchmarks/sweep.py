@@ -36,11 +36,17 @@ LEARNT = ("ppo", "ppo-randomised")  # before the sweep
 DESIGN_SEED = 0
 SEED = 0  # of a plant's first run
 OSCILLATES = 1.0  # degC that the swing on steady stretches exceeds that without control by
-DRIFTS = (  # of the gain, by which the answer is split
-    ("gain falls to less than 0.8 times", 0.0, 0.8),
-    ("gain stays within 0.8 to 1.25 times", 0.8, 1.25),
-    ("gain rises to more than 1.25 times", 1.25, np.inf),
+GROUPS = (  # of the plants that drift, by which the answer is split: half-open intervals
+    ("gain falls to less than 0.8 times", "gain_drift", 0.0, 0.8),
+    ("gain stays within 0.8 to 1.25 times", "gain_drift", 0.8, 1.25),
+    ("gain rises to more than 1.25 times", "gain_drift", 1.25, np.inf),
+    ("delay below 14 samples", "delay", 0, 14),
+    ("delay from 14 to 22 samples", "delay", 14, 23),
+    ("delay above 22 samples", "delay", 23, np.inf),
 )
+SHAPING = (  # modules of this package that shape a cell
+    "experiments", "limits", "opponents", "robustness", "rollout", "scenarios",
+)  # fmt: skip
 PAIRS = (("nn", "pi-simc"), ("nn", "nn-frozen"), ("nn-frozen", "pi-simc"))
 
 
@@ -174,8 +180,11 @@ def _cells(
 
 def _key(options: argparse.Namespace, policies: dict[str, list[Path]]) -> str:
     """Return a name made of everything that shapes the cells' results."""
-    folders = [ROOT / "mptc_gym", ROOT / "agents", ROOT / "benchmarks"]
-    sources = [source for folder in folders for source in sorted(folder.glob("*.py"))]
+    sources = [
+        *sorted((ROOT / "mptc_gym").glob("*.py")),
+        *sorted((ROOT / "agents").glob("*.py")),
+        *(ROOT / "benchmarks" / f"{name}.py" for name in SHAPING),
+    ]
     shaped_by = {
         "options": [options.design, options.plants, options.runs, options.samples],
         "policies": {name: [f.name for f in folders] for name, folders in policies.items()},
@@ -276,11 +285,10 @@ def _overview(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _differences(runs: pd.DataFrame) -> pd.DataFrame:
-    drift = runs["gain_drift"].fillna(1.0)
-    groups = {"no drift": runs[runs["gain_drift"].isna()]}
-    groups["all that drift"] = runs[runs["gain_drift"].notna()]
-    for name, low, high in DRIFTS:
-        groups[name] = runs[runs["gain_drift"].notna() & (drift >= low) & (drift < high)]
+    drifting = runs[runs["gain_drift"].notna()]
+    groups = {"no drift": runs[runs["gain_drift"].isna()], "all that drift": drifting}
+    for name, column, low, high in GROUPS:
+        groups[name] = drifting[drifting[column].between(low, high, inclusive="left")]
     rows = []
     for name, group in groups.items():
         row = {"plants": name, "number": str(group["plant"].nunique())}

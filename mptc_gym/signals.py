@@ -18,7 +18,7 @@ from mptc_gym.parameters import SLOW, Parameters
 
 BLOCK = 600  # samples made at a time
 FOREVER = 1 << 62  # samples
-_TOGETHER = 32  # plants whose noise is made at a time: it stays in the processor's cache
+_TOGETHER = 32  # plants whose draws are made at a time: they stay in the processor's cache
 _CHANGES = 60  # of a disturbance made at a time
 
 
@@ -435,14 +435,14 @@ class Disturbances:
 
     def _refill(self, which: NDArray[np.intp]) -> None:
         """Make the next levels of some plants."""
-        if not len(which):
-            return
-        draws = np.empty((len(which), _CHANGES, 3))
-        for i, row in zip(which.tolist(), draws, strict=True):
-            self._generators[i].random(out=row)
-        self._levels[which], self._last[which] = _disturbance(
-            draws, self._shapes[which], self._last[which]
-        )
+        for start in range(0, len(which), _TOGETHER):
+            plants = which[start : start + _TOGETHER]
+            draws = np.empty((len(plants), _CHANGES, 3))
+            for i, row in zip(plants.tolist(), draws, strict=True):
+                self._generators[i].random(out=row)
+            self._levels[plants], self._last[plants] = _disturbance(
+                draws, self._shapes[plants], self._last[plants]
+            )
         self._places[which] = self._ends[which] - _CHANGES
 
 
