@@ -152,8 +152,8 @@ def _scenario_panels(rows: pd.DataFrame) -> tuple[Figure, list[Axes]]:
 def plot_learning(curves: pd.DataFrame, path: Path) -> None:
     """Draw PPO's learning curves: mean |e| over samples of experience, for each policy."""
     shown = {
-        "training_mae": "training: random set points, noise, exploring",
-        "validation_mae": "validation: random set points, half of them with noise",
+        "training_mae": "training: random set points, exploring",
+        "validation_mae": "validation: random set points with noise, held ones without",
         "square_mae": "square wave, no noise",
     }
     with mpl.rc_context(STYLE):
