@@ -50,7 +50,7 @@ class TestSB3:
         picture = tmp_path / "default_sb3.png"
         assert picture.stat().st_size > 10_000
         picture.unlink()
-        sb3.main(["--plot", "--out", str(tmp_path)])
+        sb3.main([*command, "--plot"])
         assert picture.exists()
         pd.testing.assert_frame_equal(curves, pd.read_csv(tmp_path / "default_sb3.csv"))
 

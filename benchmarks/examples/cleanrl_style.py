@@ -199,6 +199,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = command_line.parser("examples.cleanrl_style", __doc__)
     for field in fields(Arguments):
         name = f"--{field.name.replace('_', '-')}"
+        # argparse shows a default beside a help text only, be it empty.
         parser.add_argument(name, type=type(field.default), default=field.default, help=" ")
     options: dict[str, Any] = vars(parser.parse_args(arguments))
     torch.set_num_threads(1)  # the networks are too small for more
