@@ -149,14 +149,15 @@ def plot(curves: pd.DataFrame, path: Path) -> None:
         palette = colours(list(cases))
         for name, rows in cases.items():
             each = rows.groupby("steps")["mae"].agg(["median", "min", "max", "count"])
-            each = each[each["count"] == each["count"].max()]  # while all seeds go on
+            seeds = int(each["count"].max())
+            each = each[each["count"] == seeds]  # while all of them go on
             thousands = each.index / 1000
             axes.fill_between(
                 thousands, each["min"], each["max"], color=palette[name], alpha=0.2, linewidth=0
             )
             axes.plot(
                 thousands, each["median"], color=palette[name],
-                label=f"{name} ({each['count'].max()} seeds)",
+                label=f"{name} ({seeds} seed{'s' * (seeds > 1)})",
             )  # fmt: skip
         for name, (error, line) in limits.items():
             axes.axhline(error, color="0.4", linewidth=1, linestyle=line, label=name)
