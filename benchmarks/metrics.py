@@ -36,7 +36,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     trajectory
         The runs.
     parameters
-        The environment's arguments in these runs.
+        The environment's arguments in these runs, with no range among them.
 
     Returns
     -------
@@ -54,7 +54,14 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
           not settled when the next comes or the run ends;
         - `dead_zone_share`: samples whose command lies inside the dead zone;
         - `saturation_share`: samples whose command lies at or beyond a limit.
+
+    Raises
+    ------
+    ValueError
+        If a number of the plant is a range.
     """
+    if parameters.ranges:
+        raise ValueError(f"parameters must hold no range, got {', '.join(parameters.ranges)}")
     interval = parameters.sampling_interval / 60.0  # min
     command = trajectory.command
     error = trajectory.setpoint - trajectory.output

@@ -25,8 +25,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
+from benchmarks.experiments import mean_error
 from benchmarks.fan_out import FanOut
-from benchmarks.metrics import measure
 from benchmarks.robustness import SPANS
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
@@ -116,6 +116,16 @@ class PPOArguments:
             "setpoint": "random",
             "setpoint_amplitude": self.setpoint_amplitude,
         }
+
+    @property
+    def plants(self) -> list[tuple[int, dict[str, Any]]]:
+        """How many plants to train on, and their arguments: the noisy ones, then the calm."""
+        calm = round(self.calm * self.n_envs)
+        groups = [
+            (self.n_envs - calm, self.training),
+            (calm, {**self.training, "noise_variance": 0.0}),
+        ]
+        return [(count, arguments) for count, arguments in groups if count]
 
 
 # What makes a policy one for many plants, those of a random design.
@@ -271,7 +281,7 @@ def is_trained(folder: Path) -> bool:
 
 def policy_key(arguments: PPOArguments) -> str:
     """Return a name made of everything that shapes a policy: arguments, versions and code."""
-    names = ("metrics.py", "ppo.py", "rollout.py", "scenarios.py", "vec_env.py")
+    names = ("experiments.py", "ppo.py", "rollout.py", "scenarios.py", "vec_env.py")
     sources = [
         *sorted((ROOT / "mptc_gym").glob("*.py")),
         *(ROOT / "benchmarks" / n for n in names),
@@ -305,7 +315,7 @@ def trained_policy(
     -------
     PPO
         The policy that did best in validation: on set points that are met neither in training
-        nor in a comparison, with noise and without. Training that was interrupted and resumed
+        nor in a comparison. Training that was interrupted and resumed
         ends in the same policy, to the bit, as training that was not.
     """
     policy, checkpoint = folder / "policy.zip", folder / "checkpoint.pkl"
@@ -362,17 +372,10 @@ def begin(arguments: PPOArguments, plants: VecEnv | None = None) -> PPO:
         The model.
     """
     if plants is None:
-        calm = round(arguments.calm * arguments.n_envs)
         plants = GymnasiumVecEnv(
             *(
-                gymnasium.make_vec(
-                    "MiddlePoint-v0", count, autoreset_mode="SameStep", **training
-                )
-                for count, training in (
-                    (arguments.n_envs - calm, arguments.training),
-                    (calm, {**arguments.training, "noise_variance": 0.0}),
-                )
-                if count
+                gymnasium.make_vec("MiddlePoint-v0", count, autoreset_mode="SameStep", **given)
+                for count, given in arguments.plants
             )
         )
     parameters = Parameters(**arguments.training)
@@ -472,7 +475,7 @@ class Keeper(BaseCallback):
     def _mae(self, arguments: dict[str, Any], runs: int, samples: int, seed: int) -> float:
         plants = make_plants(runs, samples, **arguments)
         trajectory = rollout(plants, PolicyController(self.model), samples, seed)
-        return float(measure(trajectory, Parameters(**arguments))["mae"].mean())
+        return float(mean_error(trajectory).mean())
 
 
 def _save(keeper: Keeper, path: Path) -> None:

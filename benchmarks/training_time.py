@@ -11,6 +11,7 @@ import math
 import sys
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -121,11 +122,13 @@ def train(arguments: ppo.PPOArguments, *, one_by_one: bool) -> float:
     """
     plants: VecEnv | None = None
     if one_by_one:
-
-        def make_plant() -> gymnasium.Env[Any, Any]:
-            return gymnasium.make("MiddlePoint-v0", **arguments.training)
-
-        plants = OneByOne([make_plant] * arguments.n_envs)
+        plants = OneByOne(
+            [
+                partial(gymnasium.make, "MiddlePoint-v0", **given)
+                for count, given in arguments.plants
+                for _ in range(count)
+            ]
+        )
     torch.set_num_threads(1)  # as in any training
     model = ppo.begin(arguments, plants)
     with tempfile.TemporaryDirectory() as folder, tqdm(disable=True) as bar:

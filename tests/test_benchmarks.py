@@ -86,6 +86,11 @@ class TestMeasures:
         )
         assert list(measure(both, Parameters())["mae"]) == [0.5, 3.0]
 
+    def test_ranges_are_refused(self):
+        runs = Trajectory(*np.zeros((5, 3, 1)))
+        with pytest.raises(ValueError, match="parameters must hold no range, got dead_zone"):
+            measure(runs, Parameters(dead_zone=[4, 6]))
+
 
 class TestTables:
     def test_percentiles(self):

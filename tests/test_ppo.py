@@ -20,6 +20,7 @@ def small(monkeypatch):
     monkeypatch.setattr(ppo, "CHECKPOINT_INTERVAL", 256)
     monkeypatch.setattr(ppo, "PROBE", replace(ppo.PROBE, samples=20))
     monkeypatch.setattr(ppo, "VALIDATION_SAMPLES", 20)
+    monkeypatch.setattr(ppo, "HELD", ppo.HELD[:20])
 
 
 def train(folder, arguments=SMALL, *, retrain=False):
@@ -114,6 +115,33 @@ class TestPPO:
         assert parameters.setpoint == "random"
         assert parameters.action_window == parameters.delay + 2
         assert parameters.noise_variance == SMALL.noise_variance
+
+    def test_some_of_the_plants_are_calm(self):
+        arguments = replace(SMALL, n_envs=8, calm=0.75)
+        assert [count for count, _ in arguments.plants] == [2, 6]
+        plants = ppo.begin(arguments).get_env()
+        plants.seed(0)
+        plants.reset()
+        plants.step(np.zeros((8, 1), np.float32))
+        assert [noise != 0.0 for noise in plants.infos["noise"]] == [True] * 2 + [False] * 6
+        assert [count for count, _ in replace(SMALL, calm=0.0).plants] == [4]
+        assert [count for count, _ in replace(SMALL, calm=1.0).plants] == [4]
+
+    def test_a_policy_for_many_plants(self, tmp_path):
+        arguments = replace(SMALL, steps=256, **ppo.RANDOMISED)
+        train(tmp_path, arguments)
+        kept = ppo.kept_policy(tmp_path)
+        assert kept.observation == arguments.observation
+        assert kept.observation["action_window"] == 38
+        size = Parameters(**arguments.training).observation_size
+        assert kept().act(np.zeros((5, size), np.float32)).shape == (5, 1)
+        assert ppo.policy_key(arguments) != ppo.policy_key(replace(SMALL, steps=256))
+
+    def test_set_points_of_validation_are_met_nowhere_else(self):
+        flows = np.abs(ppo.HELD) * 0.07273 / 0.04964  # t/h, by the steady-state gain
+        assert flows.min() > Parameters().dead_zone
+        assert flows.max() < Parameters().u_max
+        assert not {5.0, -5.0} & set(ppo.HELD)
 
     def test_the_best_in_validation_is_kept(self, tmp_path, monkeypatch):
         seen = []
