@@ -168,7 +168,7 @@ def plot(curves: pd.DataFrame, path: Path) -> None:
         axes.set_title(
             "Stable-Baselines3 as it comes, square wave, median and range", loc="left"
         )
-        axes.legend(ncols=2)
+        axes.legend(loc="upper right", bbox_to_anchor=(1.0, 0.9), ncols=2)
         save(figure, path)
 
 
