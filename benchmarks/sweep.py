@@ -238,7 +238,7 @@ def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
                 f"{OSCILLATES:g} °C more than with no control at all. The actuator is limited "
                 "and the plant stable, so instability can come to no more than that here. "
                 "Useless: the mean error is no smaller than with no control. Both are shares "
-                "of the runs."
+                "of the runs. PPO's policies take the plants in turn."
             ],
             _overview(runs),
         )

@@ -234,8 +234,9 @@ class Plants:
         self._place = self._samples - 1  # of the next input among the d + 1
         # Plants with a longer delay take their response from rows of earlier responses.
         self._shortest, self._longer = shortest, longest - shortest
-        self._earlier = np.zeros((self._longer + self._samples, num_envs))
-        self._taken = np.arange(self._samples * num_envs).reshape(self._response.shape)
+        if self._longer:
+            self._earlier = np.zeros((self._longer + self._samples, num_envs))
+            self._taken = np.zeros(self._response.shape, np.intp)
 
     def rest(self, which: NDArray[np.intp], drawn: Mapping[str, Values]) -> None:
         """Bring some of the plants to rest.
