@@ -17,6 +17,7 @@ from PIL import Image
 
 from benchmarks import command_line
 from benchmarks.experiments import mean_error
+from benchmarks.fan_out import FanOut
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.roster import BUILT_IN, Factory, build, label, load_factory, observation
 from benchmarks.scenarios import SCENARIOS, Scenario
@@ -210,7 +211,12 @@ def _factory(agent: str) -> Factory:
         from benchmarks import ppo  # here: torch takes seconds to load
 
         return ppo.Trained(
-            ppo.PPOArguments(), POLICIES, policies=1, jobs=1, retrain=False, progress=True
+            ppo.PPOArguments(),
+            POLICIES,
+            policies=1,
+            fan_out=FanOut(1),
+            retrain=False,
+            progress=True,
         ).members()[0]
     if agent not in BUILT_IN:
         known = ", ".join([*BUILT_IN, "ppo"])
