@@ -59,8 +59,16 @@ def test_top_level_holds_what_the_layout_says():
     }  # fmt: skip
 
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+PAGES = [
+    ROOT / "README.md",
+    *(ROOT / "benchmarks").glob("*.md"),
+    ROOT / "benchmarks" / "examples" / "README.md",
+]
+EXAMPLES = [
+    example
+    for page in PAGES
+    for example in re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+]
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=range(len(EXAMPLES)))
@@ -72,8 +80,13 @@ def test_examples_of_the_readme_run(example, monkeypatch, tmp_path):
     exec(example.replace("300_000", "2_000"), {})
 
 
-def test_readme_has_its_examples_and_pictures():
-    assert len(EXAMPLES) >= 2
-    pictures = re.findall(r"!\[.*?\]\((.*?)\)", README)
-    assert pictures
-    assert all((ROOT / picture).is_file() for picture in pictures)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_a_page_links_to_is_there(page):
+    targets = re.findall(r"\]\(([^)]*)\)", page.read_text("utf-8"))
+    for target in targets:
+        assert target.startswith("https://") or (page.parent / target).exists(), target
+
+
+def test_there_are_examples_and_pictures():
+    assert len(EXAMPLES) >= 4
+    assert "![" in PAGES[0].read_text("utf-8")
