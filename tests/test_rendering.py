@@ -314,6 +314,8 @@ def test_fonts_outlive_another_s_end_of_pygame():
     assert_same(rendering.frame(record()), before)
 
 
+# MoviePy does with NumPy 2.5 what that has come to advise against.
+@pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning")
 def test_videos_can_be_recorded(tmp_path):
     env = gymnasium.make("MiddlePoint-v0", render_mode="rgb_array", max_episode_steps=8)
     env = RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda _: True)
