@@ -50,7 +50,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     render_mode
         None, or "rgb_array": `render` returns a picture of each plant.
     **arguments
-        Those of `MiddlePointEnv`, the same for all plants.
+        Those of `MiddlePointEnv`, the same for all plants; from a range each draws its own.
 
     Raises
     ------
