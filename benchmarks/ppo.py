@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import io
 import json
 import math
@@ -20,6 +19,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
@@ -30,7 +30,7 @@ from benchmarks.fan_out import FanOut
 from benchmarks.robustness import SPANS
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
-from benchmarks.storage import ROOT, replacing, versions, write_json
+from benchmarks.storage import ROOT, fingerprint, replacing, versions, write_json
 from benchmarks.vec_env import GymnasiumVecEnv
 from mptc_gym import Parameters
 
@@ -150,7 +150,7 @@ class FixedScaling(BaseFeaturesExtractor):
 class PolicyController:
     """A trained policy as a controller; it takes the mean of the policy's distribution."""
 
-    def __init__(self, model: PPO) -> None:
+    def __init__(self, model: BaseAlgorithm) -> None:
         self._model = model
 
     def reset(self) -> None:
@@ -286,12 +286,7 @@ def policy_key(arguments: PPOArguments) -> str:
         *sorted((ROOT / "mptc_gym").glob("*.py")),
         *(ROOT / "benchmarks" / n for n in names),
     ]
-    shaped_by = {
-        "arguments": asdict(arguments),
-        "versions": versions(),
-        "sources": [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources],
-    }
-    return hashlib.sha256(json.dumps(shaped_by, sort_keys=True).encode()).hexdigest()[:16]
+    return fingerprint(sources, arguments=asdict(arguments), versions=versions())
 
 
 def trained_policy(

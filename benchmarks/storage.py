@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -41,6 +42,13 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file, whole or not at all."""
     write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def fingerprint(sources: Iterable[Path], **shaped_by: Any) -> str:
+    """Return a name made of source files and of all else that shapes a result, for JSON."""
+    hashes = [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources]
+    everything = json.dumps({**shaped_by, "sources": hashes}, sort_keys=True)
+    return hashlib.sha256(everything.encode()).hexdigest()[:16]
 
 
 def versions() -> dict[str, str]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -29,7 +27,7 @@ from benchmarks.robustness import (
 )
 from benchmarks.roster import label
 from benchmarks.statistics import Estimate, bootstrap, improvement
-from benchmarks.storage import ROOT, commit, replacing, versions, write_json
+from benchmarks.storage import ROOT, commit, fingerprint, replacing, versions, write_json
 
 AGENTS = ("nn", "nn-frozen", "pi", "pi-simc", "smith", "ppo", "ppo-randomised")
 LEARNT = ("ppo", "ppo-randomised")  # before the sweep
@@ -185,13 +183,12 @@ def _key(options: argparse.Namespace, policies: dict[str, list[Path]]) -> str:
         *sorted((ROOT / "agents").glob("*.py")),
         *(ROOT / "benchmarks" / f"{name}.py" for name in SHAPING),
     ]
-    shaped_by = {
-        "options": [options.design, options.plants, options.runs, options.samples],
-        "policies": {name: [f.name for f in folders] for name, folders in policies.items()},
-        "versions": versions(),
-        "sources": [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources],
-    }
-    return hashlib.sha256(json.dumps(shaped_by, sort_keys=True).encode()).hexdigest()[:16]
+    return fingerprint(
+        sources,
+        options=[options.design, options.plants, options.runs, options.samples],
+        policies={name: [f.name for f in folders] for name, folders in policies.items()},
+        versions=versions(),
+    )
 
 
 def _table(

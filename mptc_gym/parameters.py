@@ -300,18 +300,23 @@ class Parameters:
         names = "disturbance_amplitude", "disturbance_walk_variance"
         return any(self.range_of(name)[1] > 0.0 for name in names)
 
+    def _may_change(self, *names: str) -> bool:
+        return any(self.range_of(name) != (1.0, 1.0) for name in names)
+
     @property
     def drifts(self) -> bool:
         """Whether the dynamics change within an episode."""
-        return any(
-            self.range_of(n) != (1.0, 1.0) for n in ("gain_drift", "time_constant_drift")
-        )
+        return self._may_change("gain_drift", "time_constant_drift")
 
     @property
     def changes_time_constant(self) -> bool:
         """Whether the time constant is, or may come to be, another than that of A."""
-        names = "time_constant_factor", "time_constant_drift"
-        return any(self.range_of(name) != (1.0, 1.0) for name in names)
+        return self._may_change("time_constant_factor", "time_constant_drift")
+
+    @property
+    def changes_dynamics(self) -> bool:
+        """Whether (28) has, or may come to have, other coefficients than A and B."""
+        return self.changes_time_constant or self._may_change("gain_factor", "gain_drift")
 
     @property
     def windows(self) -> tuple[int, int, int, int]:

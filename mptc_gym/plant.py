@@ -213,9 +213,7 @@ class Plants:
 
         self._dynamics = Dynamics(parameters)
         self._drifts = parameters.drifts
-        # Whether (28) may have other coefficients than it was given.
-        own = ("gain_factor", "time_constant_factor")
-        self._fouls = self._drifts or any(parameters.range_of(n) != (1.0, 1.0) for n in own)
+        self._fouls = parameters.changes_dynamics
         self._clock = self._next_fouling = 0
         self._starts = np.zeros(num_envs if self._drifts else (), np.int64)
         self._foul()

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from benchmarks import command_line
-from benchmarks.metrics import measure
+from benchmarks.experiments import mean_error
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
@@ -191,7 +191,7 @@ def train(arguments: Arguments) -> Agent:
 def square_error(agent: Agent) -> float:
     """Return the mean |e| on the default square wave, degC."""
     trajectory = rollout(make_plants(1, 1200, **OBSERVATION), agent, 1200, seed=0)
-    return float(measure(trajectory, Parameters(**OBSERVATION))["mae"][0])
+    return float(mean_error(trajectory)[0])
 
 
 def main(arguments: list[str] | None = None) -> int:

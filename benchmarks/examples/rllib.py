@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ray.rllib.algorithms.ppo import PPOConfig
 
 from benchmarks import command_line
-from benchmarks.metrics import measure
+from benchmarks.experiments import mean_error
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
@@ -74,11 +74,11 @@ def main(arguments: list[str] | None = None) -> int:
     ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
     torch.set_num_threads(1)  # the network is too small for more
     algorithm = config.build_algo()
-    plants, parameters = make_plants(1, SAMPLES, **OBSERVATION), Parameters(**OBSERVATION)
+    plants = make_plants(1, SAMPLES, **OBSERVATION)
     for iteration in range(-(-options.steps // options.batch)):
         algorithm.train()
         runs = rollout(plants, Predictor(algorithm.get_module()), SAMPLES, seed=0)
-        error = measure(runs, parameters)["mae"][0]
+        error = mean_error(runs)[0]
         print(
             f"{(iteration + 1) * options.batch:9,} steps: mean |e| on the square wave "
             f"{error:.3f} degC", flush=True,

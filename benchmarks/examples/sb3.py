@@ -20,15 +20,16 @@ import matplotlib as mpl
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from agents import PIController
 from benchmarks import command_line
-from benchmarks.metrics import METRICS, measure
+from benchmarks.experiments import mean_error
+from benchmarks.metrics import METRICS
 from benchmarks.plots import STYLE, colours, save
+from benchmarks.ppo import PolicyController
 from benchmarks.rollout import Agent, make_plants, rollout
 from benchmarks.storage import replacing
 from mptc_gym import Parameters
@@ -39,20 +40,6 @@ SAMPLES = 1200  # two periods of the square wave
 DOING_NOTHING = Parameters().setpoint_amplitude  # y stays 0, so |e| is the set point's
 POSSIBLE = 0.907  # degC, the least of any controller, by `python -m benchmarks.limits`
 NAME = "default_sb3"
-
-
-class Predictor:
-    """A model as a controller, without its exploration."""
-
-    def __init__(self, model: BaseAlgorithm) -> None:
-        self._model = model
-
-    def reset(self) -> None:
-        """Do nothing: the observation holds all that the policy remembers."""
-
-    def act(self, observation: NDArray[Any]) -> NDArray[Any]:
-        """Return actions, shape (runs, 1)."""
-        return self._model.predict(observation, deterministic=True)[0]
 
 
 class Evaluation(BaseCallback):
@@ -77,7 +64,7 @@ class Evaluation(BaseCallback):
         if self.num_timesteps % self._interval == 0:
             row = {
                 "steps": self.num_timesteps,
-                "mae": square_error(Predictor(self.model), **OBSERVATION),
+                "mae": square_error(PolicyController(self.model), **OBSERVATION),
                 "seconds": round(time.perf_counter() - self._since, 1),
             }
             self.rows.append(self._start | row)
@@ -88,8 +75,7 @@ class Evaluation(BaseCallback):
 def square_error(agent: Agent, **arguments: Any) -> float:
     """Return the mean |e| of a controller on the noise-free square wave, degC."""
     plants = make_plants(1, SAMPLES, **arguments)
-    parameters = Parameters(**arguments)
-    return float(measure(rollout(plants, agent, SAMPLES, seed=0), parameters)["mae"][0])
+    return float(mean_error(rollout(plants, agent, SAMPLES, seed=0))[0])
 
 
 def train(
