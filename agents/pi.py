@@ -16,7 +16,8 @@ SEARCHED_GAINS = {"kp": 1.34, "ki": 0.0456}
 class PIController(Controller):
     """u(k) = -Kp e(k) - Ki sum_{i<=k} e(i), as printed in Section 5.
 
-    The signs are those of a plant whose output falls when its input rises, D(G) = -1.
+    The signs are those of a plant whose output falls when its input rises, D(G) = -1. For a
+    plant of the other direction both gains are below zero.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ class PIController(Controller):
         Parameters
         ----------
         gain
-            Steady-state gain k of the plant, degC per t/h; below zero.
+            Steady-state gain k of the plant, degC per t/h, of either sign.
         time_constant
             Its time constant tau_1, s.
         delay
@@ -118,8 +119,9 @@ class PIController(Controller):
         total = self._sum + error
         command = -self.kp * error - self.ki * total  # Section 5
         if self.anti_windup:
-            outward = (command > self.u_max) & (error < 0) | (command < self.u_min) & (
-                error > 0
+            drive = -self.ki * error  # what this error adds to the command from now on
+            outward = (command > self.u_max) & (drive > 0) | (command < self.u_min) & (
+                drive < 0
             )
             total = np.where(outward, self._sum, total)
             command = -self.kp * error - self.ki * total
@@ -137,14 +139,14 @@ def simc_gains(
 ) -> tuple[float, float]:
     """Return Kp, t/h per degC, and Ki, t/h per degC and sample: see `PIController.simc`."""
     k = check_number("gain", gain)
-    if k >= 0:
-        raise ValueError(f"gain must be below 0, D(G) = -1, got {gain!r}")
+    if k == 0:
+        raise ValueError(f"gain must not be 0, got {gain!r}")
     tau_1 = _positive("time_constant", time_constant)
     theta = check_number("delay", delay, 0)
     tau_c = theta if closed_loop_time_constant is None else closed_loop_time_constant
     tau_c = _positive("closed_loop_time_constant", tau_c)
     interval = _positive("sampling_interval", sampling_interval)
-    kp = -tau_1 / (k * (tau_c + theta))  # (23)
+    kp = -tau_1 / (k * (tau_c + theta))  # (23), with the sign of u = -Kp e
     tau_i = min(tau_1, 4 * (tau_c + theta))  # (24)
     return kp, kp * interval / tau_i
 

@@ -25,7 +25,7 @@ class SmithPredictor(PIController):
     Parameters
     ----------
     gain
-        Steady-state gain of the plant, degC per t/h; below zero.
+        Steady-state gain of the plant, degC per t/h, of either sign.
     time_constant
         Its time constant, s.
     delay

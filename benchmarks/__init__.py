@@ -1,1 +1,1 @@
-"""Studies of controllers on the plant. Each runs as `python -m benchmarks.NAME`."""
+"""Questions about controllers on this plant. `python -m benchmarks` lists them."""

@@ -3,11 +3,12 @@
 Two things limit every controller of this plant: an input takes d + 1 samples to show, and the
 actuator has limits. The bounds here follow from these two alone. Of the dead zone they suppose
 that it can be undone, so that they stay true bounds with it; they are attained where no command
-within it is needed, as `benchmarks.mpc` shows.
+within it is needed, as `benchmarks.controllers.mpc` shows.
 """
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import sys
 from dataclasses import dataclass
@@ -16,14 +17,15 @@ from functools import cache
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from rich.console import Console
 from scipy import optimize, signal, sparse, stats
 from tqdm import tqdm
 
 from agents import PIController
-from benchmarks import command_line
-from benchmarks.rollout import Trajectory, make_plants, rollout
+from benchmarks.lib import command_line
+from benchmarks.lib.tables import on_screen
+from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import SCENARIOS, Scenario, plain
-from benchmarks.tables import on_screen
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
@@ -48,21 +50,15 @@ class Limit:
     mse: float
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Print the limits of every scenario.
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    pass  # none
 
-    Parameters
-    ----------
-    arguments
-        The command line without the program's name.
 
-    Returns
-    -------
-    int
-        0.
-    """
-    parser = command_line.parser("limits", __doc__)
-    parser.parse_args(arguments)
+@command_line.command(
+    "limits", __doc__, _add_options, width=110, interrupted="nothing is kept."
+)
+def main(_: argparse.Namespace, console: Console) -> str:
+    """Print the limits of every scenario."""
     rows = []
     for name, scenario in tqdm(SCENARIOS.items(), unit="scenario"):
         limit = scenario_limit(scenario)
@@ -75,10 +71,9 @@ def main(arguments: list[str] | None = None) -> int:
         )
         rows.append(row)
     columns = ["scenario", "mean |e| (°C)", "rms e (°C)", "rms e, set point held (°C)"]
-    console = command_line.console(110)
     console.print("No controller can do better on average:")
     console.print(on_screen(pd.DataFrame(rows, columns=columns)))
-    return 0
+    return ""
 
 
 def noise_response(parameters: Parameters, samples: int) -> Array:
@@ -98,18 +93,6 @@ def minimum_variance(parameters: Parameters) -> float:
     """
     f = noise_response(parameters, parameters.delay + 1)
     return parameters.noise_variance * float(f @ f)
-
-
-def harris_index(trajectory: Trajectory, parameters: Parameters) -> Array:
-    """Return minimum variance over mean e^2 on the steady stretches, 1 at best, shape (runs,).
-
-    Steady is the second half of the time that a set point is held (T. J. Harris, "Assessment of
-    control loop performance", Canadian Journal of Chemical Engineering 67, 1989, 856-861).
-    """
-    steady = steady_stretches(trajectory.setpoint[:, 0])
-    error = (trajectory.setpoint - trajectory.output)[steady]
-    index: Array = minimum_variance(parameters) / np.square(error).mean(axis=0)
-    return index
 
 
 def held(setpoint: Array) -> list[tuple[int, int]]:
@@ -292,4 +275,4 @@ def _folded_normal(mean: Array, deviation: Array) -> tuple[Array, Array]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(None))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,8 @@ from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
 
-SETTLING_BAND = 0.05  # of the set-point change
+SETTLING_BAND = 0.05  # of the set-point change, or of the set point
+LAST = 50  # samples at the end of a run, which tell whether it has settled
 
 # Name in tables and CSV files: heading.
 METRICS: dict[str, str] = {
@@ -36,7 +38,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     trajectory
         The runs.
     parameters
-        The environment's arguments in these runs, with no range among them.
+        The environment's arguments in these runs.
 
     Returns
     -------
@@ -55,18 +57,17 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
         - `dead_zone_share`: samples whose command lies inside the dead zone;
         - `saturation_share`: samples whose command lies at or beyond a limit.
 
-    Raises
-    ------
-    ValueError
-        If a number of the plant is a range.
+        The last two are NaN where the actuator's numbers are drawn from ranges.
     """
-    if parameters.ranges:
-        raise ValueError(f"parameters must hold no range, got {', '.join(parameters.ranges)}")
     interval = parameters.sampling_interval / 60.0  # min
     command = trajectory.command
     error = trajectory.setpoint - trajectory.output
     moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
-    saturated = (command <= parameters.u_min) | (command >= parameters.u_max)
+    drawn = {"dead_zone", "u_min", "u_max"} & set(parameters.ranges)
+    inside = saturated = np.full(command.shape, np.nan)
+    if not drawn:
+        inside = np.abs(command) < parameters.dead_zone
+        saturated = (command <= parameters.u_min) | (command >= parameters.u_max)
     by_steps = [
         _measure_steps(setpoint, output)
         for setpoint, output in zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
@@ -79,7 +80,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
         "total_variation": np.abs(moves).sum(axis=0),
         "overshoot": 100.0 * overshoot,
         "settling_time": interval * settling,
-        "dead_zone_share": 100.0 * (np.abs(command) < parameters.dead_zone).mean(axis=0),
+        "dead_zone_share": 100.0 * inside.mean(axis=0),
         "saturation_share": 100.0 * saturated.mean(axis=0),
     }
 
@@ -102,3 +103,55 @@ def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]
         last = outside[-1] if len(outside) else -1
         settling = max(settling, math.inf if last == stop - start - 1 else float(last + 1))
     return itae, overshoot, settling
+
+
+def mean_error(trajectory: Trajectory) -> Array:
+    """Return the mean |e| of each run, degC, shape (runs,)."""
+    error: Array = np.abs(trajectory.setpoint - trajectory.output).mean(axis=0)
+    return error
+
+
+def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
+    """Return for each run whether its last errors are within `SETTLING_BAND` of the set point.
+
+    Returns
+    -------
+    ndarray of bool, shape (runs,)
+        Judged by the last `LAST` samples.
+    """
+    setpoint, output = trajectory.setpoint[-LAST:], trajectory.output[-LAST:]
+    within: NDArray[np.bool_] = np.all(
+        np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint), axis=0
+    )
+    return within
+
+
+def split(trajectory: Trajectory, sample: int) -> tuple[Trajectory, Trajectory]:
+    """Return what was before a sample, and what came from there on."""
+    arrays = vars(trajectory).values()
+    return Trajectory(*(a[:sample] for a in arrays)), Trajectory(*(a[sample:] for a in arrays))
+
+
+def join(trajectories: Sequence[Trajectory]) -> Trajectory:
+    """Return the runs of several batches as one."""
+    arrays = zip(*(vars(trajectory).values() for trajectory in trajectories), strict=True)
+    return Trajectory(*(np.hstack(parts) for parts in arrays))
+
+
+def reversals(applied: Array, sampling_interval: float) -> Array:
+    """Return how often a minute the valve turns round, shape (runs,).
+
+    A reversal is a move against the direction of the last move before it, however long the
+    valve stood still in between. A run begins with the valve at rest at 0.
+
+    Parameters
+    ----------
+    applied
+        u_a(k), t/h, shape (samples, runs), such as `Trajectory.applied`.
+    sampling_interval
+        s.
+    """
+    moves = np.sign(np.diff(applied, axis=0, prepend=0.0))
+    counts = [np.count_nonzero(np.diff(run[run != 0.0])) for run in moves.T]
+    minutes = len(applied) * sampling_interval / 60.0
+    return np.array(counts, dtype=np.float64) / minutes

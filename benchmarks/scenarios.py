@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from mptc_gym import Parameters
+from mptc_gym import PRESETS, Parameters
 from mptc_gym.plant import Dynamics
 
 
@@ -39,26 +40,50 @@ class Scenario:
 # The text of the paper gives the plants and not the set point, which only its figures show. Two
 # are used here: the environment's square wave between +5 and -5 degC, 300 samples each, over
 # two periods; and a step to 5 degC that is held.
-_PLANTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    ("", "dead zone 5 t/h, no noise (Figs 5 and 10)", {}),
-    ("-dead-zone-7", "dead zone 7 t/h, no noise (Figs 6 and 7)", {"dead_zone": 7.0}),
-    ("-noise", "dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)", {"noise_variance": 0.5}),
+_PLANTS = (
+    ("", "paper", "dead zone 5 t/h, no noise (Figs 5 and 10)"),
+    ("-dead-zone-7", "dead-zone-7", "dead zone 7 t/h, no noise (Figs 6 and 7)"),
+    ("-noise", "noisy", "dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)"),
 )
-_SETPOINTS: tuple[tuple[str, str, int, dict[str, Any]], ...] = (
+SETPOINTS: tuple[tuple[str, str, int, dict[str, Any]], ...] = (
     ("square", "square wave", 1200, {}),
     ("constant", "constant set point", 600, {"setpoint": 5.0}),
 )
 
 SCENARIOS: dict[str, Scenario] = {
-    setpoint + plant: Scenario(
-        name=setpoint + plant,
+    setpoint + suffix: Scenario(
+        name=setpoint + suffix,
         title=f"{setpoint_title}, {plant_title}",
         samples=samples,
-        arguments={**plant_arguments, **setpoint_arguments},
+        arguments={**PRESETS[preset], **arguments},
     )
-    for setpoint, setpoint_title, samples, setpoint_arguments in _SETPOINTS
-    for plant, plant_title, plant_arguments in _PLANTS
+    for setpoint, setpoint_title, samples, arguments in SETPOINTS
+    for suffix, preset, plant_title in _PLANTS
 }
+
+
+def scenarios_of(name: str, arguments: Mapping[str, Any]) -> dict[str, Scenario]:
+    """Return the cases of a plant that is not the paper's.
+
+    Parameters
+    ----------
+    name
+        What the plant is called.
+    arguments
+        Arguments of the environment that are not its defaults.
+
+    Returns
+    -------
+    dict of Scenario
+        The set points of the paper's cases on this plant; or, if the arguments say what the set
+        point is, one case with theirs.
+    """
+    own = {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments)
+    cases = [("run", "its own set point", 1200, {})] if own else SETPOINTS
+    return {
+        setpoint: Scenario(setpoint, f"{title}, {name}", samples, {**arguments, **more})
+        for setpoint, title, samples, more in cases
+    }
 
 
 def plain(parameters: Parameters) -> Parameters:

@@ -5,6 +5,7 @@ What is compared is measured alternately in one run and reported as a ratio, wit
 
 from __future__ import annotations
 
+import argparse
 import copy
 import importlib.util
 import subprocess
@@ -18,12 +19,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pandas as pd
+from rich.console import Console
 from tqdm import tqdm
 
 from agents import DirectNNController
-from benchmarks import command_line
+from benchmarks.lib import command_line
+from benchmarks.lib.tables import on_screen
 from benchmarks.rollout import make_plants, rollout
-from benchmarks.tables import on_screen
 from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv
 
 ROUNDS = 15
@@ -66,14 +68,16 @@ class Case:
     steps: int
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Measure and print."""
-    parser = command_line.parser("speed", __doc__)
+def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rounds", type=command_line.number, default=ROUNDS, help="measurements of each"
     )
-    rounds = parser.parse_args(arguments).rounds
-    console = command_line.console(110)
+
+
+@command_line.command("speed", __doc__, _add_options, width=110, interrupted="nothing is kept.")
+def main(options: argparse.Namespace, console: Console) -> str:
+    """Measure and print."""
+    rounds = options.rounds
 
     def show(title: str, table: pd.DataFrame) -> None:
         console.print(title, on_screen(table), sep="\n")
@@ -98,11 +102,10 @@ def main(arguments: list[str] | None = None) -> None:
     ]
     taken = 1000 * pd.DataFrame(_alternately(imports, rounds))
     more = taken["mptc_gym"] - taken["gymnasium"]
-    console.print(
+    return (
         f"import gymnasium: {taken['gymnasium'].median():.0f} ms; import mptc_gym: "
         f"{more.median():+.0f} ms ({more.quantile(0.1):+.0f} to {more.quantile(0.9):+.0f})\n"
-        f"Medians of {rounds} rounds; in parentheses, 10th to 90th percentile.",
-        soft_wrap=True,
+        f"Medians of {rounds} rounds; in parentheses, 10th to 90th percentile."
     )
 
 
@@ -286,4 +289,4 @@ def _import(module: str) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main(None))

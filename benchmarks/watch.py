@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import math
 import sys
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,21 +15,29 @@ import gymnasium
 import pygame
 from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
 from PIL import Image
+from rich.console import Console
 
-from benchmarks import command_line
-from benchmarks.experiments import mean_error
-from benchmarks.fan_out import FanOut
+from benchmarks import plants
+from benchmarks.controllers.roster import (
+    ROSTER,
+    Controller,
+    Factory,
+    Training,
+    build,
+    observation,
+    own_controller,
+)
+from benchmarks.lib import command_line
+from benchmarks.lib.storage import replacing
+from benchmarks.metrics import mean_error
 from benchmarks.rollout import Trajectory, make_plants, rollout
-from benchmarks.roster import BUILT_IN, Factory, build, label, load_factory, observation
-from benchmarks.scenarios import SCENARIOS, Scenario
-from benchmarks.storage import replacing
+from benchmarks.scenarios import SCENARIOS, SETPOINTS, Scenario, scenarios_of
 from mptc_gym import MiddlePointEnv, Parameters
 from mptc_gym.drawing import SIZE
 from mptc_gym.rendering import Frame
 
 SPEED = MiddlePointEnv.metadata["render_fps"]  # samples a second
 COLOURS = 48  # of a GIF: the lines', the areas' and what lies between them
-POLICIES = Path("results/policies")
 OUT = Path("results/watch")
 Put = Callable[[Frame], object]  # takes the pictures of a film, one after the other
 
@@ -53,39 +62,40 @@ class Closed(Exception):  # noqa: N818 (no error)
     """The window has been closed."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a controller on a scenario and show it.
-
-    Parameters
-    ----------
-    arguments
-        The command line without the program's name.
-
-    Returns
-    -------
-    int
-        0, or 130 if it was interrupted.
-    """
-    parser = command_line.parser("watch", "Watch a controller, in a window or in a film.")
+def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    names = ", ".join([*BUILT_IN, "ppo"])
+    names = ", ".join(ROSTER)
     add("--agent", default="nn", help=f"{names}, or MODULE:FACTORY for one of your own")
-    add("--scenario", default="square", choices=SCENARIOS, help="case")
+    own = ", ".join(name for name, *_ in SETPOINTS)
+    add(
+        "--scenario",
+        default="square",
+        help=f"case: {', '.join(SCENARIOS)}; on a plant of your own {own}, or run if it has a "
+        "set point of its own",
+    )
+    plants.add_options(parser)
     add("--seed", type=command_line.seed, default=0, help="of noise and initial weights")
     add("--speed", type=command_line.number, default=SPEED, help="samples a second")
     add("--video", type=Path, help="file to write, .mp4 or .gif, in place of a window")
-    options = parser.parse_args(arguments)
+
+
+@command_line.command("watch", __doc__, _add_options, interrupted="nothing is kept.")
+def main(options: argparse.Namespace, console: Console) -> str:
+    """Run a controller on a scenario and show it."""
     film: Path | None = options.video
     if film and film.suffix not in FILMS:
-        parser.error(f"--video: must end in {' or '.join(FILMS)}, got {film}")
-    try:
-        factory = _factory(options.agent)
-        observation(factory)
-    except ValueError as error:
-        parser.error(f"--agent: {error}")
+        raise command_line.UsageError(f"--video: must end in {' or '.join(FILMS)}, got {film}")
+    controller = _controller(options.agent)
+    plant = plants.chosen(options)
+    scenarios = scenarios_of(plant.name, plant.arguments) if plant.arguments else SCENARIOS
+    if options.scenario not in scenarios:
+        known = ", ".join(scenarios)
+        raise command_line.UsageError(
+            f"--scenario: no {options.scenario!r} on this plant; there are {known}"
+        )
+    scenario = scenarios[options.scenario]
+    factory = controller.members(Training(members=1))[0]
 
-    console = command_line.console()
-    scenario = SCENARIOS[options.scenario]
     if film is None and not _has_screen():
         film = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.mp4"
         console.print(f"There is no screen to open a window on: writing a film, {film}")
@@ -94,18 +104,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             trajectory = in_window(factory, scenario, options.seed, options.speed)
         else:
             trajectory = in_film(factory, scenario, options.seed, options.speed, film)
-    except KeyboardInterrupt:
-        console.print("\nInterrupted.")
-        return 130
     except Closed:
-        return 0
+        return "The window was closed."
     error = mean_error(trajectory)[0]
-    console.print(
-        f"{label(options.agent)} on {scenario.title}: mean absolute error {error:.3f} °C"
-    )
-    if film is not None:
-        console.print(f"The film is {film}")
-    return 0
+    closing = f"{controller.label} on {scenario.title}: mean absolute error {error:.3f} °C"
+    return closing if film is None else f"{closing}\nThe film is {film}"
 
 
 def in_window(factory: Factory, scenario: Scenario, seed: int, speed: int) -> Trajectory:
@@ -204,24 +207,15 @@ def _gif(path: Path, fps: float) -> Iterator[Put]:
 FILMS: dict[str, Film] = {".mp4": Film(_mp4, 30), ".gif": Film(_gif, 10)}
 
 
-def _factory(agent: str) -> Factory:
+def _controller(agent: str) -> Controller:
     if ":" in agent:
-        return load_factory(agent)
-    if agent == "ppo":
-        from benchmarks import ppo  # here: torch takes seconds to load
-
-        return ppo.Trained(
-            ppo.PPOArguments(),
-            POLICIES,
-            policies=1,
-            fan_out=FanOut(1),
-            retrain=False,
-            progress=True,
-        ).members()[0]
-    if agent not in BUILT_IN:
-        known = ", ".join([*BUILT_IN, "ppo"])
-        raise ValueError(f"no {agent!r}; there are {known}, and MODULE:FACTORY of your own")
-    return load_factory(BUILT_IN[agent])
+        return own_controller(agent, agent)
+    if agent not in ROSTER:
+        raise command_line.UsageError(
+            f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, and MODULE:FACTORY of your "
+            "own"
+        )
+    return ROSTER[agent]
 
 
 def _has_screen() -> bool:
@@ -235,4 +229,4 @@ def _has_screen() -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(None))

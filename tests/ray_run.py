@@ -5,7 +5,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from benchmarks.fan_out import CellsFailedError, FanOut
+from benchmarks.lib.fan_out import CellsFailedError, FanOut
 from tests import cells
 
 scratch = Path(sys.argv[1])

@@ -354,7 +354,7 @@ class TestSimc:
     @pytest.mark.parametrize(
         ("name", "value"),
         [
-            ("gain", 0.6), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
+            ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
             ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0),
         ],
     )  # fmt: skip

@@ -7,19 +7,13 @@ import pandas as pd
 import pytest
 
 from agents import DirectNNController
-from benchmarks import claims, evidence, ledger
-from benchmarks.experiments import (
-    Draws,
-    converged_at,
-    fail_node,
-    join,
-    mean_error,
-    settled,
-    split,
-)
-from benchmarks.ledger import Entry, Finding, Verdict, verdict
+from benchmarks.claims import __main__ as claims
+from benchmarks.claims import examinations, verdicts
+from benchmarks.claims.runs import Batch, converged_at, fail_node
+from benchmarks.claims.verdicts import Entry, Finding, Verdict, verdict
+from benchmarks.lib.statistics import Estimate
+from benchmarks.metrics import join, mean_error, settled, split
 from benchmarks.rollout import Trajectory
-from benchmarks.statistics import Estimate
 
 
 def finding(low, high, **bounds):
@@ -66,23 +60,23 @@ class TestVerdicts:
     def test_verdicts(self, findings, expected):
         assert verdict(findings) is expected
 
-    def test_ledger_by_hand(self):
+    def test_verdicts_by_hand(self):
         entries = [
             Entry("good", "Section 1", "It is good", "By looking.", (GOOD, INFORMATION)),
             Entry("none", "Section 2", "It cannot be", "Not at all.", ()),
         ]
-        table = ledger.table(entries)
+        table = verdicts.table(entries)
         assert list(table["claim"]) == ["good", "good", "none"]
         assert list(table["shown"])[:2] == ["yes", ""]
         assert list(table["criterion"])[:2] == ["at least 1", ""]
-        page = ledger.markdown(entries, "a command")
+        page = verdicts.markdown(entries, "a command")
         assert "| It is good   | holds" in page
         assert "| It cannot be | cannot be tested from the text |" in page
         assert "| 1.500   | 1.000 to 2.000" in page
 
     def test_numbers_as_people_read_them(self):
         numbers = (0.12345, 12.345, 1234.5, math.inf, -math.inf)
-        written = [ledger.write_number(value) for value in numbers]
+        written = [verdicts.write_number(value) for value in numbers]
         assert written == ["0.123", "12.3", "1,234", "never", "?"]
 
 
@@ -169,11 +163,11 @@ class TestFailure:
 
     @pytest.mark.parametrize("stuck_at", [0, 1])
     def test_it_does_not_heal(self, stuck_at):
-        draws = Draws(3)
-        network = draws.network()
+        batch = Batch(3)
+        network = batch.network()
         fail_node(network, stuck_at)
         before = network.weights
-        draws.run(network, 300, setpoint=5.0)
+        batch.run(network, 300, setpoint=5.0)
         after = network.weights
         np.testing.assert_allclose(before.W[:, 0], after.W[:, 0], atol=1e-300)
         np.testing.assert_array_equal(before.theta_1[:, 0], after.theta_1[:, 0])
@@ -185,13 +179,13 @@ class TestPlants:
     def test_poles_of_a_pi_loop(self, kp, ki):
         # A linear loop's swings grow or die by its largest pole in each sample. This loop is
         # linear: it has no dead zone and stays far from the limits.
-        y = Draws(1).run_pi(kp, ki, 2000, dead_zone=0.0, setpoint=0.01).output[:, 0]
+        y = Batch(1).run_pi(kp, ki, 2000, dead_zone=0.0, setpoint=0.01).output[:, 0]
         growth = np.ptp(y[-200:]) / np.ptp(y[800:1000])
-        assert growth == pytest.approx(evidence.largest_pole(kp, ki) ** 1000, rel=0.05)
+        assert growth == pytest.approx(examinations.largest_pole(kp, ki) ** 1000, rel=0.05)
 
 
 def run_claims(out, *options):
-    return claims.main([*map(str, options), "--draws", "8", "--out", str(out)])
+    return claims.main([*map(str, options), "--runs", "8", "--out", str(out)])
 
 
 QUICK = ("direction", "convergence", "figures")
@@ -211,19 +205,19 @@ class TestCommand:
         for shown in (page, capsys.readouterr().out):
             assert "cannot be tested from the text" in shown
 
-    def test_same_seed_same_ledger(self, tmp_path):
+    def test_same_seed_same_verdicts(self, tmp_path):
         for name in ("one", "two"):
             run_claims(tmp_path / name, "noise")
         one, two = ((tmp_path / name / "claims.csv").read_text() for name in ("one", "two"))
         assert one == two
         assert "holds" in one or "does not hold" in one
 
-    def test_other_draws_other_numbers(self):
+    def test_other_seeds_other_numbers(self):
         first, second = (
-            mean_error(Draws(4, seed).run_nn(200, noise_variance=0.5)) for seed in (0, 4)
+            mean_error(Batch(4, seed).run_nn(200, noise_variance=0.5)) for seed in (0, 4)
         )
         assert not set(first) & set(second)
-        networks = [Draws(4, seed).network().weights.theta_2 for seed in (0, 4)]
+        networks = [Batch(4, seed).network().weights.theta_2 for seed in (0, 4)]
         assert not set(networks[0]) & set(networks[1])
 
     def test_interrupted(self, tmp_path, monkeypatch, capsys):
@@ -231,7 +225,7 @@ class TestCommand:
             raise KeyboardInterrupt
 
         interrupted = dict(claims.CLAIMS)
-        interrupted["noise"] = evidence.Claim("noise", "", "", "", stop)
+        interrupted["noise"] = examinations.Claim("noise", "", "", "", stop)
         monkeypatch.setattr(claims, "CLAIMS", interrupted)
         assert run_claims(tmp_path, "direction", "noise") == 130
         assert "Interrupted" in capsys.readouterr().out
@@ -244,7 +238,7 @@ class TestCommand:
 
     @pytest.mark.parametrize("name", claims.CLAIMS)
     def test_every_claim_is_examined(self, name):
-        results = claims.CLAIMS[name].examine(Draws(6, 500))
+        results = claims.CLAIMS[name].examine(Batch(6, 500))
         assert verdict(results.findings) is Verdict.UNTESTABLE or any(
             finding.criterion for finding in results.findings
         )

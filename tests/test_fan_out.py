@@ -1,5 +1,6 @@
 """Fan-out: nothing depends on where and when cells run, and nothing that is done is lost."""
 
+import argparse
 import importlib.util
 import json
 import os
@@ -16,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import command_line, fan_out
-from benchmarks.fan_out import CellsFailedError, FanOut
+from benchmarks.lib import command_line, fan_out
+from benchmarks.lib.fan_out import CellsFailedError, FanOut
 from tests import cells
 
 ROOT = Path(__file__).parent.parent
@@ -92,7 +93,7 @@ class TestResume:
     def test_a_killed_run_goes_on_where_it_was(self, tmp_path, calls):
         program = (
             "import sys; from functools import partial; from pathlib import Path\n"
-            "from benchmarks.fan_out import FanOut; from tests import cells\n"
+            "from benchmarks.lib.fan_out import FanOut; from tests import cells\n"
             "out, calls = map(Path, sys.argv[1:])\n"
             "work = {f'plant {i}': partial(cells.draw, i, calls, 0.2) for i in range(40)}\n"
             "FanOut(2).run(work, out, progress=False)"
@@ -162,7 +163,7 @@ class TestFailures:
 
 class TestOptions:
     def parse(self, *options):
-        parser = command_line.parser("x", None)
+        parser = argparse.ArgumentParser()
         command_line.add_fan_out(parser, "cells")
         return command_line.fan_out(parser.parse_args(options))
 
@@ -257,7 +258,7 @@ class TestRay:
         assert "no such plant as 1" in out["errors"]["the fault"]
 
     def test_without_a_cluster_it_says_how_to_start_one(self):
-        program = "from benchmarks.fan_out import FanOut; FanOut(2, 'ray')"
+        program = "from benchmarks.lib.fan_out import FanOut; FanOut(2, 'ray')"
         done = subprocess.run(
             [sys.executable, "-c", program],
             env=self.environment(free_port()), cwd=ROOT, timeout=60, capture_output=True,

@@ -9,10 +9,10 @@ from scipy import integrate, stats
 
 from agents import PIController
 from benchmarks import limits
-from benchmarks.experiments import mean_error
+from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.limits import least_error, minimum_variance, scenario_limit
-from benchmarks.mpc import PredictiveController
-from benchmarks.rollout import Trajectory, make_plants, rollout
+from benchmarks.metrics import mean_error
+from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import SCENARIOS, Scenario, plain
 from mptc_gym import MiddlePointEnv, Parameters
 from tests.conftest import run
@@ -146,14 +146,6 @@ class TestNoise:
         assert variance[19:] == pytest.approx(minimum_variance(plant))
         later = limits._unknown_variance(plant, 40, from_rest=False)
         assert later == pytest.approx(np.full(40, minimum_variance(plant)))
-
-    def test_harris_index(self):
-        plant = Parameters(noise_variance=0.5)
-        setpoint = np.repeat([[5.0], [-5.0]], 100, axis=0)
-        output = setpoint + np.where(np.arange(200) % 100 < 50, 99.0, 2.0)[:, np.newaxis]
-        still = np.zeros_like(setpoint)
-        runs = Trajectory(setpoint, output, still, still, still)
-        assert limits.harris_index(runs, plant) == pytest.approx(minimum_variance(plant) / 4)
 
 
 class TestPredictiveController:

@@ -1,6 +1,7 @@
 """The layout: who imports whom, what an import loads, and the README."""
 
 import ast
+import graphlib
 import re
 import subprocess
 import sys
@@ -59,10 +60,51 @@ def test_top_level_holds_what_the_layout_says():
     }  # fmt: skip
 
 
+def modules() -> dict[str, Path]:
+    """Return the modules of benchmarks by name."""
+    files = (ROOT / "benchmarks").rglob("*.py")
+    names = {path.relative_to(ROOT).with_suffix(""): path for path in files}
+    return {
+        ".".join(name.parts).removesuffix(".__init__"): path for name, path in names.items()
+    }
+
+
+def imports_between_modules() -> dict[str, set[str]]:
+    """Return which modules of benchmarks each of them imports, also within functions."""
+    known = modules()
+    found = {}
+    for name, path in known.items():
+        targets = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                targets |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                within = {f"{node.module}.{alias.name}" for alias in node.names}
+                targets |= within & set(known) or {node.module}
+        found[name] = (targets & set(known)) - {name}
+    return found
+
+
+def test_no_import_circle():
+    try:
+        list(graphlib.TopologicalSorter(imports_between_modules()).static_order())
+    except graphlib.CycleError as error:
+        pytest.fail(f"these import each other: {' <- '.join(error.args[1])}")
+
+
+def test_questions_do_not_import_each_other():
+    # What several need is beside them, in controllers/, train/ or lib/.
+    questions = {"compare", "sweep", "tune", "identify", "examples"}
+    for name, targets in imports_between_modules().items():
+        own = name.split(".")[1] if "." in name else ""
+        others = {target.split(".")[1] for target in targets if "." in target} & questions
+        assert others <= {own}, name
+
+
 PAGES = [
-    ROOT / "README.md",
-    *(ROOT / "benchmarks").glob("*.md"),
-    ROOT / "benchmarks" / "examples" / "README.md",
+    path
+    for path in (ROOT / "README.md", *ROOT.glob("[!.]*/**/*.md"))
+    if "published" not in path.parts and not path.is_relative_to(ROOT / "results")
 ]
 EXAMPLES = [
     example
@@ -80,7 +122,7 @@ def test_examples_of_the_readme_run(example, monkeypatch, tmp_path):
     exec(example.replace("300_000", "2_000"), {})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_what_a_page_links_to_is_there(page):
     targets = re.findall(r"\]\(([^)]*)\)", page.read_text("utf-8"))
     for target in targets:

@@ -1,18 +1,17 @@
 """Training PPO: resumed, cached, validated, and seeded."""
 
-import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 
-from benchmarks import ppo, training_time
-from benchmarks.fan_out import FanOut
+from benchmarks.controllers.roster import Training
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.train import ppo
 from mptc_gym import Parameters
-from tests.budget import SMALL
+from tests.small_training import SMALL
 
 
 @pytest.fixture(autouse=True)
@@ -130,7 +129,7 @@ class TestPPO:
     def test_a_policy_for_many_plants(self, tmp_path):
         arguments = replace(SMALL, steps=256, **ppo.RANDOMISED)
         train(tmp_path, arguments)
-        kept = ppo.kept_policy(tmp_path)
+        kept = ppo.Policy(arguments, tmp_path)
         assert kept.observation == arguments.observation
         assert kept.observation["action_window"] == 38
         size = Parameters(**arguments.training).observation_size
@@ -183,24 +182,24 @@ class TestPPO:
 
 class TestTrained:
     def members(self, folder, jobs, *, retrain=False):
-        trained = ppo.Trained(
-            SMALL, folder, policies=2, fan_out=FanOut(jobs), retrain=retrain, progress=False
-        )
-        return trained, trained.members()
+        training = Training(FanOut(jobs), folder, members=2, retrain=retrain)
+        ppo._loaded.cache_clear()
+        return ppo.members(training, SMALL)
 
     def test_side_by_side_is_one_after_the_other(self, tmp_path, monkeypatch):
         monkeypatch.undo()  # other processes would not know of it
-        one, ones = self.members(tmp_path / "one", jobs=1)
-        _, twos = self.members(tmp_path / "two", jobs=2)
-        for first, second in zip(ones, twos, strict=True):
-            assert torch.equal(weights(first._model), weights(second._model))
-        assert not torch.equal(weights(ones[0]._model), weights(ones[1]._model))
-        assert [used["arguments"]["seed"] for used in one.used] == [0, 1]
-        assert set(one.curves["policy"]) == {0, 1}
+        ones = self.members(tmp_path / "one", jobs=1)
+        twos = self.members(tmp_path / "two", jobs=2)
+        first, second, third, fourth = (weights(policy()._model) for policy in (*ones, *twos))
+        assert torch.equal(first, third)
+        assert torch.equal(second, fourth)
+        assert not torch.equal(first, second)
+        assert [policy.provenance["arguments"]["seed"] for policy in ones] == [0, 1]
+        assert [len(policy.curve) for policy in ones] == [1, 1]
+        assert "0.001024 M a policy" in ones[0].account.samples
 
     def test_only_what_is_missing_is_trained(self, tmp_path, monkeypatch):
-        one, _ = self.members(tmp_path, jobs=1)
-        folders = [Path(used["folder"]) for used in one.used]
+        folders = [policy.folder for policy in self.members(tmp_path, jobs=1)]
         stamps = [(folder / "policy.zip").stat().st_mtime_ns for folder in folders]
         (folders[1] / "policy.zip").unlink()
         self.members(tmp_path, jobs=1)
@@ -216,58 +215,3 @@ class TestTrained:
         )  # as on a machine with folders of its own
         with pytest.raises(FileNotFoundError, match="must share"):
             self.members(tmp_path, jobs=1)
-
-
-class TestTrainingTime:
-    def test_training_ends_with_the_quality(self, monkeypatch):
-        monkeypatch.setattr(training_time, "QUALITY", 100.0)
-        soon = training_time.train(SMALL, one_by_one=False)
-        monkeypatch.setattr(training_time, "QUALITY", 0.0)
-        assert 0 < soon < training_time.train(SMALL, one_by_one=True) == math.inf
-
-    def test_training_goes_on_until_then(self, monkeypatch):
-        points = []
-        monkeypatch.setattr(
-            training_time.Until, "reached", property(lambda keeper: len(keeper.curve) == 2)
-        )
-        record = ppo.Keeper.record
-        monkeypatch.setattr(
-            ppo.Keeper, "record", lambda keeper: (record(keeper), points.append(keeper))
-        )
-        training_time.train(SMALL, one_by_one=False)
-        assert [point["steps"] for point in points[-1].curve] == [256, 512]
-
-    def test_both_ways_train_the_same_policy(self, monkeypatch):
-        seen = []
-
-        def see(keeper):
-            seen.append(weights(keeper.model))
-            return False
-
-        monkeypatch.setattr(training_time.Until, "reached", property(see))
-        for one_by_one in (True, False):
-            training_time.train(SMALL, one_by_one=one_by_one)
-        assert torch.equal(seen[len(seen) // 2 - 1], seen[-1])
-
-    def test_it_runs(self, monkeypatch, capsys):
-        monkeypatch.setattr(training_time, "QUALITY", 100.0)
-        monkeypatch.setattr(ppo, "PPOArguments", lambda: SMALL)
-        training_time.main(["--seeds", "2", "--one-by-one", "4", "--at-once", "2", "8"])
-        shown = capsys.readouterr().out
-        for words in ("one by one, 4", "at once, 2", "at once, 8", "seed 1", "median"):
-            assert words in shown
-
-    def test_an_interrupted_run_shows_what_has_finished(self, monkeypatch, capsys):
-        times = iter([12.5, math.inf, 14.5])
-
-        def train(arguments, *, one_by_one):
-            for seconds in times:
-                return seconds
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(training_time, "train", train)
-        assert training_time.main(["--one-by-one", "4", "--at-once", "2"]) == 130
-        rows = [line.split() for line in capsys.readouterr().out.splitlines()]
-        assert ["seed", "0", "12.5", "never"] in rows
-        assert ["seed", "1", "14.5"] in rows
-        assert ["median", "13.5", "never"] in rows

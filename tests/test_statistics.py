@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.statistics import (
+from benchmarks.lib.statistics import (
     bootstrap,
     exact,
     improvement,

@@ -6,11 +6,21 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import robustness, sweep
-from benchmarks.robustness import SPANS, agent_cell, grid, limit_cell, random_design
+from benchmarks.controllers import commissioned
+from benchmarks.controllers.engineered import simc_pi
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.sweep import __main__ as sweep
+from benchmarks.sweep import cells, plants, report
+from benchmarks.sweep.cells import agent_cell, limit_cell
+from benchmarks.sweep.plants import SPANS, grid, random_design
 from mptc_gym import Parameters
 
 NOMINAL = {"delay": 18}
+
+
+def run_cell(agent, plant, *numbers):
+    (factory,) = ROSTER[agent].members_in_service()
+    return agent_cell(factory, {}, plant, *numbers)
 
 
 class TestDesigns:
@@ -46,7 +56,7 @@ class TestDesigns:
 
 class TestCells:
     def test_no_control_leaves_the_error_at_the_set_point(self):
-        cell = agent_cell("nothing", NOMINAL, 1200, 2, 0)
+        cell = run_cell("nothing", NOMINAL, 1200, 2, 0)
         assert cell["mae"] == cell["late"] == [5.0, 5.0]
         assert cell["swing"] == [0.0, 0.0]
 
@@ -54,7 +64,7 @@ class TestCells:
         # Two stretches, of 1, 3 and of 10, 10, 10, 16: variances 1 and 6.75.
         error = np.array([[9.0], [1.0], [3.0], [9.0], [10.0], [10.0], [10.0], [16.0], [9.0]])
         steady = np.array([0, 1, 1, 0, 1, 1, 1, 1, 0], dtype=bool)
-        assert robustness._swing(error, steady) == pytest.approx([np.sqrt(7.75 / 2)])
+        assert cells._swing(error, steady) == pytest.approx([np.sqrt(7.75 / 2)])
 
     def test_the_limit_is_that_of_the_plant_and_none_for_one_that_drifts(self):
         nominal = limit_cell(NOMINAL, 1200)["mae"]
@@ -63,8 +73,8 @@ class TestCells:
         assert limit_cell({"gain_drift": 1.2}, 1200) == {"mae": None}
 
     def test_a_frozen_network_does_not_learn_and_starts_from_what_was_learnt(self):
-        learning = robustness.network(3, 0, learning=True)
-        frozen = robustness.network(3, 0, learning=False)
+        learning = commissioned.learning_network(3, 0)
+        frozen = commissioned.frozen_network(3, 0)
         np.testing.assert_array_equal(learning.weights.W, frozen.weights.W)
         before = frozen.weights.W.copy()
         for each in (learning, frozen):
@@ -73,13 +83,13 @@ class TestCells:
         np.testing.assert_array_equal(frozen.weights.W, before)
         assert not np.array_equal(learning.weights.W, before)
         # Commissioned, it knows the plant: better than one that begins to learn.
-        commissioned = agent_cell("nn-frozen", NOMINAL, 1200, 3, 0)["mae"]
-        assert np.median(commissioned) < 1.6
+        experienced = run_cell("nn-frozen", NOMINAL, 1200, 3, 0)["mae"]
+        assert np.median(experienced) < 1.6
 
     def test_a_loop_with_too_much_delay_oscillates(self):
-        slow = agent_cell("pi", {"delay": 40}, 1200, 1, 0)
-        assert slow["swing"][0] > sweep.OSCILLATES
-        calm = agent_cell("pi-simc", NOMINAL, 1200, 1, 0)
+        slow = run_cell("pi", {"delay": 40}, 1200, 1, 0)
+        assert slow["swing"][0] > report.OSCILLATES
+        calm = run_cell("pi-simc", NOMINAL, 1200, 1, 0)
         assert calm["swing"][0] < 0.2
 
 
@@ -114,8 +124,8 @@ class TestSweep:
         pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "runs.csv"), runs)
 
     def test_grid(self, tmp_path, monkeypatch):
-        monkeypatch.setitem(robustness.GRID, "delay", range(10, 22, 10))
-        monkeypatch.setitem(robustness.GRID, "gain_factor", np.array([1.0, 1.2]))
+        monkeypatch.setitem(plants.GRID, "delay", range(10, 22, 10))
+        monkeypatch.setitem(plants.GRID, "gain_factor", np.array([1.0, 1.2]))
         assert run_sweep(tmp_path, "--design", "grid") == 0
         runs = pd.read_csv(tmp_path / "runs.csv")
         assert set(zip(runs["delay"], runs["gain_factor"], strict=True)) == {
@@ -137,10 +147,13 @@ class TestSweep:
         assert len(list((tmp_path / "cells").rglob("nn *.json"))) == 2
 
 
-def _fails_on_pi(agent, *arguments, **others):
-    if agent == "pi-simc":
+def _fails_on_pi(factory, *arguments, **others):
+    if factory is simc_pi:
         raise RuntimeError("no luck")
-    return agent_cell(agent, *arguments, **others)
+    return agent_cell(factory, *arguments, **others)
+
+
+_fails_on_pi.__module__ = agent_cell.__module__
 
 
 class TestFindings:
@@ -164,7 +177,7 @@ class TestFindings:
         return pd.DataFrame(rows)
 
     def test_differences(self):
-        table = sweep._differences(self.runs()).set_index("plants")
+        table = report._differences(self.runs()).set_index("plants")
         pair = "NN - PI, SIMC"
         assert table.loc["no drift", pair] == "-0.500 [-0.500, -0.500] (100 %)"
         assert table.loc["gain falls to less than 0.8 times", pair].startswith("-0.500")
@@ -175,6 +188,6 @@ class TestFindings:
         assert table.loc["gain stays within 0.8 to 1.25 times", pair] == ""
 
     def test_overview(self):
-        table = sweep._overview(self.runs()).set_index("controller")
+        table = report._overview(self.runs()).set_index("controller")
         assert table.loc["NN, frozen", "ratio, median"] == "2.00"
         assert table.loc["NN", "oscillates (%)"] == "5.0"

@@ -10,10 +10,15 @@ import pytest
 
 from agents import DirectNNController, PIController
 from agents.pi import SEARCHED_GAINS
-from benchmarks import compare, ppo, scenarios, tune
-from benchmarks.experiments import Draws
-from benchmarks.fan_out import FanOut
-from tests.budget import SMALL
+from benchmarks import scenarios
+from benchmarks.claims.runs import Batch
+from benchmarks.compare import comparison
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.train import ppo
+from benchmarks.tune import __main__ as command
+from benchmarks.tune import search as tune
+from tests.small_training import SMALL
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -21,25 +26,25 @@ optuna.logging.set_verbosity(optuna.logging.WARNING)
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Few runs for the finalists, and a sampler that learns soon."""
-    for name, subject in tune.SUBJECTS.items():
-        small = replace(subject, finalists=2, startup=4)
-        monkeypatch.setitem(tune.SUBJECTS, name, small)
-    monkeypatch.setattr(tune, "FINAL_DRAWS", 3)
+    for name in command.TUNED:
+        tuning = replace(ROSTER[name].tuning, finalists=2, startup=4)
+        monkeypatch.setitem(ROSTER, name, replace(ROSTER[name], tuning=tuning))
+    monkeypatch.setattr(tune, "FINAL_RUNS", 3)
 
 
 def run_tune(out, controller="pi", trials=6, jobs=1):
-    options = ["--trials", str(trials), "--draws", "2", "--out", str(out), "--jobs", str(jobs)]
-    return tune.main([controller, *options])
+    options = ["--trials", str(trials), "--runs", "2", "--out", str(out), "--jobs", str(jobs)]
+    return command.main([controller, *options])
 
 
 class TestScore:
     def test_scenarios_and_seeds_are_met_by_no_comparison(self):
         compared = [scenario.parameters for scenario in scenarios.SCENARIOS.values()]
         assert not any(scenario.parameters in compared for scenario, _ in tune.SCENARIOS)
-        assert compare.SEED + 100_000 < tune.FIRST_RUN < tune.FINAL_RUN
+        assert comparison.SEED + 100_000 < tune.FIRST_RUN < tune.FINAL_FIRST_RUN
 
     def test_an_idle_controller_pays_for_not_settling(self):
-        score = tune.score(partial(PIController, kp=0.0, ki=0.0), draws=2, first_run=0)
+        score = tune.score(partial(PIController, kp=0.0, ki=0.0), runs=2, first_run=0)
         assert score["constant"] == pytest.approx(4.8)  # all of the set point, all the time
         assert score["learnt"] == pytest.approx(5.2)
         assert score["not converged"] == 1.0
@@ -47,21 +52,21 @@ class TestScore:
         assert score["objective"] == pytest.approx(np.mean(medians) + 5.0)
 
     def test_what_comes_before_the_first_sample_does_not_count(self):
-        score = tune.score(PIController, draws=1, first_run=0)
+        score = tune.score(PIController, runs=1, first_run=0)
         scenario, first = {s.name: (s, n) for s, n in tune.SCENARIOS}["learnt"]
-        runs = Draws(1).run(PIController(), scenario.samples, **scenario.arguments)
+        runs = Batch(1).run(PIController(), scenario.samples, **scenario.arguments)
         error = np.abs(runs.setpoint - runs.output)
         assert score["learnt"] == pytest.approx(error[first:].mean())
         assert score["learnt"] != pytest.approx(error.mean())
 
     def test_the_defaults_converge(self):
-        score = tune.score(DirectNNController, draws=20, first_run=0)
+        score = tune.score(DirectNNController, runs=20, first_run=0)
         assert score["not converged"] == 0.0
         assert score["objective"] < 1.5
 
     def test_the_first_run_is_honoured(self):
         first, again, other = (
-            tune.score(DirectNNController, draws=2, first_run=run) for run in (0, 0, 7)
+            tune.score(DirectNNController, runs=2, first_run=run) for run in (0, 0, 7)
         )
         assert first == again
         assert first["noise"] != other["noise"]
@@ -71,7 +76,7 @@ class TestSearch:
     @pytest.mark.parametrize("controller", ["nn", "pi"])
     def test_files(self, controller, tmp_path, capsys):
         assert run_tune(tmp_path, controller) == 0
-        space = tune.SUBJECTS[controller].space
+        space = ROSTER[controller].tuning.space
         table = pd.read_csv(tmp_path / f"{controller}.csv")
         assert len(table) == 6
         for name, (low, high) in space.items():
@@ -82,13 +87,13 @@ class TestSearch:
 
     def test_finalists_are_judged_rounded_on_new_runs(self, tmp_path):
         run_tune(tmp_path)
-        search = tune.Search("pi", 2, tmp_path, FanOut(1))
+        search = tune.Search(ROSTER["pi"], 2, tmp_path, FanOut(1))
         report = search.report(6)
         assert len(report) == 2
         for _, best in report.iterrows():
             gains = {name: float(f"{best[name]:.3g}") for name in ("kp", "ki")}
             assert (best["kp"], best["ki"]) == tuple(gains.values())
-            again = tune.score(partial(PIController, **gains), 3, tune.FINAL_RUN)
+            again = tune.score(partial(PIController, **gains), 3, tune.FINAL_FIRST_RUN)
             assert best["objective"] == again["objective"]
             assert best["objective"] != best["in the search"]
 
@@ -138,33 +143,31 @@ class TestSearch:
     def test_another_search_is_not_continued(self, tmp_path, capsys):
         run_tune(tmp_path)
         with pytest.raises(SystemExit):
-            tune.main(["pi", "--trials", "6", "--draws", "3", "--out", str(tmp_path)])
-        assert "other draws" in capsys.readouterr().err
+            command.main(["pi", "--trials", "6", "--runs", "3", "--out", str(tmp_path)])
+        assert "other runs" in capsys.readouterr().err
         assert len(pd.read_csv(tmp_path / "pi.csv")) == 6
 
     def test_defaults_are_in_the_space(self):
         # Those of PPO are not from its search.
         defaults = {"nn": DirectNNController(), "pi": PIController(**SEARCHED_GAINS)}
         for controller, default in defaults.items():
-            for name, (low, high) in tune.SUBJECTS[controller].space.items():
+            for name, (low, high) in ROSTER[controller].tuning.space.items():
                 assert low < getattr(default, name) < high
 
     def test_ppo_is_trained_once_a_trial(self, tmp_path, monkeypatch):
         trained = []
 
-        def policy(arguments, folder):
+        def train(arguments, folder, **_):
             trained.append(arguments)
-            member = partial(ppo.PolicyController, ppo.begin(SMALL))
-            member.observation = arguments.observation
-            return member
 
-        monkeypatch.setattr(ppo, "Policy", policy)
+        monkeypatch.setattr(ppo, "_train", train)
+        monkeypatch.setattr(ppo, "_loaded", lambda folder: ppo.begin(SMALL))
         monkeypatch.setattr(
             tune, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
         )
         assert run_tune(tmp_path, "ppo", trials=2) == 0
-        search = [tune.PPO_SEED + i for i in range(tune.PPO_POLICIES)]
-        final = [tune.FINAL_SEED + i for i in range(tune.FINAL_POLICIES)]
+        search = [ppo.TUNING_SEED + i for i in range(2)]
+        final = [ppo.FINAL_SEED + i for i in range(4)]
         assert [arguments.seed for arguments in trained] == [*search * 2, *final * 2]
         table = pd.read_csv(tmp_path / "ppo.csv")
-        assert list(table["gamma"]) == [trained[0].gamma, trained[tune.PPO_POLICIES].gamma]
+        assert list(table["gamma"]) == [trained[0].gamma, trained[2].gamma]

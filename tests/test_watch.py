@@ -9,10 +9,11 @@ from moviepy import VideoFileClip
 from PIL import Image
 
 from agents import PIController
-from benchmarks import ppo, watch
+from benchmarks import watch
+from benchmarks.train import ppo
 from mptc_gym import MiddlePointEnv, drawing
-from tests.budget import SMALL
 from tests.conftest import run
+from tests.small_training import SMALL
 
 SAMPLES = 40
 

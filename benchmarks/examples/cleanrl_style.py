@@ -6,6 +6,7 @@ on the noise-free square wave, without exploration. Nothing is kept.
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from dataclasses import dataclass, fields
@@ -18,8 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from benchmarks import command_line
-from benchmarks.experiments import mean_error
+from benchmarks.metrics import mean_error
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
@@ -196,7 +196,11 @@ def square_error(agent: Agent) -> float:
 
 def main(arguments: list[str] | None = None) -> int:
     """Train with the arguments of a command line, without the program's name."""
-    parser = command_line.parser("examples.cleanrl_style", __doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.examples.cleanrl_style",
+        description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
     for field in fields(Arguments):
         name = f"--{field.name.replace('_', '-')}"
         # argparse shows a default beside a help text only, be it empty.

@@ -8,6 +8,7 @@ RLlib asks for one version of Gymnasium, and so for a virtual environment of its
 
 from __future__ import annotations
 
+import argparse
 import sys
 from typing import Any
 
@@ -17,8 +18,7 @@ import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.ppo import PPOConfig
 
-from benchmarks import command_line
-from benchmarks.experiments import mean_error
+from benchmarks.metrics import mean_error
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
@@ -55,10 +55,14 @@ def main(arguments: list[str] | None = None) -> int:
     int
         0.
     """
-    parser = command_line.parser("examples.rllib", __doc__)
-    parser.add_argument("--steps", type=command_line.number, default=200_000, help="in all")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.examples.rllib",
+        description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--steps", type=int, default=200_000, help="in all")
     parser.add_argument("--seed", type=int, default=0, help="of policy and exploration")
-    parser.add_argument("--batch", type=command_line.number, default=4000, help="an iteration")
+    parser.add_argument("--batch", type=int, default=4000, help="an iteration")
     options = parser.parse_args(arguments)
 
     config = (

@@ -25,13 +25,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from agents import PIController
-from benchmarks import command_line
-from benchmarks.experiments import mean_error
-from benchmarks.metrics import METRICS
-from benchmarks.plots import STYLE, colours, save
-from benchmarks.ppo import PolicyController
+from benchmarks.lib.drawing import STYLE, colours, save
+from benchmarks.lib.storage import replacing
+from benchmarks.metrics import METRICS, mean_error
 from benchmarks.rollout import Agent, make_plants, rollout
-from benchmarks.storage import replacing
+from benchmarks.train.ppo import PolicyController
 from mptc_gym import Parameters
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC}
@@ -182,13 +180,17 @@ def main(arguments: list[str] | None = None) -> int:
     int
         0.
     """
-    parser = command_line.parser("examples.sb3", __doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.examples.sb3",
+        description=__doc__,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
     parser.add_argument("--algorithm", choices=ALGORITHMS, default="ppo", help="what learns")
-    parser.add_argument("--steps", type=command_line.number, default=300_000, help="a seed")
+    parser.add_argument("--steps", type=int, default=300_000, help="a seed")
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
-    parser.add_argument("--seeds", type=command_line.number, default=1, help="how many")
+    parser.add_argument("--seeds", type=int, default=1, help="how many")
     parser.add_argument(
-        "--interval", type=command_line.number, default=20_000, help="steps between evaluations"
+        "--interval", type=int, default=20_000, help="steps between evaluations"
     )
     parser.add_argument(
         "--env", type=argument, nargs="*", default=[], metavar="NAME=VALUE",

@@ -1,0 +1,38 @@
+"""List the questions, and the command that answers each: `python -m benchmarks`."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pandas as pd
+from rich.console import Console
+
+from benchmarks.lib.tables import on_screen
+
+MAP = Path(__file__).with_name("README.md")
+
+
+def main() -> int:
+    """Print the map: the table of questions at the top of the page beside this file."""
+    lines = [
+        line for line in MAP.read_text(encoding="utf-8").splitlines() if line.startswith("|")
+    ]
+    rows = [
+        [
+            re.sub(r"\[([^]]*)\]\([^)]*\)|`", r"\1", cell.strip())
+            for cell in line[1:-1].split("|")
+        ]
+        for line in lines
+    ]
+    header, _, *questions = rows
+    Console(width=None if sys.stdout.isatty() else 150, highlight=False, markup=False).print(
+        on_screen(pd.DataFrame(questions, columns=header)),
+        "Each command has --help.",
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

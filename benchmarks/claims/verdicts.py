@@ -1,0 +1,197 @@
+"""Claims, what was found about each, and the verdict that follows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import pandas as pd
+
+from benchmarks.lib.statistics import Estimate
+
+
+class Verdict(str, Enum):
+    """What became of a claim."""
+
+    HOLDS = "holds"
+    IN_PART = "holds in part"
+    FAILS = "does not hold"
+    UNTESTABLE = "cannot be tested from the text"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One number, and what a claim asks of it.
+
+    Attributes
+    ----------
+    quantity
+        What was measured.
+    estimate
+        What came out.
+    unit
+        Its unit.
+    at_least, at_most
+        The criterion: bounds that the number must keep. Without one the number is there to be
+        read, and has no part in the verdict.
+    """
+
+    quantity: str
+    estimate: Estimate
+    unit: str = ""
+    at_least: float = -math.inf
+    at_most: float = math.inf
+
+    @property
+    def criterion(self) -> str:
+        """What is asked, in words; empty if nothing is."""
+        asked = []
+        if self.at_least > -math.inf:
+            asked.append(f"at least {self.at_least:g}")
+        if self.at_most < math.inf:
+            asked.append(f"at most {self.at_most:g}")
+        return " and ".join(asked)
+
+    @property
+    def shown(self) -> str:
+        """Whether it keeps the criterion: "yes", "no", "undecided"; empty if nothing is asked.
+
+        It does if the whole interval does, and does not if no part of the interval does.
+        """
+        low, high = self.estimate.low, self.estimate.high
+        if not self.criterion:
+            return ""
+        if self.at_least <= low and high <= self.at_most:
+            return "yes"
+        return "no" if high < self.at_least or low > self.at_most else "undecided"
+
+
+def verdict(findings: Iterable[Finding]) -> Verdict:
+    """Judge a claim by what was found.
+
+    It holds if all that was asked is shown, in part if some of it is, and not at all if nothing
+    is; what is undecided is not shown. A claim that asks for nothing cannot be tested.
+    """
+    shown = [finding.shown == "yes" for finding in findings if finding.shown]
+    if not shown:
+        return Verdict.UNTESTABLE
+    if all(shown):
+        return Verdict.HOLDS
+    return Verdict.IN_PART if any(shown) else Verdict.FAILS
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A claim that has been examined.
+
+    Attributes
+    ----------
+    name
+        Short, for options.
+    section
+        Where the paper makes it.
+    statement
+        The claim in a few words.
+    method
+        How it was tested.
+    findings
+        What came out.
+    """
+
+    name: str
+    section: str
+    statement: str
+    method: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """What became of it."""
+        return verdict(self.findings)
+
+
+def table(entries: Sequence[Entry]) -> pd.DataFrame:
+    """Return one row for each finding, and one for a claim without any."""
+    rows = []
+    for entry in entries:
+        about = {
+            "claim": entry.name,
+            "section": entry.section,
+            "statement": entry.statement,
+            "verdict": entry.verdict.value,
+        }
+        rows += [about | _row(finding) for finding in entry.findings] or [about]
+    frame = pd.DataFrame(rows)
+    # Whole numbers, though a claim without findings has none.
+    return frame.astype({"runs": "Int64"}) if "runs" in frame else frame
+
+
+def _row(finding: Finding) -> dict[str, object]:
+    estimate = finding.estimate
+    return {
+        "quantity": finding.quantity,
+        "unit": finding.unit,
+        "value": estimate.value,
+        "low": estimate.low,
+        "high": estimate.high,
+        "runs": estimate.runs,
+        "criterion": finding.criterion,
+        "shown": finding.shown,
+    }
+
+
+def overview(entries: Sequence[Entry]) -> pd.DataFrame:
+    """Return the verdicts: one row for each claim."""
+    rows = [(entry.name, entry.statement, entry.verdict.value) for entry in entries]
+    return pd.DataFrame(rows, columns=["name", "claim", "verdict"])
+
+
+def write_number(value: float) -> str:
+    """Write a number as people read it: three digits, or 'never'."""
+    if math.isinf(value):
+        return "never" if value > 0 else "?"
+    digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 3
+    return f"{value:,.{digits}f}"
+
+
+def _section(entry: Entry) -> str:
+    rows = [
+        {
+            "measured": finding.quantity + (f" ({finding.unit})" if finding.unit else ""),
+            "value": write_number(finding.estimate.value),
+            "95 % interval": _interval(finding.estimate),
+            "asked": finding.criterion,
+            "shown": f"**{finding.shown}**" if finding.shown == "no" else finding.shown,
+        }
+        for finding in entry.findings
+    ]
+    parts = [
+        f"## {entry.statement}: {entry.verdict.value}",
+        f"{entry.section}. {entry.method}",
+    ]
+    if rows:
+        parts.append(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True))
+    return "\n\n".join(parts)
+
+
+def _interval(estimate: Estimate) -> str:
+    if estimate.runs == 1:
+        return "exact"
+    return f"{write_number(estimate.low)} to {write_number(estimate.high)}"
+
+
+def markdown(entries: Sequence[Entry], command: str) -> str:
+    """Return all verdicts as a Markdown page."""
+    return "\n\n".join(
+        [
+            "# The paper's claims",
+            f"By `{command}`. Every number rests on independent draws of initial weights and "
+            "noise. What a claim asks of a number counts as shown if the whole 95 % interval "
+            "keeps it. A claim holds if all that it asks is shown, and in part if some is.",
+            overview(entries).drop(columns="name").to_markdown(index=False),
+            *(_section(entry) for entry in entries),
+            "",
+        ]
+    )

@@ -1,0 +1,1 @@
+"""How do the controllers compare? `python -m benchmarks.compare`."""

@@ -1,0 +1,114 @@
+"""Compare controllers, all of them on the same noise: `python -m benchmarks.compare --help`."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from benchmarks import plants
+from benchmarks.compare.comparison import Comparison
+from benchmarks.controllers.roster import POLICIES, ROSTER, Training, chosen
+from benchmarks.lib import command_line
+from benchmarks.lib.tables import on_screen
+from benchmarks.scenarios import SCENARIOS, scenarios_of
+
+OUT = Path("results/compare")
+COMPARED = [name for name, controller in ROSTER.items() if controller.compared]
+RUNS = 100
+LONGEST = 60  # characters of a folder's name
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    names = {"nargs": "*", "metavar": "NAME"}
+    add("--agents", default=COMPARED, help="controllers of this repository", **names)
+    add(
+        "--agent",
+        action="append",
+        default=[],
+        metavar="NAME=MODULE:FACTORY",
+        help="a controller of your own, beside those of --agents (may be given more than once)",
+    )
+    add("--scenarios", default=argparse.SUPPRESS, help="cases (default: all)", **names)
+    plants.add_options(parser)
+    add("--runs", type=command_line.number, default=RUNS, help="number of runs of each case")
+    add(
+        "--training-steps",
+        type=command_line.number,
+        default=argparse.SUPPRESS,
+        help="samples of experience of each policy that is trained (default: the training's)",
+    )
+    add(
+        "--policies",
+        type=command_line.number,
+        default=argparse.SUPPRESS,
+        help="how many policies of each controller that is trained (default: the training's)",
+    )
+    command_line.add_fan_out(parser, "trainings")
+    add("--retrain", action="store_true", help="train policies anew")
+    add(
+        "--out",
+        type=Path,
+        default=argparse.SUPPRESS,
+        help=f"folder to write to (default: {OUT}, and a name of its own beside that for a "
+        "comparison of other controllers or cases)",
+    )
+    add("--kept", type=Path, default=POLICIES, help="folder where trained policies are kept")
+
+
+@command_line.command("compare", __doc__, _add_options, width=170)
+def main(options: argparse.Namespace, console: Console) -> str:
+    """Run the comparison and write what it finds."""
+    controllers = chosen(options.agents, options.agent)
+    options.agents = list(controllers)
+    plant = plants.chosen(options)
+    scenarios = scenarios_of(plant.name, plant.arguments) if plant.arguments else SCENARIOS
+    names = getattr(options, "scenarios", list(scenarios))
+    names = command_line.known("--scenarios", names, list(scenarios))
+    if not names:
+        raise command_line.UsageError("--scenarios: none to run")
+    training = Training(
+        command_line.fan_out(options),
+        options.kept,
+        getattr(options, "training_steps", None),
+        getattr(options, "policies", None),
+        options.retrain,
+    )
+    out = getattr(options, "out", None) or _folder(
+        [*controllers] if [*controllers] != COMPARED else [],
+        names if names != [*scenarios] else [],
+        [plant.name] if plant.arguments else [],
+        [f"{options.runs}-runs"] if options.runs != RUNS else [],
+    )
+    comparison = Comparison([scenarios[name] for name in names], options.runs, out, options)
+    try:
+        for controller in controllers.values():
+            comparison.run(controller, training)
+    except BaseException:  # Ctrl-C, too
+        comparison.finish(complete=False)
+        raise
+    report = comparison.finish(complete=True)
+
+    for section in report[:2]:
+        console.print(section.title, *section.text, sep="\n")
+        console.print(on_screen(section.table))
+    return f"The report, tables, data and plots are in {out}/"
+
+
+def _folder(*differences: list[str]) -> Path:
+    """Return a folder that says what was run, where that is not what is run by default."""
+    name = "-".join(part for difference in differences for part in difference)
+    if not name:
+        return OUT
+    name = "".join(c if c.isalnum() or c in "-_." else "-" for c in name)
+    if len(name) > LONGEST:
+        name = f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return OUT.with_name(f"{OUT.name}-{name}")
+
+
+if __name__ == "__main__":
+    sys.exit(main(None))

@@ -1,0 +1,203 @@
+"""Pictures of a comparison, drawn from the tables that it writes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+from benchmarks.controllers.roster import label
+from benchmarks.lib.drawing import COLOURS, STYLE, colours, save
+from benchmarks.metrics import METRICS
+from benchmarks.scenarios import Scenario
+
+
+def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> None:
+    """Draw set point, output and applied input of every agent over time.
+
+    Parameters
+    ----------
+    responses
+        Rows as `tables.summarise_responses` makes them, of all agents.
+    scenario
+        What was run.
+    path
+        The PNG file to write.
+    """
+    parameters = scenario.parameters
+    palette = colours(list(responses["agent"].unique()))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9, 6))
+        above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
+        for agent, rows in responses.groupby("agent", sort=False):
+            _band(above, rows, "output", palette[agent], label(agent))
+            _band(below, rows, "applied", palette[agent], label(agent))
+        minutes = rows["time_s"] / 60
+        above.step(
+            minutes, rows["setpoint"], "k--", linewidth=1, where="post", label="set point"
+        )
+        above.set_ylabel("temperature y (°C)")
+        above.set_title(scenario.title, loc="left")
+        above.legend(loc="upper right", ncols=len(palette) + 1)
+        low, high = above.get_ylim()
+        above.set_ylim(low, high + 0.15 * (high - low))  # room for the legend
+        below.axhspan(
+            -parameters.dead_zone, parameters.dead_zone, color="0.5", alpha=0.15, linewidth=0
+        )
+        below.text(
+            1.005, 0.5, "dead\nzone", transform=below.transAxes, va="center", color="0.4"
+        )
+        for limit in (parameters.u_min, parameters.u_max):
+            below.axhline(limit, color="0.4", linestyle=":", linewidth=1)
+        below.set_ylabel("applied flow u_a (t/h)")
+        below.set_xlabel("time (min)")
+        below.set_xlim(0, minutes.max())
+        save(figure, path)
+
+
+def _band(axes: Axes, rows: pd.DataFrame, signal: str, colour: str, name: str) -> None:
+    minutes = rows["time_s"] / 60
+    step = "post" if signal == "applied" else None
+    axes.fill_between(
+        minutes, rows[f"{signal}_p10"], rows[f"{signal}_p90"], step=step,
+        color=colour, alpha=0.2, linewidth=0,
+    )  # fmt: skip
+    drawstyle = "steps-post" if step else "default"
+    axes.plot(
+        minutes, rows[f"{signal}_median"], color=colour, linewidth=1.2, drawstyle=drawstyle,
+        label=name,
+    )  # fmt: skip
+
+
+def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
+    """Draw the mean errors as points with 95 % intervals; each axis begins at the limit."""
+    with mpl.rc_context(STYLE):
+        figure, panels = _scenario_panels(estimates)
+        shades = colours(list(estimates["agent"].unique()))
+        by_scenario = estimates.groupby("scenario", sort=False)
+        for axes, (_, rows) in zip(panels, by_scenario, strict=True):
+            for place, (_, row) in enumerate(rows.iterrows()):
+                ends = [[row["mean"] - row["mean_low"]], [row["mean_high"] - row["mean"]]]
+                colour = shades[row["agent"]]
+                axes.errorbar(row["mean"], place, xerr=ends, fmt="o", capsize=3, color=colour)
+            axes.set_yticks(range(len(rows)), [label(agent) for agent in rows["agent"]])
+            axes.invert_yaxis()
+            limit, worst = rows["limit"].iloc[0], rows["mean_high"].max()
+            if math.isnan(limit):
+                axes.set_xlim(left=0.0)
+                axes.set_xlabel("mean |e| (°C)")
+                continue
+            # A little to the left of it, so that a point on the limit is whole.
+            axes.axvline(limit, color="0.4", linewidth=1)
+            axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
+            axes.set_xlabel("mean |e| (°C), from the least possible on")
+        save(figure, path)
+
+
+def plot_runs(runs: pd.DataFrame, path: Path) -> None:
+    """Draw the mean error of every single run, so that no failure is averaged away."""
+    generator = np.random.default_rng(0)  # scatters points that would hide each other
+    with mpl.rc_context(STYLE):
+        figure, panels = _scenario_panels(runs)
+        shades = colours(list(runs["agent"].unique()))
+        for axes, (_, cases) in zip(panels, runs.groupby("scenario", sort=False), strict=True):
+            agents = list(cases["agent"].unique())
+            for place, agent in enumerate(agents):
+                errors = cases.loc[cases["agent"] == agent, "mae"]
+                around = place + generator.uniform(-0.3, 0.3, len(errors))
+                axes.plot(errors, around, ".", markersize=3, alpha=0.4, color=shades[agent])
+            axes.set_yticks(range(len(agents)), [label(agent) for agent in agents])
+            axes.invert_yaxis()
+            axes.set_xlim(left=0)
+            axes.set_xlabel("mean |e| of a run (°C)")
+        save(figure, path)
+
+
+def _scenario_panels(
+    rows: pd.DataFrame, height: float | None = None
+) -> tuple[Figure, list[Axes]]:
+    names = rows["scenario"].unique()
+    columns = min(3, len(names))
+    height = height or 1.2 + 0.28 * rows["agent"].nunique()
+    lines = math.ceil(len(names) / columns)
+    figure = Figure(figsize=(4.2 * columns, height * lines))
+    panels = list(figure.subplots(lines, columns, squeeze=False).flat)
+    for axes, name in zip(panels, names, strict=False):
+        axes.set_title(name, loc="left")
+    for axes in panels[len(names) :]:
+        axes.set_visible(False)
+    return figure, panels[: len(names)]
+
+
+def plot_travel(summary: pd.DataFrame, limits: Mapping[str, float], path: Path) -> None:
+    """Draw the error of every agent against its valve travel, a panel for each scenario.
+
+    Parameters
+    ----------
+    summary
+        Rows as `tables.summarise` makes them.
+    limits
+        The least possible error of each scenario, degC, or NaN.
+    path
+        The PNG file to write.
+    """
+    medians = summary.pivot_table(
+        index=["scenario", "agent"], columns="metric", values="median", sort=False
+    ).reset_index()
+    with mpl.rc_context(STYLE):
+        figure, panels = _scenario_panels(medians, 3.0)
+        shades = colours(list(medians["agent"].unique()))
+        for axes, (name, rows) in zip(
+            panels, medians.groupby("scenario", sort=False), strict=True
+        ):
+            for _, row in rows.iterrows():
+                agent, travel = row["agent"], max(row["total_variation"], 1.0)
+                axes.plot(travel, row["mae"], "o", color=shades[agent], label=label(agent))
+            axes.axhline(limits[name], color="0.4", linewidth=1, linestyle="--")
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+                axis.set_major_formatter("{x:g}")
+                axis.set_minor_formatter("")
+            axes.set_xlabel("valve travel (t/h)")
+            axes.set_ylabel("mean |e| (°C)")
+        handles, names = panels[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=6)
+        save(figure, path)
+
+
+def plot_learning(curves: pd.DataFrame, path: Path) -> None:
+    """Draw learning curves: mean |e| over samples of experience, a panel for each agent."""
+    shown = {
+        "training_mae": "training: random set points, exploring",
+        "validation_mae": "validation: set points of its own",
+        "square_mae": "square wave, no noise",
+    }
+    agents = list(curves["agent"].unique())
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9, 4.5 * len(agents)))
+        panels = figure.subplots(len(agents), 1, squeeze=False)[:, 0]
+        for axes, agent in zip(panels, agents, strict=True):
+            policies = curves[curves["agent"] == agent].dropna(axis=1, how="all")
+            for (column, name), colour in zip(shown.items(), COLOURS, strict=False):
+                for i, (_, curve) in enumerate(policies.groupby("policy")):
+                    if column in curve:
+                        axes.plot(
+                            curve["steps"] / 1000, curve[column], color=colour,
+                            linewidth=0.8, label=None if i else name,
+                        )  # fmt: skip
+            axes.set_ylim(bottom=0)
+            axes.set_xlim(left=0)
+            axes.set_xlabel("samples of experience (thousands)")
+            axes.set_ylabel(METRICS["mae"])
+            axes.set_title(f"{label(agent)}: a line a policy", loc="left")
+            axes.legend()
+        save(figure, path)

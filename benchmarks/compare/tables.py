@@ -1,0 +1,129 @@
+"""From runs to tables: percentiles over runs, and how they are written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.controllers.roster import label
+from benchmarks.lib.tables import PERCENTILES, percentiles
+from benchmarks.metrics import METRICS
+from benchmarks.rollout import Trajectory
+from benchmarks.scenarios import Scenario
+
+NOT_SETTLED = "not settled"
+NO_MEASURE = "not measured"
+NO_LIMIT = "not known"
+STEP_METRICS = ("overshoot", "settling_time")  # which mean nothing in noise
+
+
+def summarise(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return one row for each scenario, agent and metric: percentiles over the runs."""
+    rows = []
+    for (scenario, agent), group in runs.groupby(["scenario", "agent"], sort=False):
+        for metric in METRICS:
+            row = {"scenario": scenario, "agent": agent, "metric": metric, "runs": len(group)}
+            rows.append(row | percentiles(group[metric].to_numpy()))
+    return pd.DataFrame(rows)
+
+
+def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) -> pd.DataFrame:
+    """Return one row a sample: the set point, and percentiles of y and u_a over the runs.
+
+    Where every run has a set point of its own, the first run stands for all.
+    """
+    if (trajectory.setpoint != trajectory.setpoint[:, :1]).any():
+        trajectory = Trajectory(*(values[:, :1] for values in vars(trajectory).values()))
+    k = np.arange(len(trajectory.setpoint))
+    columns = {
+        "agent": agent,
+        "sample": k,
+        "time_s": k * scenario.parameters.sampling_interval,
+        "setpoint": trajectory.setpoint[:, 0],
+    }
+    for signal in ("output", "applied"):
+        # Values that occurred: between those of the applied input may lie the dead zone.
+        for name, values in percentiles(getattr(trajectory, signal), "nearest").items():
+            columns[f"{signal}_{name}"] = values
+    return pd.DataFrame(columns)
+
+
+def for_csv(table: pd.DataFrame) -> pd.DataFrame:
+    """Write infinite values, which only a settling time can have, in words."""
+    return table.astype(object).where(table != math.inf, NOT_SETTLED)
+
+
+def format_value(metric: str, value: float) -> str:
+    """Write one value of a metric as people read it."""
+    if math.isnan(value):
+        return NO_MEASURE
+    if math.isinf(value):
+        return NOT_SETTLED
+    return f"{value:.3f}" if metric == "mae" else f"{value:,.0f}"
+
+
+def format_cell(row: pd.Series) -> str:
+    """Write the median and, where they differ, the 10th and 90th percentile."""
+    median, p10, p90 = (format_value(row["metric"], row[name]) for name in PERCENTILES)
+    return median if p10 == p90 else f"{median} ({p10} to {p90})"
+
+
+def mae_table(summary: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean absolute errors: a row for each agent, a column for each scenario."""
+    rows = summary[summary["metric"] == "mae"]
+    return _by_agent(rows, rows.apply(format_cell, axis=1))
+
+
+def ratio_table(estimates: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean errors as multiples of the least possible, and what that is."""
+    table = _by_agent(estimates, estimates.apply(_format_ends, axis=1, name="ratio"))
+    limits = estimates.drop_duplicates("scenario").set_index("scenario")["limit"]
+    shown = limits.map(lambda limit: NO_LIMIT if math.isnan(limit) else f"{limit:.3f}")
+    least = {"agent": "least possible (°C)"} | shown.to_dict()
+    return pd.concat([pd.DataFrame([least]), table], ignore_index=True)
+
+
+def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
+    """Return differences to the reference: a row for each other agent."""
+    others = estimates.dropna(subset=["difference"])
+
+    def cell(row: pd.Series) -> str:
+        better = f"{100 * row['improvement']:.0f} %"
+        return f"{_format_ends(row, 'difference', '+.3f')}; {better}"
+
+    return _by_agent(others, others.apply(cell, axis=1))
+
+
+def _format_ends(row: pd.Series, name: str, form: str = ".2f") -> str:
+    if math.isnan(row[name]):
+        return NO_LIMIT
+    value, low, high = (format(row[n], form) for n in (name, f"{name}_low", f"{name}_high"))
+    return value if low == high else f"{value} ({low} to {high})"
+
+
+def _by_agent(rows: pd.DataFrame, cells: pd.Series) -> pd.DataFrame:
+    table = rows.assign(cell=cells).pivot_table(
+        index="agent", columns="scenario", values="cell", aggfunc="first", sort=False
+    )
+    return table.fillna("").rename(index=label).reset_index().rename_axis(columns=None)
+
+
+def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> pd.DataFrame:
+    """Return all other metrics: a row for each scenario and agent, a column for each metric."""
+    rows = []
+    others = summary[summary["metric"] != "mae"].sort_values(
+        "scenario", key=lambda names: names.map(list(scenarios).index), kind="stable"
+    )
+    for (scenario, agent), group in others.groupby(["scenario", "agent"], sort=False):
+        noisy = scenarios[scenario].parameters.range_of("noise_variance")[1] > 0.0
+        cells = {
+            METRICS[row["metric"]]: (
+                "" if noisy and row["metric"] in STEP_METRICS else format_cell(row)
+            )
+            for _, row in group.iterrows()
+        }
+        rows.append({"scenario": scenario, "agent": label(agent)} | cells)
+    return pd.DataFrame(rows)

@@ -1,0 +1,1 @@
+"""How do the paper's figures look here? `python -m benchmarks.figures`."""

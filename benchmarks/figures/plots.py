@@ -1,0 +1,93 @@
+"""Counterparts of the paper's figures, drawn from the curves of a typical run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib as mpl
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchmarks.lib.drawing import COLOURS, STYLE, save
+from mptc_gym import Parameters
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One of the paper's figures, as `plot_figures` draws it.
+
+    Attributes
+    ----------
+    title
+        Its heading.
+    curves
+        What `figures.summarise` returns.
+    signals
+        What to draw of it, each on axes of its own: "output", "command" or "noise".
+    parameters
+        The plant's: dead zone and limits are drawn behind the command.
+    """
+
+    title: str
+    curves: pd.DataFrame
+    signals: tuple[str, ...]
+    parameters: Parameters
+
+
+_SIGNALS = {
+    "output": ("temperature y (°C)", COLOURS[0]),
+    "command": ("command u (t/h)", COLOURS[2]),
+    "noise": ("noise n (°C)", COLOURS[3]),
+}
+
+
+def plot_figures(panels: Sequence[Panel], path: Path) -> None:
+    """Draw figures of the paper: one, or a sheet of several in two columns."""
+    axes_of = [(panel, signal) for panel in panels for signal in panel.signals]
+    columns = min(2, len(panels))
+    rows = math.ceil(len(axes_of) / columns)
+    with mpl.rc_context(STYLE):
+        size = (8, 3 * rows) if columns == 1 else (13, 2.4 * rows)
+        figure = Figure(figsize=size)
+        grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
+        for axes, (panel, signal) in zip(grid.flat, axes_of, strict=False):
+            _draw_signal(axes, panel, signal)
+        used, unused = grid.flat[: len(axes_of)], grid.flat[len(axes_of) :]
+        for axes in used[-columns:]:  # the lowest of each column
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel("time (min)")
+        for axes in unused:
+            axes.set_visible(False)
+        save(figure, path)
+
+
+def _draw_signal(axes: Axes, panel: Panel, signal: str) -> None:
+    curves, parameters = panel.curves, panel.parameters
+    minutes = curves["time_s"] / 60
+    name, colour = _SIGNALS[signal]
+    axes.fill_between(
+        minutes, curves[f"{signal}_p10"], curves[f"{signal}_p90"], color=colour, alpha=0.25,
+        linewidth=0, label="10th to 90th percentile",
+    )  # fmt: skip
+    axes.plot(
+        minutes, curves[f"{signal}_typical"], color=colour, linewidth=1, label="a typical run"
+    )
+    if signal == "output":
+        axes.step(
+            minutes, curves["setpoint"], "k--", linewidth=1, where="post", label="set point"
+        )
+    if signal == "command":
+        zone = parameters.dead_zone
+        axes.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0, label="dead zone")
+        for limit in (parameters.u_min, parameters.u_max):
+            axes.axhline(limit, color="0.4", linestyle=":", linewidth=1)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
+    axes.set_xlim(0, minutes.max())
+    axes.set_ylabel(name)
+    axes.set_title(panel.title, loc="left", fontsize="medium")
+    axes.legend(loc="upper right", ncols=3, fontsize="small")

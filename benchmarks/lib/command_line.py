@@ -1,0 +1,145 @@
+"""What the commands share: options, how they run, and how they end."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+from rich.console import Console
+
+from benchmarks.lib.fan_out import BACKENDS, CellsFailedError, FanOut
+
+Main = Callable[[Sequence[str] | None], int]
+
+
+class UsageError(ValueError):
+    """An option that does not fit. The message names it."""
+
+
+def command(
+    name: str,
+    description: str | None,
+    add_options: Callable[[argparse.ArgumentParser], None],
+    *,
+    width: int = 120,
+    interrupted: str = "what has finished is kept.",
+) -> Callable[[Callable[[argparse.Namespace, Console], str]], Main]:
+    """Make a function the `main` of `python -m benchmarks.<name>`.
+
+    Parameters
+    ----------
+    name
+        Of the command.
+    description
+        Its help text.
+    add_options
+        Adds its options to a parser.
+    width
+        Columns of the console where nothing says how wide it is.
+    interrupted
+        What the user is told after Ctrl-C.
+
+    Returns
+    -------
+    callable
+        A decorator. The function that it takes is called with the options and a console, does
+        the work and returns the closing line. The function that it returns takes the command
+        line without the program's name and returns the exit status: 0; 1 if cells failed; 130
+        if it was interrupted. A `UsageError` ends the program with status 2.
+    """
+
+    def decorate(work: Callable[[argparse.Namespace, Console], str]) -> Main:
+        def main(arguments: Sequence[str] | None = None) -> int:
+            parser = argparse.ArgumentParser(
+                prog=f"python -m benchmarks.{name}",
+                description=description,
+                formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+            )
+            add_options(parser)
+            options = parser.parse_args(arguments)
+            console = Console(
+                width=None if sys.stdout.isatty() else width, highlight=False, markup=False
+            )
+            try:
+                closing = work(options, console)
+            except UsageError as error:
+                parser.error(str(error))
+            except CellsFailedError as error:
+                console.print(str(error))
+                return 1
+            except KeyboardInterrupt:
+                console.print(f"\nInterrupted: {interrupted}")
+                return 130
+            console.print(closing)
+            return 0
+
+        main.__doc__ = work.__doc__
+        return main
+
+    return decorate
+
+
+@contextmanager
+def blame(option: str) -> Iterator[None]:
+    """Turn a ValueError into a `UsageError` that names an option."""
+    try:
+        yield
+    except UsageError:
+        raise
+    except ValueError as error:
+        raise UsageError(f"{option}: {error}") from error
+
+
+def number(text: str) -> int:
+    """Read a number of at least 1; argparse shows this function's name in its complaints."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
+    return value
+
+
+def seed(text: str) -> int:
+    """Read a number of at least 0, as `number` does."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"must be at least 0, got {value}")
+    return value
+
+
+def known(option: str, given: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Return the names that an option lists, with spaces or commas between them, each once.
+
+    Raises
+    ------
+    UsageError
+        If one of them is not among `names`.
+    """
+    chosen = [name for text in given for name in text.split(",") if name]
+    for name in chosen:
+        if name not in names:
+            raise UsageError(f"{option}: no {name!r}; there are {', '.join(names)}")
+    return list(dict.fromkeys(chosen))
+
+
+def add_fan_out(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add the options that say where and how many at once; `what` names what is run."""
+    parser.add_argument(
+        "--jobs",
+        type=number,
+        default=argparse.SUPPRESS,
+        help=f"how many {what} to run at once (default: as many as there are cores)",
+    )
+    parser.add_argument(
+        "--backend",
+        choices=BACKENDS,
+        default=BACKENDS[0],
+        help=f"where to run {what}: loky, on this machine; ray, on a Ray cluster",
+    )
+
+
+def fan_out(options: argparse.Namespace) -> FanOut:
+    """Return the fan-out that the options of `add_fan_out` ask for."""
+    with blame("--backend"):
+        return FanOut(getattr(options, "jobs", None), options.backend)

@@ -1,0 +1,36 @@
+"""The look of all plots: colours, style, and how a figure is saved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from benchmarks.lib.storage import replacing
+
+# Okabe and Ito's colours, which colour-blind readers can tell apart; then darker ones of them.
+COLOURS = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000",
+    "#004B77", "#8A3D00", "#00664B", "#8F4A72",
+)  # fmt: skip
+STYLE = {
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 110,
+    "grid.alpha": 0.3,
+    "legend.frameon": False,
+}
+
+
+def colours(names: Sequence[str]) -> dict[str, str]:
+    """Give each name a colour; the same names in the same order get the same ones."""
+    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure, whole or not at all."""
+    with replacing(path) as partial:
+        figure.savefig(partial)

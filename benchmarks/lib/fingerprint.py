@@ -1,0 +1,123 @@
+"""What makes a kept result valid: a name made of all that shapes it, and of nothing else.
+
+Three things shape a trained policy or a swept cell: its arguments, the code that runs, and the
+environment. Code is every module of this project that the code imports, directly or not,
+without comments and docstrings. Of the environment it is what it does: trajectories. So an
+edited comment keeps a result, and a moved function cannot leave a stale one in use.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import mptc_gym
+from benchmarks.lib.storage import ROOT, versions
+
+PACKAGES = ("agents", "benchmarks")  # whose code counts
+SAMPLES = 60  # of each trajectory
+
+
+def fingerprint(*modules: str, **shaped_by: Any) -> str:
+    """Return a name for what modules compute.
+
+    Parameters
+    ----------
+    *modules
+        Their names. What they import of `agents` and `benchmarks` counts, too.
+    **shaped_by
+        All else that shapes the result, in a form for JSON.
+
+    Returns
+    -------
+    str
+        Sixteen hexadecimal digits.
+    """
+    everything = {
+        **shaped_by,
+        "code": sorted({code(name) for module in modules for name in imported(module)}),
+        "environment": behaviour(),
+        "versions": versions(),
+    }
+    return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@cache
+def behaviour() -> str:
+    """Return a hash of what the environment does: of a trajectory of each preset."""
+    digest = hashlib.sha256()
+    for name, arguments in sorted(mptc_gym.PRESETS.items()):
+        windows = {"output_window": 2, "action_window": 3}
+        plants = gymnasium.make_vec("MiddlePoint-v0", 2, **arguments, **windows)
+        actions = np.random.default_rng(0).uniform(-1.2, 1.2, (SAMPLES, 2, 1))
+        digest.update(name.encode())
+        observation, _ = plants.reset(seed=0)
+        digest.update(observation.tobytes())
+        for action in actions.astype(np.float32):
+            observation, reward, *_ = plants.step(action)
+            digest.update(observation.tobytes() + np.asarray(reward).tobytes())
+        plants.close()
+    return digest.hexdigest()
+
+
+def imported(module: str) -> set[str]:
+    """Return a module's name and those that it imports of `PACKAGES`, directly or not."""
+    found: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in found and _file(name) is not None:
+            found.add(name)
+            waiting += _imports(name)
+    return found
+
+
+@cache
+def code(module: str) -> str:
+    """Return a hash of a module's code without comments, docstrings and layout."""
+    tree = _tree(module)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and _is_docstring(body[0]):
+            node.body = body[1:] or [ast.Pass()]  # type: ignore[attr-defined]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+def _is_docstring(node: ast.AST) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
+def _imports(module: str) -> Iterator[str]:
+    for node in ast.walk(_tree(module)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            # What is imported may be a module itself.
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def _tree(module: str) -> ast.Module:
+    path = _file(module)
+    assert path is not None
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def _file(module: str) -> Path | None:
+    if module.partition(".")[0] not in PACKAGES:
+        return None
+    path = ROOT.joinpath(*module.split("."))
+    candidates = (path.with_suffix(".py"), path / "__init__.py")
+    return next((candidate for candidate in candidates if candidate.is_file()), None)

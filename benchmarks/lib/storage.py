@@ -1,0 +1,64 @@
+"""Files that are either whole or not there, and where results come from."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import mptc_gym
+
+PACKAGES = ("gymnasium", "numpy", "stable_baselines3", "torch")
+ROOT = Path(__file__).parent.parent.parent  # the checkout
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a path to write to, and put what was written in place of `path` at the end.
+
+    After an error, or if the process is killed, `path` is what it was before.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # The suffix stays the last, as some writers choose a format by it or append it.
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all."""
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file, whole or not at all."""
+    write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of those packages that shape a result."""
+    found = {"python": platform.python_version(), "mptc_gym": mptc_gym.__version__}
+    for package in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            found[package] = metadata.version(package)
+    return found
+
+
+def commit() -> str:
+    """Return the commit of this checkout, "-dirty" if files differ, "unknown" without git."""
+    describe = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return done.stdout.strip()

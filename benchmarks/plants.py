@@ -1,0 +1,127 @@
+"""Which plant a command runs on: one of a file, a preset, or single arguments."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.lib.command_line import UsageError, blame
+from mptc_gym import PRESETS, Parameters
+
+NAMES = tuple(field.name for field in dataclasses.fields(Parameters))
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A plant that was asked for.
+
+    Attributes
+    ----------
+    name
+        What was asked for, in a few words; "the paper's plant" if nothing was.
+    arguments
+        Arguments of the environment that are not its defaults.
+    """
+
+    name: str
+    arguments: dict[str, Any]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which plant to run on."""
+    add = parser.add_argument
+    add(
+        "--plant",
+        type=Path,
+        metavar="FILE",
+        help="JSON file with arguments of the environment, as benchmarks.identify writes it",
+    )
+    add("--preset", choices=PRESETS, help="arguments by name, of mptc_gym.PRESETS")
+    add(
+        "--set",
+        action="append",
+        default=[],
+        metavar="ARGUMENT=VALUE",
+        help="an argument of the environment, such as delay=30 or delay=[12,24] (may be given "
+        "more than once; it goes before those of --plant and --preset)",
+    )
+
+
+def chosen(options: argparse.Namespace) -> Plant:
+    """Return the plant that the options of `add_options` ask for.
+
+    Raises
+    ------
+    UsageError
+        If the file, an argument or a value does not fit.
+    """
+    names: list[str] = []
+    arguments: dict[str, Any] = {}
+    if options.preset:
+        names.append(options.preset)
+        arguments |= PRESETS[options.preset]
+    if options.plant:
+        names.append(options.plant.stem)
+        with blame("--plant"):
+            arguments |= read_plant(options.plant)
+    for text in options.set:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise UsageError(f"--set must be ARGUMENT=VALUE, got {text!r}")
+        names.append(text)
+        try:
+            arguments[name] = json.loads(value)
+        except ValueError:
+            arguments[name] = value  # such as random
+    try:
+        Parameters(**arguments)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"--plant, --preset, --set: {error}") from error
+    return Plant(", ".join(names) or "the paper's plant", arguments)
+
+
+def read_plant(path: str | Path) -> dict[str, Any]:
+    """Return the arguments of `MiddlePoint-v0` that a file holds, checked.
+
+    Parameters
+    ----------
+    path
+        A JSON file with one object, whose names are arguments of the environment, such as
+        `plant.json` or `ranges.json` of `python -m benchmarks.identify`.
+
+    Returns
+    -------
+    dict
+        `gymnasium.make("MiddlePoint-v0", **read_plant(path))` takes it.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read, is not JSON, or holds something else; the message names the
+        file, and the argument where there is one.
+    """
+    try:
+        arguments = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:  # not JSON, or not text
+        raise ValueError(f"{path} must be a JSON file: {error}") from error
+    if not isinstance(arguments, dict):
+        raise ValueError(
+            f"{path} must hold one object of arguments, such as "
+            f'{{"delay": 20}}, got {type(arguments).__name__}'
+        )
+    unknown = [name for name in arguments if name not in NAMES]
+    if unknown:
+        raise ValueError(
+            f"{path}: MiddlePoint-v0 has no argument {unknown[0]!r}; it has {', '.join(NAMES)}"
+        )
+    try:
+        Parameters(**arguments)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return arguments

@@ -1,0 +1,1 @@
+"""Where do controllers still work on other plants? `python -m benchmarks.sweep`."""

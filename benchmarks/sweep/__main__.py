@@ -1,0 +1,197 @@
+"""Where controllers still work on other plants: `python -m benchmarks.sweep --help`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Mapping
+from datetime import datetime, timezone
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from benchmarks import plants as plant_options
+from benchmarks.controllers.roster import (
+    POLICIES,
+    ROSTER,
+    Controller,
+    Factory,
+    Training,
+    chosen,
+)
+from benchmarks.lib import command_line
+from benchmarks.lib.fingerprint import fingerprint
+from benchmarks.lib.report import provenance_line, write_report
+from benchmarks.lib.storage import commit, replacing, versions, write_json
+from benchmarks.lib.tables import on_screen
+from benchmarks.sweep.cells import agent_cell, limit_cell
+from benchmarks.sweep.plants import Plant, grid, random_design
+from benchmarks.sweep.report import report, table
+
+SWEPT = [name for name, controller in ROSTER.items() if controller.swept]
+SEED = 0  # of a plant's first run
+NOTHING = "nothing"  # the controller that sets the scale
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--design",
+        choices=("grid", "random"),
+        default="grid",
+        help="grid: 20 delays by 10 gains; random: plants that differ in everything, half of "
+        "which drift",
+    )
+    add("--plants", type=command_line.number, default=200, help="of a random design")
+    add("--design-seed", type=command_line.seed, default=0, help="of a random design")
+    add("--runs", type=command_line.number, default=20, help="of each controller on each plant")
+    add("--samples", type=command_line.number, default=1200, help="length of a run")
+    add("--agents", nargs="*", default=SWEPT, metavar="NAME", help="controllers")
+    add(
+        "--agent",
+        action="append",
+        default=[],
+        metavar="NAME=MODULE:FACTORY",
+        help="a controller of your own, beside those of --agents (may be given more than once)",
+    )
+    plant_options.add_options(parser)
+    add(
+        "--training-steps",
+        type=command_line.number,
+        default=argparse.SUPPRESS,
+        help="samples of experience of each policy that is trained (default: the training's)",
+    )
+    add(
+        "--policies",
+        type=command_line.number,
+        default=argparse.SUPPRESS,
+        help="how many policies of each controller that is trained (default: the training's)",
+    )
+    command_line.add_fan_out(parser, "cells and trainings")
+    add(
+        "--out",
+        type=Path,
+        default=argparse.SUPPRESS,
+        help="folder to write to (default: results/sweep-DESIGN)",
+    )
+    add("--kept", type=Path, default=POLICIES, help="folder where trained policies are kept")
+
+
+@command_line.command(
+    "sweep",
+    "Run controllers on plants that they were not made for. The plant that they were made for "
+    "is the paper's, or that of --plant, --preset or --set; the others differ from it in what "
+    "the design says.",
+    _add_options,
+    width=150,
+    interrupted="what has finished is kept, and the next call goes on.",
+)
+def main(options: argparse.Namespace, console: Console) -> str:
+    """Run the sweep and write what it finds."""
+    controllers = chosen(options.agents, options.agent)
+    nominal = plant_options.chosen(options).arguments
+    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    fan_out = command_line.fan_out(options)
+    out = getattr(options, "out", Path(f"results/sweep-{options.design}"))
+    training = Training(
+        fan_out,
+        options.kept,
+        getattr(options, "training_steps", None),
+        getattr(options, "policies", None),
+    )
+    members = {
+        name: controller.members_in_service(training)
+        for name, controller in {NOTHING: ROSTER[NOTHING], **controllers}.items()
+    }
+    differing = (
+        grid()
+        if options.design == "grid"
+        else random_design(options.plants, options.design_seed, options.samples)
+    )
+    plants = [{**nominal, **plant} for plant in differing]
+    cells = _cells(plants, nominal, options, members)
+    began = time.perf_counter()
+    results = fan_out.run(
+        cells,
+        out / "cells" / _key(plants, nominal, options, controllers, members),
+        title="sweep",
+    )
+    seconds = time.perf_counter() - began
+
+    runs = table(plants, list(controllers), results)
+    sections = report(runs, out, options.design)
+    with replacing(out / "runs.csv") as file:
+        runs.to_csv(file, index=False)
+    origin = {
+        "started": started,
+        "seconds": round(seconds, 1),
+        "options": {name: str(value) for name, value in vars(options).items()},
+        "policies": {
+            name: [member.provenance for member in each]
+            for name, each in members.items()
+            if hasattr(each[0], "provenance")
+        },
+        "versions": versions(),
+        "commit": commit(),
+    }
+    write_json(out / "provenance.json", origin)
+    title = "Controllers on plants that they were not made for"
+    write_report(out, title, sections, provenance_line("sweep", origin))
+    for section in sections:
+        console.print(section.title, *section.text, sep="\n")
+        if section.table is not None:
+            console.print(on_screen(section.table))
+    return f"{len(cells)} cells in {seconds:.0f} s. The report, data and maps are in {out}/"
+
+
+def _cells(
+    plants: list[Plant],
+    nominal: Plant,
+    options: argparse.Namespace,
+    members: Mapping[str, list[Factory]],
+) -> dict[str, Callable[[], Any]]:
+    """Return what is to be run: every controller on every plant, and the limits."""
+    cells: dict[str, Callable[[], Any]] = {}
+    common = {"samples": options.samples, "runs": options.runs, "seed": SEED}
+    for i, plant in enumerate(plants):
+        cells[f"limit {i}"] = partial(limit_cell, plant, options.samples)
+        for name, factories in members.items():
+            # Every plant has its own member, in turn: how much they differ shows in the maps.
+            factory = factories[i % len(factories)]
+            cells[f"{name} {i}"] = partial(agent_cell, factory, nominal, plant, **common)
+    return cells
+
+
+def _key(
+    plants: list[Plant],
+    nominal: Plant,
+    options: argparse.Namespace,
+    controllers: Mapping[str, Controller],
+    members: Mapping[str, list[Factory]],
+) -> str:
+    """Return a name made of everything that shapes the cells' results."""
+    locations = {
+        name: controller.in_service or controller.factory
+        for name, controller in controllers.items()
+    }
+    modules = {location.partition(":")[0] for location in locations.values() if location}
+    return fingerprint(
+        agent_cell.__module__,
+        *sorted(modules),
+        options=[options.runs, options.samples],
+        plants=plants,
+        nominal=nominal,
+        controllers=locations,
+        policies={
+            name: [member.provenance for member in each]
+            for name, each in members.items()
+            if hasattr(each[0], "provenance")
+        },
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(None))

@@ -1,0 +1,77 @@
+"""What is run on each plant of a sweep: every controller, and the limit."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.controllers.roster import Factory, build, observation
+from benchmarks.limits import scenario_limit, steady_stretches
+from benchmarks.metrics import mean_error
+from benchmarks.rollout import make_plants, rollout
+from benchmarks.scenarios import Scenario
+from benchmarks.sweep.plants import SETPOINT, Plant
+from mptc_gym import Parameters
+
+
+def limit_cell(plant: Plant, samples: int) -> dict[str, float | None]:
+    """Return the least mean |e| that is possible on a plant, degC; None if it is not known."""
+    try:
+        limit = scenario_limit(Scenario("", "", samples, {**plant, **SETPOINT}))
+    except ValueError:  # it drifts
+        return {"mae": None}
+    return {"mae": limit.mae}
+
+
+def agent_cell(
+    factory: Factory, nominal: Plant, plant: Plant, samples: int, runs: int, seed: int
+) -> dict[str, list[float]]:
+    """Run a controller on a plant that it was not made for.
+
+    Parameters
+    ----------
+    factory
+        Makes the controller.
+    nominal
+        The plant that it is made for, and told about.
+    plant
+        The plant that it runs on.
+    samples
+        Length of a run.
+    runs
+        How many; run i has the noise, and the initial weights, of seed `seed + i`.
+    seed
+        The first.
+
+    Returns
+    -------
+    dict of list
+        Of each run: `mae`, mean |e|; `late`, the same over the second half; `swing`, the
+        standard deviation of the error on the steady stretches, all in degC; and `travel`, the
+        total variation of the applied flow, t/h.
+    """
+    windows = observation(factory)
+    controller = build(factory, Parameters(**{**nominal, **SETPOINT, **windows}), runs, seed)
+    plants = make_plants(runs, samples, **{**plant, **SETPOINT, **windows})
+    trajectory = rollout(plants, controller, samples, seed)
+    error = trajectory.setpoint - trajectory.output
+    steady = steady_stretches(trajectory.setpoint[:, 0])
+    moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
+    measures = {
+        "mae": mean_error(trajectory),
+        "late": np.abs(error[samples // 2 :]).mean(axis=0),
+        "swing": _swing(error, steady),
+        "travel": np.abs(moves).sum(axis=0),
+    }
+    return {name: values.tolist() for name, values in measures.items()}
+
+
+def _swing(error: NDArray[np.float64], steady: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the deviation of the error within each stretch, in the mean square of all."""
+    edges = np.flatnonzero(np.diff(steady, prepend=False, append=False))
+    variances = [
+        error[start:stop].var(axis=0)
+        for start, stop in zip(edges[::2], edges[1::2], strict=True)
+    ]
+    swing: NDArray[np.float64] = np.sqrt(np.mean(variances, axis=0))
+    return swing

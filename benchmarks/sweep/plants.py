@@ -1,0 +1,64 @@
+"""The plants of a sweep: a grid over delay and gain, or a random design."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+Plant = dict[str, Any]  # arguments of the environment
+
+SETPOINT: Plant = {"setpoint": "square", "setpoint_period": 600}
+
+# What a random design draws from. A gain below 0.74 puts 5 degC beyond the limits.
+SPANS = {
+    "delay": (6, 36),
+    "dead_zone": (0.0, 8.0),
+    "noise_variance": (0.0, 1.0),
+    "gain_factor": (0.75, 1.6),
+    "time_constant_factor": (0.5, 2.0),
+}
+GRID = {"delay": range(2, 42, 2), "gain_factor": np.linspace(0.75, 1.65, 10)}
+
+
+def grid() -> list[Plant]:
+    """Return the paper's plant with other delays and other gains, without noise."""
+    return [
+        {"delay": delay, "gain_factor": round(float(gain), 6)}
+        for gain in GRID["gain_factor"]
+        for delay in GRID["delay"]
+    ]
+
+
+def random_design(count: int, seed: int, samples: int) -> list[Plant]:
+    """Return plants that differ in everything, spread evenly over `SPANS`.
+
+    The second half of them drift: in the course of `samples` samples, gain and time constant
+    go to another place in their spans.
+
+    Parameters
+    ----------
+    count
+        How many.
+    seed
+        Of the design, a Latin hypercube.
+    samples
+        How long they drift.
+    """
+    drawn = qmc.LatinHypercube(len(SPANS) + 2, rng=np.random.default_rng(seed)).random(count)
+    drifting = ("gain_factor", "time_constant_factor")
+    spans = np.array([*SPANS.values(), *(SPANS[name] for name in drifting)])
+    rows = spans[:, 0] + drawn * (spans[:, 1] - spans[:, 0])
+    plants = []
+    for i, row in enumerate(rows.round(4).tolist()):
+        plant = dict(zip(SPANS, row, strict=False)) | {"delay": round(row[0])}
+        if i >= count // 2:
+            gain, time_constant = row[len(SPANS) :]
+            plant |= {
+                "gain_drift": gain / plant["gain_factor"],
+                "time_constant_drift": time_constant / plant["time_constant_factor"],
+                "drift_samples": samples,
+            }
+        plants.append(plant)
+    return plants

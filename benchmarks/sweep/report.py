@@ -1,0 +1,159 @@
+"""What a sweep found: one row a run, and what there is to say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.controllers.roster import label
+from benchmarks.lib.report import Section
+from benchmarks.lib.statistics import Estimate, bootstrap, improvement
+from benchmarks.sweep import maps
+from benchmarks.sweep.plants import Plant
+
+SEED = 0  # of the bootstraps
+OSCILLATES = 1.0  # degC that the swing on steady stretches exceeds that without control by
+GROUPS = (  # of the plants that drift, by which the answer is split: half-open intervals
+    ("gain falls to less than 0.8 times", "gain_drift", 0.0, 0.8),
+    ("gain stays within 0.8 to 1.25 times", "gain_drift", 0.8, 1.25),
+    ("gain rises to more than 1.25 times", "gain_drift", 1.25, np.inf),
+    ("delay below 14 samples", "delay", 0, 14),
+    ("delay from 14 to 22 samples", "delay", 14, 23),
+    ("delay above 22 samples", "delay", 23, np.inf),
+)
+PAIRS = (("nn", "pi-simc"), ("nn", "nn-frozen"), ("nn-frozen", "pi-simc"))
+
+
+def table(
+    plants: Sequence[Plant], agents: Sequence[str], results: dict[str, Any]
+) -> pd.DataFrame:
+    """Return one row a run: the plant, what came of it, and how that compares.
+
+    Parameters
+    ----------
+    plants
+        Of the sweep.
+    agents
+        The controllers.
+    results
+        Of all cells by name: "limit I", "nothing I" and "AGENT I" for plant I.
+    """
+    rows = []
+    for i, plant in enumerate(plants):
+        limit = results[f"limit {i}"]["mae"]
+        nothing = pd.DataFrame(results[f"nothing {i}"])
+        for agent in agents:
+            cell = pd.DataFrame(results[f"{agent} {i}"])
+            cell.insert(0, "plant", i)
+            cell.insert(1, "agent", agent)
+            cell.insert(2, "run", range(len(cell)))
+            cell["limit"] = np.nan if limit is None else limit
+            cell["ratio"] = cell["mae"] / cell["limit"]
+            # The same noise with no control, which sets both scales.
+            cell["oscillates"] = cell["swing"] > nothing["swing"] + OSCILLATES
+            cell["useless"] = cell["mae"] >= nothing["mae"]
+            rows.append(cell.assign(**plant))
+    return pd.concat(rows, ignore_index=True)
+
+
+def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
+    """Draw the maps, and return what there is to say.
+
+    Parameters
+    ----------
+    runs
+        One row a run.
+    out
+        Where to write the maps.
+    design
+        "grid" or "random".
+    """
+    sections = [
+        Section(
+            "How many plants each controller works on",
+            [
+                "Ratio: mean error as a multiple of the least possible, median and 90th "
+                "percentile over the plants whose limit is known (the median run of each). "
+                f"Oscillates: on steady stretches the error swings, by its deviation, "
+                f"{OSCILLATES:g} °C more than with no control at all. The actuator is limited "
+                "and the plant stable, so instability can come to no more than that here. "
+                "Useless: the mean error is no smaller than with no control. Both are shares "
+                "of the runs. PPO's policies take the plants in turn."
+            ],
+            _overview(runs),
+        )
+    ]
+    if design == "grid":
+        maps.plot_grid(runs, out / "map.png")
+        sections[0] = replace(sections[0], pictures=["map.png"])
+        return sections
+    maps.plot_plants(runs, out / "plants.png")
+    maps.plot_drift(runs, PAIRS[0], out / "drift.png")
+    sections[0] = replace(sections[0], pictures=["plants.png"])
+    if {agent for pair in PAIRS for agent in pair} <= set(runs["agent"]):
+        sections.append(
+            Section(
+                "Does learning help when the plant drifts?",
+                [
+                    "Differences of the mean error over the second half of a run (°C), run by "
+                    "run in the same noise, with 95 % intervals over plants and runs: below 0 "
+                    "the first of the two is better; in parentheses, the share of runs in "
+                    "which it is. All were made for the nominal plant: the networks learnt on "
+                    "it, the PI is tuned by rule from its step test."
+                ],
+                _differences(runs),
+                ["drift.png"],
+            )
+        )
+    return sections
+
+
+def _overview(runs: pd.DataFrame) -> pd.DataFrame:
+    rows = []
+    for agent, group in runs.groupby("agent", sort=False):
+        ratio = group.groupby("plant")["ratio"].median().dropna()
+        rows.append(
+            {
+                "controller": label(agent),
+                "ratio, median": f"{ratio.median():.2f}",
+                "ratio, 90 %": f"{ratio.quantile(0.9):.2f}",
+                "oscillates (%)": f"{100 * group['oscillates'].mean():.1f}",
+                "useless (%)": f"{100 * group['useless'].mean():.1f}",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _differences(runs: pd.DataFrame) -> pd.DataFrame:
+    drifting = runs[runs["gain_drift"].notna()]
+    groups = {"no drift": runs[runs["gain_drift"].isna()], "all that drift": drifting}
+    for name, column, low, high in GROUPS:
+        groups[name] = drifting[drifting[column].between(low, high, inclusive="left")]
+    rows = []
+    for name, group in groups.items():
+        row = {"plants": name, "number": str(group["plant"].nunique())}
+        for pair in PAIRS:
+            ours, theirs = (
+                group[group["agent"] == agent]
+                .pivot_table(index="plant", columns="run", values="late")
+                .to_numpy()
+                for agent in pair
+            )
+            if len(ours) > 1:
+                difference = bootstrap(ours - theirs, SEED)
+                better = improvement(ours, theirs, SEED)
+                row[" - ".join(map(label, pair))] = _cell(difference, better)
+        rows.append(row)
+    return pd.DataFrame(rows).fillna("")
+
+
+def _cell(difference: Estimate, better: Estimate) -> str:
+    return (
+        f"{difference.value:+.3f} [{difference.low:+.3f}, {difference.high:+.3f}] "
+        f"({100 * better.value:.0f} %)"
+    )

@@ -1,0 +1,1 @@
+"""How are the learnt controllers trained? `python -m benchmarks.train`."""

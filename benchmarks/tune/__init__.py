@@ -1,0 +1,1 @@
+"""Which gains are best? `python -m benchmarks.tune`."""

@@ -1,0 +1,326 @@
+"""A search for a controller's gains with Optuna, which is saved after every trial."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import pandas as pd
+from optuna.distributions import FloatDistribution
+from tqdm import tqdm
+
+from benchmarks.controllers.roster import (
+    ROSTER,
+    Controller,
+    Factory,
+    Tuning,
+    build,
+    label,
+    load,
+    load_factory,
+    observation,
+)
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.storage import replacing, write_json, write_text
+from benchmarks.metrics import mean_error, settled, split
+from benchmarks.rollout import make_plants, rollout
+from benchmarks.scenarios import Scenario
+from mptc_gym import Parameters
+
+RUNS = 100  # of each scenario in a trial, each with noise and initial weights of its own
+SEED = 1  # of the search
+FIRST_RUN = 3_000_000  # runs have seeds from here on, which no comparison uses
+FINAL_RUNS, FINAL_FIRST_RUN = 1000, 4_000_000  # for the best, judged again
+DIGITS = 3  # significant, of the gains that are proposed
+
+# Neighbours of the paper's cases, each with its first sample that counts: three that begin with
+# an untrained controller, and two that show what comes after learning.
+SCENARIOS: tuple[tuple[Scenario, int], ...] = (
+    (Scenario("constant", "constant set point", 600, {"setpoint": 4.8}), 0),
+    (
+        Scenario(
+            "dead zone", "square wave, dead zone 6.5 t/h", 1280,
+            {"setpoint_amplitude": 5.1, "setpoint_period": 640, "dead_zone": 6.5},
+        ),
+        0,
+    ),
+    (
+        Scenario(
+            "noise", "square wave, R = 0.4 °C²", 1040,
+            {"setpoint_amplitude": 4.9, "setpoint_period": 520, "noise_variance": 0.4},
+        ),
+        0,
+    ),
+    (
+        Scenario(
+            "learnt", "square wave", 2240, {"setpoint_amplitude": 5.2, "setpoint_period": 560}
+        ),
+        1120,
+    ),
+    (
+        Scenario(
+            "learnt, slow", "square wave", 1920,
+            {"setpoint_amplitude": 5.4, "setpoint_period": 640},
+        ),
+        1280,
+    ),
+)  # fmt: skip
+
+
+def score(
+    factory: Factory,
+    runs: int,
+    first_run: int,
+    penalty: float = Tuning.penalty,
+    plant: Mapping[str, Any] | None = None,
+) -> dict[str, float]:
+    """Judge a controller on the tuning scenarios.
+
+    Parameters
+    ----------
+    factory
+        Makes the controller, as `roster.build` calls it.
+    runs
+        Of each scenario.
+    first_run
+        Seed of the first; every scenario has seeds of its own.
+    penalty
+        For failing to settle, degC.
+    plant
+        Arguments of the environment, if it is not the paper's plant.
+
+    Returns
+    -------
+    dict
+        For each scenario the median over runs of the mean |e|, degC; `not converged`, the
+        share of runs at the constant set point that failed to; and `objective`: the mean of
+        the medians, plus the penalty times that share.
+    """
+    medians: dict[str, float] = {}
+    for i, (scenario, first_sample) in enumerate(SCENARIOS):
+        seed = first_run + i * 100_000
+        environment = {**(plant or {}), **scenario.arguments, **observation(factory)}
+        controller = build(factory, Parameters(**environment), runs, seed)
+        plants = make_plants(runs, scenario.samples, **environment)
+        trajectory = rollout(plants, controller, scenario.samples, seed)
+        _, counted = split(trajectory, first_sample)
+        medians[scenario.name] = float(np.median(mean_error(counted)))
+        if scenario.name == "constant":
+            failed = 1.0 - float(settled(trajectory).mean())
+    objective = float(np.mean(list(medians.values()))) + penalty * failed
+    return {**medians, "not converged": failed, "objective": objective}
+
+
+def _score(
+    controller: Controller,
+    gains: dict[str, float],
+    runs: int,
+    first_run: int,
+    plant: Mapping[str, Any],
+    *,
+    final: bool,
+    member: int,
+) -> dict[str, float]:
+    tuning = tuning_of(controller)
+    if tuning.make:
+        factory = load(tuning.make)(**gains, final=final, member=member)
+    else:
+        factory = partial(load_factory(controller.factory), **gains)
+    return score(factory, runs, first_run, tuning.penalty, plant)
+
+
+def tuning_of(controller: Controller) -> Tuning:
+    """Return how a controller's gains are searched; ValueError if they are not."""
+    if controller.tuning is None:
+        tuned = ", ".join(name for name, each in ROSTER.items() if each.tuning)
+        raise ValueError(f"no gains of {controller.name!r} to search; there are {tuned}")
+    return controller.tuning
+
+
+class Search:
+    """A search that is saved after every trial.
+
+    Parameters
+    ----------
+    controller
+        Whose gains are searched.
+    runs
+        Of each scenario in a trial.
+    folder
+        Where it is kept, as `<controller>.csv`; what is there is continued.
+    fan_out
+        Runs what does not depend on each other: the members of a trial, and the finalists.
+    plant
+        Arguments of the environment, if it is not the paper's plant.
+
+    Raises
+    ------
+    ValueError
+        If what is there was another search.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        runs: int,
+        folder: Path,
+        fan_out: FanOut,
+        plant: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.path = folder / f"{controller.name}.csv"
+        self._plant = dict(plant or {})
+        self._runs = runs
+        self._controller = controller
+        self._fan_out = fan_out
+        self._tuning = tuning_of(controller)
+        space = self._tuning.space
+        self._space = {name: FloatDistribution(*ends, log=True) for name, ends in space.items()}
+        self._study = optuna.create_study()
+        self._rows: list[dict[str, float]] = []
+        # In the form in which JSON gives it back.
+        settings = json.loads(
+            json.dumps(
+                {
+                    "runs": runs,
+                    "plant": self._plant,
+                    "seed": SEED,
+                    "first run": FIRST_RUN,
+                    "space": {name: list(ends) for name, ends in space.items()},
+                    "scenarios": {
+                        s.name: [s.samples, first, s.arguments] for s, first in SCENARIOS
+                    },
+                    "penalty": self._tuning.penalty,
+                    "startup": self._tuning.startup,
+                    "Optuna": optuna.__version__,
+                }
+            )
+        )
+        beside = self.path.with_suffix(".json")
+        if self.path.exists():
+            earlier = json.loads(beside.read_text(encoding="utf-8"))
+            changed = [name for name in settings if settings[name] != earlier.get(name)]
+            if changed:
+                raise ValueError(f"{self.path} is of a search with other {', '.join(changed)}")
+            with self.path.open(encoding="utf-8", newline="") as file:
+                for row in csv.DictReader(file):
+                    self._add({name: float(value) for name, value in row.items()})
+        write_json(beside, settings)
+
+    @property
+    def trials(self) -> pd.DataFrame:
+        """One row a trial: the gains, and what `score` says of them."""
+        return pd.DataFrame(self._rows)
+
+    def _add(self, row: dict[str, float]) -> None:
+        gains = {name: row[name] for name in self._space}
+        self._study.add_trial(
+            optuna.trial.create_trial(
+                params=gains, distributions=self._space, value=row["objective"]
+            )
+        )
+        self._rows.append(row)
+
+    def run(self, trials: int) -> None:
+        """Try gains until `trials` have been tried in all."""
+        with tqdm(total=trials, initial=len(self._rows), desc=self._controller.name) as bar:
+            while len(self._rows) < trials:
+                self._add(self._try())
+                with replacing(self.path) as file:
+                    self.trials.to_csv(file, index=False)
+                bar.set_postfix(best=f"{self._study.best_value:.3f}")
+                bar.update()
+
+    def _try(self) -> dict[str, float]:
+        # The sampler starts anew from the search's seed and the trial's number, so that a
+        # search that was interrupted goes on as it would have gone.
+        seed = SEED * 1_000_000 + len(self._rows)
+        sampler = optuna.samplers.TPESampler(
+            seed=seed, n_startup_trials=self._tuning.startup, multivariate=True
+        )
+        asking = optuna.create_study(sampler=sampler)
+        asking.add_trials(self._study.trials)
+        gains = asking.ask(self._space).params
+        return {**gains, **self._judge([gains], self._runs, FIRST_RUN, final=False)[0]}
+
+    def _judge(
+        self, candidates: list[dict[str, float]], runs: int, first_run: int, *, final: bool
+    ) -> list[dict[str, float]]:
+        """Return, for each of the candidates, the mean of its members' scores."""
+        members = self._tuning.members[final]
+        cells = {
+            f"candidate {i}, member {member}": partial(
+                _score,
+                self._controller,
+                gains,
+                runs,
+                first_run,
+                self._plant,
+                final=final,
+                member=member,
+            )
+            for i, gains in enumerate(candidates)
+            for member in range(members)
+        }
+        # One alone gains nothing from another process, which takes seconds to start.
+        fan_out = self._fan_out if len(cells) > 1 else FanOut(jobs=1)
+        answers = fan_out.run(cells, title="new runs for the best", progress=final)
+        scores = pd.DataFrame(list(answers.values()))
+        groups = [scores.iloc[i : i + members] for i in range(0, len(scores), members)]
+        return [{name: float(np.mean(group[name])) for name in group} for group in groups]
+
+    def report(self, trials: int) -> pd.DataFrame:
+        """Judge the best gains again, rounded and on new runs, and write them, best first.
+
+        The gains that did best in a search did so by luck too; new runs tell.
+
+        Parameters
+        ----------
+        trials
+            How many of the trials count.
+        """
+        best = self.trials.head(trials).nsmallest(self._tuning.finalists, "objective")
+        candidates = [
+            {name: float(f"{trial[name]:.{DIGITS}g}") for name in self._space}
+            for _, trial in best.iterrows()
+        ]
+        again = self._judge(candidates, FINAL_RUNS, FINAL_FIRST_RUN, final=True)
+        rows: list[dict[str, Any]] = [
+            {**gains, **judged, "in the search": objective}
+            for gains, judged, objective in zip(
+                candidates, again, best["objective"], strict=True
+            )
+        ]
+        table = pd.DataFrame(rows).sort_values("objective", ignore_index=True)
+        write_text(self.path.with_suffix(".md"), self._page(table, trials))
+        return table
+
+    def _page(self, table: pd.DataFrame, trials: int) -> str:
+        improved = self.trials.head(trials)
+        improved = improved[improved["objective"].cummin().diff().fillna(-1.0) < 0.0]
+        scenarios = pd.DataFrame(
+            [(s.name, s.title, s.samples, first) for s, first in SCENARIOS],
+            columns=["scenario", "what it is", "samples", "first that counts"],
+        )
+        penalty = self._tuning.penalty
+        return "\n\n".join(
+            [
+                f"# Gains: {label(self._controller.name)}",
+                f"By `python -m benchmarks.tune {self._controller.name} --trials {trials} "
+                f"--runs {self._runs}`. In each scenario: the median over runs of the mean "
+                f"absolute error, °C. The objective is their mean, plus {penalty:g} °C times "
+                "the share of runs at the constant set point that do not settle.",
+                f"## The best {len(table)} of {trials}, on {FINAL_RUNS} new runs",
+                table.to_markdown(index=False, floatfmt=".4g"),
+                "## The search: every trial that was better than all before",
+                improved.reset_index(names="trial").to_markdown(index=False, floatfmt=".4g"),
+                "## Scenarios",
+                scenarios.to_markdown(index=False),
+                "",
+            ]
+        )

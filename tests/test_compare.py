@@ -1,0 +1,591 @@
+"""Scenarios, measures, tables and the comparison, on small budgets."""
+
+import json
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pandas as pd
+import pytest
+
+from agents import PIController
+from benchmarks.compare import __main__ as compare
+from benchmarks.compare import comparison
+from benchmarks.compare.estimates import beaten, estimate
+from benchmarks.controllers.roster import ROSTER, build, chosen, load_factory, observation
+from benchmarks.lib import storage, tables
+from benchmarks.lib.command_line import UsageError
+from benchmarks.lib.report import Section, write_report
+from benchmarks.limits import scenario_limit
+from benchmarks.metrics import METRICS, measure
+from benchmarks.rollout import Trajectory, make_plants, rollout
+from benchmarks.scenarios import SCENARIOS
+from benchmarks.train import ppo
+from mptc_gym import Parameters
+from tests.small_training import SMALL
+
+ROOT = Path(__file__).parent.parent
+# Those that are compared without any training before.
+FIXED = [name for name, each in ROSTER.items() if each.compared and each.factory]
+
+
+def trajectory(setpoint, output, command=None, applied=None):
+    """One run, as columns."""
+    still = np.zeros(len(setpoint))
+    columns = (setpoint, output, still if command is None else command)
+    columns += (columns[2] if applied is None else applied, still)
+    return Trajectory(*(np.array(column, dtype=float)[:, np.newaxis] for column in columns))
+
+
+def measured(runs, **arguments):
+    # One sample a minute, so that minutes are samples.
+    values = measure(runs, Parameters(sampling_interval=60.0, **arguments))
+    assert set(values) == set(METRICS)
+    return {name: value[0] for name, value in values.items()}
+
+
+class TestMeasures:
+    def test_errors_by_hand(self):
+        values = measured(trajectory([4, 4, 4, -2, -2], [0, 1, 6, 0, -2]))
+        assert values["mae"] == pytest.approx((4 + 3 + 2 + 2 + 0) / 5)
+        assert values["ise"] == pytest.approx(16 + 9 + 4 + 4 + 0)
+        # t starts again with the change: 0*4 + 1*3 + 2*2, then 0*2 + 1*0
+        assert values["itae"] == pytest.approx(7)
+        # 2 beyond a change of 4; the second change, of -6, is not exceeded
+        assert values["overshoot"] == pytest.approx(50)
+
+    def test_overshoot_downwards(self):
+        values = measured(trajectory([0, -4, -4], [9, 0, -5]))
+        assert values["overshoot"] == pytest.approx(25)
+
+    def test_settling(self):
+        # Within 5 % of 10 from the third sample after the change on.
+        assert measured(trajectory([10] * 5, [0, 9.6, 9.49, 9.51, 10.5]))["settling_time"] == 3
+        # Of two changes the longer counts: 1 sample, then 2.
+        two = trajectory([10, 10, 10, 0, 0, 0], [0, 10, 10, 10, 10, 0])
+        assert measured(two)["settling_time"] == 2
+
+    @pytest.mark.parametrize(
+        "output", [[0, 10, 10, 9, 0, 0], [0, 10, 10, 10, 1, 2], [0, 0, 0, 0, 0, 0]]
+    )
+    def test_not_settled(self, output):
+        runs = trajectory([10, 10, 10, 10, 0, 0], output)
+        assert measured(runs)["settling_time"] == math.inf
+
+    def test_input_by_hand(self):
+        commands = [6, 4.9, 5, -12, -10, -4]
+        applied = [6, 0, 5, -10, -10, 0]
+        values = measured(trajectory([1] * 6, [0] * 6, commands, applied))
+        assert values["total_variation"] == 6 + 6 + 5 + 15 + 0 + 10
+        assert values["dead_zone_share"] == pytest.approx(100 * 2 / 6)
+        assert values["saturation_share"] == pytest.approx(100 * 2 / 6)
+
+    def test_runs_are_measured_apart(self):
+        one, other = trajectory([1, 1], [0, 1]), trajectory([3, 3], [0, 0])
+        both = Trajectory(
+            *(np.hstack([getattr(t, f) for t in (one, other)]) for f in vars(one))
+        )
+        assert list(measure(both, Parameters())["mae"]) == [0.5, 3.0]
+
+    def test_what_cannot_be_measured_of_drawn_actuators_is_not(self):
+        runs = Trajectory(*np.zeros((5, 3, 1)))
+        values = measure(runs, Parameters(dead_zone=[4, 6]))
+        assert np.isnan(values["dead_zone_share"]).all()
+        assert np.isnan(values["saturation_share"]).all()
+        assert values["mae"] == 0.0
+
+
+class TestTables:
+    def test_percentiles(self):
+        values = tables.percentiles(np.arange(11.0))
+        assert values == {"median": 5.0, "p10": 1.0, "p90": 9.0}
+
+    def test_percentiles_of_some_that_do_not_settle(self):
+        values = tables.percentiles(np.array([1.0, 2.0, 3.0, np.inf]))
+        assert values == {"median": 3.0, "p10": 2.0, "p90": np.inf}
+
+    def test_not_settled_is_written_in_words(self):
+        table = comparison.tables.for_csv(pd.DataFrame({"a": ["x", "y"], "s": [1.5, np.inf]}))
+        assert table.to_csv(index=False) == "a,s\nx,1.5\ny,not settled\n"
+
+
+def some_runs(**errors):
+    """Make up runs on the constant set point: errors of agents by policy and seed."""
+    return pd.DataFrame(
+        [
+            {"scenario": "constant", "agent": agent, "policy": p, "seed": i, "mae": error}
+            for agent, policies in errors.items()
+            for p, row in enumerate(policies)
+            for i, error in enumerate(row)
+        ]
+    )
+
+
+class TestEstimates:
+    def test_by_hand(self):
+        limit = scenario_limit(SCENARIOS["constant"]).mae
+        runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
+        nn, ppo_ = estimate(runs, {"constant": limit}, "nn").to_dict("records")
+        assert (nn["mean"], nn["limit"], nn["ratio"]) == (2.0, limit, 2.0 / limit)
+        assert ppo_["mean"] == pytest.approx(1.5)
+        assert ppo_["difference"] == pytest.approx(-0.5)
+        assert ppo_["improvement"] == pytest.approx((1 + 0.5 + 1 + 0 + 0.5 + 1) / 6)
+        assert math.isnan(nn["difference"])
+        assert nn["mean_low"] < nn["mean"] < nn["mean_high"]
+
+    def test_who_beats_a_limit_is_named(self):
+        limit = scenario_limit(SCENARIOS["constant"]).mae
+        runs = some_runs(
+            a=[[limit, limit]], b=[[0.9 * limit] * 2], c=[[0.9 * limit, 1.2 * limit]]
+        )
+        assert list(beaten(estimate(runs, {"constant": limit}, "a"))["agent"]) == ["b"]
+
+    def test_no_controller_does(self, tmp_path):
+        # All runs of all controllers but PPO, which is trained elsewhere.
+        run_compare(tmp_path / "out", "--agents", *FIXED, "--runs", 20)
+        estimates = pd.read_csv(tmp_path / "out/estimates.csv")
+        assert len(estimates) == len(FIXED) * len(SCENARIOS)
+        assert beaten(estimates).empty
+        best = estimates[estimates["agent"] == "mpc"]
+        assert best["ratio"].between(0.97, 1.05).all()
+        report = (tmp_path / "out/report.md").read_text()
+        assert "No controller beats a limit" in report
+
+
+class TestReport:
+    def test_pages(self, tmp_path):
+        (tmp_path / "picture.png").write_bytes(b"\x89PNG")
+        table = pd.DataFrame({"name": ["a < b"], "value": ["1.0"]})
+        sections = [Section("First", ["Some text."], table, ["picture.png"]), Section("Second")]
+        write_report(tmp_path, "Title", sections, "made today")
+        page = (tmp_path / "report.md").read_text()
+        assert page.startswith("# Title\n\nmade today\n\n## First\n\nSome text.\n\n| name")
+        assert "![First](picture.png)" in page
+        html = (tmp_path / "report.html").read_text()
+        assert "a &lt; b" in html
+        assert 'name="viewport"' in html
+        assert "made today" in html
+        assert 'src="data:image/png;base64,iVBORw=="' in html
+        assert "http" not in html  # nothing is fetched
+
+
+class TestRosterOfThePaper:
+    def test_each_has_an_account(self):
+        for controller in ROSTER.values():
+            assert controller.account.prior_knowledge, controller.name
+
+    @pytest.mark.parametrize("name", FIXED)
+    def test_limits_reach_them(self, name):
+        parameters = Parameters(u_min=-20.0, u_max=12.0)
+        plants = make_plants(2, 30, u_min=-20.0, u_max=12.0)
+        controller = build(load_factory(ROSTER[name].factory), parameters, 2, 0)
+        runs = rollout(plants, controller, 30, 0)
+        if name not in ("nn", "mpc", "nothing"):  # which keep within them by themselves
+            assert (runs.command[0] < 0).all()
+        expected = getattr(controller, "command", runs.command[-1])
+        np.testing.assert_allclose(runs.command[-1], expected, rtol=1e-5, atol=1e-5)
+
+
+class TestScenarios:
+    def test_the_cases_of_the_paper(self):
+        plants = {
+            (s.parameters.dead_zone, s.parameters.noise_variance) for s in SCENARIOS.values()
+        }
+        assert plants == {(5.0, 0.0), (7.0, 0.0), (5.0, 0.5)}
+        assert {s.parameters.setpoint for s in SCENARIOS.values()} == {"square", 5.0}
+        assert len(SCENARIOS) == 6
+        assert all(name == scenario.name for name, scenario in SCENARIOS.items())
+
+
+def test_a_wrong_shape_of_actions_is_named():
+    agent = PIController()
+    agent.act = lambda observation: np.zeros(3)
+    with pytest.raises(ValueError, match=r"shape \(2, 1\), got \(3,\)"):
+        rollout(make_plants(2, 10), agent, 10, seed=0)
+
+
+class Constant:
+    """Always the same action."""
+
+    def __init__(self, action):
+        self.action = action
+
+    def reset(self):
+        """Nothing to forget."""
+
+    def act(self, observation):
+        return np.full((len(observation), 1), self.action, np.float32)
+
+
+class TestRollout:
+    def test_samples_line_up(self):
+        plants = make_plants(2, 50, setpoint=5.0)
+        runs = rollout(plants, Constant(-1.0), 50, seed=0)
+        assert np.all(runs.command == -10.0)  # u(0) is in row 0 ...
+        assert np.all(runs.output[:19] == 0.0)
+        assert np.all(runs.output[19] == pytest.approx(0.456))  # ... and shows in row 19
+
+    def test_every_controller_meets_the_same_noise(self):
+        noises = [
+            rollout(make_plants(3, 30, noise_variance=0.5), agent, 30, seed=8).noise
+            for agent in (Constant(-1.0), PIController())
+        ]
+        np.testing.assert_array_equal(*noises)
+        assert not np.array_equal(noises[0][:, 0], noises[0][:, 1])
+
+    def test_the_controller_begins_afresh(self):
+        plants, agent = make_plants(1, 30, setpoint=5.0), PIController()
+        first, second = (rollout(plants, agent, 30, seed=0) for _ in range(2))
+        np.testing.assert_array_equal(first.command, second.command)
+
+    def test_runs_do_not_depend_on_how_many_there_are(self):
+        many = rollout(make_plants(3, 30, noise_variance=0.5), PIController(), 30, seed=8)
+        one = rollout(make_plants(1, 30, noise_variance=0.5), PIController(), 30, seed=10)
+        np.testing.assert_array_equal(many.output[:, 2], one.output[:, 0])
+
+
+class TestRoster:
+    def test_a_factory_gets_what_it_asks_for(self):
+        def factory(num_envs, seed, parameters, gain=2):
+            return num_envs, seed, parameters, gain
+
+        parameters = Parameters()
+        assert build(factory, parameters, 3, 7) == (3, 7, parameters, 2)
+        assert isinstance(build(PIController, parameters, 3, 7), PIController)
+
+    def test_a_factory_that_takes_anything_gets_everything(self):
+        got = build(lambda **offered: offered, Parameters(), 3, 7)
+        assert set(got) == {"num_envs", "seed", "u_min", "u_max", "parameters"}
+
+    def test_an_observation_cannot_change_the_plant(self):
+        class Cheat:
+            observation = {"dead_zone": 0.0}  # noqa: RUF012
+
+        with pytest.raises(ValueError, match="'dead_zone'"):
+            observation(Cheat)
+        assert observation(PIController) == {}
+
+    @pytest.mark.parametrize("location", ["agents", "agents:", "nowhere:x", "agents:__name__"])
+    def test_bad_locations(self, location):
+        with pytest.raises(ValueError, match=location):
+            load_factory(location)
+
+
+class TestStorage:
+    def test_a_failed_write_leaves_the_old_file(self, tmp_path):
+        path = tmp_path / "file.txt"
+        storage.write_text(path, "old")
+
+        def write_half():
+            with storage.replacing(path) as partial:
+                partial.write_text("half of the n")
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            write_half()
+        assert path.read_text() == "old"
+        assert list(tmp_path.iterdir()) == [path]
+
+
+def run_compare(out, *options):
+    policies = out.parent / "policies"
+    return compare.main(["--out", str(out), "--kept", str(policies), *map(str, options)])
+
+
+class TestCompare:
+    def test_files_and_their_contents(self, tmp_path, capsys):
+        out = tmp_path / "out"
+        status = run_compare(
+            out, "--agents", "nn,pi", "--scenarios", "constant", "constant-noise", "--runs", 3
+        )
+        assert status == 0
+        runs = pd.read_csv(out / "runs.csv")
+        assert list(runs.columns) == ["scenario", "agent", "policy", "seed", *METRICS]
+        cells = [(s, a) for a in ("nn", "pi") for s in ("constant", "constant-noise")]
+        expected = [(s, a, 0, i) for s, a in cells for i in range(3)]
+        assert list(runs.iloc[:, :4].itertuples(index=False, name=None)) == expected
+        # The paper's PI is the same in every run without noise, and never settles.
+        pi = runs[(runs.agent == "pi") & (runs.scenario == "constant")]
+        assert pi["mae"].nunique() == 1
+        assert pi["mae"].iloc[0] == pytest.approx(1.6, abs=0.05)
+        assert set(pi["settling_time"]) == {"not settled"}
+
+        summary = pd.read_csv(out / "summary.csv")
+        row = summary.query("agent == 'nn' and scenario == 'constant' and metric == 'mae'")
+        nn = runs[(runs.agent == "nn") & (runs.scenario == "constant")]["mae"]
+        assert float(row["median"].iloc[0]) == pytest.approx(nn.median())
+        assert float(row["p90"].iloc[0]) == pytest.approx(nn.quantile(0.9))
+
+        limit = scenario_limit(SCENARIOS["constant"]).mae
+        page, screen = (out / "report.md").read_text(), capsys.readouterr().out
+        for shown in (page, (out / "report.html").read_text(), screen):
+            assert f"{nn.median():.3f}" in shown
+            assert f"{limit:.3f}" in shown
+            assert f"{pi['mae'].iloc[0] / limit:.2f}" in shown
+            assert "No controller beats a limit" in shown
+        assert "not settled" in page
+
+        provenance = json.loads((out / "provenance.json").read_text())
+        assert provenance["complete"] is True
+        assert provenance["seeds"] == [0, 1, 2]
+        assert provenance["options"]["agents"] == ["nn", "pi"]
+        assert {"gymnasium", "numpy", "torch"} <= set(provenance["versions"])
+
+        responses = pd.read_csv(out / "constant.csv")
+        assert len(responses) == 2 * 600
+        assert (responses["output_p10"] <= responses["output_p90"]).all()
+        for name in ("constant.png", "constant-noise.png", "limits.png", "runs.png"):
+            picture = matplotlib.image.imread(out / name)
+            assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
+
+    def test_same_command_same_numbers(self, tmp_path):
+        options = ("--agents", "nn", "--scenarios", "constant-noise", "--runs", 2)
+        run_compare(tmp_path / "one", *options)
+        run_compare(tmp_path / "two", *options)
+        assert (tmp_path / "one/runs.csv").read_text() == (
+            tmp_path / "two/runs.csv"
+        ).read_text()
+
+    def test_ppo_is_trained_once(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.setattr(
+            ppo.PPOArguments, "__init__", _with_defaults(ppo.PPOArguments.__init__, SMALL)
+        )
+        monkeypatch.setattr(ppo, "POLICIES", 2)
+        options = (
+            "--agents",
+            "ppo",
+            "--scenarios",
+            "constant",
+            "--runs",
+            1,
+            "--training-steps",
+            256,
+            "--jobs",
+            1,
+        )
+        assert run_compare(tmp_path / "one", *options) == 0
+        curve = pd.read_csv(tmp_path / "one/learning.csv")
+        assert list(curve["steps"]) == [256, 256]
+        assert list(curve["policy"]) == [0, 1]
+        assert (tmp_path / "one/learning.png").exists()
+        provenance = json.loads((tmp_path / "one/provenance.json").read_text())
+        for seed, used in enumerate(provenance["policies"]["ppo"]):
+            assert used["arguments"]["seed"] == seed
+            assert used["arguments"]["steps"] == 256
+            assert (Path(used["folder"]) / "policy.zip").exists()
+        runs = pd.read_csv(tmp_path / "one/runs.csv")
+        assert list(runs["policy"]) == [0, 1]
+
+        with monkeypatch.context() as patch:
+            patch.setattr(ppo.PPO, "learn", None)  # training again would raise
+            assert run_compare(tmp_path / "two", *options) == 0
+        assert (tmp_path / "one/runs.csv").read_text() == (
+            tmp_path / "two/runs.csv"
+        ).read_text()
+        with monkeypatch.context() as patch:
+            patch.setattr(ppo.PPO, "learn", None)
+            assert run_compare(tmp_path / "three", *options, "--retrain") == 1
+            assert "seed 0: TypeError" in capsys.readouterr().out
+
+    def test_a_controller_of_the_user(self, tmp_path, monkeypatch):
+        (tmp_path / "mine.py").write_text(
+            "import numpy as np\n"
+            "class Mine:\n"
+            "    observation = {'output_window': 1, 'error_window': 0}\n"
+            "    def __init__(self, num_envs, parameters):\n"
+            "        self.num_envs = num_envs\n"
+            "        assert parameters.observation_size == 4\n"
+            "    def reset(self): pass\n"
+            "    def act(self, observations):\n"
+            "        assert observations.shape == (self.num_envs, 4)\n"
+            "        return np.full((self.num_envs, 1), -1.0, np.float32)\n"
+        )
+        monkeypatch.syspath_prepend(tmp_path)
+        status = run_compare(
+            tmp_path / "out", "--agents", "pi", "--agent", "mine=mine:Mine",
+            "--scenarios", "constant", "--runs", 2,
+        )  # fmt: skip
+        assert status == 0
+        runs = pd.read_csv(tmp_path / "out/runs.csv")
+        assert list(runs["agent"]) == ["pi", "pi", "mine", "mine"]
+        assert set(runs[runs.agent == "mine"]["saturation_share"]) == {100.0}
+
+    def test_the_example_of_the_readme(self, tmp_path, monkeypatch):
+        readme = (ROOT / "README.md").read_text(encoding="utf-8")
+        (example,) = re.findall(r"```python\n(from agents import PIC.*?)```", readme, re.DOTALL)
+        (option,) = re.findall(r"--agent (\S+)`", readme)
+        (tmp_path / "my_controllers.py").write_text(example)
+        monkeypatch.syspath_prepend(tmp_path)
+        run_compare(
+            tmp_path / "out", "--agents", "--agent", option, "--scenarios", "constant",
+            "--runs", 1,
+        )  # fmt: skip
+        runs = pd.read_csv(tmp_path / "out/runs.csv")
+        assert runs["mae"].iloc[0] == pytest.approx(0.291, abs=0.001)  # as the README says
+
+    def test_files_of_an_earlier_run_do_not_stay(self, tmp_path):
+        out = tmp_path / "out"
+        options = ("--agents", "pi", "--runs", 1, "--scenarios")
+        run_compare(out, *options, "constant", "square")
+        (out / "mine.txt").write_text("not of the comparison")
+        run_compare(out, *options, "constant")
+        names = {path.name for path in out.iterdir()}
+        assert names == {
+            "runs.csv", "summary.csv", "estimates.csv", "report.md", "report.html",
+            "limits.png", "runs.png", "travel.png", "constant.csv", "constant.png",
+            "provenance.json",
+            "mine.txt",
+        }  # fmt: skip
+
+    def run_and_stop(self, out, monkeypatch, error, after):
+        calls = 0
+
+        def stopped(*arguments):
+            nonlocal calls
+            calls += 1
+            if calls > after:
+                raise error
+            return rollout(*arguments)
+
+        monkeypatch.setattr(comparison, "rollout", stopped)
+        return run_compare(
+            out, "--agents", "pi", "nn", "--scenarios", "constant", "square", "--runs", 1
+        )
+
+    def test_an_interrupted_run_keeps_what_it_has(self, tmp_path, monkeypatch, capsys):
+        out = tmp_path / "out"
+        # The square wave is run twice.
+        assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=3) == 130
+        assert "Interrupted" in capsys.readouterr().out
+        assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
+        assert json.loads((out / "provenance.json").read_text())["complete"] is False
+        assert (out / "report.md").exists()
+        assert (out / "square.png").exists()
+
+    def test_what_ran_before_a_failing_controller_is_kept(self, tmp_path, monkeypatch):
+        out = tmp_path / "out"
+        with pytest.raises(ZeroDivisionError):
+            self.run_and_stop(out, monkeypatch, ZeroDivisionError, after=3)
+        assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
+        assert json.loads((out / "provenance.json").read_text())["complete"] is False
+        assert (out / "report.md").exists()
+
+    def test_every_case_is_saved_before_the_next_begins(self, tmp_path, monkeypatch):
+        saved = []
+
+        def watched(*arguments):
+            runs = tmp_path / "out" / "runs.csv"
+            saved.append(len(pd.read_csv(runs)) if runs.exists() else 0)
+            return rollout(*arguments)
+
+        monkeypatch.setattr(comparison, "rollout", watched)
+        scenarios = ("constant", "square", "constant-noise")
+        run_compare(tmp_path / "out", "--agents", "pi", "--runs", 2, "--scenarios", *scenarios)
+        assert saved == [0, 2, 2, 4]  # the square wave is run twice
+
+    def test_interrupted_before_anything_has_finished(self, tmp_path, monkeypatch):
+        out = tmp_path / "out"
+        out.mkdir()
+        (out / "runs.csv").write_text("of an earlier run")
+        assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=0) == 130
+        assert (out / "runs.csv").read_text() == "of an earlier run"
+
+    @pytest.mark.parametrize(
+        ("options", "complaint"),
+        [
+            (["--agents", "nn", "pid"], "no 'pid'"),
+            (["--scenarios", "circle"], "no 'circle'"),
+            (["--runs", "0"], "must be at least 1"),
+            (["--runs", "many"], "invalid number value"),
+            (["--scenarios", ""], "--scenarios"),
+            (["--agents"], "no controller"),
+            (["--set", "delay=-1"], "delay must be"),
+            (["--set", "delay"], "ARGUMENT=VALUE"),
+            (["--plant", "nowhere.json"], "nowhere.json"),
+            (["--agent", "PI=agents:PIController"], "NEW_NAME"),
+            (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
+            (["--agent", "pi=agents:PIController"], "NEW_NAME"),
+            (["--agent", "x=agents:Nothing"], "agents:Nothing"),
+        ],
+    )
+    def test_bad_options(self, options, complaint, capsys, tmp_path):
+        with pytest.raises(SystemExit) as stop:
+            run_compare(tmp_path / "out", *options)
+        assert stop.value.code == 2
+        assert complaint in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+
+    def test_as_a_command(self, tmp_path):
+        command = [sys.executable, "-m", "benchmarks.compare", "--agents", "pi", "--runs", "1"]
+        command += ["--scenarios", "constant", "--out", str(tmp_path / "out")]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+        assert "1.62" in done.stdout
+        assert (tmp_path / "out/report.md").exists()
+
+
+class TestOtherPlants:
+    @pytest.mark.parametrize("preset", ["disturbed", "hard"])
+    def test_what_has_no_bound_or_measure_says_so(self, preset, tmp_path):
+        options = ("--preset", preset, "--agents", "nothing", "pi", "--runs", 2)
+        assert run_compare(tmp_path / "out", *options) == 0
+        report = (tmp_path / "out/report.md").read_text()
+        assert "PI" in report
+        assert ("not known" in report) or ("least possible" in report)
+        provenance = json.loads((tmp_path / "out/provenance.json").read_text())
+        assert provenance["complete"] is True
+
+    def test_controllers_are_told_about_the_plant_that_is_run(self, tmp_path):
+        plant = {"b": [0.04560, 0.00404], "delay": 9, "a": [1, -0.9]}
+        (tmp_path / "plant.json").write_text(json.dumps(plant))
+        options = ("--plant", tmp_path / "plant.json", "--agents", "pi-simc", "smith")
+        assert (
+            run_compare(tmp_path / "out", *options, "--scenarios", "square", "--runs", 1) == 0
+        )
+        errors = pd.read_csv(tmp_path / "out/runs.csv").set_index("agent")["mae"]
+        # Its gain has the other sign: who is told about the paper's plant drives it to a limit.
+        assert (errors < 3.0).all()
+
+    def test_a_part_goes_to_a_folder_of_its_own(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        options = ["--agents", "pi", "--scenarios", "constant", "--runs", "1"]
+        assert compare.main([*options, "--set", "delay=30"]) == 0
+        (folder,) = (tmp_path / "results").iterdir()
+        assert folder.name == "compare-pi-constant-delay-30-1-runs"
+
+
+class TestOwnControllers:
+    """What is no controller is named before anything runs."""
+
+    @pytest.mark.parametrize(
+        ("code", "complaint"),
+        [
+            ("class Mine:\n    def act(self, o): return [[0.0]] * len(o)", "reset"),
+            ("class Mine:\n    observation = 3", "observation of .* must be a dict"),
+            (
+                "class Mine:\n    def reset(self): pass\n    def act(self, o): return 0.0",
+                r"shape \(2, 6\).*got shape \(\)",
+            ),
+            (
+                "class Mine:\n    def reset(self): pass\n"
+                "    def act(self, o): return float(o[0]) * 0",
+                "it raised TypeError",
+            ),
+        ],
+    )
+    def test_bad_ones(self, code, complaint, tmp_path, monkeypatch):
+        name = f"own_{abs(hash(code))}"
+        (tmp_path / f"{name}.py").write_text(code)
+        monkeypatch.syspath_prepend(tmp_path)
+        with pytest.raises(UsageError, match=complaint):
+            chosen([], [f"mine={name}:Mine"])
+
+
+def _with_defaults(init, defaults):
+    def initialise(self, **given):
+        init(self, **(vars(defaults) | given))
+
+    return initialise

@@ -1,0 +1,67 @@
+"""What makes a kept result valid, and what does not."""
+
+import sys
+
+import pytest
+
+import mptc_gym
+from benchmarks.lib import fingerprint as module
+from benchmarks.lib.fingerprint import behaviour, code, fingerprint, imported
+
+HELPER = "def double(x):\n    return 2 * x\n"
+USER = "from own.helper import double\n\n\ndef four():\n    return double(2)\n"
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """Return a function that writes a package `own` and says its fingerprint."""
+    monkeypatch.setattr(module, "ROOT", tmp_path)
+    monkeypatch.setattr(module, "PACKAGES", ("own",))
+    (tmp_path / "own").mkdir()
+
+    def write(helper=HELPER, user=USER, **shaped_by):
+        for name, text in (("helper", helper), ("user", user), ("__init__", "")):
+            (tmp_path / "own" / f"{name}.py").write_text(text)
+        code.cache_clear()
+        return fingerprint("own.user", **shaped_by)
+
+    yield write
+    code.cache_clear()
+
+
+def test_comments_docstrings_and_layout_do_not_count(own):
+    edited = '"""A helper."""\n\n\ndef double(x):\n    """Twice."""\n'
+    edited += "    # really\n    return (2 * x)\n"
+    assert own() == own(helper=edited)
+
+
+def test_code_that_is_imported_counts(own):
+    assert own() != own(helper=HELPER.replace("2 * x", "3 * x"))
+    assert own() != own(user=USER + "FIVE = 5\n")
+
+
+def test_a_moved_function_counts(own):
+    moved = USER.replace("own.helper", "own.elsewhere")
+    assert own() != own(user=moved)
+
+
+def test_arguments_count(own):
+    assert own(seed=1) == own(seed=1) != own(seed=2)
+
+
+def test_what_the_environment_does_counts(own, monkeypatch):
+    before = own()
+    behaviour.cache_clear()
+    monkeypatch.setitem(mptc_gym.PRESETS, "noisy", {"noise_variance": 0.6})
+    assert own() != before
+    monkeypatch.undo()
+    behaviour.cache_clear()
+
+
+def test_imports_are_followed_through_modules():
+    found = imported("benchmarks.sweep.cells")
+    assert {"benchmarks.sweep.cells", "benchmarks.rollout", "benchmarks.metrics"} <= found
+    assert not any(name.startswith("mptc_gym") for name in found)
+    # Without loading them.
+    assert "benchmarks.examples.rllib" not in sys.modules
+    assert "benchmarks.examples.rllib" in imported("benchmarks.examples.rllib")

@@ -1,0 +1,127 @@
+"""A step test of any plant, plants in files, and the wear of the valve."""
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+
+from benchmarks.controllers.step_test import StepTest, step_response, step_test
+from benchmarks.metrics import reversals
+from benchmarks.plants import read_plant
+from mptc_gym import PRESETS, Parameters
+
+
+def first_order(gain, time_constant, delay):
+    """Return arguments of a plant of first order, with `delay` samples until an input shows."""
+    pole = np.exp(-8.0 / time_constant)
+    return {"a": [1.0, -pole], "b": [gain * (1.0 - pole)], "delay": delay - 1}
+
+
+def test_paper_plant_shows_the_numbers_its_controllers_are_tuned_with():
+    found = step_test(Parameters())
+    # Steady-state gain -0.0496 / 0.0727, the time constant of the pole at 0.9515, 19 samples.
+    assert found == StepTest(-0.6825, 161.0, 152.0, 8.0)
+
+
+@pytest.mark.parametrize("gain", [-0.3, 0.02, 4.0])
+@pytest.mark.parametrize("time_constant", [4.0, 60.0, 900.0])
+@pytest.mark.parametrize("delay", [1, 5, 80])
+def test_plant_of_first_order_shows_its_own_numbers(gain, time_constant, delay):
+    found = step_test(Parameters(**first_order(gain, time_constant, delay)))
+    assert found.gain == pytest.approx(gain, rel=1e-3)
+    assert found.time_constant == pytest.approx(time_constant, rel=0.01, abs=1.0)
+    assert found.delay == 8.0 * delay
+
+
+def test_model_is_close_to_the_response_of_a_plant_of_higher_order():
+    a = np.poly([0.95, 0.9, 0.8])
+    plant = Parameters(a=a.tolist(), b=[0.001, 0.0005], delay=10)
+    found = step_test(plant)
+    times = 8.0 * np.arange(300)
+    model = found.gain * -np.expm1(
+        -np.maximum(times - found.delay + 8.0, 0) / found.time_constant
+    )
+    model[times < found.delay] = 0.0
+    assert np.abs(model - step_response(plant, 300)).max() < 0.1 * found.gain
+
+
+def test_sampling_interval_scales_times():
+    slow = step_test(Parameters(sampling_interval=80.0))
+    assert (slow.time_constant, slow.delay) == (1610.0, 1520.0)
+
+
+def test_factors_are_those_of_the_plant_and_ranges_their_middle():
+    drawn = Parameters(gain_factor=[1.0, 2.0], time_constant_factor=[1.5, 2.5], delay=[10, 20])
+    found = step_test(drawn)
+    assert found.gain == pytest.approx(1.5 * -0.6825, rel=1e-3)
+    # 1 / (1 - pole) is doubled: 41.2 samples, whose time constant is 40.7 samples.
+    assert found.time_constant == pytest.approx(40.74 * 8.0, rel=0.01)
+    assert found.delay == 16 * 8.0
+
+
+def test_drift_and_disturbances_do_not_show():
+    assert step_test(Parameters(**PRESETS["fouling"])) == step_test(Parameters())
+
+
+def test_response_is_that_of_the_environment():
+    env = gymnasium.make("MiddlePoint-v0", dead_zone=0.0, disable_env_checker=True)
+    env.reset()
+    outputs = [0.0] + [env.step(np.array([0.1], np.float32))[-1]["output"] for _ in range(60)]
+    np.testing.assert_allclose(step_response(Parameters(), 61), outputs, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ({"a": [1.0, -1.0]}, "a"),
+        ({"a": [1.0, -1.1]}, "a"),
+        ({"b": [0.1, -0.1]}, "b"),
+    ],
+)
+def test_plant_without_a_new_steady_state_is_refused(arguments, name):
+    with pytest.raises(ValueError, match=f"^{name} must"):
+        step_test(Parameters(**arguments))
+
+
+def test_plant_file_makes_an_environment(tmp_path):
+    path = tmp_path / "plant.json"
+    path.write_text(json.dumps({"delay": 20, "gain_factor": [1.0, 2.0]}))
+    arguments = read_plant(path)
+    assert arguments == {"delay": 20, "gain_factor": [1.0, 2.0]}
+    gymnasium.make("MiddlePoint-v0", **arguments)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("{", "must be a JSON file"),
+        ("[1, 2]", "must hold one object"),
+        ('{"dely": 3}', "no argument 'dely'; it has a, b, c, delay"),
+        ('{"delay": -1}', "delay must be"),
+    ],
+)
+def test_bad_plant_file_is_named(tmp_path, text, complaint):
+    path = tmp_path / "plant.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=complaint) as caught:
+        read_plant(path)
+    assert str(path) in str(caught.value)
+
+
+def test_plant_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ValueError, match="cannot be read: No such file"):
+        read_plant(tmp_path / "none.json")
+
+
+def test_reversals_are_counted_across_stillness():
+    applied = np.array(
+        [
+            # up, still, up, down, still, up: 2 reversals
+            [1.0, 1.0, 2.0, 0.0, 0.0, 3.0],
+            [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # never moves
+            [1.0, 0.0, 1.0, 0.0, 1.0, 0.0],  # to and fro: 5
+        ]
+    ).T
+    # 6 samples of 10 s are a minute.
+    np.testing.assert_array_equal(reversals(applied, 10.0), [2.0, 0.0, 5.0])
