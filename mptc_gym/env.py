@@ -13,9 +13,9 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym import rendering
-from mptc_gym.parameters import Parameters
+from mptc_gym.parameters import Parameters, argument_signature, argument_table
 from mptc_gym.plant import Plant, action_from_command
-from mptc_gym.ranges import Ranges
+from mptc_gym.ranges import Ranges, numbers_of_plant
 from mptc_gym.signals import BLOCK, Disturbance, Noise, SetPoint, Streams
 
 _FLOAT32 = np.dtype(np.float32)  # quicker to pass on than the type
@@ -131,39 +131,14 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
     ## Arguments
 
-    All are keyword-only and can be given to `gymnasium.make`. Where the default is marked with an
-    asterisk, the argument can also be a range [low, high], from which `reset` draws a number,
-    uniformly (an integer where the argument is one).
+    All are keyword-only and can be given to `gymnasium.make`. An asterisk marks an argument that
+    can also be a range [low, high]: each `reset` draws a number from it, uniformly (an integer
+    where the default is one). They are declared in `mptc_gym/parameters.py`.
 
-    | Argument | Default | Meaning |
-    |---|---|---|
-    | `a` | (1, -0.45181, -0.47546) | coefficients of A in (28), from z^0 on; the first is 1. An unstable A is taken as it is: y may grow beyond all floats |
-    | `b` | (-0.04560, -0.00404) | coefficients of B in (28), from z^-1 on, degC per t/h |
-    | `c` | (1, -0.35740, -0.03392) | coefficients of C in (28), from z^0 on; the first is 1 |
-    | `delay` | 18* | transport delay d, samples |
-    | `dead_zone` | 5.0* | half width of the dead zone, t/h |
-    | `u_min`, `u_max` | -10.0*, 10.0* | the actuator's limits, t/h |
-    | `noise_variance` | 0.0* | R, the variance of xi, degC^2 |
-    | `measurement_noise_variance` | 0.0* | variance of the transmitter's noise, degC^2 |
-    | `disturbance_amplitude` | 0.0* | of the steps of the load disturbance, degC |
-    | `disturbance_interval` | 150.0* | mean interval between these steps, samples; below 10 it is 10 |
-    | `disturbance_walk_variance` | 0.0* | that the random walk of the load disturbance gains a sample, degC^2 |
-    | `gain_factor` | 1.0* | steady-state gain, as a multiple of that of `a` and `b` |
-    | `time_constant_factor` | 1.0* | dominant time constant, as a multiple of that of `a` |
-    | `gain_drift` | 1.0* | by which factor the gain has changed after `drift_samples` |
-    | `time_constant_drift` | 1.0* | by which factor the time constant has |
-    | `drift_samples` | 1200 | how long they drift, samples |
-    | `sampling_interval` | 8.0 | s; the scale of the time axis, without effect on the dynamics |
-    | `setpoint` | "square" | "square", "random", a number (constant), or a list of numbers (one a sample, the last one held) |
-    | `setpoint_amplitude` | 5.0 | A, degC. "square": A for the first half period, then -A. "random": levels uniform in [-A, A] |
-    | `setpoint_period` | 600 | samples. "random": each level is held for a length uniform in [period/6, period/2] |
-    | `setpoint_window`, `error_window` | 3, 3 | how many of the latest y_d and e the observation holds |
-    | `output_window`, `action_window` | 0, 0 | the same for measured outputs and past actions |
-    | `temperature_span` | 50.0 | degC; the measurement saturates at +-span |
-    | `reward` | "quadratic" | "quadratic" or "absolute" |
-    | `error_scale` | 5.0 | degC; the error that costs 1/2 ("quadratic") or 1 ("absolute") a step |
-    | `move_weight` | 0.0 | cost of a unit change of the normalised action |
-    | `render_mode` | None | None, "human", "rgb_array" or "ansi"; see Rendering |
+    <arguments>
+
+    `render_mode` is None, "human", "rgb_array" or "ansi"; see Rendering. A list or tuple may also
+    be a NumPy array. For `setpoint`, [-5, 5] means two samples, not a range.
 
     ## Info
 
@@ -209,7 +184,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     # One list of arguments, that of `Parameters`; help() and editors see it spelt out here.
     __signature__: ClassVar[inspect.Signature] = inspect.Signature(
         [
-            *inspect.signature(Parameters).parameters.values(),
+            *argument_signature(),
             inspect.Parameter(
                 "render_mode",
                 inspect.Parameter.KEYWORD_ONLY,
@@ -220,7 +195,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     )
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
-        self.parameters = parameters = Parameters(**arguments)
+        self.parameters = parameters = Parameters.of_environment(arguments)
         rendering.check_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         self._record: rendering.Record | None = None  # for pictures; None if there are none
@@ -274,22 +249,18 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
             self._streams = Streams.spawn(seeds)
         parameters = self.parameters
-        numbers, drawn = self._ranges.given, {}
+        numbers = self._ranges.given
         if self._ranges.names or parameters.is_disturbed:
             generator = self._streams.plant.next_episode()
-            draws = self._ranges.draw([generator], 1)
-            drawn = {name: float(draw[0]) for name, draw in draws.items()}
-            numbers = {**numbers, **drawn}
+            numbers = numbers_of_plant(self._ranges.draw([generator], 1), 0)
             self._disturbance.restart(generator, numbers)
-        self._noise.restart(self._streams.noise, numbers["noise_variance"])
-        self._transmitter.restart(
-            self._streams.transmitter, numbers["measurement_noise_variance"]
-        )
+        self._noise.restart(self._streams.noise, numbers.noise_variance)
+        self._transmitter.restart(self._streams.transmitter, numbers.measurement_noise_variance)
         self._setpoint.restart(self._streams.setpoint)
         self._plant = Plant(parameters, numbers)
 
         # At rest u is 0, whatever action that is.
-        self._action = action_from_command(0.0, numbers["u_min"], numbers["u_max"])
+        self._action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         rest = _limited(self._action, 1.0)
         size, actions = parameters.observation_size, parameters.action_window
         # One element to spare at the end: see step.
@@ -316,7 +287,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         }
         if self._tells_more:
             self._tell_more(info, 0.0)
-        return np.fromiter(self._window, _FLOAT32, size), info | drawn
+        return np.fromiter(self._window, _FLOAT32, size), info | numbers.chosen(
+            self._ranges.names
+        )
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
         """Apply a normalised action for one sample.
@@ -429,6 +402,18 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             info["disturbance"] = load
         if self.parameters.drifts:
             info["gain_factor"], info["time_constant_factor"] = self._plant.factors
+
+
+def _with_table(docstring: str | None) -> str | None:
+    """Put the table of arguments where the docstring has its place."""
+    if docstring is None:  # as in `python -OO`
+        return None
+    before = docstring.partition("<arguments>")[0]
+    indentation = before[before.rfind("\n") + 1 :]  # none from Python 3.13 on
+    return docstring.replace("<arguments>", argument_table().replace("\n", f"\n{indentation}"))
+
+
+MiddlePointEnv.__doc__ = _with_table(MiddlePointEnv.__doc__)
 
 
 def _limited(value: float, limit: float) -> float:

@@ -1,144 +1,162 @@
-"""Every argument of the environment, in one frozen dataclass that checks itself."""
+"""Every argument of the environment, each declared once, in a dataclass that checks itself."""
+
+# ruff: noqa: RUF009 (`_argument` makes fields)
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from numbers import Integral, Real
-from typing import Any, Final, NoReturn
+import difflib
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from types import MappingProxyType
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 
-SETPOINTS: Final = ("square", "random")
-REWARDS: Final = ("quadratic", "absolute")
-LARGEST: Any = 10**9  # of any argument; beyond, float32 observations and squares lose meaning
+from mptc_gym import checks
+from mptc_gym.checks import Number, reject
 
-# The arguments that can be a range, in the order of their draws: a new one comes last.
-PLANT_NUMBERS: Final = (
-    "delay",
-    "dead_zone",
-    "u_min",
-    "u_max",
-    "noise_variance",
-    "measurement_noise_variance",
-    "disturbance_amplitude",
-    "disturbance_interval",
-    "disturbance_walk_variance",
-    "gain_factor",
-    "time_constant_factor",
-    "gain_drift",
-    "time_constant_drift",
-)
-SLOW: Final = 10  # samples between two changes of the load disturbance and of the dynamics
-Number = float | Sequence[float]  # or a range, [low, high]
+DRAWS: Final = 32  # an episode: enough for every plant number, and for those to come
+
+Value = TypeVar("Value")  # of a plant number: float, an array for many plants, or `Number`
 
 
-def _reject(name: str, value: object, allowed: str) -> NoReturn:
-    raise ValueError(f"{name} must be {allowed}, got {value!r}")
+@dataclass(frozen=True)
+class Argument:
+    """What is declared of an argument of the environment, beside its name and its type.
+
+    Attributes
+    ----------
+    default
+        Its default.
+    check
+        Returns a valid value in plain Python types, and raises a ValueError otherwise.
+    unit
+        Its unit, "" if there is none.
+    meaning
+        What the tables of arguments say about it.
+    draw
+        If it can be a range: which of the draws at a reset it takes. Once released, this number
+        never changes, as it is part of what a seed means. A new argument takes the next number.
+    """
+
+    default: Any
+    check: checks.Check
+    unit: str
+    meaning: str
+    draw: int | None
+
+    def checked(self, name: str, value: Any) -> Any:
+        """Return a valid value in plain Python types; ValueError, naming it, otherwise."""
+        check = self.check if self.draw is None else checks.or_range(self.check)
+        return check(name, checks.plain(value))
+
+    @property
+    def is_integer(self) -> bool:
+        """Whether an integer is drawn from a range, both ends included."""
+        return isinstance(self.default, int)
+
+    def row(self, name: str) -> str:
+        """Return its row in a Markdown table of arguments."""
+        default = repr(self.default).replace("'", '"')
+        star = "" if self.draw is None else "*"
+        return f"| `{name}` | {default}{star} | {self.unit} | {self.meaning} |"
 
 
-def _is_number(value: Any) -> bool:
-    if not isinstance(value, Real) or isinstance(value, bool):
-        return False
-    return bool(-LARGEST <= value <= LARGEST)
+def _argument(
+    default: Any, check: checks.Check, unit: str, meaning: str, *, draw: int | None = None
+) -> Any:
+    """Declare an argument: a field of a dataclass that carries an `Argument`."""
+    declared = Argument(default, check, unit, meaning, draw)
+    return field(default=default, metadata={"argument": declared})
 
 
-def _number(name: str, value: Any, allowed: str = "a number within +-1e9") -> float:
-    if not _is_number(value):
-        _reject(name, value, allowed)
-    return float(value) + 0.0  # never -0
+@dataclass(frozen=True, kw_only=True)
+class PlantNumbers(Generic[Value]):
+    """The numbers of a plant that can differ from episode to episode.
+
+    As arguments they are a `Number` each: a number, or a range to draw from. During an episode
+    they are a float each for one plant, and an array each for many.
+    """
+
+    delay: Value = _argument(
+        18, checks.count, "samples", "transport delay d of the plant (28)", draw=0
+    )
+    dead_zone: Value = _argument(
+        5.0, checks.not_negative, "t/h", "half width of the actuator's dead zone (29)", draw=1
+    )
+    u_min: Value = _argument(
+        -10.0, checks.number, "t/h", "lower limit of the actuator, U_min in (29)", draw=2
+    )
+    u_max: Value = _argument(
+        10.0, checks.number, "t/h", "upper limit of the actuator, U_max in (29)", draw=3
+    )
+    noise_variance: Value = _argument(
+        0.0, checks.not_negative, "degC^2", "R, the variance of xi in (28)", draw=4
+    )
+    measurement_noise_variance: Value = _argument(
+        0.0,
+        checks.not_negative,
+        "degC^2",
+        "variance of the transmitter's white noise, which the observation shows and the reward "
+        "does not",
+        draw=5,
+    )
+    disturbance_amplitude: Value = _argument(
+        0.0,
+        checks.not_negative,
+        "degC",
+        "largest level of the steps of the load disturbance, up or down",
+        draw=6,
+    )
+    disturbance_interval: Value = _argument(
+        150.0,
+        checks.at_least_1,
+        "samples",
+        "mean interval between these steps; below 10 it is 10",
+        draw=7,
+    )
+    disturbance_walk_variance: Value = _argument(
+        0.0,
+        checks.not_negative,
+        "degC^2",
+        "variance that the random walk of the load disturbance adds in each sample",
+        draw=8,
+    )
+    gain_factor: Value = _argument(
+        1.0,
+        checks.positive,
+        "",
+        "steady-state gain, as a multiple of the gain that `a` and `b` have",
+        draw=9,
+    )
+    time_constant_factor: Value = _argument(
+        1.0,
+        checks.positive,
+        "",
+        "dominant time constant, as a multiple of the one that `a` has",
+        draw=10,
+    )
+    gain_drift: Value = _argument(
+        1.0, checks.positive, "", "factor by which the gain changes in `drift_samples`", draw=11
+    )
+    time_constant_drift: Value = _argument(
+        1.0,
+        checks.positive,
+        "",
+        "factor by which the time constant changes in `drift_samples`",
+        draw=12,
+    )
+
+    def chosen(self, names: Sequence[str]) -> dict[str, Value]:
+        """Return some of the numbers by name."""
+        return {name: getattr(self, name) for name in names}
 
 
-def _not_negative(name: str, value: Any) -> float:
-    allowed = "a number from 0 to 1e9"
-    if _number(name, value, allowed) < 0:
-        _reject(name, value, allowed)
-    return float(value)
-
-
-def _positive(name: str, value: Any) -> float:
-    allowed = "a number above 0, up to 1e9"
-    if _number(name, value, allowed) <= 0:
-        _reject(name, value, allowed)
-    return float(value)
-
-
-def is_count(value: Any, minimum: int = 0) -> bool:
-    """Whether a value is an integer of at least `minimum`."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= minimum
-
-
-def _count(name: str, value: Any, minimum: int = 0) -> int:
-    if not is_count(value, minimum):
-        _reject(name, value, f"an integer of at least {minimum}")
-    return int(value)
-
-
-def positive_count(name: str, value: Any) -> int:
-    """Return a value if it is an integer of at least 1; ValueError, naming it, otherwise."""
-    return _count(name, value, minimum=1)
-
-
-def _at_least_1(name: str, value: Any) -> float:
-    allowed = "a number from 1 to 1e9"
-    if _number(name, value, allowed) < 1:
-        _reject(name, value, allowed)
-    return float(value)
-
-
-def _or_range(check: Callable[[str, Any], float]) -> Callable[[str, Any], Number]:
-    """Return a check that takes a range [low, high] as well, of what `check` takes."""
-
-    def checked(name: str, value: Any) -> Number:
-        if not isinstance(value, list | tuple):
-            return check(name, value)
-        if len(value) != 2:
-            _reject(name, value, "one number, or a range [low, high]")
-        low, high = check(name, value[0]), check(name, value[1])
-        if low > high:
-            _reject(name, value, "one number, or a range [low, high] with low <= high")
-        return low, high
-
-    return checked
-
-
-def _numbers(
-    name: str, value: Any, allowed: str = "a list of one or more numbers within +-1e9"
-) -> tuple[float, ...]:
-    if not isinstance(value, list | tuple) or not value or not all(map(_is_number, value)):
-        _reject(name, value, allowed)
-    return tuple(float(element) for element in value)
-
-
-def _polynomial(name: str, value: Any) -> tuple[float, ...]:
-    allowed = "a list of numbers within +-1e9, the first of them 1"
-    coefficients = _numbers(name, value, allowed)
-    if coefficients[0] != 1.0:
-        _reject(name, value, allowed)
-    return coefficients
-
-
-def _setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
-    if isinstance(value, str) and value in SETPOINTS:
-        return value
-    allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
-    if isinstance(value, list | tuple):
-        return _numbers(name, value, allowed)
-    return _number(name, value, allowed)
-
-
-def _reward(name: str, value: Any) -> str:
-    if not isinstance(value, str) or value not in REWARDS:
-        _reject(name, value, "'quadratic' or 'absolute'")
-    return value
-
-
-def slowest_pole(a: Sequence[float]) -> float:
-    """Return the largest pole of 1 / A, NaN if it is none or not real."""
+def slowest_pole(a: Sequence[float]) -> complex | None:
+    """Return the pole of 1 / A with the largest magnitude, None if there is no pole."""
     poles = np.roots(a)
-    slowest = poles[np.argmax(np.abs(poles))] if len(poles) else np.nan
-    return float(slowest.real) if np.isreal(slowest) else math.nan
+    return complex(poles[np.argmax(np.abs(poles))]) if len(poles) else None
 
 
 def _least_magnitude(low: float, high: float) -> float:
@@ -150,11 +168,11 @@ def _shown(number: Number) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parameters:
+class Parameters(PlantNumbers[Number]):
     """The arguments of `MiddlePoint-v0`, checked and brought to plain Python types.
 
     The defaults are the first case of the paper (Section 5, Fig. 5). All quantities are
-    deviations from the operating point. Those named in `PLANT_NUMBERS` can be a range.
+    deviations from the operating point. The fields of `PlantNumbers` can be a range.
 
     Raises
     ------
@@ -164,94 +182,117 @@ class Parameters:
     """
 
     # The plant, (28): A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k).
-    a: Sequence[float] = (1.0, -0.45181, -0.47546)  # A, from z^0 on; the first is 1
-    b: Sequence[float] = (-0.04560, -0.00404)  # B, from z^-1 on; degC per t/h
-    c: Sequence[float] = (1.0, -0.35740, -0.03392)  # C, from z^0 on; the first is 1
-    delay: Number = 18  # d, samples
-    # The actuator, (29).
-    dead_zone: Number = 5.0  # t/h
-    u_min: Number = -10.0  # U_min, t/h
-    u_max: Number = 10.0  # U_max, t/h
-    noise_variance: Number = 0.0  # R, the variance of xi, degC^2
-    # What the paper names in Section 1, beside delay and actuator, and leaves out of (28).
-    measurement_noise_variance: Number = 0.0  # white, degC^2
-    disturbance_amplitude: Number = 0.0  # of its steps, degC
-    disturbance_interval: Number = 150.0  # between steps, on average, samples
-    disturbance_walk_variance: Number = 0.0  # that its random walk gains a sample, degC^2
-    gain_factor: Number = 1.0  # steady-state gain, in multiples of that of B / A
-    time_constant_factor: Number = 1.0  # dominant time constant, in multiples of that of A
-    gain_drift: Number = 1.0  # by which factor the gain has changed after drift_samples
-    time_constant_drift: Number = 1.0  # by which the time constant has
-    drift_samples: int = 1200
-    sampling_interval: float = 8.0  # s (Section 5)
-    # The set point y_d. The paper plots it and does not state it.
-    setpoint: str | float | Sequence[float] = "square"
-    setpoint_amplitude: float = 5.0  # degC
-    setpoint_period: int = 600  # samples
-    # The observation: how many of the latest samples of each signal.
-    setpoint_window: int = 3  # y_d(k), y_d(k-1), y_d(k-2): inputs 1 to 3 of the paper's NN
-    error_window: int = 3  # e(k), e(k-1), e(k-2): inputs 4 to 6
-    output_window: int = 0
-    action_window: int = 0
-    temperature_span: float = 50.0  # degC; the transmitter saturates at +-span
-    # The reward.
-    reward: str = "quadratic"  # the negative of the cost (12), scaled
-    error_scale: float = 5.0  # degC
-    move_weight: float = 0.0  # per unit of normalised action
+    a: Sequence[float] = _argument(
+        (1.0, -0.45181, -0.47546),
+        checks.polynomial,
+        "",
+        "coefficients of A in (28), from z^0 on; the first is 1. A may be unstable, and y may "
+        "then grow beyond all floats",
+    )
+    b: Sequence[float] = _argument(
+        (-0.04560, -0.00404),
+        checks.numbers,
+        "degC per t/h",
+        "coefficients of B in (28), from z^-1 on",
+    )
+    c: Sequence[float] = _argument(
+        (1.0, -0.35740, -0.03392),
+        checks.polynomial,
+        "",
+        "coefficients of C in (28), from z^0 on; the first is 1",
+    )
+    drift_samples: int = _argument(
+        1200, checks.positive_count, "samples", "how long gain and time constant drift"
+    )
+    sampling_interval: float = _argument(  # Section 5
+        8.0, checks.positive, "s", "scale of the time axis, without effect on the dynamics"
+    )
+    # The paper plots the set point and does not state it.
+    setpoint: str | float | Sequence[float] = _argument(
+        "square",
+        checks.setpoint,
+        "degC",
+        '"square", "random", a number (constant), or a list with a number for each sample, of '
+        "which the last one is held. [-5, 5] is a list of two samples, not a range",
+    )
+    setpoint_amplitude: float = _argument(
+        5.0,
+        checks.not_negative,
+        "degC",
+        'A. "square": A for the first half period, then -A. "random": levels uniform in '
+        "[-A, A]",
+    )
+    setpoint_period: int = _argument(
+        600,
+        checks.positive_count,
+        "samples",
+        'period of "square". "random": each level is held for a length uniform in '
+        "[period/6, period/2]",
+    )
+    # The observation. By default it is the six inputs of the paper's network: y_d(k), y_d(k-1),
+    # y_d(k-2), e(k), e(k-1), e(k-2).
+    setpoint_window: int = _argument(
+        3, checks.count, "samples", "how many of the latest set points the observation holds"
+    )
+    error_window: int = _argument(3, checks.count, "samples", "the same for errors")
+    output_window: int = _argument(0, checks.count, "samples", "the same for measured outputs")
+    action_window: int = _argument(0, checks.count, "samples", "the same for past actions")
+    temperature_span: float = _argument(
+        50.0,
+        checks.positive,
+        "degC",
+        "range of the transmitter: the measurement saturates at +-`temperature_span`",
+    )
+    reward: str = _argument("quadratic", checks.reward, "", '"quadratic" or "absolute"')
+    error_scale: float = _argument(
+        5.0,
+        checks.positive,
+        "degC",
+        'the error that costs 1/2 ("quadratic") or 1 ("absolute") in each sample',
+    )
+    move_weight: float = _argument(
+        0.0, checks.not_negative, "", "cost of a change of the normalised action by 1"
+    )
 
     def __post_init__(self) -> None:
-        checks: dict[str, Callable[[str, Any], Any]] = {
-            "a": _polynomial,
-            "b": _numbers,
-            "c": _polynomial,
-            "delay": _or_range(_count),
-            "dead_zone": _or_range(_not_negative),
-            "u_min": _or_range(_number),
-            "u_max": _or_range(_number),
-            "noise_variance": _or_range(_not_negative),
-            "measurement_noise_variance": _or_range(_not_negative),
-            "disturbance_amplitude": _or_range(_not_negative),
-            "disturbance_interval": _or_range(_at_least_1),
-            "disturbance_walk_variance": _or_range(_not_negative),
-            "gain_factor": _or_range(_positive),
-            "time_constant_factor": _or_range(_positive),
-            "gain_drift": _or_range(_positive),
-            "time_constant_drift": _or_range(_positive),
-            "drift_samples": positive_count,
-            "sampling_interval": _positive,
-            "setpoint": _setpoint,
-            "setpoint_amplitude": _not_negative,
-            "setpoint_period": positive_count,
-            "setpoint_window": _count,
-            "error_window": _count,
-            "output_window": _count,
-            "action_window": _count,
-            "temperature_span": _positive,
-            "reward": _reward,
-            "error_scale": _positive,
-            "move_weight": _not_negative,
-        }
-        for name, check in checks.items():
-            object.__setattr__(self, name, check(name, getattr(self, name)))
-
+        for name, argument in ARGUMENTS.items():
+            object.__setattr__(self, name, argument.checked(name, getattr(self, name)))
         self._check_actuator()
         self._check_dynamics()
         if self.observation_size == 0:
-            _reject(
+            reject(
                 "setpoint_window, error_window, output_window, action_window",
                 (0, 0, 0, 0),
                 "such that the observation has at least one element",
             )
 
+    @classmethod
+    def of_environment(cls, arguments: Mapping[str, Any]) -> Parameters:
+        """Check what an environment was given by name.
+
+        Raises
+        ------
+        TypeError
+            If an argument is unknown; the message names the one that was probably meant.
+        ValueError
+            If an argument is out of range.
+        """
+        for name in arguments:
+            if name not in ARGUMENTS:
+                close = difflib.get_close_matches(name, [*ARGUMENTS, "render_mode"], n=1)
+                hint = f": did you mean {close[0]!r}?" if close else ""
+                raise TypeError(f"MiddlePoint-v0 has no argument {name!r}{hint}")
+        return cls(**arguments)
+
     def _check_actuator(self) -> None:
         """Refuse limits and a dead zone that do not fit together, whatever is drawn."""
         (lowest, low), (high, highest) = self.range_of("u_min"), self.range_of("u_max")
         if low >= high:
-            _reject("u_min", self.u_min, f"below u_max = {_shown(self.u_max)}")
+            reject("u_min", self.u_min, f"below u_max = {_shown(self.u_max)}")
         # The draw that leaves least of both limits.
         reach = max(_least_magnitude(lowest, low), _least_magnitude(high, highest))
         if self.range_of("dead_zone")[1] > reach:
-            _reject(
+            reject(
                 "dead_zone",
                 self.dead_zone,
                 "small enough to leave some command effective, at most max(|u_min|, |u_max|) = "
@@ -261,24 +302,36 @@ class Parameters:
     def _check_dynamics(self) -> None:
         """Refuse a change of dynamics that A has no meaning for."""
         name = "time_constant_factor"
-        drift = self.range_of("time_constant_drift")[0]
         if self.changes_time_constant:
+            names, given = (
+                f"{name}, time_constant_drift",
+                (
+                    self.time_constant_factor,
+                    self.time_constant_drift,
+                ),
+            )
             pole = slowest_pole(self.a)
-            if not 0.0 < pole < 1.0:
-                _reject(
-                    f"{name}, time_constant_drift",
-                    (getattr(self, name), self.time_constant_drift),
-                    f"1 for this a, whose slowest pole, {pole:g}, is not between 0 and 1",
+            if pole is None:
+                reject(names, given, "1 for this a, which has no pole")
+            if pole.imag != 0.0:
+                reject(names, given, "1 for this a, whose slowest poles are complex")
+            rate = 1.0 - pole.real
+            if not 0.0 < pole.real < 1.0:
+                reject(
+                    names,
+                    given,
+                    f"1 for this a, whose slowest pole, {pole.real:g}, is not between 0 and 1",
                 )
-            if self.range_of(name)[0] * min(drift, 1.0) < 1.0 - pole:
-                _reject(
-                    f"{name}, time_constant_drift",
-                    (getattr(self, name), self.time_constant_drift),
-                    f"such that the factor is never below {1.0 - pole:g}, where the slowest "
-                    "pole comes to 0",
+            drift = self.range_of("time_constant_drift")[0]
+            if self.range_of(name)[0] * min(drift, 1.0) < rate:
+                reject(
+                    names,
+                    given,
+                    f"such that the factor is never below {rate:g}, where the slowest pole "
+                    "comes to 0",
                 )
         if self.is_disturbed and not np.all(np.abs(np.roots(self.a)) < 1.0):
-            _reject(
+            reject(
                 "disturbance_amplitude, disturbance_walk_variance",
                 (self.disturbance_amplitude, self.disturbance_walk_variance),
                 "0 for this a, which is not stable and has no steady state",
@@ -341,3 +394,36 @@ class Parameters:
             return self.setpoint_amplitude
         levels = self.setpoint if isinstance(self.setpoint, tuple) else (self.setpoint,)
         return max(abs(float(level)) for level in levels)
+
+
+def _places_of_draws() -> Mapping[str, int]:
+    """Return which draw each plant number takes, once it is sure that no two take the same."""
+    places = {each.name: each.metadata["argument"].draw for each in fields(PlantNumbers)}
+    if len(set(places.values())) < len(places) or not set(places.values()) <= set(range(DRAWS)):
+        raise TypeError(f"each plant number needs a draw of its own below {DRAWS}: {places}")
+    return MappingProxyType(places)
+
+
+ARGUMENTS: Final[Mapping[str, Argument]] = MappingProxyType(
+    {each.name: each.metadata["argument"] for each in fields(Parameters)}
+)
+"""What is declared of each argument, by name."""
+
+PLANT_NUMBERS: Final = _places_of_draws()
+"""The arguments that can be a range, by name, and which draw of a reset each takes."""
+
+
+def argument_table() -> str:
+    """Return a Markdown table of all arguments but `render_mode`."""
+    rows = (argument.row(name) for name, argument in ARGUMENTS.items())
+    return "\n".join(["| Argument | Default | Unit | Meaning |", "|---|---|---|---|", *rows])
+
+
+def argument_signature() -> list[inspect.Parameter]:
+    """Return all arguments but `render_mode` as those of a function, for help()."""
+    return [
+        each.replace(annotation="float | Sequence[float]")
+        if each.name in PLANT_NUMBERS
+        else each
+        for each in inspect.signature(Parameters).parameters.values()
+    ]

@@ -7,16 +7,16 @@ and `Plants` in arrays. Both do the same operations in the same order, and agree
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
 from operator import mul
-from typing import Any
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import PLANT_NUMBERS, SLOW, Parameters, slowest_pole
+from mptc_gym.parameters import PLANT_NUMBERS, Parameters, PlantNumbers, slowest_pole
 
 Values = NDArray[np.float64]  # one a plant, shape (n,)
+DRIFT_INTERVAL: Final = 10  # samples between two changes of drifting dynamics
 
 
 def action_from_command(command: float, u_min: Any, u_max: Any) -> Any:
@@ -46,14 +46,14 @@ class Dynamics:
         self._sum = sum(parameters.a)
         self._quotient: tuple[float, ...] | None = None
         if parameters.changes_time_constant:
-            pole = slowest_pole(parameters.a)
+            pole = cast("complex", slowest_pole(parameters.a)).real  # as Parameters has checked
             self._rate = 1.0 - pole
             quotient = [1.0]  # Q, by Horner's scheme
             for coefficient in parameters.a[1:-1]:
                 quotient.append(coefficient + pole * quotient[-1])
             self._quotient = (*quotient, 0.0)
 
-    def factors(self, numbers: Mapping[str, Any], age: Any) -> tuple[Any, Any]:
+    def factors(self, numbers: PlantNumbers[Any], age: Any) -> tuple[Any, Any]:
         """Return g and t.
 
         Parameters
@@ -64,10 +64,10 @@ class Dynamics:
             k, one number, or an array.
         """
         share = np.minimum(age / self._samples, 1.0)
-        gain, time_constant = numbers["gain_factor"], numbers["time_constant_factor"]
+        gain, time_constant = numbers.gain_factor, numbers.time_constant_factor
         return (
-            gain + gain * (numbers["gain_drift"] - 1.0) * share,
-            time_constant + time_constant * (numbers["time_constant_drift"] - 1.0) * share,
+            gain + gain * (numbers.gain_drift - 1.0) * share,
+            time_constant + time_constant * (numbers.time_constant_drift - 1.0) * share,
         )
 
     def coefficients(self, gain: Any, time_constant: Any) -> tuple[list[Any], Any, Any]:
@@ -110,9 +110,9 @@ class Plant:
         Gain and time constant, as multiples of those that A and B have.
     """
 
-    def __init__(self, parameters: Parameters, numbers: Mapping[str, float]) -> None:
-        u_min, u_max = numbers["u_min"], numbers["u_max"]
-        self._actuator = numbers["dead_zone"], u_min, u_max, (u_max - u_min) / 2.0
+    def __init__(self, parameters: Parameters, numbers: PlantNumbers[float]) -> None:
+        u_min, u_max = numbers.u_min, numbers.u_max
+        self._actuator = numbers.dead_zone, u_min, u_max, (u_max - u_min) / 2.0
         self._numbers = numbers
         self._drifts = parameters.drifts
         self._age = 0
@@ -120,7 +120,7 @@ class Plant:
         self._foul()
         # Each coefficient with its place in the history it is for, and both histories with the
         # newest sample first: y(k), y(k-1), ... and u_a(k), u_a(k-1), ...
-        delay = int(numbers["delay"])
+        delay = int(numbers.delay)
         self._beta = tuple(enumerate(parameters.b, start=delay))
         self._outputs = _at_rest(len(self._alpha))
         self._inputs = _at_rest(delay + len(self._beta))
@@ -148,7 +148,7 @@ class Plant:
         """
         if self._drifts:
             self._age += 1
-            if self._age % SLOW == 0:
+            if self._age % DRIFT_INTERVAL == 0:
                 self._foul()
         dead_zone, u_min, u_max, half_range = self._actuator
         command = u_min + (action + 1.0) * half_range  # Section 4, last formula
@@ -199,16 +199,20 @@ class Plants:
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         # An array of one number costs less in arithmetic than a number does. Where arrays are
         # compared, full ones cost less still.
-        self._numbers = {
-            name: np.full(num_envs if name in parameters.ranges else (), low, np.float64)
-            for name in PLANT_NUMBERS
-            for low in parameters.range_of(name)[:1]
-        }
+        self._drawn = parameters.ranges
+        self._numbers: PlantNumbers[Values] = PlantNumbers(
+            **{
+                name: np.full(
+                    num_envs if name in self._drawn else (), parameters.range_of(name)[0], float
+                )
+                for name in PLANT_NUMBERS
+            }
+        )
         zero, one = np.array(0.0), np.array(1.0)
-        u_min, u_max = self._numbers["u_min"], self._numbers["u_max"]
+        u_min, u_max = self._numbers.u_min, self._numbers.u_max
         self._half_range = np.array((u_max - u_min) / 2.0)
         self._limits = np.full(num_envs, u_min), np.full(num_envs, u_max)
-        dead_zone = self._numbers["dead_zone"]
+        dead_zone = self._numbers.dead_zone
         self._actuator = zero, one, self._half_range, u_min, dead_zone, *self._limits
 
         self._dynamics = Dynamics(parameters)
@@ -236,32 +240,31 @@ class Plants:
             self._earlier = np.zeros((self._longer + self._samples, num_envs))
             self._taken = np.zeros(self._response.shape, np.intp)
 
-    def rest(self, which: NDArray[np.intp], drawn: Mapping[str, Values]) -> None:
+    def rest(self, which: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
         """Bring some of the plants to rest.
 
         Parameters
         ----------
         which
             Their indices.
-        drawn
-            What is drawn of their plant numbers, each of shape (len(which),).
+        numbers
+            Their plant numbers; those that are drawn have the shape (len(which),).
         """
         self._inputs[:, which] = 0.0
         self._response[:, which] = 0.0
         for outputs in self._outputs:
             outputs[which] = 0.0
-        for name, values in drawn.items():
-            self._numbers[name][which] = values
-        numbers = self._numbers
-        if "u_min" in drawn or "u_max" in drawn:
-            u_min, u_max = numbers["u_min"], numbers["u_max"]
+        for name, values in numbers.chosen(self._drawn).items():
+            getattr(self._numbers, name)[which] = values
+        if "u_min" in self._drawn or "u_max" in self._drawn:
+            u_min, u_max = self._numbers.u_min, self._numbers.u_max
             for limit, values in zip(self._limits, (u_min, u_max), strict=True):
                 limit[:] = values
             self._half_range[:] = (u_max - u_min) / 2.0
         if self._longer:
             self._earlier[:, which] = 0.0
             rows = np.arange(self._samples)[:, np.newaxis] + self._longer + self._shortest
-            rows = rows - numbers["delay"][which].astype(np.intp)
+            rows = rows - numbers.delay.astype(np.intp)
             self._taken[:, which] = rows * self._inputs.shape[1] + which
         if self._fouls:
             if self._drifts:
@@ -335,11 +338,11 @@ class Plants:
     def _foul(self) -> None:
         """Bring the dynamics to the plants' ages."""
         ages = self._clock - self._starts
-        slow = ages // SLOW * SLOW
+        slow = ages // DRIFT_INTERVAL * DRIFT_INTERVAL
         self.factors = self._dynamics.factors(self._numbers, slow)
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*self.factors)
         self._alpha = tuple(map(np.asarray, alpha))
-        self._next_fouling = self._clock + int((slow + SLOW - ages).min())
+        self._next_fouling = self._clock + int((slow + DRIFT_INTERVAL - ages).min())
 
 
 def _at_rest(samples: int) -> deque[float]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import PLANT_NUMBERS, Parameters
+from mptc_gym.parameters import ARGUMENTS, DRAWS, PLANT_NUMBERS, Parameters, PlantNumbers
 
-_DRAWS = 32  # an episode: enough for every plant number, and for those to come
+Values = NDArray[np.float64]  # of shape (episodes,), or () where all episodes have the same
 
 
 class Ranges:
@@ -21,28 +22,34 @@ class Ranges:
     Parameters
     ----------
     parameters
-        Uses the arguments named in `PLANT_NUMBERS`.
+        Uses the plant numbers.
 
     Attributes
     ----------
     names : tuple of str
         The arguments that are ranges.
-    given : dict of str to float
+    given : PlantNumbers of float
         All plant numbers, with the lower end of a range.
+    given_arrays : PlantNumbers of ndarray
+        The same as arrays of shape ().
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self.names = parameters.ranges
-        self.given = {name: float(parameters.range_of(name)[0]) for name in PLANT_NUMBERS}
-        self._places = [PLANT_NUMBERS.index(name) for name in self.names]
-        self._lows = np.array([self.given[name] for name in self.names])
+        lows = {name: float(parameters.range_of(name)[0]) for name in PLANT_NUMBERS}
+        self.given: PlantNumbers[float] = PlantNumbers(**lows)
+        self.given_arrays: PlantNumbers[Values] = PlantNumbers(
+            **{name: np.array(low) for name, low in lows.items()}
+        )
+        self._places = [PLANT_NUMBERS[name] for name in self.names]
+        self._lows = np.array([lows[name] for name in self.names])
         highs = np.array([float(parameters.range_of(name)[1]) for name in self.names])
-        self._whole = np.array([name == "delay" for name in self.names], np.bool_)
+        self._whole = np.array([ARGUMENTS[name].is_integer for name in self.names], np.bool_)
         self._widths = highs - self._lows + self._whole
 
     def draw(
         self, generators: Iterable[np.random.Generator], episodes: int
-    ) -> dict[str, NDArray[np.float64]]:
+    ) -> PlantNumbers[Values]:
         """Draw for some episodes.
 
         Parameters
@@ -54,12 +61,22 @@ class Ranges:
 
         Returns
         -------
-        dict
-            What is a range, each of shape (episodes,).
+        PlantNumbers of ndarray
+            What is a range has the shape (episodes,), anything else the shape ().
         """
-        draws = np.empty((episodes, _DRAWS))
+        draws = np.empty((episodes, DRAWS))
         for generator, row in zip(generators, draws, strict=True):
             generator.random(out=row)
         offsets = draws[:, self._places] * self._widths
         offsets[:, self._whole] = np.floor(offsets[:, self._whole])
-        return dict(zip(self.names, (self._lows + offsets).T, strict=True))
+        return replace(
+            self.given_arrays, **dict(zip(self.names, (self._lows + offsets).T, strict=True))
+        )
+
+
+def numbers_of_plant(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
+    """Return the numbers of the i-th of many plants."""
+    arrays = numbers.chosen(tuple(PLANT_NUMBERS))
+    return PlantNumbers(
+        **{name: float(array[i] if array.ndim else array) for name, array in arrays.items()}
+    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from types import ModuleType
 from typing import cast
@@ -18,6 +18,8 @@ import numpy as np
 from gymnasium import logger
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from numpy.typing import NDArray
+
+from mptc_gym.parameters import PlantNumbers
 
 Frame = NDArray[np.uint8]
 Sample = tuple[float, float, float, float]  # y_d(k), y(k), u(k-1), u_a(k-1)
@@ -163,7 +165,7 @@ class Record:
         }
 
 
-def begin(numbers: Mapping[str, float], sampling_interval: float, setpoint: float) -> Record:
+def begin(numbers: PlantNumbers[float], sampling_interval: float, setpoint: float) -> Record:
     """Begin the record of an episode, of a plant at rest.
 
     Parameters
@@ -176,10 +178,10 @@ def begin(numbers: Mapping[str, float], sampling_interval: float, setpoint: floa
         y_d(0), degC.
     """
     plate = Nameplate(
-        delay=int(numbers["delay"]),
-        dead_zone=numbers["dead_zone"],
-        u_min=numbers["u_min"],
-        u_max=numbers["u_max"],
+        delay=int(numbers.delay),
+        dead_zone=numbers.dead_zone,
+        u_min=numbers.u_min,
+        u_max=numbers.u_max,
         sampling_interval=sampling_interval,
     )
     return Record(plate, setpoint)

@@ -8,17 +8,18 @@ costs a small part of drawing them one by one, and gives the same numbers.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import SLOW, Parameters
+from mptc_gym.parameters import Parameters, PlantNumbers
 
 BLOCK = 600  # samples made at a time
 FOREVER = 1 << 62  # samples
 _TOGETHER = 32  # plants whose draws are made at a time: they stay in the processor's cache
+LOAD_INTERVAL = 10  # samples between two changes of the load disturbance
 _CHANGES = 60  # of a disturbance made at a time
 
 
@@ -139,7 +140,7 @@ class Noises:
         self,
         which: NDArray[np.intp],
         streams: Iterable[EpisodeStream],
-        variances: NDArray[np.float64] | None,
+        variances: NDArray[np.float64],
     ) -> None:
         """Begin an episode of some plants.
 
@@ -150,11 +151,11 @@ class Noises:
         streams
             One for each.
         variances
-            Of their xi, shape (len(which),), if it is drawn.
+            Of their xi, shape (len(which),), or () where it is not drawn.
         """
         if self.silent:
             return
-        if variances is not None and not self._alike:
+        if not self._alike:
             self._colour[:, which] = np.sqrt(variances)[:, np.newaxis] * self._c
         self._past[which] = 0.0
         for i, stream in zip(which.tolist(), streams, strict=True):
@@ -341,9 +342,9 @@ class SetPoints:
 class Disturbance:
     """The load disturbance w(k), from k = 0 on: steps and a random walk, both from 0.
 
-    It changes every `SLOW` samples. Then the walk takes a step, uniform and as wide as the
-    variance asks for, as the sum of many is normal all the same; and with a probability of
-    `SLOW / disturbance_interval` the other part jumps to a new level, uniform within
+    It changes every `LOAD_INTERVAL` samples. The walk takes a uniform step, as wide as the
+    variance asks for; the sum of many is normal all the same. With a probability of
+    `LOAD_INTERVAL / disturbance_interval` the other part jumps to a new level, uniform within
     +-`disturbance_amplitude`.
 
     Parameters
@@ -355,7 +356,7 @@ class Disturbance:
     def __init__(self, parameters: Parameters) -> None:
         self._silent = not parameters.is_disturbed
 
-    def restart(self, generator: np.random.Generator, numbers: Mapping[str, float]) -> None:
+    def restart(self, generator: np.random.Generator, numbers: PlantNumbers[float]) -> None:
         """Begin an episode; draws go on from where the generator is.
 
         Parameters
@@ -368,7 +369,7 @@ class Disturbance:
         self._generator = generator
         self._shape = np.array([_shape(numbers)])
         self._last = np.zeros((1, 2))
-        self._ahead = [0.0] * SLOW
+        self._ahead = [0.0] * LOAD_INTERVAL
 
     def take(self, samples: int) -> list[float]:
         """Return the next values of w, degC."""
@@ -377,7 +378,7 @@ class Disturbance:
         while len(self._ahead) < samples:
             draws = self._generator.random((1, _CHANGES, 3))
             levels, self._last = _disturbance(draws, self._shape, self._last)
-            self._ahead += np.repeat(levels[0], SLOW).tolist()
+            self._ahead += np.repeat(levels[0], LOAD_INTERVAL).tolist()
         values, self._ahead = self._ahead[:samples], self._ahead[samples:]
         return values
 
@@ -410,16 +411,17 @@ class Disturbances:
         self,
         which: NDArray[np.intp],
         generators: Iterable[np.random.Generator],
-        numbers: Mapping[str, NDArray[np.float64]],
+        numbers: PlantNumbers[NDArray[np.float64]],
         clock: int,
     ) -> None:
         """Begin an episode of some plants, with a generator and plant numbers for each."""
         self._generators |= zip(which.tolist(), generators, strict=True)
-        self._shapes[which] = np.stack(_shape(numbers), axis=-1)
+        for column, values in enumerate(_shape(numbers)):
+            self._shapes[which, column] = values
         self._last[which] = 0.0
         self._now[which] = 0.0
         self._places[which] = self._ends[which]
-        self._changes[which] = clock + SLOW
+        self._changes[which] = clock + LOAD_INTERVAL
         self._next_change = int(self._changes.min())
 
     def at(self, clock: int) -> NDArray[np.float64]:
@@ -429,7 +431,7 @@ class Disturbances:
             self._refill(np.flatnonzero(due & (self._places == self._ends)))
             np.copyto(self._now, self._levels.take(self._places, mode="clip"), where=due)
             self._places += due
-            self._changes += SLOW * due
+            self._changes += LOAD_INTERVAL * due
             self._next_change = int(self._changes.min())
         return self._now
 
@@ -446,13 +448,13 @@ class Disturbances:
         self._places[which] = self._ends[which] - _CHANGES
 
 
-def _shape(numbers: Mapping[str, Any]) -> tuple[Any, Any, Any]:
+def _shape(numbers: PlantNumbers[Any]) -> tuple[Any, Any, Any]:
     """Return amplitude, probability of a jump and half width of the walk's steps."""
     return (
-        numbers["disturbance_amplitude"],
-        SLOW / numbers["disturbance_interval"],
+        numbers.disturbance_amplitude,
+        LOAD_INTERVAL / numbers.disturbance_interval,
         # Uniform within +-h, a step has the variance h^2 / 3.
-        np.sqrt(3.0 * SLOW * numbers["disturbance_walk_variance"]),
+        np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance),
     )
 
 

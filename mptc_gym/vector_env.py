@@ -14,10 +14,10 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mptc_gym import rendering
+from mptc_gym.checks import is_count, positive_count
 from mptc_gym.env import MiddlePointEnv
-from mptc_gym.parameters import is_count, positive_count
 from mptc_gym.plant import Plants, action_from_command
-from mptc_gym.ranges import Ranges
+from mptc_gym.ranges import Ranges, numbers_of_plant
 from mptc_gym.signals import BLOCK, FOREVER, Disturbances, Noises, SetPoints, Streams
 
 Infos = dict[str, Any]
@@ -161,9 +161,6 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         self._newest = tuple(
             np.s_[:, head] if window else None
             for head, window in zip((0, *parameters.heads), parameters.windows, strict=True)
-        )
-        self._rest_action = action_from_command(
-            0.0, self._ranges.given["u_min"], self._ranges.given["u_max"]
         )
         self._actions = np.zeros(num_envs)  # the last ones
         # The observations of all plants lie in this row, one after the other, from a place on
@@ -400,32 +397,21 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     def _begin(self, which: Indices, infos: Infos) -> None:
         """Begin an episode of some plants, and put their infos of k = 0 in."""
         streams = [self._streams[i] for i in which.tolist()]
-        drawn: dict[str, Values] = {}
+        numbers = self._ranges.given_arrays
         if self._ranges.names or self._disturbances is not None:
             generators = [each.plant.next_episode() for each in streams]
-            drawn = self._ranges.draw(generators, len(which))
+            numbers = self._ranges.draw(generators, len(which))
             if self._disturbances is not None:
-                numbers = {
-                    name: drawn.get(name, np.full(len(which), value))
-                    for name, value in self._ranges.given.items()
-                }
                 self._disturbances.restart(which, generators, numbers, self._clock)
-        self._plants.rest(which, drawn)
-        self._noises.restart(
-            which, (each.noise for each in streams), drawn.get("noise_variance")
-        )
+        self._plants.rest(which, numbers)
+        self._noises.restart(which, (each.noise for each in streams), numbers.noise_variance)
         self._transmitters.restart(
             which,
             (each.transmitter for each in streams),
-            drawn.get("measurement_noise_variance"),
+            numbers.measurement_noise_variance,
         )
         self._setpoints.restart(which, (each.setpoint for each in streams), self._clock)
-        rest_action = self._rest_action
-        if "u_min" in drawn or "u_max" in drawn:
-            u_min, u_max = (
-                drawn.get(name, self._ranges.given[name]) for name in ("u_min", "u_max")
-            )
-            rest_action = action_from_command(0.0, u_min, u_max)
+        rest_action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         self._actions[which] = rest_action
         self._ends[which] = self._clock + self._limit
         self._first_end = int(self._ends.min())
@@ -445,13 +431,13 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             infos[name][which] = setpoint if name in ("setpoint", "error") else 0.0
         for name, factors in zip(self._factors, self._plants.factors, strict=False):
             infos[name][which] = factors[which]
-        for name, values in drawn.items():
+        for name, values in numbers.chosen(self._ranges.names).items():
             infos[name][which] = values
         if self.render_mode is not None:
             for j, (i, first) in enumerate(zip(which.tolist(), setpoint.tolist(), strict=True)):
-                own = {name: float(values[j]) for name, values in drawn.items()}
                 interval = self.parameters.sampling_interval
-                self._records[i] = rendering.begin(self._ranges.given | own, interval, first)
+                own = numbers_of_plant(numbers, j)
+                self._records[i] = rendering.begin(own, interval, first)
 
     def _seed(self, which: Indices, seeds: Sequence[int | None]) -> None:
         for i in which.tolist():

@@ -1,5 +1,6 @@
 """What is off by default: transmitter noise, disturbance, other dynamics, fouling, ranges."""
 
+from dataclasses import field, make_dataclass, replace
 from pathlib import Path
 
 import gymnasium
@@ -8,7 +9,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy.signal import lfilter
 
-from mptc_gym import PRESETS, MiddlePointEnv, presets
+from mptc_gym import PRESETS, MiddlePointEnv, parameters, presets
+from tests.arguments import STRATEGIES
 from tests.conftest import run
 
 A = np.array([1, -0.45181, -0.47546])
@@ -23,6 +25,49 @@ EVERYTHING = {
     "dead_zone": [3, 7], "u_min": [-12, -9], "u_max": [9, 12], "setpoint": "random",
     "output_window": 2, "action_window": 2,
 }  # fmt: skip
+
+
+class TestDeclarations:
+    def test_what_a_seed_draws_never_changes(self):
+        # The order of draws is part of what a seed means: append, never change.
+        assert dict(parameters.PLANT_NUMBERS) == {
+            "delay": 0, "dead_zone": 1, "u_min": 2, "u_max": 3, "noise_variance": 4,
+            "measurement_noise_variance": 5, "disturbance_amplitude": 6,
+            "disturbance_interval": 7, "disturbance_walk_variance": 8, "gain_factor": 9,
+            "time_constant_factor": 10, "gain_drift": 11, "time_constant_drift": 12,
+        }  # fmt: skip
+
+    def test_draws_by_hand(self):
+        env = MiddlePointEnv(delay=[3, 6], time_constant_drift=[1.0, 3.0])
+        _, info = env.reset(seed=7)
+        # The third of the seed's streams is the plant's; draw 0 is the delay's, 12 the drift's.
+        stream = np.random.SeedSequence(7).spawn(4)[2]
+        draws = np.random.Generator(np.random.PCG64(stream)).random(32)
+        assert info["delay"] == 3 + int(4 * draws[0])
+        assert info["time_constant_drift"] == 1.0 + 2.0 * draws[12]
+
+    @pytest.mark.parametrize("draw", [0, 32])
+    def test_two_cannot_take_the_same_draw_nor_one_beyond_the_last(self, draw, monkeypatch):
+        declared = replace(parameters.ARGUMENTS["gain_drift"], draw=draw)
+        faulty = make_dataclass(
+            "Faulty",
+            [("delay", int), ("gain_drift", float)],
+            namespace={
+                "delay": field(default=1, metadata={"argument": parameters.ARGUMENTS["delay"]}),
+                "gain_drift": field(default=1.0, metadata={"argument": declared}),
+            },
+        )
+        monkeypatch.setattr(parameters, "PlantNumbers", faulty)
+        with pytest.raises(TypeError, match="a draw of its own below 32"):
+            parameters._places_of_draws()
+
+    def test_the_page_has_the_table_of_arguments(self):
+        # If this fails, put in what mptc_gym.parameters.argument_table() returns now.
+        page = (Path(presets.__file__).parent / "README.md").read_text("utf-8")
+        assert parameters.argument_table() in page
+
+    def test_every_argument_is_tried_in_all_combinations(self):
+        assert set(STRATEGIES) == set(parameters.ARGUMENTS)
 
 
 class TestTransmitter:
@@ -239,9 +284,9 @@ class TestRanges:
         ({"gain_drift": -1}, "gain_drift must be a number above 0"),
         ({"time_constant_factor": 0.01}, "time_constant_factor, .* never below 0.048"),
         ({"time_constant_drift": 0.01}, "time_constant_factor, time_constant_drift must be"),
-        ({"time_constant_factor": 2, "a": [1.0]}, "slowest pole"),
-        ({"time_constant_factor": 2, "a": [1.0, 0.0, 0.5]}, "slowest pole"),
-        ({"time_constant_factor": 2, "a": [1.0, -1.0]}, "slowest pole"),
+        ({"time_constant_factor": 2, "a": [1.0]}, "which has no pole"),
+        ({"time_constant_factor": 2, "a": [1.0, 0.0, 0.5]}, "slowest poles are complex"),
+        ({"time_constant_factor": 2, "a": [1.0, -1.0]}, "slowest pole, 1, is not between"),
         ({"disturbance_amplitude": 1, "a": [1.0, -1.0]}, "not stable"),
         ({"drift_samples": 0}, "drift_samples must be an integer of at least 1"),
         ({"setpoint_period": [1, 2]}, "setpoint_period must be an integer"),

@@ -1,0 +1,154 @@
+"""Checks of single values: each returns a plain Python value, or raises a ValueError."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from numbers import Integral, Real
+from typing import Any, Final, NoReturn
+
+import numpy as np
+
+LARGEST: Final[Any] = (
+    10**9
+)  # of any argument; beyond, float32 observations and squares lose meaning
+SETPOINTS: Final = ("square", "random")
+REWARDS: Final = ("quadratic", "absolute")
+_LONGEST = 80  # characters of a value that an error message shows
+
+Number = float | Sequence[float]  # or a range, [low, high]
+Check = Callable[[str, Any], Any]
+
+
+def reject(name: str, value: object, allowed: str) -> NoReturn:
+    """Raise the ValueError that says what an argument must be and what it is."""
+    raise ValueError(f"{name} must be {allowed}, got {shortened(value)}")
+
+
+def shortened(value: object) -> str:
+    """Return the value as Python writes it; of a long one the beginning and the length."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no integers of more than some thousand digits
+        return "a number of thousands of digits"
+    if len(text) <= _LONGEST:
+        return text
+    length = f" ({len(value)} elements)" if isinstance(value, list | tuple) else ""
+    return f"{text[:_LONGEST]}...{length}"
+
+
+def plain(value: Any) -> Any:
+    """Return the lists and numbers of a NumPy array or scalar; anything else as it is."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number within the bounds of all arguments."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    return bool(-LARGEST <= value <= LARGEST)
+
+
+def is_count(value: Any, minimum: int = 0) -> bool:
+    """Whether a value is an integer of at least `minimum`."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= minimum
+
+
+def number(name: str, value: Any, allowed: str = "a number within +-1e9") -> float:
+    """Return any number, never as -0."""
+    if not is_number(value):
+        reject(name, value, allowed)
+    return float(value) + 0.0
+
+
+def not_negative(name: str, value: Any) -> float:
+    """Return a number of at least 0."""
+    allowed = "a number from 0 to 1e9"
+    if number(name, value, allowed) < 0:
+        reject(name, value, allowed)
+    return float(value)
+
+
+def positive(name: str, value: Any) -> float:
+    """Return a number above 0."""
+    allowed = "a number above 0, up to 1e9"
+    if number(name, value, allowed) <= 0:
+        reject(name, value, allowed)
+    return float(value)
+
+
+def at_least_1(name: str, value: Any) -> float:
+    """Return a number of at least 1."""
+    allowed = "a number from 1 to 1e9"
+    if number(name, value, allowed) < 1:
+        reject(name, value, allowed)
+    return float(value)
+
+
+def count(name: str, value: Any, minimum: int = 0) -> int:
+    """Return an integer of at least `minimum`."""
+    if not is_count(value, minimum):
+        reject(name, value, f"an integer of at least {minimum}")
+    return int(value)
+
+
+def positive_count(name: str, value: Any) -> int:
+    """Return an integer of at least 1."""
+    return count(name, value, minimum=1)
+
+
+def numbers(
+    name: str, value: Any, allowed: str = "a list of one or more numbers within +-1e9"
+) -> tuple[float, ...]:
+    """Return a list of one number or more."""
+    if not isinstance(value, list | tuple) or not value:
+        reject(name, value, allowed)
+    for i, element in enumerate(value):
+        if not is_number(element):
+            raise ValueError(
+                f"{name} must be {allowed}, got {shortened(value)}, "
+                f"where element {i} is {shortened(element)}"
+            )
+    return tuple(float(element) for element in value)
+
+
+def polynomial(name: str, value: Any) -> tuple[float, ...]:
+    """Return coefficients of which the first is 1."""
+    allowed = "a list of numbers within +-1e9, the first of them 1"
+    coefficients = numbers(name, value, allowed)
+    if coefficients[0] != 1.0:
+        reject(name, value, allowed)
+    return coefficients
+
+
+def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
+    """Return a kind of set point, a constant, or one number a sample."""
+    if isinstance(value, str) and value in SETPOINTS:
+        return value
+    allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
+    if isinstance(value, list | tuple):
+        return numbers(name, value, allowed)
+    return number(name, value, allowed)
+
+
+def reward(name: str, value: Any) -> str:
+    """Return a kind of reward."""
+    if not isinstance(value, str) or value not in REWARDS:
+        reject(name, value, "'quadratic' or 'absolute'")
+    return value
+
+
+def or_range(check: Check) -> Callable[[str, Any], Number]:
+    """Return a check that takes a range [low, high] as well, of what `check` takes."""
+
+    def checked(name: str, value: Any) -> Number:
+        if not isinstance(value, list | tuple):
+            single: float = check(name, value)
+            return single
+        if len(value) != 2:
+            reject(name, value, "one number, or a range [low, high]")
+        low, high = check(name, value[0]), check(name, value[1])
+        if low > high:
+            reject(name, value, "one number, or a range [low, high] with low <= high")
+        return low, high
+
+    return checked
