@@ -9,8 +9,9 @@ from itertools import islice
 
 import numpy as np
 import pygame
+from numpy.typing import NDArray
 
-from mptc_gym.rendering import Axis, Frame, Record
+from mptc_gym.record import Axis, Record
 
 Colour = tuple[int, int, int]
 Point = tuple[float, float]
@@ -77,7 +78,7 @@ class Panel:
         return [max(least, min(most, bottom - (value - low) * scale)) for value in values]
 
 
-def frame(record: Record) -> Frame:
+def frame(record: Record) -> NDArray[np.uint8]:
     """Return a picture, shape (540, 960, 3)."""
     return np.array(pygame.surfarray.pixels3d(draw(record)).swapaxes(0, 1), order="C")
 
@@ -142,7 +143,7 @@ def _header(surface: pygame.Surface, record: Record) -> None:
     }
     pygame.draw.rect(surface, _PANEL, (0, 0, SIZE[0], 66))
     pygame.draw.line(surface, _FRAME, (0, 66), (SIZE[0], 66))
-    for i, (name, value) in enumerate(record.numbers.items()):
+    for i, (name, value) in enumerate(record.readings.items()):
         x = 24 + 156 * i
         _write(surface, name, _SMALL, _FAINT, topleft=(x, 12))
         for character in value:  # one by one: what changes is made of pictures that are kept
@@ -172,13 +173,13 @@ def _temperatures(surface: pygame.Surface, panel: Panel) -> None:
 
 
 def _flows(surface: pygame.Surface, panel: Panel) -> None:
-    record, plate = panel.record, panel.record.plate
+    record, plant = panel.record, panel.record.plant
     now, departed = panel.x(record.k), max(_LEFT, panel.x(record.k - record.in_transit))
     zero = panel.y(0.0)
     _ground(surface, panel, "feedwater, t/h")
     surface.set_clip(panel.rect)
-    if plate.dead_zone > 0.0:
-        upper, lower = panel.y(plate.dead_zone), panel.y(-plate.dead_zone)
+    if plant.dead_zone > 0.0:
+        upper, lower = panel.y(plant.dead_zone), panel.y(-plant.dead_zone)
         surface.fill(DEAD_ZONE, (_LEFT, upper, _RIGHT - _LEFT, lower - upper + 1))
         _write(surface, "dead zone", _SMALL, _FAINT, topleft=(_LEFT + 8, upper + 4))
     if record.in_transit:
@@ -187,7 +188,7 @@ def _flows(surface: pygame.Surface, panel: Panel) -> None:
             (departed, panel.top, now - departed, panel.bottom - panel.top),
             pygame.BLEND_RGB_MULT,
         )
-    for limit, side in ((plate.u_max, "bottomleft"), (plate.u_min, "topleft")):
+    for limit, side in ((plant.u_max, "bottomleft"), (plant.u_min, "topleft")):
         y = panel.y(limit)
         for x in range(_LEFT, _RIGHT, 8):
             pygame.draw.line(surface, LIMIT, (x, y), (x + 3, y))
@@ -218,7 +219,7 @@ def _ground(surface: pygame.Surface, panel: Panel, title: str) -> None:
     """Draw what lies behind the lines: the panel, its grid and its tick labels."""
     surface.fill(_PANEL, panel.rect)
     record = panel.record
-    per_minute = 60.0 / record.plate.sampling_interval
+    per_minute = 60.0 / record.sampling_interval
     for minute in record.minutes.ticks():
         x = panel.x(minute * per_minute)
         pygame.draw.line(surface, _GRID, (x, panel.top), (x, panel.bottom))
@@ -250,7 +251,7 @@ def _bracket(surface: pygame.Surface, panel: Panel, left: float, right: float) -
 
 def _time_axis(surface: pygame.Surface, panel: Panel) -> None:
     record = panel.record
-    per_minute = 60.0 / record.plate.sampling_interval
+    per_minute = 60.0 / record.sampling_interval
     for minute in record.minutes.ticks():
         x, y = panel.x(minute * per_minute), panel.bottom
         pygame.draw.line(surface, _FRAME, (x, y), (x, y + 5))

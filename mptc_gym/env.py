@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from mptc_gym import rendering
 from mptc_gym.parameters import Parameters, argument_signature, argument_table
 from mptc_gym.plant import Plant, action_from_command
-from mptc_gym.ranges import Ranges, numbers_of_plant
+from mptc_gym.ranges import Ranges
+from mptc_gym.record import Record
 from mptc_gym.signals import BLOCK, Disturbance, Noise, SetPoint, Streams
 
 _FLOAT32 = np.dtype(np.float32)  # quicker to pass on than the type
@@ -198,7 +199,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self.parameters = parameters = Parameters.of_environment(arguments)
         rendering.check_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
-        self._record: rendering.Record | None = None  # for pictures; None if there are none
+        self._record: Record | None = None  # for pictures; None if there are none
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = observation_space(parameters)
         # What step uses, in two tuples: unpacking one costs less than as many attributes.
@@ -217,7 +218,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self._transmitter = Noise([1.0], parameters.range_of("measurement_noise_variance"))
         self._disturbance = Disturbance(parameters)
         self._setpoint = SetPoint(parameters)
-        self._tells_more = parameters.is_disturbed or parameters.drifts
+        self._has_more_info = parameters.is_disturbed or parameters.drifts
         self._streams: Streams | None = None
         self._root: np.random.Generator | None = None  # what the streams come from
         # y_d, n, w and the transmitter's noise of the samples ahead, the next one last.
@@ -252,19 +253,19 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         numbers = self._ranges.given
         if self._ranges.names or parameters.is_disturbed:
             generator = self._streams.plant.next_episode()
-            numbers = numbers_of_plant(self._ranges.draw([generator], 1), 0)
-            self._disturbance.restart(generator, numbers)
-        self._noise.restart(self._streams.noise, numbers.noise_variance)
-        self._transmitter.restart(self._streams.transmitter, numbers.measurement_noise_variance)
-        self._setpoint.restart(self._streams.setpoint)
+            numbers = self._ranges.draw_one(generator)
+            self._disturbance.reset(generator, numbers)
+        self._noise.reset(self._streams.noise, numbers.noise_variance)
+        self._transmitter.reset(self._streams.transmitter, numbers.measurement_noise_variance)
+        self._setpoint.reset(self._streams.setpoint)
         self._plant = Plant(parameters, numbers)
 
         # At rest u is 0, whatever action that is.
         self._action = action_from_command(0.0, numbers.u_min, numbers.u_max)
-        rest = _limited(self._action, 1.0)
+        rest_action = _limited(self._action, 1.0)
         size, actions = parameters.observation_size, parameters.action_window
         # One element to spare at the end: see step.
-        self._window = [0.0] * (size - actions) + [rest] * (actions + 1)
+        self._window = [0.0] * (size - actions) + [rest_action] * (actions + 1)
         self._ahead.clear()
 
         setpoint = self._setpoint.take(1)[0]
@@ -273,9 +274,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self._window[0] = setpoint
         self._window[error_head] = setpoint
         self._window[output_head] = 0.0
-        self._window[action_head] = rest
+        self._window[action_head] = rest_action
         if self.render_mode is not None:
-            self._record = rendering.begin(numbers, parameters.sampling_interval, setpoint)
+            self._record = Record(numbers, parameters.sampling_interval, setpoint)
             self._show()
         info = {
             "output": 0.0,
@@ -285,8 +286,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             "applied": 0.0,
             "noise": 0.0,
         }
-        if self._tells_more:
-            self._tell_more(info, 0.0)
+        if self._has_more_info:
+            self._add_more_info(info, 0.0)
         return np.fromiter(self._window, _FLOAT32, size), info | numbers.chosen(
             self._ranges.names
         )
@@ -313,8 +314,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         """
         # This is the hot path: built-ins and function calls only where they are rarely reached.
         try:
-            a = float(action.item())
-        except (AttributeError, TypeError, ValueError):
+            a = float(action.item() - 0.0)  # text is no number, even where float() reads one
+        except (AttributeError, TypeError, ValueError, OverflowError):
             a = _scalar(action)
         shown = a if -1.0 <= a <= 1.0 else _beyond_the_box(a)
         if not self._ahead:
@@ -352,8 +353,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             "applied": applied,
             "noise": noise,
         }
-        if self._tells_more:
-            self._tell_more(info, load)
+        if self._has_more_info:
+            self._add_more_info(info, load)
         if self._record is not None:
             self._record.add(setpoint, output, command, applied)
             self._show()
@@ -396,7 +397,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         signals = self._setpoint, self._noise, self._disturbance, self._transmitter
         self._ahead = list(zip(*(signal.take(BLOCK) for signal in signals), strict=True))[::-1]
 
-    def _tell_more(self, info: dict[str, float], load: float) -> None:
+    def _add_more_info(self, info: dict[str, float], load: float) -> None:
         """Add to the info what belongs to arguments that are off by default."""
         if self.parameters.is_disturbed:
             info["disturbance"] = load
@@ -422,7 +423,7 @@ def _limited(value: float, limit: float) -> float:
 
 def _scalar(action: Any) -> float:
     try:
-        return float(np.asarray(action).item())
+        return float(np.asarray(action).item() - 0.0)
     except (TypeError, ValueError, OverflowError):
         raise _bad_action(action) from None
 

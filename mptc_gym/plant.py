@@ -1,7 +1,7 @@
 """The plant and its actuator: arithmetic on state, input and parameters, nothing else.
 
 It stands here twice, side by side: `Plant` in plain floats, which are fastest for one plant,
-and `Plants` in arrays. Both do the same operations in the same order, and agree to the bit.
+and `PlantBatch` in arrays. Both do the same operations in the same order, and agree to the bit.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Plant:
         self._drifts = parameters.drifts
         self._age = 0
         self._dynamics = Dynamics(parameters)
-        self._foul()
+        self._update_dynamics()
         # Each coefficient with its place in the history it is for, and both histories with the
         # newest sample first: y(k), y(k-1), ... and u_a(k), u_a(k-1), ...
         delay = int(numbers.delay)
@@ -149,7 +149,7 @@ class Plant:
         if self._drifts:
             self._age += 1
             if self._age % DRIFT_INTERVAL == 0:
-                self._foul()
+                self._update_dynamics()
         dead_zone, u_min, u_max, half_range = self._actuator
         command = u_min + (action + 1.0) * half_range  # Section 4, last formula
         applied = command  # (29) from here on
@@ -172,7 +172,7 @@ class Plant:
         outputs.appendleft(output)
         return command, applied, output
 
-    def _foul(self) -> None:
+    def _update_dynamics(self) -> None:
         """Bring the dynamics to the plant's age."""
         gain, time_constant = map(float, self._dynamics.factors(self._numbers, self._age))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(gain, time_constant)
@@ -180,7 +180,7 @@ class Plant:
         self.factors = gain, time_constant
 
 
-class Plants:
+class PlantBatch:
     """Many plants side by side: `Plant` in arrays.
 
     Parameters
@@ -217,10 +217,10 @@ class Plants:
 
         self._dynamics = Dynamics(parameters)
         self._drifts = parameters.drifts
-        self._fouls = parameters.changes_dynamics
-        self._clock = self._next_fouling = 0
+        self._changes_dynamics = parameters.changes_dynamics
+        self._clock = self._next_update = 0
         self._starts = np.zeros(num_envs if self._drifts else (), np.int64)
-        self._foul()
+        self._update_dynamics()
         order = len(self._alpha)
         self._outputs = deque(np.zeros((order, num_envs)), maxlen=order)
 
@@ -240,8 +240,8 @@ class Plants:
             self._earlier = np.zeros((self._longer + self._samples, num_envs))
             self._taken = np.zeros(self._response.shape, np.intp)
 
-    def rest(self, which: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
-        """Bring some of the plants to rest.
+    def reset(self, which: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
+        """Bring some of the plants to rest, with new numbers.
 
         Parameters
         ----------
@@ -266,10 +266,10 @@ class Plants:
             rows = np.arange(self._samples)[:, np.newaxis] + self._longer + self._shortest
             rows = rows - numbers.delay.astype(np.intp)
             self._taken[:, which] = rows * self._inputs.shape[1] + which
-        if self._fouls:
+        if self._changes_dynamics:
             if self._drifts:
                 self._starts[which] = self._clock
-            self._foul()
+            self._update_dynamics()
 
     def step(
         self, action: Values, noise: Values, load: Values | None = None
@@ -293,8 +293,8 @@ class Plants:
         """
         if self._drifts:
             self._clock += 1
-            if self._clock >= self._next_fouling:
-                self._foul()
+            if self._clock >= self._next_update:
+                self._update_dynamics()
         zero, one, half_range, offset, dead_zone, u_min, u_max = self._actuator
         command = action + one
         command *= half_range
@@ -313,7 +313,7 @@ class Plants:
             place = 0
         self._place = place
         response = self._response[place]
-        if self._fouls:
+        if self._changes_dynamics:
             response = self._scale * response
         if load is not None:
             noise = noise + self._load_gain * load
@@ -335,14 +335,14 @@ class Plants:
             self._earlier[self._longer :] = self._response
             self._earlier.take(self._taken, out=self._response, mode="clip")
 
-    def _foul(self) -> None:
+    def _update_dynamics(self) -> None:
         """Bring the dynamics to the plants' ages."""
         ages = self._clock - self._starts
         slow = ages // DRIFT_INTERVAL * DRIFT_INTERVAL
         self.factors = self._dynamics.factors(self._numbers, slow)
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*self.factors)
         self._alpha = tuple(map(np.asarray, alpha))
-        self._next_fouling = self._clock + int((slow + DRIFT_INTERVAL - ages).min())
+        self._next_update = self._clock + int((slow + DRIFT_INTERVAL - ages).min())
 
 
 def _at_rest(samples: int) -> deque[float]:

@@ -67,11 +67,20 @@ class Ranges:
         draws = np.empty((episodes, DRAWS))
         for generator, row in zip(generators, draws, strict=True):
             generator.random(out=row)
-        offsets = draws[:, self._places] * self._widths
-        offsets[:, self._whole] = np.floor(offsets[:, self._whole])
-        return replace(
-            self.given_arrays, **dict(zip(self.names, (self._lows + offsets).T, strict=True))
-        )
+        drawn = self._scaled(draws).T
+        return replace(self.given_arrays, **dict(zip(self.names, drawn, strict=True)))
+
+    def draw_one(self, generator: np.random.Generator) -> PlantNumbers[float]:
+        """Draw for one episode, with its generator."""
+        drawn = self._scaled(generator.random(DRAWS)).tolist()
+        return replace(self.given, **dict(zip(self.names, drawn, strict=True)))
+
+    def _scaled(self, draws: Values) -> Values:
+        """Bring draws of all plant numbers, from 0 to 1, to the ranges: shape (..., ranges)."""
+        offsets: Values = draws[..., self._places] * self._widths
+        offsets[..., self._whole] = np.floor(offsets[..., self._whole])
+        offsets += self._lows
+        return offsets
 
 
 def numbers_of_plant(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:

@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 
 from mptc_gym.parameters import Parameters, PlantNumbers
 
-BLOCK = 600  # samples made at a time
+BLOCK = 600  # samples of a signal that are made together
 FOREVER = 1 << 62  # samples
-_TOGETHER = 32  # plants whose draws are made at a time: they stay in the processor's cache
+_PLANTS_AT_A_TIME = (
+    32  # plants whose draws are made at a time: they stay in the processor's cache
+)
 LOAD_INTERVAL = 10  # samples between two changes of the load disturbance
-_CHANGES = 60  # of a disturbance made at a time
+_LEVELS_AT_A_TIME = 60  # of the load disturbance, made together
 
 
 class EpisodeStream:
@@ -83,7 +85,7 @@ class Noise:
         self._c = c
         self._silent = variances[1] == 0.0
 
-    def restart(self, stream: EpisodeStream, variance: float) -> None:
+    def reset(self, stream: EpisodeStream, variance: float) -> None:
         """Begin an episode, with one draw a sample; without noise the stream is untouched."""
         self._generator = None if self._silent else stream.next_episode()
         deviation = math.sqrt(variance)
@@ -100,7 +102,7 @@ class Noise:
         return noise
 
 
-class Noises:
+class NoiseBatch:
     """`Noise` for many plants, each to the bit what it is alone.
 
     Parameters
@@ -136,7 +138,7 @@ class Noises:
         self._block = np.zeros((0 if self.silent else block, num_envs))
         self._row = 0  # the next one
 
-    def restart(
+    def reset(
         self,
         which: NDArray[np.intp],
         streams: Iterable[EpisodeStream],
@@ -180,8 +182,8 @@ class Noises:
         """Make the noise of some plants, from a row on to the end of the block."""
         order = len(self._c) - 1
         samples = len(self._block) - first_row
-        for start in range(0, len(which), _TOGETHER):
-            plants = which[start : start + _TOGETHER]
+        for start in range(0, len(which), _PLANTS_AT_A_TIME):
+            plants = which[start : start + _PLANTS_AT_A_TIME]
             draws = np.empty((len(plants), order + samples))
             draws[:, :order] = self._past[plants]
             for i, row in zip(plants.tolist(), draws[:, order:], strict=True):
@@ -254,7 +256,7 @@ class SetPoint:
     def __init__(self, parameters: Parameters) -> None:
         self._levels = Levels(parameters)
 
-    def restart(self, stream: EpisodeStream) -> None:
+    def reset(self, stream: EpisodeStream) -> None:
         """Begin an episode; the stream is untouched unless levels are random."""
         self._generator = stream.next_episode() if self._levels.random else None
         self._place = 0  # of the next level
@@ -280,7 +282,7 @@ class SetPoint:
             self._place = (self._place + 1) % len(levels.values)
 
 
-class SetPoints:
+class SetPointBatch:
     """`SetPoint` for many plants, each to the bit what it is alone.
 
     Its clock counts samples since all plants began; each plant has its own k.
@@ -310,7 +312,7 @@ class SetPoints:
         self._changes = np.zeros(num_envs, np.int64)  # by the clock, of the next level
         self.next_change = 0
 
-    def restart(
+    def reset(
         self, which: NDArray[np.intp], streams: Iterable[EpisodeStream], clock: int
     ) -> None:
         """Begin an episode of some plants, given by indices, with a stream for each."""
@@ -356,7 +358,7 @@ class Disturbance:
     def __init__(self, parameters: Parameters) -> None:
         self._silent = not parameters.is_disturbed
 
-    def restart(self, generator: np.random.Generator, numbers: PlantNumbers[float]) -> None:
+    def reset(self, generator: np.random.Generator, numbers: PlantNumbers[float]) -> None:
         """Begin an episode; draws go on from where the generator is.
 
         Parameters
@@ -376,14 +378,14 @@ class Disturbance:
         if self._silent:
             return [0.0] * samples
         while len(self._ahead) < samples:
-            draws = self._generator.random((1, _CHANGES, 3))
+            draws = self._generator.random((1, _LEVELS_AT_A_TIME, 3))
             levels, self._last = _disturbance(draws, self._shape, self._last)
             self._ahead += np.repeat(levels[0], LOAD_INTERVAL).tolist()
         values, self._ahead = self._ahead[:samples], self._ahead[samples:]
         return values
 
 
-class Disturbances:
+class DisturbanceBatch:
     """`Disturbance` for many plants, each to the bit what it is alone.
 
     Its clock counts samples since all plants began; each plant has its own k.
@@ -398,16 +400,16 @@ class Disturbances:
         self._generators: dict[int, np.random.Generator] = {}
         self._shapes = np.zeros((num_envs, 3))
         self._last = np.zeros((num_envs, 2))
-        self._levels = np.zeros((num_envs, _CHANGES))  # those ahead
+        self._levels = np.zeros((num_envs, _LEVELS_AT_A_TIME))  # those ahead
         self._ends = (
-            np.arange(1, num_envs + 1) * _CHANGES
+            np.arange(1, num_envs + 1) * _LEVELS_AT_A_TIME
         )  # of each plant's, when all lie in a row
         self._places = self._ends.copy()  # of the next level, there
         self._now = np.zeros(num_envs)
         self._changes = np.zeros(num_envs, np.int64)  # by the clock, of the next level
         self._next_change = 0
 
-    def restart(
+    def reset(
         self,
         which: NDArray[np.intp],
         generators: Iterable[np.random.Generator],
@@ -437,15 +439,15 @@ class Disturbances:
 
     def _refill(self, which: NDArray[np.intp]) -> None:
         """Make the next levels of some plants."""
-        for start in range(0, len(which), _TOGETHER):
-            plants = which[start : start + _TOGETHER]
-            draws = np.empty((len(plants), _CHANGES, 3))
+        for start in range(0, len(which), _PLANTS_AT_A_TIME):
+            plants = which[start : start + _PLANTS_AT_A_TIME]
+            draws = np.empty((len(plants), _LEVELS_AT_A_TIME, 3))
             for i, row in zip(plants.tolist(), draws, strict=True):
                 self._generators[i].random(out=row)
             self._levels[plants], self._last[plants] = _disturbance(
                 draws, self._shapes[plants], self._last[plants]
             )
-        self._places[which] = self._ends[which] - _CHANGES
+        self._places[which] = self._ends[which] - _LEVELS_AT_A_TIME
 
 
 def _shape(numbers: PlantNumbers[Any]) -> tuple[Any, Any, Any]:

@@ -16,9 +16,17 @@ from numpy.typing import NDArray
 from mptc_gym import rendering
 from mptc_gym.checks import is_count, positive_count
 from mptc_gym.env import MiddlePointEnv
-from mptc_gym.plant import Plants, action_from_command
+from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
-from mptc_gym.signals import BLOCK, FOREVER, Disturbances, Noises, SetPoints, Streams
+from mptc_gym.record import Record
+from mptc_gym.signals import (
+    BLOCK,
+    FOREVER,
+    DisturbanceBatch,
+    NoiseBatch,
+    SetPointBatch,
+    Streams,
+)
 
 Infos = dict[str, Any]
 Values = NDArray[np.float64]  # one a plant, shape (num_envs,)
@@ -26,7 +34,7 @@ Indices = NDArray[np.intp]
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")
 _FLOAT64 = np.dtype(np.float64)  # quicker to pass on than the type
-_ROOM = 64  # steps until the window of the observations is moved back
+_STEPS_PER_SHIFT = 64  # steps until the window of the observations is moved back
 
 
 class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
@@ -112,15 +120,15 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         if max_episode_steps is not None and max_episode_steps != -1:
             self._limit = min(FOREVER, positive_count("max_episode_steps", max_episode_steps))
         try:
-            self._mode = AutoresetMode(autoreset_mode)
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
             allowed = ", ".join(repr(mode.value) for mode in AutoresetMode)
             raise ValueError(
                 f"autoreset_mode must be one of {allowed}, got {autoreset_mode!r}"
             ) from None
-        self.metadata = {**self.metadata, "autoreset_mode": self._mode}
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
-        self._records: dict[int, rendering.Record] = {}  # of every plant, for pictures
+        self._records: dict[int, Record] = {}  # of every plant, for pictures
         self.parameters = parameters = single.parameters
         self.single_action_space = single.action_space
         self.single_observation_space = single.observation_space
@@ -130,25 +138,25 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         self._seeds: list[int | None] = [None] * num_envs
         self._streams: dict[int, Streams] = {}  # of every plant, once they have been reset
         self._clock = 0  # samples since the plants were made
-        self._plants = Plants(parameters, num_envs)
+        self._plants = PlantBatch(parameters, num_envs)
         # Blocks of noise that come out even at the end of an episode.
         block = math.ceil(self._limit / math.ceil(self._limit / BLOCK))
-        self._noises = Noises(
+        self._noise = NoiseBatch(
             parameters.c, parameters.range_of("noise_variance"), num_envs, block
         )
-        self._transmitters = Noises(
+        self._transmitter = NoiseBatch(
             [1.0], parameters.range_of("measurement_noise_variance"), num_envs, block
         )
         self._ranges = Ranges(parameters)
-        self._disturbances = Disturbances(num_envs) if parameters.is_disturbed else None
+        self._disturbance = DisturbanceBatch(num_envs) if parameters.is_disturbed else None
         self._factors = ("gain_factor", "time_constant_factor") if parameters.drifts else ()
-        load = ("disturbance",) if self._disturbances is not None else ()
+        load = ("disturbance",) if self._disturbance is not None else ()
         self._names = (*INFO, *load, *self._factors)  # of what infos hold
-        self._setpoints = SetPoints(parameters, num_envs)
+        self._setpoint = SetPointBatch(parameters, num_envs)
         self._ends = np.zeros(num_envs, np.int64)  # by the clock, of the episodes
         self._first_end = 0
         self._ended: NDArray[np.bool_] | None = None  # those still to be reset, if any
-        # Arrays in place of numbers, as in `Plants`.
+        # Arrays in place of numbers, as in `PlantBatch`.
         span = parameters.temperature_span
         self._span = np.full(num_envs, -span), np.full(num_envs, span), span * span
         self._reward_terms = (
@@ -168,8 +176,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         # their first elements have to be written.
         self._shape = num_envs, parameters.observation_size
         self._elements = num_envs * parameters.observation_size
-        self._row = np.zeros(self._elements + _ROOM, np.float32)
-        self._place = _ROOM
+        self._row = np.zeros(self._elements + _STEPS_PER_SHIFT, np.float32)
+        self._place = _STEPS_PER_SHIFT
         self._everyone, self._nobody = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
 
     @property
@@ -218,7 +226,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         infos: Infos = {
             name: np.zeros(self.num_envs) for name in {*self._names, *self._ranges.names}
         }
-        self._begin(which, infos)
+        self._reset_plants(which, infos)
         if self._ended is not None:
             ended = self._ended & ~mask
             self._ended = ended if ended.any() else None
@@ -263,11 +271,11 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             none = self._nobody
             return observations, np.zeros(self.num_envs), none.copy(), none.copy(), infos
         self._clock = clock = self._clock + 1
-        if clock >= self._setpoints.next_change:
-            self._setpoints.move(clock)
-        setpoint = self._setpoints.now
-        noise = self._noises.next()
-        load = self._disturbances.at(clock) if self._disturbances is not None else None
+        if clock >= self._setpoint.next_change:
+            self._setpoint.move(clock)
+        setpoint = self._setpoint.now
+        noise = self._noise.next()
+        load = self._disturbance.at(clock) if self._disturbance is not None else None
         command, applied, output = self._plants.step(a, noise, load)
 
         error_scale, minus_half, quadratic, move_weight = self._reward_terms
@@ -283,8 +291,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         self._actions = a
 
         measured, measured_error = output, error
-        if not self._transmitters.silent:
-            measured = output + self._transmitters.next()
+        if not self._transmitter.silent:
+            measured = output + self._transmitter.next()
             measured_error = setpoint - measured
         lowest, highest, squared = self._span
         # Otherwise no single one can be beyond the span.
@@ -293,8 +301,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             np.fmax(measured, lowest, out=measured)
             measured_error = setpoint - measured
         if self._place == 0:
-            self._row[_ROOM:] = self._row[:-_ROOM]
-            self._place = _ROOM
+            self._row[_STEPS_PER_SHIFT:] = self._row[:-_STEPS_PER_SHIFT]
+            self._place = _STEPS_PER_SHIFT
         self._place = place = self._place - 1
         window = self._row[place : place + self._elements].reshape(self._shape)
         setpoints, errors, outputs, past_actions = self._newest
@@ -366,13 +374,13 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     def _end_episodes(self, rewards: Values, infos: Infos) -> NDArray[np.bool_]:
         """Do what the end of an episode asks for, and return which have ended."""
         ended = self._ends <= self._clock
-        if self._mode is AutoresetMode.SAME_STEP:
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
             which = np.flatnonzero(ended)
             final_info = {name: np.where(ended, infos[name], 0.0) for name in self._names}
             final_obs = np.full(self.num_envs, None, object)
             for i, observation in zip(which, self._window()[which], strict=True):
                 final_obs[i] = observation
-            self._restart(ended, infos)
+            self._reset_ended(ended, infos)
             infos |= {
                 "final_obs": final_obs,
                 "_final_obs": ended.copy(),
@@ -382,41 +390,41 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             return ended
         if self._ended is not None:  # at the step before this one
             rewards[self._ended] = 0.0
-            self._restart(self._ended, infos)
+            self._reset_ended(self._ended, infos)
             ended = self._ends <= self._clock
         self._ended = ended.copy() if ended.any() else None
         return ended
 
-    def _restart(self, ended: NDArray[np.bool_], infos: Infos) -> None:
+    def _reset_ended(self, ended: NDArray[np.bool_], infos: Infos) -> None:
         """Begin an episode of those that have ended, within the infos of a step."""
         for name in self._ranges.names:
             if name not in self._names:
                 infos[name], infos[f"_{name}"] = np.zeros(self.num_envs), ended.copy()
-        self._begin(np.flatnonzero(ended), infos)
+        self._reset_plants(np.flatnonzero(ended), infos)
 
-    def _begin(self, which: Indices, infos: Infos) -> None:
+    def _reset_plants(self, which: Indices, infos: Infos) -> None:
         """Begin an episode of some plants, and put their infos of k = 0 in."""
         streams = [self._streams[i] for i in which.tolist()]
         numbers = self._ranges.given_arrays
-        if self._ranges.names or self._disturbances is not None:
+        if self._ranges.names or self._disturbance is not None:
             generators = [each.plant.next_episode() for each in streams]
             numbers = self._ranges.draw(generators, len(which))
-            if self._disturbances is not None:
-                self._disturbances.restart(which, generators, numbers, self._clock)
-        self._plants.rest(which, numbers)
-        self._noises.restart(which, (each.noise for each in streams), numbers.noise_variance)
-        self._transmitters.restart(
+            if self._disturbance is not None:
+                self._disturbance.reset(which, generators, numbers, self._clock)
+        self._plants.reset(which, numbers)
+        self._noise.reset(which, (each.noise for each in streams), numbers.noise_variance)
+        self._transmitter.reset(
             which,
             (each.transmitter for each in streams),
             numbers.measurement_noise_variance,
         )
-        self._setpoints.restart(which, (each.setpoint for each in streams), self._clock)
+        self._setpoint.reset(which, (each.setpoint for each in streams), self._clock)
         rest_action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         self._actions[which] = rest_action
         self._ends[which] = self._clock + self._limit
         self._first_end = int(self._ends.min())
 
-        setpoint = self._setpoints.now[which]
+        setpoint = self._setpoint.now[which]
         rest = np.zeros((len(which), self.parameters.observation_size), np.float32)
         setpoints, errors, _, _ = self._newest
         if setpoints is not None:
@@ -437,7 +445,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             for j, (i, first) in enumerate(zip(which.tolist(), setpoint.tolist(), strict=True)):
                 interval = self.parameters.sampling_interval
                 own = numbers_of_plant(numbers, j)
-                self._records[i] = rendering.begin(own, interval, first)
+                self._records[i] = Record(own, interval, first)
 
     def _seed(self, which: Indices, seeds: Sequence[int | None]) -> None:
         for i in which.tolist():
@@ -485,15 +493,20 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         if not self._streams:
             raise ResetNeeded("call reset before step")
         n = self.num_envs
+        given: NDArray[Any]
         try:
-            given = np.array(actions, _FLOAT64)
+            given = np.asarray(actions)
+            if given.dtype == object:
+                given = np.array((given - 0.0).tolist())
+            # Text is no number, even where NumPy reads one.
+            given = given.astype(_FLOAT64, casting="same_kind")
         except (TypeError, ValueError, OverflowError):
             given = np.empty(0)
         if given.shape != (n, 1):
             raise ValueError(f"actions must be numbers, shape ({n}, 1), got {actions!r}")
         a = given.ravel()
         if self._ended is not None:
-            if self._mode is AutoresetMode.DISABLED:
+            if self.autoreset_mode is AutoresetMode.DISABLED:
                 ended = np.flatnonzero(self._ended)
                 raise ResetNeeded(f"episodes of environments {ended} have ended: reset them")
             a[self._ended] = 0.0

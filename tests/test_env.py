@@ -367,8 +367,14 @@ def test_numpy_scalars_are_taken():
 
 
 @pytest.mark.parametrize(
-    "action", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.zeros(0), None, "up"]
-)
+    "action",
+    [
+        np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.zeros(0), None, "up",
+        "0.3", b"0.3", np.str_("0.3"), np.bytes_(b"0.3"), np.array(["0.3"]), ["0.3"],
+        np.array("0.3", object), np.array([10**400], object), 0.3 + 0j,
+    ],
+    ids=repr,
+)  # fmt: skip
 def test_bad_action_leaves_the_plant_untouched(action):
     reference = run(MiddlePointEnv(noise_variance=0.5), np.ones(40))
     env = MiddlePointEnv(noise_variance=0.5)

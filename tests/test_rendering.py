@@ -4,6 +4,7 @@ import copy
 import math
 import pickle
 import sys
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -18,7 +19,9 @@ from hypothesis import strategies as st
 from moviepy import VideoFileClip
 
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, drawing, rendering
-from mptc_gym.rendering import Nameplate, Record
+from mptc_gym.parameters import Parameters
+from mptc_gym.ranges import Ranges
+from mptc_gym.record import Record
 from tests.conftest import run
 
 NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
@@ -38,10 +41,10 @@ def assert_same(ours, theirs):
     assert np.count_nonzero((ours != theirs).any(axis=-1)) <= 3
 
 
-def record(*samples, setpoint=0.0, **plate):
+def record(*samples, setpoint=0.0, sampling_interval=8.0, **numbers):
     """Return a record of samples (y_d, y, u, u_a) of the paper's plant, or one unlike it."""
-    known = {"delay": 18, "dead_zone": 5.0, "u_min": -10.0, "u_max": 10.0}
-    made = Record(Nameplate(**{**known, "sampling_interval": 8.0, **plate}), setpoint)
+    paper = Ranges(Parameters()).given
+    made = Record(replace(paper, **numbers), sampling_interval, setpoint)
     for sample in samples:
         made.add(*sample)
     return made

@@ -79,8 +79,8 @@ def test_it_equals_one_environment_after_the_other(
     if seed is None:
         seed = rng.integers(0, 2**40, num_envs).tolist()
     with (  # so small that many blocks are made and the window is moved back often
-        patch.multiple("mptc_gym.vector_env", BLOCK=7, _ROOM=3),
-        patch.multiple("mptc_gym.signals", _TOGETHER=2),
+        patch.multiple("mptc_gym.vector_env", BLOCK=7, _STEPS_PER_SHIFT=3),
+        patch.multiple("mptc_gym.signals", _PLANTS_AT_A_TIME=2),
     ):
         native, sync = make_both(num_envs, mode, limit, **arguments)
         assert_equal(native.reset(seed=seed), sync.reset(seed=seed))
@@ -101,6 +101,7 @@ def test_spaces_are_those_of_gymnasium():
     for name in ("action_space", "observation_space"):
         assert getattr(native, name) == getattr(sync, name)
         assert getattr(native, f"single_{name}") == getattr(sync, f"single_{name}")
+    assert native.autoreset_mode is sync.autoreset_mode
     assert native.metadata == {**sync.metadata, "render_modes": ["rgb_array"]}
 
 
@@ -126,11 +127,11 @@ def test_time_limit_is_that_of_the_registration_unless_another_is_given():
     assert not any(truncations(max_episode_steps=-1))
 
 
-def test_autoreset_mode_is_in_the_metadata():
+def test_autoreset_mode_is_an_attribute_as_in_gymnasium_s_own_and_in_the_metadata():
     given = [*MODES, *AutoresetMode]
     made = [MiddlePointVectorEnv(2, autoreset_mode=mode) for mode in given]
     for mode, envs in zip(given, made, strict=True):
-        assert envs.metadata["autoreset_mode"] is AutoresetMode(mode)
+        assert envs.metadata["autoreset_mode"] is envs.autoreset_mode is AutoresetMode(mode)
 
 
 def test_an_actuator_that_does_not_reach_zero_flow(rng):
@@ -295,6 +296,8 @@ def test_bad_reset_mask_is_refused(mask):
 BAD_ACTIONS = [
     np.zeros(2), np.zeros((1, 1)), np.zeros((2, 2)), np.array([[np.nan], [0.0]]),
     np.array([[0.0], [np.inf]]), [[10**400], [0]], [["up"], ["down"]], [[0.0], [None]], None,
+    [["0.3"], ["0.3"]], np.array([["0.3"], ["0.3"]]), np.array([["0.3"], ["0.3"]], object),
+    [[b"0.3"], [b"0.3"]], [["0.3"], [0.3]], np.array([["0.3"], [0.3]], object), [[0.3], [0.3j]],
 ]  # fmt: skip
 
 
@@ -306,6 +309,16 @@ def test_bad_actions_leave_the_plants_untouched(actions):
         with pytest.raises(ValueError, match="actions"):
             envs.step(actions)
         assert_equal(envs.step(np.ones((2, 1))), twin.step(np.ones((2, 1))))
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [[[1], [0]], [[True], [False]], np.array([[1.0], [0.0]], object), np.array([[1], [0]])],
+)
+def test_any_numbers_are_actions(actions):
+    envs, twin = (MiddlePointVectorEnv(2) for _ in range(2))
+    envs.reset(seed=0), twin.reset(seed=0)
+    assert_equal(envs.step(actions), twin.step(np.array([[1.0], [0.0]], np.float32)))
 
 
 def test_huge_actions_are_taken():
