@@ -124,6 +124,7 @@ def draw(record: Record) -> pygame.Surface:
     _temperatures(surface, top)
     _flows(surface, bottom)
     _time_axis(surface, bottom)
+    _legend(surface, record.plant.dead_zone > 0.0)
     return surface
 
 
@@ -181,18 +182,14 @@ def _flows(surface: pygame.Surface, panel: Panel) -> None:
     if plant.dead_zone > 0.0:
         upper, lower = panel.y(plant.dead_zone), panel.y(-plant.dead_zone)
         surface.fill(DEAD_ZONE, (_LEFT, upper, _RIGHT - _LEFT, lower - upper + 1))
-        _write(surface, "dead zone", _SMALL, _FAINT, topleft=(_LEFT + 8, upper + 4))
     if record.in_transit:
         surface.fill(
             IN_TRANSIT,
             (departed, panel.top, now - departed, panel.bottom - panel.top),
             pygame.BLEND_RGB_MULT,
         )
-    for limit, side in ((plant.u_max, "bottomleft"), (plant.u_min, "topleft")):
-        y = panel.y(limit)
-        for x in range(_LEFT, _RIGHT, 8):
-            pygame.draw.line(surface, LIMIT, (x, y), (x + 3, y))
-        _write(surface, "limit", _SMALL, _FAINT, **{side: (_LEFT + 8, y + 1)})
+    for limit in (plant.u_max, plant.u_min):
+        _dotted(surface, _LEFT, _RIGHT, panel.y(limit))
     pygame.draw.line(surface, _FRAME, (_LEFT, zero), (_RIGHT, zero))
 
     # An input is held from its sample to the next. The first entry is of before the episode.
@@ -257,6 +254,24 @@ def _time_axis(surface: pygame.Surface, panel: Panel) -> None:
         pygame.draw.line(surface, _FRAME, (x, y), (x, y + 5))
         _write(surface, f"{minute:.6g}", _SMALL, _FAINT, midtop=(x, y + 9))
     _write(surface, "time, min", _SMALL, _INK, topleft=(_RIGHT + 24, panel.bottom + 9))
+
+
+def _legend(surface: pygame.Surface, has_dead_zone: bool) -> None:
+    """Say what shade and dots mean, below the panels, where no line is drawn over it."""
+    x, y = _LEFT, SIZE[1] - 10
+    _dotted(surface, x, x + 28, y)
+    _write(surface, "limits", _SMALL, _FAINT, midleft=(x + 36, y))
+    if has_dead_zone:
+        x += 104
+        surface.fill(DEAD_ZONE, (x, y - 5, 28, 10))
+        pygame.draw.rect(surface, _FRAME, (x, y - 5, 28, 10), 1)
+        _write(surface, "dead zone", _SMALL, _FAINT, midleft=(x + 36, y))
+
+
+def _dotted(surface: pygame.Surface, left: int, right: int, y: float) -> None:
+    """Draw the line of a limit."""
+    for x in range(left, right, 8):
+        pygame.draw.line(surface, LIMIT, (x, y), (x + 3, y))
 
 
 def _curve(surface: pygame.Surface, colour: Colour, points: Sequence[Point]) -> None:

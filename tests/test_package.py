@@ -35,6 +35,21 @@ def test_layers_import_downwards_only(package):
         assert imported(path) <= ALLOWED[package] | STDLIB, path
 
 
+def test_the_environment_has_no_import_circle():
+    files = {path.stem: path for path in (ROOT / "mptc_gym").glob("[!_]*.py")}
+    graph = {
+        name: {
+            part
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mptc_gym")
+            for part in ([*node.module.split(".")[1:]] or [each.name for each in node.names])
+        }
+        for name, path in files.items()
+    }
+    assert "record" in graph["drawing"]
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError
+
+
 def test_import_loads_nothing_heavy():
     program = "import sys, mptc_gym; print(*{name.partition('.')[0] for name in sys.modules})"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)

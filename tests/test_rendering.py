@@ -104,6 +104,17 @@ def test_the_limits_are_marked():
     assert np.diff(rows[5.0]) == pytest.approx([15 / 18.6 * 150], abs=1)
 
 
+def test_no_line_runs_through_the_names_of_shade_and_limits(rng):
+    waves = [(0.0, 0.0, 20.0 * wave, 10.0 * wave) for wave in rng.uniform(-1, 1, 200)]
+    calm, busy = (rendering.frame(record(*samples)).copy() for samples in ([], waves))
+    names = np.s_[521:540, 72:300]  # below the panels and their tick labels
+    np.testing.assert_array_equal(calm[names], busy[names])
+    for colour in (drawing.DEAD_ZONE, drawing.LIMIT, drawing._FAINT):
+        assert len(places(busy[names], colour)[0]) > 10
+    within = np.s_[347:495, 80:840]
+    assert len(places(calm[within], drawing._FAINT)[0]) == 0  # no words there
+
+
 @pytest.mark.parametrize(("k", "delay", "expected"), [
     (10, 18, 10), (18, 18, 18), (60, 18, 18), (60, 40, 40), (60, 0, 0),
 ])  # fmt: skip
