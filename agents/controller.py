@@ -13,8 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 Values = NDArray[np.float64] | np.float64  # one value a loop: shape (), or (batch,)
 
 
-def action_from_command(command: Values, u_min: float, u_max: float) -> NDArray[np.float32]:
+def action_from_command(
+    command: Values, u_min: float, u_max: float, dead_zone: float = 0.0
+) -> NDArray[np.float32]:
     """Scale commands to normalised actions, -1 at `u_min` and 1 at `u_max`.
+
+    An action has the precision of float32. Rounded to it, a command on the edge of the dead
+    zone can fall inside and have no effect. Such an action is moved outwards by one float.
 
     Parameters
     ----------
@@ -22,14 +27,23 @@ def action_from_command(command: Values, u_min: float, u_max: float) -> NDArray[
         u, t/h, any shape. Commands beyond the limits become actions beyond +-1.
     u_min, u_max
         The actuator's limits, t/h.
+    dead_zone
+        The actuator's, t/h: a command outside of it stays outside. 0 if it is not known.
 
     Returns
     -------
     ndarray of float32
         Actions, with one more axis of length 1 at the end.
     """
-    action = 2.0 * (command - u_min) / (u_max - u_min) - 1.0
-    return np.asarray(action, dtype=np.float32)[..., np.newaxis]
+    exact = 2.0 * (command - u_min) / (u_max - u_min) - 1.0
+    action = np.asarray(exact, dtype=np.float32)
+    if dead_zone > 0.0:
+        arrives = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0
+        lost = (np.abs(command) >= dead_zone) & (np.abs(arrives) < dead_zone)
+        # Below 1, floats are finer than what is left of them once the plant has added 1.
+        outwards = np.copysign(np.spacing(np.maximum(np.abs(action), np.float32(1))), command)
+        action = np.where(lost, action + outwards, action).astype(np.float32)
+    return action[..., np.newaxis]
 
 
 def check_count(name: str, value: Any, least: int) -> int:
@@ -61,6 +75,9 @@ class Controller(ABC):
         The least number of elements of an observation.
     u_min, u_max
         The actuator's limits, t/h.
+    dead_zone
+        The actuator's, t/h: a command on its edge becomes an action that has an effect. 0 if it
+        is not known.
 
     Attributes
     ----------
@@ -71,15 +88,18 @@ class Controller(ABC):
     Raises
     ------
     ValueError
-        If the limits are not finite or not in order.
+        If the limits are not finite or not in order, or the dead zone is negative.
     """
 
-    def __init__(self, *, n_obs: int, u_min: float, u_max: float) -> None:
+    def __init__(
+        self, *, n_obs: int, u_min: float, u_max: float, dead_zone: float = 0.0
+    ) -> None:
         self.n_obs = n_obs
         self.u_min = check_number("u_min", u_min)
         self.u_max = check_number("u_max", u_max)
         if self.u_min >= self.u_max:
             raise ValueError(f"u_min must be below u_max = {u_max!r}, got {u_min!r}")
+        self.dead_zone = check_number("dead_zone", dead_zone, 0)
         self.command: Values = np.float64(0.0)
 
     def reset(self) -> None:
@@ -116,7 +136,7 @@ class Controller(ABC):
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")
         self.command = self._control(values)
-        return action_from_command(self.command, self.u_min, self.u_max)
+        return action_from_command(self.command, self.u_min, self.u_max, self.dead_zone)
 
     @abstractmethod
     def _control(self, observation: NDArray[np.float64]) -> Values:

@@ -33,7 +33,8 @@ class SmithPredictor(PIController):
     closed_loop_time_constant
         Of the loop without the delay, s.
     dead_zone
-        The actuator's, t/h: commands within it are 0 to the model. 0 if it is not known.
+        The actuator's, t/h: commands within it are 0 to the model, those on its edge have an
+        effect. 0 if it is not known.
     sampling_interval
         s.
     error_index

@@ -185,6 +185,25 @@ class TestPredictiveController:
         assert runs.output[300:].mean() == pytest.approx(2.0, abs=0.05)
         assert set(np.unique(runs.applied[300:].round(3))) <= {0.0, -5.0}
 
+    @pytest.mark.parametrize(
+        ("plant", "setpoint"),
+        [
+            ({"dead_zone": 7.0}, 2.0),  # no float32 action commands 7 t/h, nor 4.1
+            ({"dead_zone": 4.1}, 1.0),
+            ({"dead_zone": 7.0, "u_min": -6.0}, 2.0),  # -7 brings about -6, and -6 nothing
+        ],
+    )
+    def test_the_plant_applies_what_it_believes_in(self, plant, setpoint):
+        controller = PredictiveController(Parameters(**plant), 1)
+        believed = []
+        plants = make_plants(1, 600, setpoint=setpoint, **plant)
+        newest = -20  # of its d + 2 inputs
+        watch = lambda k: believed.append(controller._state[0, newest])  # noqa: E731
+        runs = rollout(plants, controller, 600, seed=0, before=watch)
+        np.testing.assert_allclose(believed[1:], runs.applied[:-1, 0], rtol=0, atol=1e-5)
+        assert len(np.unique(runs.applied[300:].round(3))) == 2  # it switches ...
+        assert runs.output[300:].mean() == pytest.approx(setpoint, abs=0.05)  # ... and holds
+
     def test_other_orders_of_plant(self):
         plant = {"a": (1.0, -0.9), "b": (-0.1, 0.0, -0.05), "c": (1.0,), "delay": 2}
         runs = run_mpc(2, 400, noise_variance=0.01, setpoint=9.0, **plant)

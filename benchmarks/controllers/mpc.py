@@ -19,13 +19,13 @@ SWEEPS, TOLERANCE = 100, 1e-4  # of coordinate descent: how many at most, and t/
 
 
 class PredictiveController:
-    """Plans, at each sample, the commands that bring the expected output to the set point.
+    """Plans, at each sample, the inputs that bring the expected output to the set point.
 
     Of the plant (28) it knows A, B, C and d, so that it recovers xi from what it measures, and
     predicts the output that is to be expected without further commands. Over the samples that
     the planned commands reach first it minimises the sum of the squared errors, the set point
-    staying as it is, with commands within the limits. A first command inside the dead zone
-    becomes 0 or the edge, whichever the rest of a plan makes better.
+    staying as it is, with inputs within the limits. A first input inside the dead zone becomes
+    0 or what a command on the edge brings about, whichever the rest of a plan makes better.
 
     The roots of C must lie within the unit circle, as the paper's do; else xi cannot be told
     from what is measured.
@@ -82,17 +82,20 @@ class PredictiveController:
         inside = np.abs(plan[:, 0]) < self._p.dead_zone
         if inside.any():
             edge = np.copysign(self._p.dead_zone, plan[:, 0])
+            edge = edge.clip(self._p.u_min, self._p.u_max)
             plans = [
-                self._optimise(target, plan, np.clip(first, self._p.u_min, self._p.u_max))
-                for first in (np.zeros_like(edge), edge)
+                self._optimise(target, plan, first) for first in (np.zeros_like(edge), edge)
             ]
             costs = [self._cost(target, p) for p in plans]
             best = np.where((costs[0] <= costs[1])[:, np.newaxis], *plans)
             plan = np.where(inside[:, np.newaxis], best, plan)
-        command = plan[:, 0]
+        applied = plan[:, 0]
         self._plan = plan
-        self._state = np.hstack([y, old_xi, command[:, np.newaxis], u[:, :-1]])
-        return action_from_command(command, self._p.u_min, self._p.u_max)
+        self._state = np.hstack([y, old_xi, applied[:, np.newaxis], u[:, :-1]])
+        # A limit inside the dead zone is reached by a command on the edge.
+        needed = np.copysign(np.maximum(np.abs(applied), self._p.dead_zone), applied)
+        command = np.where(applied == 0.0, 0.0, needed)
+        return action_from_command(command, self._p.u_min, self._p.u_max, self._p.dead_zone)
 
     def _optimise(self, target: Array, start: Array, first: Array | None = None) -> Array:
         """Minimise u Q u / 2 - target u within the limits, one coordinate after the other."""
