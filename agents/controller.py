@@ -99,6 +99,8 @@ class Controller(ABC):
         self.u_max = check_number("u_max", u_max)
         if self.u_min >= self.u_max:
             raise ValueError(f"u_min must be below u_max = {u_max!r}, got {u_min!r}")
+        if not math.isfinite(self.u_max - self.u_min):
+            raise ValueError(f"u_min and u_max are too far apart, got {u_min!r}, {u_max!r}")
         self.dead_zone = check_number("dead_zone", dead_zone, 0)
         self.command: Values = np.float64(0.0)
 

@@ -140,6 +140,8 @@ class DirectNNController(Controller):
         self.direction = direction
         self.input_scale = check_number("input_scale", input_scale)
         self.weight_scale = check_number("weight_scale", weight_scale, 0)
+        if not np.isfinite(2.0 * self.weight_scale):  # how wide the initial weights lie
+            raise ValueError(f"weight_scale must be at most 8.9e307, got {weight_scale!r}")
         self.num_envs = None if num_envs is None else check_count("num_envs", num_envs, 1)
         self._batch = () if self.num_envs is None else (self.num_envs,)  # the leading axis
         self.learning = learning

@@ -148,7 +148,9 @@ class TestEveryController:
             controller.act(bad)
         assert np.array_equal(controller.act(np.ones(6)), twin.act(np.ones(6)))
 
-    @pytest.mark.parametrize("limits", [(1.0, 1.0), (2.0, 1.0), (-np.inf, 1.0)])
+    @pytest.mark.parametrize(
+        "limits", [(1.0, 1.0), (2.0, 1.0), (-np.inf, 1.0), (-1e308, 1e308)]
+    )
     def test_bad_limits(self, controller, limits):
         with pytest.raises(ValueError, match="u_min"):
             type(controller)(u_min=limits[0], u_max=limits[1])
@@ -336,6 +338,7 @@ class TestDirectNN:
             ("n_inputs", 0), ("n_hidden", 1.5), ("eta", -0.1), ("eta_1", np.nan),
             ("eta_theta", np.inf), ("eta_1_theta", -1), ("direction", 0), ("direction", 0.5),
             ("input_scale", np.nan), ("weight_scale", -1.0), ("num_envs", 0),
+            ("weight_scale", 1e308),
             ("update_interval", 0), ("seed", -1), ("error_index", -1), ("n_inputs", "6"),
             ("num_envs", True), ("eta", None),
         ],
