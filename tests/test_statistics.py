@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.lib import statistics
 from benchmarks.lib.statistics import (
     bootstrap,
     exact,
@@ -104,21 +105,41 @@ class TestBootstrap:
         assert bootstrap(np.arange(9.0), seed=1) == first
         assert np.random.get_state()[1].tolist() == state  # noqa: NPY002
 
-    def test_members_are_drawn_first(self, rng):
+    def test_members_are_drawn(self, rng):
         # Four trainings that differ much, with runs that differ little: what counts is four.
         level = np.array([[0.0], [1.0], [2.0], [3.0]])
         values = level + rng.normal(0, 0.01, (4, 100))
-        nested = bootstrap(values, seed=0)
+        crossed = bootstrap(values, seed=0)
         flat = bootstrap(values.reshape(-1), seed=0)
-        assert nested.value == flat.value == pytest.approx(1.5, abs=0.01)
+        assert crossed.value == flat.value == pytest.approx(1.5, abs=0.01)
         # The mean of four draws out of 0, 1, 2, 3 has the deviation sqrt(1.25 / 4) = 0.56.
-        assert nested.high - nested.low == pytest.approx(2 * 1.96 * 0.56, rel=0.1)
+        assert crossed.high - crossed.low == pytest.approx(2 * 1.96 * 0.56, rel=0.1)
         assert flat.high - flat.low < 0.3
 
-    def test_runs_are_drawn_too(self, rng):
+    def test_runs_are_those_of_all_members(self, rng):
+        # Members that do the same in every run are no more runs than there were.
         values = rng.normal(size=100)
-        nested = bootstrap(np.stack([values, values[::-1]]), seed=0)
-        assert nested.high - nested.low == pytest.approx(2 * 1.96 / math.sqrt(200), rel=0.2)
+        alone, five = bootstrap(values, seed=0), bootstrap(np.stack([values] * 5), seed=0)
+        assert five.high - five.low == pytest.approx(alone.high - alone.low, rel=0.1)
+        assert alone.high - alone.low == pytest.approx(2 * 1.96 / math.sqrt(100), rel=0.2)
+
+    @pytest.mark.parametrize(
+        ("members", "of_members", "of_cells"), [(5, 0.0, 0.1), (5, 0.1, 0.3), (15, 0.3, 0.3)]
+    )
+    def test_intervals_of_members_in_the_same_runs_hold_the_truth(
+        self, members, of_members, of_cells, rng, monkeypatch
+    ):
+        # What a run does to all members, what a member does in all runs, and what is left.
+        monkeypatch.setattr(statistics, "RESAMPLES", 400)
+        runs, trials, held, widths = 60, 200, 0, []
+        for _ in range(trials):
+            values = rng.normal(size=(1, runs)) + of_members * rng.normal(size=(members, 1))
+            estimate = bootstrap(values + of_cells * rng.normal(size=(members, runs)), seed=0)
+            held += estimate.low <= 0.0 <= estimate.high
+            widths.append(estimate.high - estimate.low)
+        assert 0.89 <= held / trials <= 0.99
+        variance = 1 / runs + of_members**2 / members + of_cells**2 / (members * runs)
+        assert np.mean(widths) == pytest.approx(2 * 1.96 * math.sqrt(variance), rel=0.1)
 
     def test_other_statistics(self):
         values = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 1000.0])
