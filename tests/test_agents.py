@@ -420,13 +420,15 @@ class TestSmithPredictor:
     def smith(self, **changes):
         return SmithPredictor(**{**PLANT, "closed_loop_time_constant": 80.0, **changes})
 
-    def test_with_the_right_model_there_is_no_delay_to_the_loop(self):
+    @pytest.mark.parametrize("setpoint", [2.0, 6.5])  # the latter takes more than the limits
+    def test_with_the_right_model_there_is_no_delay_to_the_loop(self, setpoint):
         # On a plant that is its model, the output is that of the loop without delay, later.
         pole = np.exp(-8 / 161)
         plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), "dead_zone": 0.0}
-        late = rollout(make_plants(1, 200, setpoint=2.0, **plant), self.smith(), 200, seed=0)
+        plant["setpoint"] = setpoint
+        late = rollout(make_plants(1, 200, **plant), self.smith(), 200, seed=0)
         prompt = PIController(self.smith().kp, self.smith().ki, anti_windup=True)
-        soon = rollout(make_plants(1, 200, setpoint=2.0, **plant, delay=0), prompt, 200, seed=0)
+        soon = rollout(make_plants(1, 200, **plant, delay=0), prompt, 200, seed=0)
         np.testing.assert_allclose(late.output[18:], soon.output[:-18], atol=1e-4)
 
     def test_it_beats_simc_on_the_paper_s_plant(self):

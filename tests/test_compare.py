@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from agents import PIController
+from agents import DirectNNController, PIController
 from benchmarks.compare import __main__ as compare
 from benchmarks.compare import comparison
 from benchmarks.compare.estimates import beaten, estimate
@@ -349,6 +349,17 @@ class TestCompare:
         assert (tmp_path / "one/runs.csv").read_text() == (
             tmp_path / "two/runs.csv"
         ).read_text()
+
+    def test_the_second_run_goes_on_with_what_was_learnt(self, tmp_path):
+        run_compare(tmp_path, "--agents", "nn", "--scenarios", "square", "--runs", 3)
+        network, plants = DirectNNController(num_envs=3), make_plants(3, 1200)
+        while_learning, after = (
+            np.abs(run.setpoint - run.output).mean()
+            for run in (rollout(plants, network, 1200, seed=0) for _ in range(2))
+        )
+        assert after < 0.95 * while_learning
+        row = f"{while_learning:.3f} | {after:.3f} |"
+        assert row in re.sub(" +", " ", (tmp_path / "report.md").read_text())
 
     def test_ppo_is_trained_once(self, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(

@@ -123,6 +123,24 @@ class TestSweep:
         assert {file: file.stat().st_mtime_ns for file in saved} == saved
         pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "runs.csv"), runs)
 
+    def test_cells_of_other_options_are_not_taken(self, tmp_path):
+        first = ["--design", "random", "--plants", 2, "--agents", "pi-simc"]
+        run_sweep(tmp_path / "one", *first)
+        for out in ("one", "two"):
+            run_sweep(tmp_path / out, *first, "--samples", 650)
+        ours, theirs = (pd.read_csv(tmp_path / name / "runs.csv") for name in ("one", "two"))
+        pd.testing.assert_frame_equal(ours, theirs)
+
+    def test_every_option_that_shapes_a_cell_is_in_the_key(self):
+        keys = [
+            sweep._key(sweep._parser().parse_args(options), {})
+            for options in (
+                [], ["--design", "random"], ["--plants", "3"], ["--runs", "1"],
+                ["--samples", "650"],
+            )
+        ]  # fmt: skip
+        assert len(set(keys)) == len(keys)
+
     def test_grid(self, tmp_path, monkeypatch):
         monkeypatch.setitem(plants.GRID, "delay", range(10, 22, 10))
         monkeypatch.setitem(plants.GRID, "gain_factor", np.array([1.0, 1.2]))
