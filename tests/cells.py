@@ -35,6 +35,12 @@ def die(seed: int) -> Rows:
     os._exit(seed + 1)
 
 
+def hold(pipe: str, seconds: float) -> None:
+    """Write to a pipe, and keep it open as long as the process lives."""
+    os.write(os.open(pipe, os.O_WRONLY), b"x")
+    time.sleep(seconds)
+
+
 def fail(seed: int) -> Rows:
     """Raise an exception that cannot be pickled."""
 

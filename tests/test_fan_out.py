@@ -5,6 +5,7 @@ import importlib.util
 import json
 import os
 import secrets
+import select
 import signal
 import socket
 import subprocess
@@ -90,6 +91,30 @@ class TestResume:
         assert run(work(3, calls), tmp_path / "out") == whole
         assert counted(calls) == Counter([1])
 
+    @pytest.mark.parametrize(
+        "damage",
+        [
+            lambda text: "[]",
+            lambda text: "null",
+            lambda text: '{"mae": null}',
+            lambda text: json.dumps(json.loads(text)["value"]),  # without its checksum
+            lambda text: text.replace('"seed": 1', '"seed": 3'),
+            lambda text: text[: len(text) // 2],
+            lambda text: "",
+            lambda text: "\0" * len(text),
+        ],
+    )
+    def test_a_damaged_result_is_made_again(self, tmp_path, calls, damage):
+        whole = run(work(3), tmp_path / "out")
+        file = tmp_path / "out" / "plant 1.json"
+        text = file.read_text()
+        damaged = damage(text)
+        assert damaged != text
+        file.write_text(damaged)
+        assert run(work(3, calls), tmp_path / "out") == whole
+        assert counted(calls) == Counter([1])
+        assert file.read_text() == text
+
     def test_a_killed_run_goes_on_where_it_was(self, tmp_path, calls):
         program = (
             "import sys; from functools import partial; from pathlib import Path\n"
@@ -111,6 +136,25 @@ class TestResume:
         missing = {seed for seed in range(40) if f"plant {seed}" not in done}
         assert counted(calls) == Counter(missing)
         assert results == run(work(40))
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="Windows tells no child of its parent")
+    def test_workers_end_when_their_parent_is_killed(self, tmp_path):
+        # As long as a worker lives, one end of this pipe is open; here one waits, one works.
+        pipe = tmp_path / "pipe"
+        os.mkfifo(pipe)
+        program = (
+            "import sys; from functools import partial\n"
+            "from benchmarks.fan_out import FanOut; from tests import cells\n"
+            "work = {str(i): partial(cells.hold, sys.argv[1], 60.0 * i) for i in range(2)}\n"
+            "FanOut(2).run(work, progress=False)"
+        )
+        command = [sys.executable, "-c", program, str(pipe)]
+        with subprocess.Popen(command, cwd=ROOT) as process, pipe.open("rb", 0) as held:
+            assert held.read(1) + held.read(1) == b"xx"
+            process.kill()
+            select.select([held], [], [], 15.0)
+            os.set_blocking(held.fileno(), False)
+            assert held.read(1) == b""  # None as long as there is a worker
 
 
 class TestFailures:

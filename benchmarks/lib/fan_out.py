@@ -11,10 +11,14 @@ import json
 import logging
 import os
 import socket
+import threading
+import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -22,12 +26,13 @@ from urllib.parse import quote
 import joblib
 from tqdm import tqdm
 
-from benchmarks.lib.storage import replacing
+from benchmarks.lib.storage import seal, unseal, write_text
 
 BACKENDS = ("loky", "ray")
 LOSSES = 3  # a cell that saw so many workers vanish runs alone, to see whether it is to blame
 GIVE_UP = 10  # when so many cells were to blame, there is another fault
 NAMED = 10  # failed cells in a message
+PATIENCE = 0.5  # s between two looks at whether the parent is still there
 
 INSTALL_RAY = 'Ray is not installed: pip install -e ".[bench,ray]"'
 START_RAY = (
@@ -111,8 +116,8 @@ class FanOut:
             of a function of a module, and return what JSON can hold.
         folder
             Where results are saved, a file a cell. What lies there under a cell's name is taken
-            for its result: cells with other arguments or code need a folder of their own.
-            None: they are not saved.
+            for its result: cells with other arguments or code need a folder of their own. A
+            file that is not what was written is no result. None: they are not saved.
         title
             Stands before the progress bar.
         progress
@@ -128,12 +133,12 @@ class FanOut:
         CellsFailedError
             At the end, if cells raised an exception or lost their worker again and again.
         """
-        texts = {} if folder is None else _saved(cells, folder)
-        missing = {key: cell for key, cell in cells.items() if key not in texts}
+        results = {} if folder is None else _saved(cells, folder)
+        missing = {key: cell for key, cell in cells.items() if key not in results}
         errors: dict[str, str] = {}
         losses: Counter[str] = Counter()
         blamed = 0
-        bar = tqdm(total=len(cells), initial=len(texts), desc=title, disable=not progress)
+        bar = tqdm(total=len(cells), initial=len(results), desc=title, disable=not progress)
         with bar:
             while missing:
                 suspect = next((key for key in missing if losses[key] >= LOSSES), None)
@@ -144,10 +149,9 @@ class FanOut:
                         if error:
                             errors[key] = error
                         else:
-                            texts[key] = text
+                            results[key] = json.loads(text)
                             if folder is not None:
-                                with replacing(_file(folder, key)) as file:
-                                    file.write_text(text, encoding="utf-8")
+                                write_text(_file(folder, key), seal(results[key]))
                         del missing[key]
                         bar.update()
                 except self._lost as lost:
@@ -167,17 +171,19 @@ class FanOut:
         if errors:
             named = {key: errors[key] for key in cells if key in errors}
             raise CellsFailedError(named, len(cells))
-        return {key: json.loads(texts[key]) for key in cells}
+        return {key: results[key] for key in cells}
 
     def _answers(
         self, cells: Mapping[str, Callable[[], Any]], started: list[str]
     ) -> Iterator[tuple[str, str, str]]:
         """Run cells, yield their answers as they come, and note which were handed out."""
+        # The workers of a cluster are its own, and end with their driver.
+        parent = os.getpid() if self.backend == "loky" else None
 
         def tasks() -> Iterator[Any]:
             for key, cell in list(cells.items()):
                 started.append(key)
-                yield joblib.delayed(_answer)(key, cell)
+                yield joblib.delayed(_answer)(key, cell, parent)
 
         # With one process joblib would use this one, which no cell is to bring down.
         processes = 1 if self.jobs == 1 else max(2, min(self.jobs, len(cells)))
@@ -191,8 +197,10 @@ class FanOut:
         yield from parallel(tasks())
 
 
-def _answer(key: str, cell: Callable[[], Any]) -> tuple[str, str, str]:
+def _answer(key: str, cell: Callable[[], Any], parent: int | None) -> tuple[str, str, str]:
     """Run a cell; return its name, its result as JSON, and what went wrong, if anything."""
+    if parent is not None and parent != os.getpid():
+        _end_with(parent)
     try:
         return key, json.dumps(cell()), ""
     except Exception:
@@ -200,20 +208,32 @@ def _answer(key: str, cell: Callable[[], Any]) -> tuple[str, str, str]:
         return key, "", traceback.format_exc()
 
 
+@cache
+def _end_with(parent: int) -> None:
+    """See to it that this process ends when its parent does, even if that was killed.
+
+    Otherwise a worker would finish what it is at, and wait for more for some minutes. Windows
+    does not tell that a parent is gone, and workers do so there.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PATIENCE)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def _file(folder: Path, key: str) -> Path:
     return folder / f"{quote(key, safe=' ,=+')}.json"
 
 
-def _saved(keys: Mapping[str, Any], folder: Path) -> dict[str, str]:
-    texts = {}
+def _saved(keys: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    results = {}
     for key in keys:
-        try:
-            text = _file(folder, key).read_text(encoding="utf-8")
-            json.loads(text)
-        except (FileNotFoundError, ValueError):  # not there, or damaged
-            continue
-        texts[key] = text
-    return texts
+        with suppress(FileNotFoundError, ValueError):  # not there, or damaged
+            results[key] = unseal(_file(folder, key).read_text(encoding="utf-8"))
+    return results
 
 
 def _connect() -> tuple[int, type[BaseException]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -43,6 +44,31 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file, whole or not at all."""
     write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def seal(value: Any) -> str:
+    """Return a value as JSON, with a checksum that tells whether it is what was written."""
+    return json.dumps({"sha256": _checksum(value), "value": value})
+
+
+def unseal(text: str) -> Any:
+    """Return the value of a text that `seal` has made.
+
+    Raises
+    ------
+    ValueError
+        If it is damaged, or something else.
+    """
+    sealed = json.loads(text)
+    if not isinstance(sealed, dict) or sealed.keys() != {"sha256", "value"}:
+        raise ValueError("not a kept result")
+    if sealed["sha256"] != _checksum(sealed["value"]):
+        raise ValueError("the checksum of a kept result does not fit")
+    return sealed["value"]
+
+
+def _checksum(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:
