@@ -1,7 +1,9 @@
 """Scenarios, measures, tables and the comparison, on small budgets."""
 
+import errno
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -289,6 +291,38 @@ class TestStorage:
             write_half()
         assert path.read_text() == "old"
         assert list(tmp_path.iterdir()) == [path]
+
+    def test_a_folder_that_is_a_file(self, tmp_path):
+        path = tmp_path / "file" / "table.csv"
+        path.parent.write_text("in the way")
+        with pytest.raises(storage.NotWrittenError, match=r"table\.csv could not be written"):
+            storage.write_text(path, "new")
+
+    def test_a_full_disk_is_named_and_leaves_the_old_file(self, tmp_path, monkeypatch):
+        path = tmp_path / "file.txt"
+        storage.write_text(path, "old")
+
+        def full(self, text, encoding):
+            with self.open("w", encoding=encoding) as file:
+                file.write(text[:3])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(Path, "write_text", full)
+        with pytest.raises(storage.NotWrittenError, match=r"file\.txt .* No space left"):
+            storage.write_text(path, "new text")
+        assert path.read_text() == "old"
+        assert list(tmp_path.iterdir()) == [path]
+
+    @pytest.mark.parametrize("text", ["", "null", "[1]", "{", "\0\0"])
+    def test_a_damaged_object_is_named(self, tmp_path, text):
+        path = tmp_path / "some.json"
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"some\.json is damaged"):
+            storage.read_object(path)
+
+    def test_a_missing_object_is_named(self, tmp_path):
+        with pytest.raises(ValueError, match=r"some\.json is missing"):
+            storage.read_object(tmp_path / "some.json")
 
 
 def run_compare(out, *options):

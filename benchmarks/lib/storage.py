@@ -19,20 +19,33 @@ PACKAGES = ("gymnasium", "numpy", "stable_baselines3", "torch")
 ROOT = Path(__file__).parent.parent.parent  # the checkout
 
 
+class NotWrittenError(RuntimeError):
+    """A file could not be written; the message names it and says why."""
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a path to write to, and put what was written in place of `path` at the end.
 
     After an error, or if the process is killed, `path` is what it was before.
+
+    Raises
+    ------
+    NotWrittenError
+        If the folder or the disk does not let it be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     # The suffix stays the last, as some writers choose a format by it or append it.
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield partial
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise NotWrittenError(f"{path} could not be written: {reason}") from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -44,6 +57,19 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file, whole or not at all."""
     write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Read a JSON object; ValueError if the file is not there or is damaged."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ValueError(f"{path} is missing") from error
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} is damaged: it holds no JSON object")
+    return value
 
 
 def seal(value: Any) -> str:
