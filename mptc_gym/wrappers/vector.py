@@ -1,0 +1,129 @@
+"""Wrappers of many environments side by side: `IncrementalAction`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from mptc_gym.parameters import Parameters
+from mptc_gym.wrappers import NUMBERS, Actuator, check_arguments
+
+__all__ = ["IncrementalAction"]
+
+
+class IncrementalAction(VectorActionWrapper):
+    """The action changes the flow: `mptc_gym.wrappers.IncrementalAction` for many plants.
+
+    Every plant has a wanted flow of its own, which is 0 when an episode of it begins. All that
+    `reset` and `step` return equals what the same number of wrapped environments return.
+
+    Parameters
+    ----------
+    env
+        A `MiddlePointVectorEnv`, or another vector environment of `MiddlePointEnv` in NumPy,
+        such as Gymnasium's `SyncVectorEnv`. All three autoreset modes and partial resets work.
+    max_move, undo_dead_zone
+        See `mptc_gym.wrappers.IncrementalAction`.
+
+    Raises
+    ------
+    ValueError
+        From the constructor if an argument is out of range, it names it. From `step` if the
+        actions have another shape than (num_envs, 1), or one is not finite; nothing has
+        changed then.
+    ResetNeeded
+        From `step`, if the environments have never been reset.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        *,
+        max_move: float = 0.4,
+        undo_dead_zone: bool | float = False,
+    ) -> None:
+        super().__init__(env)
+        check_arguments(max_move, undo_dead_zone)
+        self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._arguments = max_move, undo_dead_zone
+        plants = _parameters(env)
+        self._numbers = {
+            name: np.array([plant.range_of(name)[0] for plant in plants]) for name in NUMBERS
+        }
+        self._mode = AutoresetMode(env.metadata["autoreset_mode"])
+        self._flows: NDArray[np.float64] | None = None
+        self._ended = np.zeros(self.num_envs, np.bool_)  # and will be reset by the next step
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
+        """Reset all environments, or those of `reset_mask`, and their wanted flows to 0."""
+        # Looked at first, as Gymnasium's own environments take it out of the options.
+        mask = None if options is None else options.get("reset_mask")
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._restart(np.ones(self.num_envs, np.bool_) if mask is None else mask, infos)
+        return observations, infos
+
+    def step(self, actions: Any) -> Any:
+        """Move the wanted flows by actions, shape (num_envs, 1), and step the environments."""
+        if self._flows is None:
+            raise ResetNeeded("call reset before step")
+        flows = self._moved(self._flows, actions)
+        returned = self.env.step(self._actuator.action(flows).astype(np.float32)[:, np.newaxis])
+        _, _, terminations, truncations, infos = returned
+        self._flows = flows
+        ended = terminations | truncations
+        begun = ended if self._mode is AutoresetMode.SAME_STEP else self._ended.copy()
+        if begun.any():
+            self._restart(begun, infos)
+        if self._mode is AutoresetMode.NEXT_STEP:
+            self._ended = ended
+        return returned
+
+    def _moved(self, flows: NDArray[np.float64], actions: Any) -> NDArray[np.float64]:
+        """Return the wanted flows after these actions."""
+        try:
+            moves = np.array(actions, np.float64)
+        except (TypeError, ValueError, OverflowError):
+            moves = np.empty(0)
+        if moves.shape != (self.num_envs, 1):
+            raise ValueError(
+                f"actions must be numbers, shape ({self.num_envs}, 1), got {actions!r}"
+            )
+        moves = moves[:, 0]
+        moves[self._ended] = 0.0  # ignored
+        if not np.isfinite(moves).all():
+            raise ValueError(f"actions must be finite, got {actions!r}")
+        actuator = self._actuator
+        moved: NDArray[np.float64] = flows + actuator.move * moves.clip(-1.0, 1.0)
+        return moved.clip(actuator.u_min, actuator.u_max)
+
+    def _restart(self, begun: NDArray[np.bool_], infos: dict[str, Any]) -> None:
+        """Want no flow where an episode has begun, and note what was drawn for it."""
+        for name in NUMBERS:
+            if name in infos:
+                self._numbers[name][begun] = infos[name][begun]
+        self._actuator = Actuator(self._numbers, *self._arguments)
+        self._flows = np.zeros(self.num_envs) if self._flows is None else self._flows
+        self._flows[begun] = 0.0
+        self._ended = self._ended & ~begun
+
+
+def _parameters(env: VectorEnv[Any, Any, Any]) -> list[Parameters]:
+    """Return the arguments of each environment."""
+    inner = env.unwrapped
+    own = getattr(inner, "parameters", None)
+    if isinstance(own, Parameters):
+        return [own] * env.num_envs
+    try:
+        plants = list(inner.get_attr("parameters"))  # type: ignore[attr-defined]
+    except AttributeError:
+        plants = []
+    if not plants or not all(isinstance(plant, Parameters) for plant in plants):
+        raise ValueError(f"env must be of MiddlePointEnv, got {env}")
+    return plants

@@ -1,0 +1,256 @@
+"""The wrappers whose action changes the flow."""
+
+import json
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from mptc_gym import MiddlePointEnv
+from mptc_gym.wrappers import IncrementalAction
+from mptc_gym.wrappers import vector as many
+
+MODES = [mode.value for mode in AutoresetMode]
+RANGES = {
+    "dead_zone": [2.0, 8.0],
+    "u_min": [-14.0, -9.0],
+    "u_max": [8.0, 12.0],
+    "delay": [3, 9],
+    "noise_variance": 0.3,
+    "setpoint": "random",
+    "setpoint_period": 40,
+    "action_window": 4,
+    "move_weight": 0.1,
+}
+PLANTS, LIMIT = 3, 7
+
+
+def make(arguments=None, **wrapper):
+    return IncrementalAction(
+        gymnasium.make("MiddlePoint-v0", max_episode_steps=LIMIT, **(arguments or {})),
+        **wrapper,
+    )
+
+
+def infos_of(env, moves, *, seed=0):
+    """Reset, take moves, and return the infos of the steps."""
+    env.reset(seed=seed)
+    return [env.step(np.array([move], np.float32))[4] for move in moves]
+
+
+def test_a_move_is_a_share_of_half_the_range():
+    moves = [1.0, 0.5, 0.0, -1.0, -0.25]
+    infos = infos_of(make({"dead_zone": 0.0}, max_move=0.2), moves)
+    # Half the range is 10 t/h: 2 t/h a move of 1.
+    assert [info["command"] for info in infos] == pytest.approx([2, 3, 3, 1, 0.5], abs=1e-5)
+    assert [info["applied"] for info in infos] == pytest.approx([2, 3, 3, 1, 0.5], abs=1e-5)
+
+
+def test_the_flow_stays_within_limits_and_leaves_them_at_once():
+    infos = infos_of(make(max_move=0.5), [1, 1, 1, 1, -1])
+    assert [info["command"] for info in infos] == pytest.approx([5, 10, 10, 10, 5])
+
+
+def test_an_action_beyond_the_box_moves_no_further():
+    (info,) = infos_of(make({"dead_zone": 0.0}, max_move=0.3), [17.0])
+    assert info["command"] == pytest.approx(3.0, abs=1e-5)
+
+
+def test_the_first_flow_is_none_whatever_the_limits():
+    arguments = {"u_min": -7.3, "u_max": 12.9}
+    for undo in (False, True):
+        (info,) = infos_of(make(arguments, undo_dead_zone=undo), [0.0])
+        assert info["command"] == pytest.approx(0.0, abs=1e-6)
+        assert info["applied"] == 0.0
+
+
+def test_reset_begins_again_with_no_flow():
+    env = make(undo_dead_zone=True)
+    first, second = (infos_of(env, [0.3, 0.7]) for _ in range(2))
+    assert first == second
+    assert first[1]["applied"] > 5.0
+
+
+@pytest.mark.parametrize("dead_zone", [0.1, 2.3, 5.0, 7.0, 9.9, 10.0])
+def test_every_flow_passes_the_dead_zone_that_is_undone(dead_zone):
+    env = make({"dead_zone": dead_zone}, max_move=2.0, undo_dead_zone=True)
+    for wanted in (1e-12, 1e-3, 0.5, 1.0, -1e-12, -0.3, -1.0):
+        # 2 is the whole range, from -1 to 1, and so a move of w / 2 wants w.
+        env.reset(seed=0)
+        info = env.step(np.array([wanted / 2.0]))[4]
+        expected = np.sign(wanted) * (dead_zone + (10.0 - dead_zone) * abs(wanted))
+        assert info["applied"] == pytest.approx(expected, abs=5e-5)
+
+
+def test_a_number_is_undone_whatever_the_dead_zone_is():
+    for dead_zone in (0.0, [1.0, 4.0], 5.0):
+        env = make({"dead_zone": dead_zone}, max_move=2.0, undo_dead_zone=6)
+        (info,) = infos_of(env, [0.25])  # wants half of the way
+        assert info["applied"] == pytest.approx(6.0 + 4.0 * 0.5, abs=5e-5)
+
+
+def test_a_limit_within_the_dead_zone_is_reached():
+    env = make({"u_min": -3.0, "u_max": 9.0}, max_move=2.0, undo_dead_zone=True)
+    (info,) = infos_of(env, [-0.1])
+    assert info["applied"] == -3.0
+
+
+def test_drawn_numbers_are_those_of_the_episode():
+    env = make(RANGES, max_move=2.0, undo_dead_zone=True)
+    drawn = set()
+    for _ in range(5):
+        _, info = env.reset(seed=None if drawn else 3)
+        drawn.add(info["dead_zone"])
+        least = env.step(np.array([1e-9]))[4]["applied"]
+        assert least == pytest.approx(info["dead_zone"], abs=1e-4)
+        assert env.step(np.array([1.0]))[4]["applied"] == pytest.approx(info["u_max"], abs=1e-4)
+        assert env.step(np.array([-1.0]))[4]["applied"] == pytest.approx(
+            info["u_min"], abs=1e-4
+        )
+    assert len(drawn) == 5
+
+
+def test_past_actions_tell_the_wanted_flow():
+    env = make({"action_window": 2, "dead_zone": 0.0}, max_move=0.1)
+    env.reset(seed=0)
+    shown = [env.step(np.array([1.0]))[0][-2:] for _ in range(3)]
+    np.testing.assert_allclose(shown, [[0.1, 0.0], [0.2, 0.1], [0.3, 0.2]], atol=1e-6)
+
+
+@pytest.mark.parametrize("action", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), "x"])
+def test_a_bad_action_changes_nothing(action):
+    env, other = make(RANGES), make(RANGES)
+    for each in (env, other):
+        each.reset(seed=0)
+        each.step(np.array([0.5]))
+    with pytest.raises(ValueError, match="action"):
+        env.step(action)
+    assert data_equivalence(env.step(np.array([0.1])), other.step(np.array([0.1])), exact=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("max_move", 0.0), ("max_move", 2.1), ("max_move", float("nan")), ("max_move", "x"),
+        ("max_move", True), ("undo_dead_zone", -1.0), ("undo_dead_zone", float("inf")),
+        ("undo_dead_zone", "yes"), ("undo_dead_zone", None),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        make(**{name: value})
+    with pytest.raises(ValueError, match=name):
+        many.IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2), **{name: value})
+
+
+def test_other_environments_are_refused():
+    with pytest.raises(ValueError, match="env"):
+        IncrementalAction(gymnasium.make("CartPole-v1"))
+    for others in (
+        gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="sync"),
+        gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="vector_entry_point"),
+    ):
+        with pytest.raises(ValueError, match="env"):
+            many.IncrementalAction(others)
+
+
+def test_the_spec_makes_it_again():
+    env = make({"action_window": 20}, max_move=0.3, undo_dead_zone=True)
+    spec = EnvSpec.from_json(env.spec.to_json())
+    again = gymnasium.make(spec)
+    assert isinstance(again, IncrementalAction)
+    assert json.loads(again.spec.to_json()) == json.loads(env.spec.to_json())
+    for _ in range(2):
+        assert infos_of(env, [0.4, -1.0, 0.2]) == infos_of(again, [0.4, -1.0, 0.2])
+
+
+def test_both_checkers_have_no_complaint():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # That it is a wrapper is all that Gymnasium's has to say.
+        warnings.filterwarnings("ignore", message=".*is different from the unwrapped version")
+        env = IncrementalAction(MiddlePointEnv(action_window=20), undo_dead_zone=True)
+        check_env(env, skip_render_check=True)
+        checker = pytest.importorskip("stable_baselines3.common.env_checker")
+        checker.check_env(env)
+
+
+def test_reset_comes_first():
+    with pytest.raises(ResetNeeded):
+        make().step(np.zeros(1, np.float32))
+    with pytest.raises(ResetNeeded):
+        many.IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2)).step(
+            np.zeros((2, 1), np.float32)
+        )
+
+
+def batches(mode, *, undo):
+    """Return three times the same: wrapped one by one, and two batches that are wrapped."""
+
+    def plain():
+        return gymnasium.make("MiddlePoint-v0", max_episode_steps=LIMIT, **RANGES)
+
+    def wrapped():
+        return make(RANGES, undo_dead_zone=undo)
+
+    return (
+        SyncVectorEnv([wrapped] * PLANTS, autoreset_mode=mode),
+        many.IncrementalAction(
+            SyncVectorEnv([plain] * PLANTS, autoreset_mode=mode), undo_dead_zone=undo
+        ),
+        many.IncrementalAction(
+            gymnasium.make_vec(
+                "MiddlePoint-v0", PLANTS, max_episode_steps=LIMIT, autoreset_mode=mode, **RANGES
+            ),
+            undo_dead_zone=undo,
+        ),
+    )
+
+
+@pytest.mark.parametrize("undo", [False, True, 4.0])
+@pytest.mark.parametrize("mode", MODES)
+def test_a_batch_is_each_of_them_wrapped(rng, mode, undo):
+    envs = batches(mode, undo=undo)
+    reference = envs[0]
+    for env in envs[1:]:
+        assert env.single_action_space == reference.single_action_space
+        assert env.action_space == reference.action_space
+
+    def all_the_same(returned):
+        for each in returned[1:]:
+            assert data_equivalence(each, returned[0], exact=True)
+        return returned[0]
+
+    all_the_same([env.reset(seed=5) for env in envs])
+    ended = np.zeros(PLANTS, np.bool_)  # and reset by the next step, which takes no action
+    for k in range(60):
+        actions = rng.uniform(-1.5, 1.5, (PLANTS, 1)).astype(np.float32)
+        actions[ended] = np.nan
+        _, _, _, truncations, _ = all_the_same([env.step(actions) for env in envs])
+        # After k = 40 whoever steps resets what has ended, whatever the mode.
+        reset = truncations if mode == "Disabled" or k > 40 else np.zeros(PLANTS, np.bool_)
+        if k in (4, 29, 34):  # episodes end at different times from now on
+            reset = reset | (np.arange(PLANTS) == k % PLANTS)
+        ended = truncations & ~reset & (mode == "NextStep")
+        if reset.any():
+            all_the_same([env.reset(options={"reset_mask": reset.copy()}) for env in envs])
+
+
+@pytest.mark.parametrize("bad", [np.zeros(2), np.zeros((3, 1)), np.full((2, 1), np.nan)])
+def test_bad_actions_of_a_batch_change_nothing(bad):
+    env, other = (
+        many.IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2, **RANGES))
+        for _ in range(2)
+    )
+    good = np.array([[0.5], [-0.5]], np.float32)
+    for each in (env, other):
+        each.reset(seed=0)
+        each.step(good)
+    with pytest.raises(ValueError, match="actions"):
+        env.step(bad)
+    assert data_equivalence(env.step(good), other.step(good), exact=True)
