@@ -3,6 +3,14 @@
 from agents.controller import Controller
 from agents.direct_nn import DirectNNController, Weights
 from agents.pi import PIController
+from agents.self_tuning import SelfTuningController
 from agents.smith import SmithPredictor
 
-__all__ = ["Controller", "DirectNNController", "PIController", "SmithPredictor", "Weights"]
+__all__ = [
+    "Controller",
+    "DirectNNController",
+    "PIController",
+    "SelfTuningController",
+    "SmithPredictor",
+    "Weights",
+]

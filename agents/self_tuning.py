@@ -1,0 +1,356 @@
+"""A self-tuning controller: it identifies the plant while it controls it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.controller import Controller, Values, check_count, check_number
+
+Array = NDArray[np.float64]
+
+# Time constants in the bank, as multiples of the step test's.
+TIME_CONSTANTS = (0.5, 0.7, 1.0, 1.4, 2.0)
+# How sure the step test is, in standard deviations: of the gain, as a share of it; of the
+# delay, samples; of the time constant's logarithm; of the dead zone, as a share of the larger
+# limit. And the noise that is expected (degC), worth so many samples of it.
+GAIN_SPREAD, DELAY_SPREAD, TIME_CONSTANT_SPREAD, ZONE_SPREAD = 0.5, 8.0, 0.5, 0.2
+NOISE, NOISE_SAMPLES = 0.5, 30.0
+GAINS = (0.3, 3.0)  # estimates stay between these multiples of the step test's gain
+# The prefilter (1 - 0.92 z^-1) / (1 - 0.6 z^-1) of what is compared: its zero makes the noise
+# white, its pole takes out what is too quick for models of first order.
+PREFILTER_ZERO, PREFILTER_POLE = 0.92, 0.6
+LEAST_NOISE = 0.02  # degC; smaller errors tell no model from another
+CAUTION = 0.5  # factor of the log-likelihood, as the errors are not quite white
+EXCITED = 0.05  # of half the range: the flow has to have moved by it to be learnt from
+MEMORY = 20  # samples before the longest delay, in which it has to have moved
+INTERVAL = 5  # samples between two designs
+BLEND = 0.3  # share of a design that is taken over
+BIAS_RATE = 0.005  # a sample, of the offset's estimate
+DISTURBANCE_POLE = 0.5  # of the filter of the disturbance
+CLEARANCE = 0.2  # t/h that a command passes a dead zone by
+_ROOM = 64  # samples until the histories are moved back
+
+
+class SelfTuningController(Controller):
+    """A predictive controller that identifies the plant while it controls it.
+
+    *Identification.* There is a bank of models, one for each combination of a delay d, a time
+    constant and a dead zone: `y(k) = g s(k - d)`. Here s is what a plant of first order, with
+    gain 1 and no delay, makes of the flow that this dead zone and the limits let pass. The gain
+    g of each model is estimated by recursive least squares with exponential forgetting, on
+    prefiltered signals. A model's probability follows from how well it fits the output and
+    how near it is to the step test. The controller uses the average of all models
+    (D. T. Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE
+    Transactions on Automatic Control 10, 1965, 434-439).
+
+    *Control.* As in a Smith predictor, the model foresees the output at the end of the delay.
+    The disturbance, by which the output differs from the model, is added. It fades over the
+    delay as the plant's own response would; only its slow mean does not, so that no
+    steady error remains. The command is `u = s + K (y_d - foreseen output)`, with K such that
+    the error decays with the time constant that is asked for. The response s takes the place of
+    an integral. It is the response to the flow that has passed the actuator, so nothing winds
+    up. A command within the dead zone, the most likely one, is moved to its edge or to 0,
+    whichever is nearer.
+
+    *Safeguards* (K. J. Astrom and B. Wittenmark, "Adaptive Control", 2nd edition, 1995,
+    chapter 11):
+
+    - The step test's gain is a prior that is never forgotten. So the covariance is bounded, and
+      an estimate that gets no new information returns to it (M. E. Salgado, G. C. Goodwin and
+      R. H. Middleton, "Modified least squares algorithm incorporating exponential resetting and
+      forgetting", International Journal of Control 47, 1988, 477-491).
+    - While the flow stands still, nothing is learnt and nothing is forgotten.
+    - All models are stable. Their gains have the sign of the step test's, and stay between 0.3
+      and 3 times that.
+    - Certainty comes from evidence: with none, the controller is that of the step test. Errors
+      below 0.02 degC are no evidence, and a new design is taken over gradually.
+
+    Parameters
+    ----------
+    gain
+        Steady-state gain by a step test, degC per t/h; below zero or above.
+    time_constant
+        By the step test, s.
+    delay
+        By the step test, s; the sample that any input takes to show is part of it.
+    dead_zone
+        The actuator's, as far as is known, t/h.
+    dead_zones
+        Those that it may have, t/h. One alone is taken for granted.
+    shortest_delay, longest_delay
+        Delays that the plant may have, d in samples: an input shows after d + 1.
+    closed_loop_time_constant
+        As a share of the plant's, whatever that is found to be.
+    forgetting
+        What a sample leaves of the weight of those before it; up to 1, which forgets nothing.
+    sampling_interval
+        s.
+    setpoint_index, error_index
+        Where the observation holds y_d(k) and e(k), degC.
+    u_min, u_max
+        The actuator's limits, t/h.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range; the message names it.
+    """
+
+    # What a batch remembers: responses without delay, of unit gain, and the same prefiltered,
+    # (loops, time, responses); the flow within the limits, t/h, (loops, time).
+    _units: Array
+    _filtered: Array
+    _flows: Array
+    # The last output, its offset and the disturbance that is foreseen, degC, (loops,), and the
+    # last prefiltered outputs, (loops, INTERVAL).
+    _output: Array
+    _bias: Array
+    _disturbance: Array
+    _filtered_outputs: Array
+    # Sums over the past: of squared regressors and of regressors times outputs, (loops,
+    # models); of squared outputs and of the samples themselves, (loops, 1).
+    _information: Array
+    _products: Array
+    _energy: Array
+    _seen: Array
+    # The design: probabilities and, times these, gains of the models, (loops, models).
+    _weights: Array
+    _gains: Array
+
+    def __init__(
+        self,
+        *,
+        gain: float,
+        time_constant: float,
+        delay: float,
+        dead_zone: float = 5.0,
+        dead_zones: Sequence[float] = (0.0, 2.0, 3.5, 5.0, 6.5, 8.0),
+        shortest_delay: int = 6,
+        longest_delay: int = 36,
+        closed_loop_time_constant: float = 0.15,
+        forgetting: float = 0.996,
+        sampling_interval: float = 8.0,
+        setpoint_index: int = 0,
+        error_index: int = 3,
+        u_min: float = -10.0,
+        u_max: float = 10.0,
+    ) -> None:
+        self.setpoint_index = check_count("setpoint_index", setpoint_index, 0)
+        self.error_index = check_count("error_index", error_index, 0)
+        super().__init__(n_obs=max(setpoint_index, error_index) + 1, u_min=u_min, u_max=u_max)
+        self.gain = check_number("gain", gain)
+        if gain == 0:
+            raise ValueError(f"gain must not be 0, got {gain!r}")
+        self._interval = _positive("sampling_interval", sampling_interval)
+        samples = _positive("time_constant", time_constant) / self._interval
+        self._closed_loop = _positive("closed_loop_time_constant", closed_loop_time_constant)
+        if not 0.0 < check_number("forgetting", forgetting) <= 1.0:
+            raise ValueError(f"forgetting must be above 0, up to 1, got {forgetting!r}")
+        self._forgetting = float(forgetting)
+        shortest = check_count("shortest_delay", shortest_delay, 0)
+        longest = check_count("longest_delay", longest_delay, shortest)
+        if not isinstance(dead_zones, Sequence) or not len(dead_zones):
+            raise ValueError(f"dead_zones must be a list of numbers, got {dead_zones!r}")
+        self._zones = np.array([check_number("dead_zones", zone, 0) for zone in dead_zones])
+
+        # Responses without delay differ by dead zone and pole, models by delay, too: the
+        # longest one first, as in the history of the responses.
+        self._delays = np.arange(longest, shortest - 1, -1)
+        constants = np.tile(samples * np.array(TIME_CONSTANTS), len(self._zones))
+        self._constants = constants
+        self._poles = np.exp(-1.0 / constants)
+        self._dead_zones = np.repeat(self._zones, len(TIME_CONSTANTS))
+        self._fading = (self._poles ** self._delays[:, np.newaxis]).ravel()
+        told_delay = check_number("delay", delay, 0) / self._interval - 1.0
+        told_zone = check_number("dead_zone", dead_zone, 0)
+        limit = max(abs(self.u_min), abs(self.u_max))
+        off_delay = (self._delays - told_delay) / DELAY_SPREAD
+        off_constant = np.log(constants / samples) / TIME_CONSTANT_SPREAD
+        off_zone = (self._dead_zones - told_zone) / (ZONE_SPREAD * limit)
+        off = np.square(off_delay)[:, np.newaxis] + np.square(off_constant) + off_zone**2
+        self._prior = -0.5 * off.ravel()  # log-probability, but for a constant
+        self._excited = EXCITED * (self.u_max - self.u_min) / 2.0
+        self._history = longest + max(MEMORY, INTERVAL)
+        self._loops = 0  # not known before the first observation
+
+    @property
+    def estimates(self) -> dict[str, Array]:
+        """What is thought of the plants now, the mean over the models, each of shape (batch,).
+
+        `gain` (degC per t/h), `time_constant` (s), `delay` (s, as in the constructor) and
+        `dead_zone` (t/h, the most likely one). Empty before the first observation.
+        """
+        if not self._loops:
+            return {}
+        by_mode, by_delay = (self._by_model(self._weights).sum(axis) for axis in (1, 2))
+        return {
+            "gain": self._gains.sum(1),
+            "time_constant": (by_mode * self._constants).sum(1) * self._interval,
+            "delay": ((by_delay * self._delays).sum(1) + 1.0) * self._interval,
+            "dead_zone": self._zone.copy(),
+        }
+
+    def reset(self) -> None:
+        """Forget the episode and what was learnt: the next plant may be another."""
+        super().reset()
+        self._loops = 0
+
+    def _control(self, observation: Array) -> Values:
+        rows = np.atleast_2d(observation)
+        if not self._loops:
+            self._start(len(rows))
+        if len(rows) != self._loops:
+            raise ValueError(
+                f"observation must be of {self._loops} loops until reset, got {len(rows)}"
+            )
+        setpoint = rows[:, self.setpoint_index]
+        output = setpoint - rows[:, self.error_index]
+        now, delays = self._now, len(self._delays)
+
+        filtered = (
+            PREFILTER_POLE * self._filtered_outputs[:, -1]
+            + output
+            - PREFILTER_ZERO * self._output
+        )
+        self._output = output
+        self._filtered_outputs[:, :-1] = self._filtered_outputs[:, 1:].copy()
+        self._filtered_outputs[:, -1] = filtered
+        self._samples += 1
+        if self._samples % INTERVAL == 0:
+            self._learn()
+            self._design(BLEND)
+
+        first = now - int(self._delays[0])
+        delayed = self._units[:, first : first + delays].reshape(self._loops, -1)
+        off = output - _dot(self._gains, delayed)
+        self._bias = self._bias + BIAS_RATE * (off - self._bias)
+        fading = self._trust * (output - self._bias) - _dot(self._faded, delayed)
+        self._disturbance += (1.0 - DISTURBANCE_POLE) * (fading - self._disturbance)
+        response = self._units[:, now]
+        foreseen = _dot(self._sums, response) + self._bias + self._disturbance
+        command: Array = _dot(self._shares, response)
+        command += self._feedback * (setpoint - foreseen)
+        command = self._beyond_the_dead_zone(command)
+        self._apply(command)
+        return command if observation.ndim == 2 else command[0]
+
+    def _start(self, loops: int) -> None:
+        """Bring everything to rest, and the models to what the step test has shown."""
+        models = len(self._prior)
+        history = self._history + 1
+        self._loops, self._samples, self._now = loops, 0, history - 1
+        shape = loops, history + _ROOM, len(self._poles)
+        self._units, self._filtered = np.zeros(shape), np.zeros(shape)
+        self._flows = np.zeros(shape[:2])
+        self._output, self._bias = np.zeros(loops), np.zeros(loops)
+        self._disturbance = np.zeros(loops)
+        self._filtered_outputs = np.zeros((loops, INTERVAL))
+        self._information, self._products = np.zeros((loops, models)), np.zeros((loops, models))
+        self._energy, self._seen = np.zeros((loops, 1)), np.zeros((loops, 1))
+        self._variance = np.full((loops, 1), NOISE**2)
+        self._weights, self._gains = np.zeros((loops, models)), np.zeros((loops, models))
+        self._design(1.0)
+
+    def _learn(self) -> None:
+        """Add the last samples to the sums, of those loops whose flow has moved."""
+        now, delays = self._now, len(self._delays)
+        flows = self._flows[:, now - self._history : now]
+        moved = flows.max(1) - flows.min(1) > self._excited
+        gate = moved.astype(float)[:, np.newaxis]
+        kept = 1.0 - gate * (1.0 - self._forgetting**INTERVAL)
+        first = now - int(self._delays[0])
+        filtered = self._filtered[:, first - INTERVAL + 1 : first + delays]
+        outputs = self._filtered_outputs * gate
+        squares = np.square(filtered) * gate[:, :, np.newaxis]
+        information, products = (
+            self._by_model(self._information),
+            self._by_model(self._products),
+        )
+        self._information *= kept
+        self._products *= kept
+        for i in range(INTERVAL):
+            information += squares[:, i : i + delays]
+            products += filtered[:, i : i + delays] * outputs[:, i, np.newaxis, np.newaxis]
+        self._energy *= kept
+        self._energy += np.square(outputs).sum(1, keepdims=True)
+        self._seen *= kept
+        self._seen += INTERVAL * gate
+
+    def _design(self, share: float) -> None:
+        """Weigh the models by what was seen, and take over a share of what they ask for."""
+        prior = self._variance / (GAIN_SPREAD * self.gain) ** 2
+        information = self._information + prior
+        products = self._products + prior * self.gain
+        gains = products / information
+        errors = self._energy + prior * self.gain**2 - products * gains  # sums of squares
+        weights = self._prior - (0.5 * CAUTION) * errors / self._variance
+        weights -= weights.max(1, keepdims=True)
+        np.exp(weights, out=weights)
+        weights /= weights.sum(1, keepdims=True)
+        least = np.maximum(errors.min(1, keepdims=True), LEAST_NOISE**2 * self._seen)
+        self._variance = (least + NOISE_SAMPLES * NOISE**2) / (self._seen + NOISE_SAMPLES)
+
+        gains = np.clip(gains / self.gain, *GAINS) * self.gain  # the direction stays
+        self._weights += share * (weights - self._weights)
+        self._gains += share * (weights * gains - self._gains)
+
+        # Averages over the models of what the control law needs.
+        self._faded = self._gains * self._fading
+        self._trust = np.einsum("ij,j->i", self._weights, self._fading)
+        self._sums = self._by_model(self._gains).sum(1)
+        rates = self._sums * (1.0 - self._poles)
+        rate = rates.sum(1)
+        self._shares = rates / rate[:, np.newaxis]
+        constant = self._sums.sum(1) / rate  # of the average plant, samples
+        self._feedback = -np.expm1(-1.0 / (self._closed_loop * constant)) / rate
+        by_zone = self._by_model(self._weights).sum(1)
+        by_zone = by_zone.reshape(self._loops, len(self._zones), -1).sum(2)
+        self._zone = self._zones[by_zone.argmax(1)]
+
+    def _beyond_the_dead_zone(self, command: Array) -> Array:
+        """Move what lies within the dead zone to its edge or to 0, whichever is nearer."""
+        edge = np.where(self._zone > 0.0, self._zone + CLEARANCE, 0.0)
+        size = np.abs(command)
+        moved = np.where(size < edge / 2.0, 0.0, np.copysign(edge, command))
+        return np.where(size < edge, moved, command)
+
+    def _apply(self, command: Array) -> None:
+        """Let the models without delay respond to a command."""
+        flow = np.clip(command, self.u_min, self.u_max)
+        column = flow[:, np.newaxis]
+        applied = column * (np.abs(column) >= self._dead_zones)
+        now = self._now
+        units = self._poles * self._units[:, now] + (1.0 - self._poles) * applied
+        filtered = (
+            PREFILTER_POLE * self._filtered[:, now]
+            + units
+            - PREFILTER_ZERO * self._units[:, now]
+        )
+        self._flows[:, now] = flow
+        if now + 1 == self._units.shape[1]:
+            for history in (self._units, self._filtered, self._flows):
+                history[:, : self._history] = history[:, _ROOM + 1 :].copy()
+            now = self._history - 1
+        self._now = now = now + 1
+        self._units[:, now] = units
+        self._filtered[:, now] = filtered
+
+    def _by_model(self, values: Array) -> Array:
+        """Return what there is of each model by loop, delay and response without delay."""
+        return values.reshape(self._loops, len(self._delays), -1)
+
+
+def _dot(first: Array, second: Array) -> Array:
+    """Return the products of rows with rows."""
+    products: Array = np.einsum("ij,ij->i", first, second)
+    return products
+
+
+def _positive(name: str, value: float) -> float:
+    number = check_number(name, value, 0)
+    if number == 0:
+        raise ValueError(f"{name} must be above 0, got {value!r}")
+    return number

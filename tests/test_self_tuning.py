@@ -1,0 +1,187 @@
+"""The self-tuning controller: what it finds out about plants, and what it does not fall for."""
+
+import numpy as np
+import pytest
+
+from agents import SelfTuningController, SmithPredictor
+from benchmarks.rollout import make_plants, rollout
+
+STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
+# Steady-state gain of (28), degC per t/h, and 1 / (1 - p) samples of 8 s, p its slowest pole.
+GAIN = (-0.04560 - 0.00404) / (1.0 - 0.45181 - 0.47546)
+TIME_CONSTANT = 8.0 / (1.0 - 0.95147)
+
+
+def control(controller, samples=1200, runs=1, seed=5_900_000, **plant):
+    """Run a controller, and return what happened."""
+    return rollout(make_plants(runs, samples, **plant), controller, samples, seed)
+
+
+def mean_error(trajectory, start=0):
+    return np.abs(trajectory.setpoint - trajectory.output)[start:].mean()
+
+
+@pytest.mark.parametrize(
+    ("delay", "gain", "time_constant"), [(8, 1.5, 0.6), (18, 1.0, 1.0), (33, 0.8, 1.8)]
+)
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_it_finds_out_what_the_plant_is(delay, gain, time_constant, noise):
+    controller = SelfTuningController(**STEP_TEST)
+    control(
+        controller, runs=2, delay=delay, gain_factor=gain, noise_variance=noise,
+        time_constant_factor=time_constant, dead_zone=0.0, setpoint_period=240,
+    )  # fmt: skip
+    found = controller.estimates
+    assert found["delay"] == pytest.approx(np.full(2, 8.0 * (delay + 1)), abs=16.0)
+    assert found["gain"] == pytest.approx(np.full(2, GAIN * gain), rel=0.1)
+    assert found["time_constant"] == pytest.approx(
+        np.full(2, TIME_CONSTANT * time_constant), rel=0.2
+    )
+
+
+def test_before_it_has_learnt_it_is_what_the_step_test_says():
+    controller = SelfTuningController(**STEP_TEST, dead_zone=3.5)
+    assert controller.estimates == {}
+    controller.act(np.zeros(6))
+    found = controller.estimates
+    assert found["gain"] == pytest.approx(-0.6825)
+    assert found["delay"] == pytest.approx(152.0, rel=0.05)
+    assert found["time_constant"] == pytest.approx(161.0, rel=0.15)
+    assert found["dead_zone"] == 3.5
+
+
+@pytest.mark.parametrize("gain", [(1.5, 0.85), (0.85, 1.5)])
+def test_it_follows_a_plant_that_drifts(gain):
+    first, last = gain
+    plant = {
+        "gain_factor": first, "gain_drift": last / first, "noise_variance": 0.05, "delay": 30,
+        "runs": 3,
+    }  # fmt: skip
+    tuning = SelfTuningController(**STEP_TEST)
+    fixed = SmithPredictor(**STEP_TEST, closed_loop_time_constant=80.0, dead_zone=5.0)
+    ours, theirs = (mean_error(control(each, **plant), 600) for each in (tuning, fixed))
+    assert ours < theirs - 0.1
+    assert tuning.estimates["gain"] == pytest.approx(np.full(3, GAIN * last), rel=0.2)
+
+
+def test_it_finds_the_dead_zone_that_it_was_not_told():
+    # 5 degC take 6.1 t/h here, which does not pass: the loop has to find it out.
+    plant = {"dead_zone": 7.5, "gain_factor": 1.2, "noise_variance": 0.05, "runs": 3}
+    knowing, told = (
+        SelfTuningController(**STEP_TEST, dead_zones=zones)
+        for zones in ((0.0, 2.0, 3.5, 5.0, 6.5, 8.0), (5.0,))
+    )
+    ours, theirs = (mean_error(control(each, **plant), 600) for each in (knowing, told))
+    assert (knowing.estimates["dead_zone"] >= 6.5).all()
+    assert ours < theirs
+
+
+def test_ten_thousand_quiet_samples_teach_nothing():
+    controller = SelfTuningController(**STEP_TEST)
+    control(controller, delay=26, gain_factor=1.3)
+    for _ in range(400):  # until the flow has come to rest
+        controller.act(np.zeros(6))
+    before = controller.estimates
+    assert before["delay"] == pytest.approx(8.0 * 27, abs=16.0)
+    for _ in range(10_000):
+        controller.act(np.zeros(6))
+    for name, values in controller.estimates.items():
+        assert values == pytest.approx(before[name], rel=1e-6), name
+
+
+def test_nothing_bursts_in_noise_without_changes_of_the_set_point():
+    plant = {"setpoint": 5.0, "noise_variance": 0.3, "delay": 26, "runs": 2}
+    controller = SelfTuningController(**STEP_TEST)
+    trajectory = control(controller, samples=6000, **plant)
+    errors = np.abs(trajectory.setpoint - trajectory.output).reshape(6, 1000, 2).mean((1, 2))
+    assert errors[1:].max() < 1.5 * errors[1:].min()
+    assert controller.estimates["gain"] == pytest.approx(np.full(2, GAIN), rel=0.4)
+
+
+def test_a_gain_of_the_wrong_sign_is_not_believed():
+    controller = SelfTuningController(**STEP_TEST)
+    control(controller, b=[0.04560, 0.00404], runs=2)
+    assert (controller.estimates["gain"] <= 0.3 * -0.6825 + 1e-12).all()
+
+
+def test_nonsense_does_not_lead_it_beyond_its_bounds(rng):
+    controller = SelfTuningController(**STEP_TEST)
+    for scale in (1.0, 1e3, 1e6, 1.0):
+        for _ in range(200):
+            controller.act(rng.normal(size=(3, 6)) * scale)
+            assert np.isfinite(controller.command).all()
+    found = controller.estimates
+    for values, low, high in ((found["gain"] / -0.6825, 0.3, 3.0), (found["delay"], 56, 296)):
+        assert values.min() >= low
+        assert values.max() <= high
+
+
+def test_a_plant_of_the_other_direction_is_its_mirror_image():
+    usual, other = (
+        control(
+            SelfTuningController(**STEP_TEST | {"gain": sign * -0.6825}),
+            samples=500, b=[sign * -0.04560, sign * -0.00404], noise_variance=0.1,
+        )
+        for sign in (1.0, -1.0)
+    )  # fmt: skip
+    # The actions are in float32, and not quite as many of them are below 0 as above.
+    np.testing.assert_allclose(usual.output, other.output, atol=1e-3)
+    np.testing.assert_allclose(usual.command, -other.command, atol=1e-2)
+
+
+def test_no_offset_remains_under_a_steady_load():
+    controller = SelfTuningController(**STEP_TEST)
+    trajectory = control(
+        controller, samples=1500, setpoint=4.0, dead_zone=0.0,
+        disturbance_amplitude=2.0, disturbance_interval=1e6, delay=12,
+    )  # fmt: skip
+    assert mean_error(trajectory, 1300) < 0.05
+
+
+def test_a_batch_is_its_members_to_the_bit(rng):
+    plants = make_plants(4, 400, noise_variance=0.2, delay=[6, 36], dead_zone=[0, 8])
+    batch = SelfTuningController(**STEP_TEST)
+    singles = [SelfTuningController(**STEP_TEST) for _ in range(4)]
+    observation, _ = plants.reset(seed=5_900_100)
+    for _ in range(399):
+        actions = batch.act(observation)
+        alone = [single.act(own) for single, own in zip(singles, observation, strict=True)]
+        np.testing.assert_array_equal(actions, alone)
+        observation, *_ = plants.step(actions)
+    for i, single in enumerate(singles):
+        for name, values in single.estimates.items():
+            np.testing.assert_array_equal(values, batch.estimates[name][i : i + 1])
+
+
+def test_reset_forgets_what_was_learnt():
+    controller = SelfTuningController(**STEP_TEST)
+    first, second = (control(controller, samples=300, delay=30) for _ in range(2))
+    np.testing.assert_array_equal(first.command, second.command)
+    controller.reset()
+    assert controller.command == 0.0
+    assert controller.estimates == {}
+
+
+def test_the_number_of_loops_is_fixed_until_reset():
+    controller = SelfTuningController(**STEP_TEST)
+    controller.act(np.zeros((2, 6)))
+    with pytest.raises(ValueError, match="observation"):
+        controller.act(np.zeros((3, 6)))
+    controller.reset()
+    controller.act(np.zeros((3, 6)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
+        ("dead_zone", -1.0), ("dead_zones", ()), ("dead_zones", [-1.0]), ("dead_zones", 5.0),
+        ("shortest_delay", -1), ("longest_delay", 5), ("longest_delay", 10.0),
+        ("closed_loop_time_constant", 0.0), ("forgetting", 0.0), ("forgetting", 1.1),
+        ("sampling_interval", 0.0), ("setpoint_index", -1), ("error_index", 1.5),
+        ("u_min", 10.0),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        SelfTuningController(**STEP_TEST | {name: value})
