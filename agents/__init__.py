@@ -1,8 +1,9 @@
-"""Controllers for the middle-point temperature. They know numbers, not the environment."""
+"""Controllers of the middle-point temperature, in NumPy alone."""
 
 from agents.controller import Controller
-from agents.direct_nn import DirectNNController, Weights
+from agents.direct_nn import DirectNNController
 from agents.pi import PIController
+from agents.policy_network import PolicyNetwork
 from agents.self_tuning import SelfTuningController
 from agents.smith import SmithPredictor
 
@@ -10,7 +11,7 @@ __all__ = [
     "Controller",
     "DirectNNController",
     "PIController",
+    "PolicyNetwork",
     "SelfTuningController",
     "SmithPredictor",
-    "Weights",
 ]

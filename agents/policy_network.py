@@ -1,0 +1,302 @@
+"""A trained feed-forward policy, run in NumPy alone."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agents.controller import Controller, Values, check_count, check_number
+
+Array = NDArray[np.float64]
+
+WINDOWS: Final = ("setpoint_window", "error_window", "output_window", "action_window")
+PRETRAINED: Final = Path(__file__).parent / "pretrained"
+_FORMAT = 1  # of the file
+
+
+def _elu(x: Array) -> Array:
+    return np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))
+
+
+def _relu(x: Array) -> Array:
+    return np.maximum(x, 0.0)
+
+
+def _tanh(x: Array) -> Array:
+    return np.tanh(x)
+
+
+def _linear(x: Array) -> Array:
+    return x
+
+
+ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
+    "elu": _elu,
+    "relu": _relu,
+    "tanh": _tanh,
+}
+OUTPUTS: Final[Mapping[str, Callable[[Array], Array]]] = {"linear": _linear, "tanh": _tanh}
+
+
+@dataclass(frozen=True)
+class Increments:
+    """Velocity form: the network's output changes the valve's position, which is kept here.
+
+    Attributes
+    ----------
+    max_move
+        By how much an output of 1 changes the position in one sample. Positions reach from -1
+        to 1, as actions do.
+    dead_zone
+        t/h. If it is above 0, positions are spread over the flows outside the dead zone: just
+        above 0 stands for its upper edge and just below 0 for its lower one. If it is 0, a
+        position is an action.
+    """
+
+    max_move: float
+    dead_zone: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_number("max_move", self.max_move, 0)
+        check_number("dead_zone", self.dead_zone, 0)
+
+
+class PolicyNetwork(Controller):
+    """A feed-forward network from the latest observation to an action.
+
+    The observation is multiplied by `input_scale` and goes through the layers. The activation
+    follows each of them but the last, which gives one number z. The output is
+    `output_scale` * z or `output_scale` * tanh(z), limited to [-1, 1]. It is the action, or
+    with `increments` the velocity of the valve. All is computed in float64.
+
+    Parameters
+    ----------
+    layers
+        Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
+    observation
+        The windows of the observation that the network wants, by the names of the
+        environment's arguments: `setpoint_window`, `error_window`, `output_window`,
+        `action_window`. A window that is not named is 0.
+    input_scale
+        What each element of the observation is multiplied with; shape (n_obs,).
+    activation
+        "elu", "relu" or "tanh".
+    output
+        "linear" or "tanh".
+    output_scale
+        See above. With "tanh", a scale above 1 lets the network reach the limits.
+    increments
+        The velocity form, if the network was trained in it.
+    provenance
+        Where the weights come from; whatever JSON can hold.
+    u_min, u_max
+        The actuator's limits, t/h.
+
+    Attributes
+    ----------
+    observation : dict of str to int
+        All four windows, as arguments for the environment.
+    provenance : dict
+        As given.
+
+    Raises
+    ------
+    ValueError
+        If arguments are out of range or do not fit together; the message names them.
+    """
+
+    def __init__(
+        self,
+        layers: Sequence[tuple[ArrayLike, ArrayLike]],
+        *,
+        observation: Mapping[str, int],
+        input_scale: ArrayLike,
+        activation: str = "elu",
+        output: str = "linear",
+        output_scale: float = 1.0,
+        increments: Increments | None = None,
+        provenance: Mapping[str, Any] | None = None,
+        u_min: float = -10.0,
+        u_max: float = 10.0,
+    ) -> None:
+        for name in observation:
+            if name not in WINDOWS:
+                raise ValueError(f"observation must name {', '.join(WINDOWS)}, got {name!r}")
+        self.observation = {
+            name: check_count(f"observation[{name!r}]", observation.get(name, 0), 0)
+            for name in WINDOWS
+        }
+        dead_zone = 0.0 if increments is None else increments.dead_zone
+        super().__init__(n_obs=sum(self.observation.values()), u_min=u_min, u_max=u_max)
+        if dead_zone >= min(-self.u_min, self.u_max) and dead_zone > 0.0:
+            raise ValueError(
+                f"increments.dead_zone must be inside the limits {u_min!r} and {u_max!r}, "
+                f"got {dead_zone!r}"
+            )
+        if activation not in ACTIVATIONS:
+            raise ValueError(f"activation must be one of {[*ACTIVATIONS]}, got {activation!r}")
+        if output not in OUTPUTS:
+            raise ValueError(f"output must be one of {[*OUTPUTS]}, got {output!r}")
+        self.activation, self.output = activation, output
+        self.output_scale = check_number("output_scale", output_scale)
+        self.increments = increments
+        self.provenance = dict(provenance or {})
+        self.input_scale = _finite("input_scale", input_scale, (self.n_obs,))
+        self.layers = _checked(layers, self.n_obs)
+        self._position: Values | None = None  # of the valve, in velocity form
+
+    @classmethod
+    def pretrained(
+        cls, name: str, *, u_min: float = -10.0, u_max: float = 10.0
+    ) -> PolicyNetwork:
+        """Return a network that comes with the project, such as "nn-dpc" or "nn-adaptive".
+
+        Raises
+        ------
+        ValueError
+            If there is none of this name.
+        """
+        names = sorted(path.stem for path in PRETRAINED.glob("*.npz"))
+        if name not in names:
+            raise ValueError(f"name must be one of {', '.join(names)}, got {name!r}")
+        return cls.load(PRETRAINED / f"{name}.npz", u_min=u_min, u_max=u_max)
+
+    @classmethod
+    def load(
+        cls, path: str | PathLike[str], *, u_min: float = -10.0, u_max: float = 10.0
+    ) -> PolicyNetwork:
+        """Read a network that `save` has written. Nothing in the file is executed.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is no such file.
+        ValueError
+            If the file is damaged or does not hold a network.
+        """
+        with Path(path).open("rb") as raw:
+            try:
+                with np.load(raw, allow_pickle=False) as file:
+                    about = json.loads(str(file["about"]))
+                    if about["format"] != _FORMAT:
+                        raise ValueError(f"its format is {about['format']!r}, not {_FORMAT}")
+                    increments = about["increments"]
+                    return cls(
+                        [(file[f"W{i}"], file[f"b{i}"]) for i in range(about["layers"])],
+                        observation=about["observation"],
+                        input_scale=file["input_scale"],
+                        activation=about["activation"],
+                        output=about["output"],
+                        output_scale=about["output_scale"],
+                        increments=None if increments is None else Increments(**increments),
+                        provenance=about["provenance"],
+                        u_min=u_min,
+                        u_max=u_max,
+                    )
+            except Exception as error:  # damage shows in zip, zlib, NumPy, JSON or the checks
+                raise ValueError(
+                    f"{path} holds no policy network, or is damaged: {error}"
+                ) from error
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the network to a `.npz` file, whole or not at all."""
+        about = {
+            "format": _FORMAT,
+            "layers": len(self.layers),
+            "observation": self.observation,
+            "activation": self.activation,
+            "output": self.output,
+            "output_scale": self.output_scale,
+            "increments": None if self.increments is None else asdict(self.increments),
+            "provenance": self.provenance,
+        }
+        arrays: dict[str, Any] = {
+            "about": np.array(json.dumps(about)),
+            "input_scale": self.input_scale,
+        }
+        for i, (W, b) in enumerate(self.layers):
+            arrays |= {f"W{i}": W, f"b{i}": b}
+        target = Path(path)
+        partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+        try:
+            with partial.open("wb") as file:
+                np.savez_compressed(file, **arrays)
+            partial.replace(target)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    def reset(self) -> None:
+        """Forget the episode: in velocity form, the valve's position."""
+        super().reset()
+        self._position = None
+
+    def _control(self, observation: Array) -> Values:
+        if observation.shape[-1] != self.n_obs:
+            raise ValueError(
+                f"observation must have {self.n_obs} elements, those of {self.observation}, "
+                f"got {observation.shape[-1]}"
+            )
+        x = observation * self.input_scale
+        *hidden, (last_W, last_b) = self.layers
+        for W, b in hidden:
+            x = ACTIVATIONS[self.activation](x @ W.T + b)
+        z = x @ last_W[0] + last_b[0]
+        output = np.clip(self.output_scale * OUTPUTS[self.output](z), -1.0, 1.0)
+        if self.increments is None:
+            command: Values = self.u_min + (output + 1.0) * (self.u_max - self.u_min) / 2.0
+            return command
+        return self._move(output, self.increments)
+
+    def _move(self, output: Values, increments: Increments) -> Values:
+        """Move the valve, and return its flow, t/h."""
+        before = np.zeros_like(output) if self._position is None else self._position
+        if np.shape(before) != np.shape(output):
+            raise ValueError(
+                f"observation must be of as many runs as before: {np.shape(before)}, "
+                f"got {np.shape(output)}"
+            )
+        position = np.clip(before + increments.max_move * output, -1.0, 1.0)
+        self._position = position
+        edge = increments.dead_zone
+        if edge == 0.0:
+            return self.u_min + (position + 1.0) * (self.u_max - self.u_min) / 2.0
+        limit = np.where(position > 0.0, self.u_max, -self.u_min)
+        flow: Values = np.sign(position) * (edge + np.abs(position) * (limit - edge))
+        return flow
+
+
+def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite")
+    return array
+
+
+def _checked(
+    layers: Sequence[tuple[ArrayLike, ArrayLike]], inputs: int
+) -> list[tuple[Array, Array]]:
+    """Return the layers in float64 if each fits the one before it and the last has one node."""
+    if not layers:
+        raise ValueError("layers must hold at least one")
+    checked = []
+    for i, (W, b) in enumerate(layers):
+        last = i == len(layers) - 1
+        nodes = 1 if last else len(np.atleast_1d(np.asarray(b)))
+        checked.append(
+            (
+                _finite(f"weights of layer {i}", W, (nodes, inputs)),
+                _finite(f"biases of layer {i}", b, (nodes,)),
+            )
+        )
+        inputs = nodes
+    return checked

@@ -1,0 +1,265 @@
+"""Trained networks in NumPy: what they compute, keep and refuse."""
+
+import itertools
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+from agents import Increments, PolicyNetwork
+
+WINDOWS = {"setpoint_window": 1, "output_window": 2, "action_window": 2}
+
+
+def layers(*sizes, seed=0, dtype=np.float64):
+    generator = np.random.default_rng(seed)
+    return [
+        (
+            generator.normal(size=(after, before)).astype(dtype),
+            generator.normal(size=after).astype(dtype),
+        )
+        for before, after in itertools.pairwise(sizes)
+    ]
+
+
+def policy(**arguments):
+    given = {"observation": WINDOWS, "input_scale": [0.2] * 3 + [1.0] * 2, **arguments}
+    return PolicyNetwork(layers(5, 7, 6, 1), **given)
+
+
+def constant(value, **arguments):
+    """Return a network whose output before scaling is the same whatever it sees."""
+    only = [(np.zeros((1, 1)), np.array([value]))]
+    return PolicyNetwork(only, observation={"error_window": 1}, input_scale=[1.0], **arguments)
+
+
+class TestForward:
+    def test_by_hand(self):
+        # z = 1 * elu(2 * (0.5 * 3) - 4) + 0.25 = elu(-1) + 0.25 = e^-1 - 1 + 0.25
+        network = PolicyNetwork(
+            [([[2.0]], [-4.0]), ([[1.0]], [0.25])],
+            observation={"error_window": 1},
+            input_scale=[0.5],
+        )
+        expected = np.exp(-1.0) - 0.75
+        assert network.act([3.0]) == pytest.approx([expected], abs=1e-7)
+        assert network.command == pytest.approx(10.0 * expected, abs=1e-12)
+
+    @pytest.mark.parametrize("activation", ["elu", "relu", "tanh"])
+    @pytest.mark.parametrize("output", ["linear", "tanh"])
+    def test_equals_torch(self, activation, output):
+        torch = pytest.importorskip("torch")
+        network = policy(activation=activation, output=output, output_scale=1.2)
+        x = np.random.default_rng(1).uniform(-20, 20, size=(50, 5))
+        functions = {"elu": torch.nn.functional.elu, "relu": torch.relu, "tanh": torch.tanh}
+        h = torch.tensor(x * network.input_scale)
+        for i, (W, b) in enumerate(network.layers):
+            h = torch.nn.functional.linear(h, torch.tensor(W), torch.tensor(b))
+            h = functions[activation](h) if i < len(network.layers) - 1 else h
+        h = 1.2 * (torch.tanh(h) if output == "tanh" else h)
+        expected = h.clamp(-1.0, 1.0).numpy()
+        assert np.abs(expected).min() < 0.9  # not all at the limits
+        assert network.act(x) == pytest.approx(expected, abs=1e-6)
+
+    def test_a_batch_is_what_its_members_are_alone(self):
+        x = np.random.default_rng(1).uniform(-20, 20, size=(300, 5)).astype(np.float32)
+        network = policy()
+        batch = network.act(x)
+        assert batch.shape == (300, 1)
+        assert batch.dtype == np.float32
+        alone = np.array([network.act(row) for row in x])
+        assert np.abs(batch - alone).max() < 1e-6
+
+    def test_actions_stay_within_the_limits(self):
+        x = np.full((1, 5), 1e9)
+        for output in ("linear", "tanh"):
+            assert np.abs(policy(output=output, output_scale=3.0).act(x)) <= 1.0
+
+    def test_commands_fit_other_limits(self):
+        network = constant(0.5, u_min=-4.0, u_max=8.0)
+        assert network.act([[0.0]]) == pytest.approx(0.5)
+        assert network.command == pytest.approx(5.0)  # three quarters of the way up
+
+    def test_an_observation_of_other_windows_is_refused(self):
+        with pytest.raises(ValueError, match="observation must have 5 elements"):
+            policy().act(np.zeros(6))
+
+    def test_observation_names_every_window(self):
+        assert policy().observation == {**WINDOWS, "error_window": 0}
+
+
+class TestIncrements:
+    def test_the_position_adds_up_and_stops_at_the_limit(self):
+        network = constant(0.5, increments=Increments(max_move=0.8))
+        actions = [float(network.act([0.0])[0]) for _ in range(4)]
+        assert actions == pytest.approx([0.4, 0.8, 1.0, 1.0])
+
+    def test_reset_forgets_the_position(self):
+        network = constant(-0.5, increments=Increments(max_move=0.8))
+        first = network.act([[0.0], [0.0]])
+        network.act([[0.0], [0.0]])
+        network.reset()
+        assert np.array_equal(network.act([[0.0], [0.0]]), first)
+
+    def test_the_dead_zone_is_stepped_over(self):
+        # Positions 0.2, 0.4, ...: of the 5 t/h beyond the dead zone's edge of 5 t/h.
+        up = constant(0.5, increments=Increments(max_move=0.4, dead_zone=5.0))
+        flows = []
+        for _ in range(3):
+            up.act([0.0])
+            flows.append(float(up.command))
+        assert flows == pytest.approx([6.0, 7.0, 8.0])
+        down = constant(-0.5, increments=Increments(max_move=0.4, dead_zone=5.0))
+        down.act([0.0])
+        assert down.command == pytest.approx(-6.0)
+
+    def test_another_batch_within_an_episode_is_refused(self):
+        network = constant(0.5, increments=Increments(max_move=0.8))
+        network.act([[0.0], [0.0]])
+        with pytest.raises(ValueError, match="as many runs as before"):
+            network.act([[0.0]])
+
+
+class TestFile:
+    def test_what_is_loaded_equals_what_was_saved(self, tmp_path):
+        saved = policy(
+            activation="tanh",
+            output="tanh",
+            output_scale=1.2,
+            increments=Increments(0.3, 5.0),
+            provenance={"seed": 3, "score": 1.02},
+        )
+        saved.save(tmp_path / "policy.npz")
+        loaded = PolicyNetwork.load(tmp_path / "policy.npz")
+        x = np.random.default_rng(1).uniform(-20, 20, size=(9, 5))
+        for _ in range(3):
+            assert np.array_equal(loaded.act(x), saved.act(x))
+        assert loaded.provenance == {"seed": 3, "score": 1.02}
+        assert loaded.observation == saved.observation
+        assert loaded.increments == saved.increments
+
+    def test_a_save_that_fails_leaves_the_file_and_nothing_else(self, tmp_path, monkeypatch):
+        path = tmp_path / "policy.npz"
+        policy().save(path)
+        before = path.read_bytes()
+
+        def fail(file, **arrays):
+            file.write(b"half")
+            raise OSError("disk full")
+
+        monkeypatch.setattr(np, "savez_compressed", fail)
+        with pytest.raises(OSError, match="disk full"):
+            policy().save(path)
+        assert path.read_bytes() == before
+        assert list(tmp_path.iterdir()) == [path]
+
+    @pytest.mark.parametrize("kept", [0, 1, 20, 200, 0.5, 0.9, 0.99, -1])
+    def test_a_file_that_was_cut_off(self, tmp_path, kept):
+        path = tmp_path / "policy.npz"
+        policy().save(path)
+        data = path.read_bytes()
+        path.write_bytes(data[: int(kept * len(data)) if isinstance(kept, float) else kept])
+        with pytest.raises(ValueError, match=r"policy\.npz holds no policy network"):
+            PolicyNetwork.load(path)
+
+    def test_a_file_with_a_changed_byte_loads_or_says_so(self, tmp_path):
+        path = tmp_path / "policy.npz"
+        policy().save(path)
+        data, refused = path.read_bytes(), 0
+        for place in range(0, len(data), 97):
+            damaged = bytearray(data)
+            damaged[place] ^= 0xFF
+            path.write_bytes(damaged)
+            try:
+                PolicyNetwork.load(path)  # some bytes nobody reads
+            except ValueError:
+                refused += 1
+        assert refused > len(data) // 97 / 2
+
+    def test_files_of_something_else(self, tmp_path):
+        class Harm:
+            def __reduce__(self):
+                return print, ("executed",)
+
+        np.savez(tmp_path / "other.npz", W=np.zeros(3))
+        np.save(tmp_path / "array.npy", np.zeros(3))
+        (tmp_path / "pickle.npz").write_bytes(pickle.dumps(Harm()))
+        np.savez(tmp_path / "object.npz", about=np.array(Harm(), dtype=object))
+        for name in ("other.npz", "array.npy", "pickle.npz", "object.npz"):
+            with pytest.raises(ValueError, match="holds no policy network"):
+                PolicyNetwork.load(tmp_path / name)
+
+    def test_nothing_in_a_file_is_executed(self, tmp_path, capsys):
+        self.test_files_of_something_else(tmp_path)
+        assert capsys.readouterr().out == ""
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"format": 99}, "format is 99"),
+            ({"activation": "swish"}, "activation"),
+            ({"layers": 2}, "weights of layer 1"),
+            ({"observation": {"flow_window": 3}}, "flow_window"),
+            ({"increments": {"step": 1}}, "step"),
+            ({"observation": 3}, "damaged"),
+        ],
+    )
+    def test_a_description_that_does_not_fit(self, tmp_path, change, message):
+        path = tmp_path / "policy.npz"
+        policy().save(path)
+        with np.load(path) as file:
+            arrays = dict(file)
+        about = json.loads(str(arrays.pop("about"))) | change
+        np.savez(path, about=np.array(json.dumps(about)), **arrays)
+        with pytest.raises(ValueError, match=message):
+            PolicyNetwork.load(path)
+
+    def test_weights_that_are_no_numbers(self, tmp_path):
+        path = tmp_path / "policy.npz"
+        policy().save(path)
+        with np.load(path) as file:
+            arrays = dict(file)
+        arrays["W1"][2, 3] = np.nan
+        np.savez(path, **arrays)
+        with pytest.raises(ValueError, match="weights of layer 1 must be finite"):
+            PolicyNetwork.load(path)
+
+    def test_a_missing_file(self, tmp_path):
+        with pytest.raises(FileNotFoundError):
+            PolicyNetwork.load(tmp_path / "policy.npz")
+
+    def test_an_unknown_name(self):
+        with pytest.raises(ValueError, match="name must be one of"):
+            PolicyNetwork.pretrained("../pretrained/nn-dpc")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"observation": {"window": 5}}, "observation"),
+        ({"observation": {"output_window": 5.0}}, "output_window"),
+        ({"observation": {"output_window": 4}}, "input_scale"),
+        ({"input_scale": [1.0] * 4 + [np.inf]}, "input_scale must be finite"),
+        ({"activation": "elu "}, "activation"),
+        ({"output": "clip"}, "output must be"),
+        ({"output_scale": np.nan}, "output_scale"),
+        ({"u_min": 10.0}, "u_max"),
+        ({"increments": Increments(0.1, 10.0)}, "increments.dead_zone"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        policy(**arguments)
+
+
+def test_layers_that_do_not_fit_are_named():
+    given = {"observation": WINDOWS, "input_scale": np.ones(5)}
+    for bad, message in (
+        ([], "layers"),
+        (layers(4, 3, 1), r"weights of layer 0 must have shape \(3, 5\)"),
+        (layers(5, 3, 2), r"weights of layer 1 must have shape \(1, 3\)"),
+        ([(np.zeros((3, 5)), np.zeros(2))], "weights of layer 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            PolicyNetwork(bad, **given)
