@@ -74,8 +74,9 @@ class PolicyNetwork(Controller):
 
     The observation is multiplied by `input_scale` and goes through the layers. The activation
     follows each of them but the last, which gives one number z. The output is
-    `output_scale` * z or `output_scale` * tanh(z), limited to [-1, 1]. It is the action, or
-    with `increments` the velocity of the valve. All is computed in float64.
+    `output_scale` * z or `output_scale` * tanh(z), plus what `direct` adds, limited to [-1, 1].
+    It is the action, or with `increments` the velocity of the valve. All is computed in
+    float64.
 
     Parameters
     ----------
@@ -93,6 +94,10 @@ class PolicyNetwork(Controller):
         "linear" or "tanh".
     output_scale
         See above. With "tanh", a scale above 1 lets the network reach the limits.
+    direct
+        Weights of a linear path from the observation, before it is scaled, to the output; shape
+        (n_obs,). It can hold what is known of the plant, such as the flow that holds a set
+        point. 0 without.
     increments
         The velocity form, if the network was trained in it.
     provenance
@@ -122,6 +127,7 @@ class PolicyNetwork(Controller):
         activation: str = "elu",
         output: str = "linear",
         output_scale: float = 1.0,
+        direct: ArrayLike | None = None,
         increments: Increments | None = None,
         provenance: Mapping[str, Any] | None = None,
         u_min: float = -10.0,
@@ -150,6 +156,8 @@ class PolicyNetwork(Controller):
         self.increments = increments
         self.provenance = dict(provenance or {})
         self.input_scale = _finite("input_scale", input_scale, (self.n_obs,))
+        nothing = np.zeros(self.n_obs)
+        self.direct = _finite("direct", nothing if direct is None else direct, (self.n_obs,))
         self.layers = _checked(layers, self.n_obs)
         self._position: Values | None = None  # of the valve, in velocity form
 
@@ -196,6 +204,7 @@ class PolicyNetwork(Controller):
                         activation=about["activation"],
                         output=about["output"],
                         output_scale=about["output_scale"],
+                        direct=file["direct"],
                         increments=None if increments is None else Increments(**increments),
                         provenance=about["provenance"],
                         u_min=u_min,
@@ -221,6 +230,7 @@ class PolicyNetwork(Controller):
         arrays: dict[str, Any] = {
             "about": np.array(json.dumps(about)),
             "input_scale": self.input_scale,
+            "direct": self.direct,
         }
         for i, (W, b) in enumerate(self.layers):
             arrays |= {f"W{i}": W, f"b{i}": b}
@@ -249,7 +259,8 @@ class PolicyNetwork(Controller):
         for W, b in hidden:
             x = ACTIVATIONS[self.activation](x @ W.T + b)
         z = x @ last_W[0] + last_b[0]
-        output = np.clip(self.output_scale * OUTPUTS[self.output](z), -1.0, 1.0)
+        output = self.output_scale * OUTPUTS[self.output](z) + observation @ self.direct
+        output = np.clip(output, -1.0, 1.0)
         if self.increments is None:
             command: Values = self.u_min + (output + 1.0) * (self.u_max - self.u_min) / 2.0
             return command

@@ -71,6 +71,14 @@ class TestForward:
         alone = np.array([network.act(row) for row in x])
         assert np.abs(batch - alone).max() < 1e-6
 
+    def test_the_direct_path_adds_to_the_output(self):
+        direct = [0.1, 0.0, -0.2, 0.3, 0.0]
+        x = np.array([[1.0, 2.0, 3.0, 0.5, -0.5], [-1.0, 0.0, 1.0, 0.2, 0.4]])
+        added = np.array([0.1 - 0.6 + 0.15, -0.1 - 0.2 + 0.06])
+        given = {"output": "tanh", "output_scale": 0.1}
+        difference = policy(**given, direct=direct).act(x) - policy(**given).act(x)
+        assert difference[:, 0] == pytest.approx(added, abs=1e-6)
+
     def test_actions_stay_within_the_limits(self):
         x = np.full((1, 5), 1e9)
         for output in ("linear", "tanh"):
@@ -127,6 +135,7 @@ class TestFile:
             activation="tanh",
             output="tanh",
             output_scale=1.2,
+            direct=[0.1, 0.2, 0.3, 0.4, 0.5],
             increments=Increments(0.3, 5.0),
             provenance={"seed": 3, "score": 1.02},
         )
@@ -244,6 +253,7 @@ class TestFile:
         ({"activation": "elu "}, "activation"),
         ({"output": "clip"}, "output must be"),
         ({"output_scale": np.nan}, "output_scale"),
+        ({"direct": [1.0]}, "direct"),
         ({"u_min": 10.0}, "u_max"),
         ({"increments": Increments(0.1, 10.0)}, "increments.dead_zone"),
     ],
