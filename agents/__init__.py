@@ -1,17 +1,19 @@
-"""Controllers of the middle-point temperature, in NumPy alone."""
+"""Controllers for the middle-point temperature. They know numbers, not the environment."""
 
 from agents.controller import Controller
-from agents.direct_nn import DirectNNController
+from agents.direct_nn import DirectNNController, Weights
 from agents.pi import PIController
-from agents.policy_network import PolicyNetwork
+from agents.policy_network import Increments, PolicyNetwork
 from agents.self_tuning import SelfTuningController
 from agents.smith import SmithPredictor
 
 __all__ = [
     "Controller",
     "DirectNNController",
+    "Increments",
     "PIController",
     "PolicyNetwork",
     "SelfTuningController",
     "SmithPredictor",
+    "Weights",
 ]
