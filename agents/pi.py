@@ -107,6 +107,17 @@ class PIController(Controller):
         super().reset()
         self._sum = None
 
+    def transfer(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the transfer function from e to u while no limit is met.
+
+        Returns
+        -------
+        numerator, denominator
+            Coefficients of z^0, z^-1 and so on. Kp e + Ki e / (1 - z^-1), with the sign of u.
+        """
+        numerator = np.array([-(self.kp + self.ki), self.kp])
+        return numerator, np.array([1.0, -1.0])
+
     def _control(self, observation: NDArray[np.float64]) -> Values:
         error: Values = observation[..., self.error_index]
         if self._sum is None:

@@ -82,6 +82,27 @@ class SmithPredictor(PIController):
         super().reset()
         self._model = []
 
+    def transfer(self) -> tuple[Array, Array]:
+        """Return the transfer function from e to u while no limit and no dead zone is met.
+
+        Returns
+        -------
+        numerator, denominator
+            Coefficients of z^0, z^-1 and so on: those of the PI controller with the model, with
+            and without its delay, fed back around it.
+        """
+        pi, integral = super().transfer()
+        model = np.array([0.0, self._input_gain]), np.array([1.0, -self._pole])
+        ahead = np.zeros(self._delay)  # 1 - z^-(delay - 1): what is on its way
+        ahead[0] += 1.0
+        ahead[-1] -= 1.0
+        outgoing = np.convolve(integral, model[1])
+        returning = np.convolve(np.convolve(pi, model[0]), ahead)
+        denominator = np.zeros(max(len(outgoing), len(returning)))
+        denominator[: len(outgoing)] += outgoing
+        denominator[: len(returning)] += returning
+        return np.convolve(pi, model[1]), denominator
+
     def _control(self, observation: Array) -> Values:
         if not self._model:
             rest = np.zeros_like(observation[..., self.error_index])

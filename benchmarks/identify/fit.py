@@ -25,7 +25,7 @@ WORTH_A_FIT = 16.0  # candidates that the search leaves this far behind get no f
 MOST_FITS = 60
 MAGNITUDES = 40  # most dead zones that are tried at once
 LEAST_SAMPLES = 100  # beside those that the longest delay takes
-ANSWERS = 25.0  # twice the log likelihood that a flow with effect brings at least
+CHANCE = 0.01  # that a flow without effect is taken for one with effect
 FOLLOWS = 0.98  # share of the flow's moves that, explained by the temperature, is feedback
 
 
@@ -179,8 +179,10 @@ class _Search:
         check_excitation(self.command, self.output, options)
         magnitudes = np.unique(np.abs(self.command[np.isfinite(self.command)]))
         self.magnitudes = magnitudes[magnitudes > 0.0]
-        most = max((options.orders or Orders(3, 3, 3)).b, 1)
-        self.rows = Rows(self._known(max(order.a for order in self._orders()), most))
+        most = max(orders.b for orders in self._orders())
+        self.most_b = most
+        self.longest_delay = self.options.longest_delay
+        self.rows = self._rows()
         if len(self.rows) < LEAST_SAMPLES:
             raise CannotTellError(
                 f"the log is too short: {len(self.output)} rows leave {len(self.rows)} without "
@@ -191,15 +193,16 @@ class _Search:
     def _orders(self) -> tuple[Orders, ...]:
         return (self.options.orders,) if self.options.orders else ALL_ORDERS
 
-    def _known(self, order_a: int, order_b: int) -> NDArray[np.bool_]:
-        """Return which rows have all that (28) takes, for every delay that is tried."""
-        reach = self.options.longest_delay + order_b
+    def _rows(self) -> Rows:
+        """Return the rows that have all that (28) takes, for every delay that is tried."""
+        order_a = max(orders.a for orders in self._orders())
+        reach = self.longest_delay + self.most_b
         flow, temperature = np.isfinite(self.command), np.isfinite(self.output)
         known = _all_of_last(temperature, order_a + 1)
         flows = _all_of_last(flow, reach)
         known[1:] &= flows[:-1]
         known[: max(order_a, reach)] = False
-        return known
+        return Rows(known)
 
     # Regressors ---------------------------------------------------------------------------
 
@@ -254,7 +257,7 @@ class _Search:
 
     def scan(self, orders: Orders, c: Array, gaps: list[_Gap]) -> list[tuple[float, int, _Gap]]:
         """Return the deviance of every delay and gap with a given C, the best first."""
-        rows, count = self.rows, self.options.longest_delay + 1
+        rows, count = self.rows, self.longest_delay + 1
         target, columns = self.regressors(0, _Gap(0.0, 0.0), Orders(orders.a, 0, orders.c))
         basis, _ = np.linalg.qr(rows.whitened(columns, c))
         white = rows.whitened(target[:, np.newaxis], c)[:, 0]
@@ -296,11 +299,15 @@ class _Search:
         criteria = self.choose_orders(best, c)
         orders = next(iter(criteria))
         c = self.fit(*best[0][1:], orders, c).solution.c
-        best = self.scan(orders, c, self.gaps())
+        gaps = self.gaps()
+        best = self.scan(orders, c, gaps)
         if len(self.magnitudes) > MAGNITUDES and self.options.find_dead_zone:
-            best = self.scan(orders, c, self.gaps(around=best[0][2]))
-        worth = [entry for entry in best if entry[0] < best[0][0] + WORTH_A_FIT][:MOST_FITS]
-        fits = [self.fit(delay, gap, orders, c) for _, delay, gap in worth]
+            gaps = self.gaps(around=best[0][2])
+            best = self.scan(orders, c, gaps)
+        # Without the longest delays, rows at the beginning and after gaps are known, too.
+        self.longest_delay = max(delay for _, delay, _ in _near(best))
+        self.rows = self._rows()
+        fits = [self.fit(delay, gap, orders, c) for _, delay, gap in _near(self.scan(orders, c, gaps))]
         fits.sort(key=lambda fit: fit.deviance)
         self._check_answer(fits[0], orders)
         return self._summarise(fits, orders, criteria)
@@ -311,7 +318,10 @@ class _Search:
         without = np.delete(columns, np.s_[orders.a : orders.a + orders.b], axis=1)
         none = self.rows.solve(target, without, orders.c, best.solution.c)
         gained = self.deviance(none.square) - best.deviance
-        if gained < ANSWERS:
+        # As many delays and dead zones have been tried, the best of them gains by chance.
+        tried = (self.options.longest_delay + 1) * len(self.gaps())
+        least = float(stats.chi2.isf(CHANCE / tried, orders.b))
+        if gained < least:
             raise CannotTellError(
                 "the temperature does not answer the flow in this log: a model without the "
                 f"flow explains it as well (twice the log likelihood differs by {gained:.1f}, "
@@ -573,6 +583,11 @@ def _all_of_last(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     ends = np.arange(1, len(flags) + 1)
     result: NDArray[np.bool_] = unset[ends] == unset[np.maximum(ends - count, 0)]
     return result
+
+
+def _near(found: list[tuple[float, int, _Gap]]) -> list[tuple[float, int, _Gap]]:
+    """Return what is worth a fit of its own, out of what is sorted by its deviance."""
+    return [entry for entry in found if entry[0] < found[0][0] + WORTH_A_FIT][:MOST_FITS]
 
 
 def _polynomials(

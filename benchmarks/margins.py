@@ -1,0 +1,219 @@
+"""How far a loop is from instability: margins from its frequency response."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy import optimize
+
+from benchmarks.plots import STYLE, colours, save
+from benchmarks.step_test import nominal
+from mptc_gym import Parameters
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+SLOWEST = 1e-5  # lowest frequency, of the Nyquist frequency
+POINTS = 20_000  # of the frequency response
+
+
+class Linear(Protocol):
+    """A controller that is linear between the limits of the flow."""
+
+    def transfer(self) -> tuple[Array, Array]:
+        """Return numerator and denominator, in powers of z^-1, from e to u."""
+
+
+@dataclass(frozen=True)
+class Margins:
+    """What a loop bears before it is unstable.
+
+    Attributes
+    ----------
+    gain
+        Factor on the gain of the plant; infinite if none makes it unstable.
+    phase
+        Phase shift in either direction, degrees; infinite if the loop gain is below 1
+        everywhere.
+    delay
+        Further delay, s; infinite likewise.
+    sensitivity
+        Ms, the largest factor by which the loop amplifies a disturbance, 1 or more. 1 / Ms is
+        the least distance of the loop's frequency response from -1.
+
+    All are NaN if the loop is not stable.
+    """
+
+    gain: float
+    phase: float
+    delay: float
+    sensitivity: float
+
+    @property
+    def stable(self) -> bool:
+        """Whether the loop is stable."""
+        return not math.isnan(self.sensitivity)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A controller and a plant, opened at the error: what e comes back as.
+
+    Attributes
+    ----------
+    numerator, denominator
+        Of the loop's transfer function, in powers of z^-1.
+    sampling_interval
+        s.
+    """
+
+    numerator: Array
+    denominator: Array
+    sampling_interval: float
+
+    @classmethod
+    def of(cls, controller: Linear, parameters: Parameters) -> Loop:
+        """Return the loop of a controller and a plant, (28) without the actuator.
+
+        Parameters
+        ----------
+        controller
+            Linear between the limits.
+        parameters
+            The plant's. A range stands for its middle, and a plant that drifts is taken at
+            k = 0.
+        """
+        plant = nominal(parameters)
+        delay = int(plant.range_of("delay")[0])
+        b = np.concatenate([np.zeros(delay + 1), plant.b])
+        numerator, denominator = controller.transfer()
+        # u follows e, and y follows u: L = G_u G.
+        return cls(
+            np.convolve(numerator, b),
+            np.convolve(denominator, plant.a),
+            plant.sampling_interval,
+        )
+
+    def response(self, frequency: Array) -> Complex:
+        """Return L at frequencies, rad/s."""
+        back = np.exp(-1j * np.asarray(frequency) * self.sampling_interval)  # z^-1
+        values: Complex = np.polynomial.polynomial.polyval(back, self.numerator)
+        values = values / np.polynomial.polynomial.polyval(back, self.denominator)
+        return values
+
+    def frequencies(self) -> Array:
+        """Return frequencies up to Nyquist's, rad/s, dense enough to see every crossing."""
+        nyquist = math.pi / self.sampling_interval
+        slow = np.geomspace(SLOWEST * nyquist, nyquist, POINTS)
+        return np.union1d(slow, np.linspace(nyquist / POINTS, nyquist, POINTS))
+
+    @property
+    def stable(self) -> bool:
+        """Whether the closed loop is stable: no root of 1 + L at or beyond the unit circle."""
+        size = max(len(self.numerator), len(self.denominator))
+        closed = np.zeros(size)
+        closed[: len(self.denominator)] += self.denominator
+        closed[: len(self.numerator)] += self.numerator
+        return bool(np.all(np.abs(np.roots(closed)) < 1.0))
+
+
+def margins(controller: Linear, parameters: Parameters) -> Margins:
+    """Return the margins of a controller on a plant, while no limit and no dead zone is met.
+
+    Parameters
+    ----------
+    controller
+        `agents.PIController` or `agents.SmithPredictor`, or anything else with their method
+        `transfer`.
+    parameters
+        The plant's.
+    """
+    loop = Loop.of(controller, parameters)
+    if not loop.stable:
+        return Margins(math.nan, math.nan, math.nan, math.nan)
+    frequency = loop.frequencies()
+    values = loop.response(frequency)
+
+    def at(w: float) -> complex:
+        return complex(loop.response(np.array([w]))[0])
+
+    gain = math.inf
+    for w in _crossings(frequency, values.imag, lambda w: at(w).imag):
+        real = at(w).real
+        if -1.0 < real < 0.0:
+            gain = min(gain, -1.0 / real)
+    end = values[-1].real  # at Nyquist's frequency L is real, without a change of sign
+    if -1.0 < end < 0.0:
+        gain = min(gain, -1.0 / end)
+    phase = delay = math.inf
+    for w in _crossings(frequency, np.abs(values) - 1.0, lambda w: abs(at(w)) - 1.0):
+        left = (math.atan2(at(w).imag, at(w).real) + math.pi) % (2.0 * math.pi)
+        phase = min(phase, math.degrees(min(left, 2.0 * math.pi - left)))
+        delay = min(delay, left / w)
+    return Margins(gain, phase, delay, _largest_sensitivity(loop, frequency, values))
+
+
+def _crossings(frequency: Array, values: Array, exact: Callable[[float], float]) -> list[float]:
+    """Return the frequencies at which values change their sign."""
+    changes = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
+    found = []
+    for i in changes:
+        low, high = float(frequency[i]), float(frequency[i + 1])
+        if exact(low) * exact(high) < 0.0:
+            found.append(float(optimize.brentq(exact, low, high, xtol=1e-14, rtol=1e-12)))
+    return found
+
+
+def _largest_sensitivity(loop: Loop, frequency: Array, values: Complex) -> float:
+    distance = np.abs(1.0 + values)
+    i = int(np.argmin(distance))
+    low, high = frequency[max(i - 1, 0)], frequency[min(i + 1, len(frequency) - 1)]
+    nearest = optimize.minimize_scalar(
+        lambda w: float(np.abs(1.0 + loop.response(np.array([w])))[0]),
+        bounds=(low, high),
+        method="bounded",
+    )
+    return 1.0 / min(float(nearest.fun), float(distance[i]))
+
+
+def plot_margins(loops: Mapping[str, Loop], path: Path) -> None:
+    """Draw the loops around -1, and how much they amplify a disturbance of each frequency.
+
+    Parameters
+    ----------
+    loops
+        By the name of the controller.
+    path
+        The PNG file to write.
+    """
+    palette = colours(list(loops))
+    turn = np.linspace(0.0, 2.0 * math.pi, 200)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(10, 4.2))
+        plane, sensitivity = figure.subplots(1, 2)
+        for name, loop in loops.items():
+            frequency = loop.frequencies()
+            values = loop.response(frequency)
+            plane.plot(values.real, values.imag, color=palette[name], label=name)
+            sensitivity.loglog(frequency, 1.0 / np.abs(1.0 + values), color=palette[name])
+        for peak, style in ((1.6, "--"), (2.0, ":")):
+            plane.plot(
+                -1 + np.cos(turn) / peak, np.sin(turn) / peak, style, color="0.4",
+                linewidth=1, label=f"Ms = {peak:g}",
+            )  # fmt: skip
+        plane.plot(-1, 0, "k+")
+        plane.set(xlim=(-2.2, 0.8), ylim=(-1.5, 1.5), aspect="equal")
+        plane.set(xlabel="Re L", ylabel="Im L", title="the loop around -1")
+        plane.legend(fontsize="small", loc="upper left")
+        sensitivity.axhline(1.0, color="0.4", linewidth=1)
+        sensitivity.set_ylim(bottom=0.02)
+        sensitivity.set(xlabel="frequency (rad/s)", title="amplification of a disturbance |S|")
+        save(figure, path)

@@ -1,0 +1,115 @@
+"""Margins: against python-control, and against loops that are driven to instability."""
+
+import math
+
+import control
+import numpy as np
+import pytest
+from scipy import signal
+
+from agents import PIController, SmithPredictor
+from agents.pi import SEARCHED_GAINS
+from benchmarks.margins import Loop, margins, plot_margins
+from benchmarks.opponents import STEP_TEST
+from mptc_gym import Parameters
+
+PLANTS = {
+    "paper": {},
+    "long": {"delay": 35, "gain_factor": 1.1},
+    "slow": {"time_constant_factor": 2.0, "sampling_interval": 2.0},
+    "first order": {"a": [1.0, -0.9], "b": [-0.06], "delay": 4},
+}
+
+
+def controllers():
+    return {
+        "simc": PIController.simc(**STEP_TEST),
+        "searched": PIController(**SEARCHED_GAINS),
+        "smith": SmithPredictor(**STEP_TEST, closed_loop_time_constant=80.0),
+        "gentle": PIController(0.5, 0.01),
+    }
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+@pytest.mark.parametrize("name", controllers())
+def test_agreement_with_python_control(plant, name):
+    parameters = Parameters(**PLANTS[plant])
+    controller = controllers()[name]
+    found = margins(controller, parameters)
+
+    interval = parameters.sampling_interval
+    loop = Loop.of(controller, parameters)
+    size = max(len(loop.numerator), len(loop.denominator))
+    system = control.tf(
+        np.pad(loop.numerator, (0, size - len(loop.numerator))),
+        np.pad(loop.denominator, (0, size - len(loop.denominator))),
+        interval,
+    )
+    poles = control.feedback(system, 1).poles()
+    assert found.stable == bool(np.all(np.abs(poles) < 1.0))
+    if not found.stable:
+        return
+    frequency = np.geomspace(1e-4, 0.9999, 4000) * math.pi / interval
+    gains, phases, distances, _, crossings, _ = control.stability_margins(
+        control.frd(system, frequency, smooth=True), returnall=True
+    )
+    assert found.sensitivity == pytest.approx(1.0 / min(distances), rel=1e-3)
+    assert found.gain == pytest.approx(min(gains[gains > 1.0]), rel=1e-3)
+    assert found.phase == pytest.approx(np.abs(phases).min(), rel=1e-3)
+    delays = np.radians(phases % 360.0) / crossings
+    assert found.delay == pytest.approx(min(delays), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", controllers())
+def test_transfer_function_is_what_the_controller_does(name):
+    # Away from limits and dead zone, commands are the error, filtered.
+    controller = controllers()[name]
+    errors = np.random.default_rng(0).normal(0.0, 0.1, 200)
+    commands = []
+    for error in errors:
+        controller.act([0.0, 0.0, 0.0, error])
+        commands.append(controller.command)
+    assert np.abs(commands).max() < 10.0
+    np.testing.assert_allclose(
+        commands, signal.lfilter(*controller.transfer(), errors), atol=1e-9
+    )
+
+
+def closed(controller, parameters, factor=1.0, delay=0):
+    """Return the late over the early amplitude of the free response of a loop."""
+    loop = Loop.of(controller, parameters)
+    numerator = np.concatenate([np.zeros(delay), factor * loop.numerator])
+    denominator = np.pad(loop.denominator, (0, len(numerator)))[: len(numerator)]
+    response = signal.lfilter(numerator, denominator + numerator, np.eye(1, 6000)[0])
+    return np.abs(response[-500:]).max() / np.abs(response[500:1000]).max()
+
+
+def test_gain_and_delay_margins_are_where_the_loop_begins_to_grow():
+    controller = PIController.simc(**STEP_TEST)
+    found = margins(controller, Parameters())
+    assert closed(controller, Parameters(), 0.97 * found.gain) < 0.5
+    assert closed(controller, Parameters(), 1.03 * found.gain) > 2.0
+    samples = found.delay / 8.0
+    assert closed(controller, Parameters(), delay=math.floor(samples)) < 1.0
+    assert closed(controller, Parameters(), delay=math.ceil(samples) + 1) > 2.0
+
+
+def test_unstable_loop_has_no_margins():
+    found = margins(PIController(kp=8.0, ki=0.5), Parameters())
+    assert not found.stable
+    assert math.isnan(found.gain)
+
+
+def test_other_direction_has_the_same_margins():
+    mirrored = Parameters(b=[-b for b in Parameters().b])
+    shown = {**STEP_TEST, "gain": -STEP_TEST["gain"]}
+    for make in (PIController.simc, SmithPredictor):
+        more = {"closed_loop_time_constant": 80.0}
+        ours = margins(make(**STEP_TEST, **more), Parameters())
+        assert margins(make(**shown, **more), mirrored) == ours
+
+
+def test_plot_is_written(tmp_path):
+    loops = {name: Loop.of(agent, Parameters()) for name, agent in controllers().items()}
+    plot_margins(loops, tmp_path / "margins.png")
+    assert (tmp_path / "margins.png").stat().st_size > 10_000
