@@ -144,7 +144,7 @@ class TestResume:
         os.mkfifo(pipe)
         program = (
             "import sys; from functools import partial\n"
-            "from benchmarks.fan_out import FanOut; from tests import cells\n"
+            "from benchmarks.lib.fan_out import FanOut; from tests import cells\n"
             "work = {str(i): partial(cells.hold, sys.argv[1], 60.0 * i) for i in range(2)}\n"
             "FanOut(2).run(work, progress=False)"
         )
