@@ -14,9 +14,11 @@ from benchmarks import scenarios
 from benchmarks.claims.runs import Batch
 from benchmarks.compare import comparison
 from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib import fingerprint, storage
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.train import ppo
 from benchmarks.tune import __main__ as command
+from benchmarks.tune import objective
 from benchmarks.tune import search as tune
 from tests.small_training import SMALL
 
@@ -133,9 +135,10 @@ class TestSearch:
         run_tune(tmp_path / "one")
         table = pd.read_csv(tmp_path / "one/pi.csv")
         (tmp_path / "two").mkdir()
-        (tmp_path / "two/pi.json").write_text((tmp_path / "one/pi.json").read_text())
+        kept = storage.unseal((tmp_path / "one/pi.json").read_text())
         turned = table.head(5).assign(objective=-table["objective"])
-        turned.to_csv(tmp_path / "two/pi.csv", index=False)
+        kept["trials"] = turned.to_dict("records")
+        (tmp_path / "two/pi.json").write_text(storage.seal(kept))
         run_tune(tmp_path / "two")
         other = pd.read_csv(tmp_path / "two/pi.csv")
         assert other["kp"].iloc[5] != pytest.approx(table["kp"].iloc[5])
@@ -146,6 +149,66 @@ class TestSearch:
             command.main(["pi", "--trials", "6", "--runs", "3", "--out", str(tmp_path)])
         assert "other runs" in capsys.readouterr().err
         assert len(pd.read_csv(tmp_path / "pi.csv")) == 6
+
+    @pytest.mark.parametrize(
+        ("edited", "goes_on"),
+        [
+            ("agents.pi", False), ("benchmarks.tune.objective", False),
+            ("benchmarks.metrics", False), ("agents.direct_nn", True),
+            ("benchmarks.tune.search", True),
+        ],
+    )  # fmt: skip
+    def test_trials_before_and_after_an_edit_are_not_mixed(
+        self, edited, goes_on, tmp_path, monkeypatch, capsys
+    ):
+        run_tune(tmp_path, trials=2)
+        real = fingerprint.code
+        for module in (fingerprint, tune):
+            monkeypatch.setattr(
+                module, "code", lambda name: "edited" if name == edited else real(name)
+            )
+        if goes_on:
+            assert run_tune(tmp_path, trials=3) == 0
+            assert len(pd.read_csv(tmp_path / "pi.csv")) == 3
+            return
+        with pytest.raises(SystemExit):
+            run_tune(tmp_path, trials=3)
+        complaint = capsys.readouterr().err
+        assert "pi.json is of a search with other code: to begin anew, remove" in complaint
+        assert len(pd.read_csv(tmp_path / "pi.csv")) == 2
+
+    def test_without_its_json_a_search_is_not_continued(self, tmp_path, capsys):
+        run_tune(tmp_path, trials=2)
+        (tmp_path / "pi.json").unlink()
+        with pytest.raises(SystemExit):
+            run_tune(tmp_path, trials=3)
+        assert "pi.json, which" in capsys.readouterr().err
+
+    @pytest.mark.parametrize("at", [0.0, 0.4, 0.99])
+    def test_a_damaged_search_is_named(self, at, tmp_path, capsys):
+        run_tune(tmp_path, trials=2)
+        kept = tmp_path / "pi.json"
+        text = kept.read_text()
+        digits = [i for i, letter in enumerate(text) if letter.isdigit()]
+        place = digits[int(at * len(digits))]
+        for damaged in (
+            text[:place] + str(9 - int(text[place])) + text[place + 1 :],
+            text[: int(at * len(text))], "null", "[]", "{}",
+        ):  # fmt: skip
+            kept.write_text(damaged)
+            with pytest.raises(SystemExit):
+                run_tune(tmp_path, trials=3)
+            complaint = capsys.readouterr().err
+            assert "pi.json is damaged" in complaint
+            assert "remove" in complaint
+        kept.write_text(text)
+        assert run_tune(tmp_path, trials=3) == 0
+
+    def test_the_table_for_readers_is_written_anew(self, tmp_path):
+        run_tune(tmp_path, trials=2)
+        (tmp_path / "pi.csv").write_bytes(b"\0\xff")
+        assert run_tune(tmp_path, trials=3) == 0
+        assert len(pd.read_csv(tmp_path / "pi.csv")) == 3
 
     def test_defaults_are_in_the_space(self):
         # Those of PPO are not from its search.
@@ -163,7 +226,7 @@ class TestSearch:
         monkeypatch.setattr(ppo, "_train", train)
         monkeypatch.setattr(ppo, "_loaded", lambda folder: ppo.begin(SMALL))
         monkeypatch.setattr(
-            tune, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
+            objective, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
         )
         assert run_tune(tmp_path, "ppo", trials=2) == 0
         search = [ppo.TUNING_SEED + i for i in range(2)]

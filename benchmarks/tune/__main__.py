@@ -50,6 +50,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     trials = getattr(options, "trials", tuning.trials)
     fan_out = command_line.fan_out(options)
     plant = plants.chosen(options)
+    command_line.out_folder(options.out)
     with command_line.blame("--out, --runs"):
         search = Search(controller, options.runs, options.out, fan_out, plant.arguments)
     search.run(trials)

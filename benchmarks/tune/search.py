@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping
 from functools import partial
@@ -18,103 +17,21 @@ from tqdm import tqdm
 from benchmarks.controllers.roster import (
     ROSTER,
     Controller,
-    Factory,
     Tuning,
-    build,
     label,
     load,
     load_factory,
-    observation,
 )
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.storage import replacing, write_json, write_text
-from benchmarks.metrics import mean_error, settled, split
-from benchmarks.rollout import make_plants, rollout
-from benchmarks.scenarios import Scenario
-from mptc_gym import Parameters
+from benchmarks.lib.fingerprint import code, fingerprint
+from benchmarks.lib.storage import replacing, seal, unseal, write_text
+from benchmarks.tune.objective import SCENARIOS, score
 
 RUNS = 100  # of each scenario in a trial, each with noise and initial weights of its own
 SEED = 1  # of the search
 FIRST_RUN = 3_000_000  # runs have seeds from here on, which no comparison uses
 FINAL_RUNS, FINAL_FIRST_RUN = 1000, 4_000_000  # for the best, judged again
 DIGITS = 3  # significant, of the gains that are proposed
-
-# Neighbours of the paper's cases, each with its first sample that counts: three that begin with
-# an untrained controller, and two that show what comes after learning.
-SCENARIOS: tuple[tuple[Scenario, int], ...] = (
-    (Scenario("constant", "constant set point", 600, {"setpoint": 4.8}), 0),
-    (
-        Scenario(
-            "dead zone", "square wave, dead zone 6.5 t/h", 1280,
-            {"setpoint_amplitude": 5.1, "setpoint_period": 640, "dead_zone": 6.5},
-        ),
-        0,
-    ),
-    (
-        Scenario(
-            "noise", "square wave, R = 0.4 °C²", 1040,
-            {"setpoint_amplitude": 4.9, "setpoint_period": 520, "noise_variance": 0.4},
-        ),
-        0,
-    ),
-    (
-        Scenario(
-            "learnt", "square wave", 2240, {"setpoint_amplitude": 5.2, "setpoint_period": 560}
-        ),
-        1120,
-    ),
-    (
-        Scenario(
-            "learnt, slow", "square wave", 1920,
-            {"setpoint_amplitude": 5.4, "setpoint_period": 640},
-        ),
-        1280,
-    ),
-)  # fmt: skip
-
-
-def score(
-    factory: Factory,
-    runs: int,
-    first_run: int,
-    penalty: float = Tuning.penalty,
-    plant: Mapping[str, Any] | None = None,
-) -> dict[str, float]:
-    """Judge a controller on the tuning scenarios.
-
-    Parameters
-    ----------
-    factory
-        Makes the controller, as `roster.build` calls it.
-    runs
-        Of each scenario.
-    first_run
-        Seed of the first; every scenario has seeds of its own.
-    penalty
-        For failing to settle, degC.
-    plant
-        Arguments of the environment, if it is not the paper's plant.
-
-    Returns
-    -------
-    dict
-        For each scenario the median over runs of the mean |e|, degC; `not converged`, the
-        share of runs at the constant set point that failed to; and `objective`: the mean of
-        the medians, plus the penalty times that share.
-    """
-    medians: dict[str, float] = {}
-    for i, (scenario, first_sample) in enumerate(SCENARIOS):
-        seed = first_run + i * 100_000
-        environment = {**(plant or {}), **scenario.arguments, **observation(factory)}
-        controller = build(factory, Parameters(**environment), runs, seed)
-        plants = make_plants(runs, scenario.samples, **environment)
-        trajectory = rollout(plants, controller, scenario.samples, seed)
-        _, counted = split(trajectory, first_sample)
-        medians[scenario.name] = float(np.median(mean_error(counted)))
-        if scenario.name == "constant":
-            failed = 1.0 - float(settled(trajectory).mean())
-    objective = float(np.mean(list(medians.values()))) + penalty * failed
-    return {**medians, "not converged": failed, "objective": objective}
 
 
 def _score(
@@ -153,7 +70,8 @@ class Search:
     runs
         Of each scenario in a trial.
     folder
-        Where it is kept, as `<controller>.csv`; what is there is continued.
+        Where it is kept, as `<controller>.json`; what is there is continued. The trials are in
+        `<controller>.csv` too, for readers.
     fan_out
         Runs what does not depend on each other: the members of a trial, and the finalists.
     plant
@@ -162,7 +80,8 @@ class Search:
     Raises
     ------
     ValueError
-        If what is there was another search.
+        If what is there was another search, or one that other code judged, or is damaged; the
+        message says what to do.
     """
 
     def __init__(
@@ -184,7 +103,7 @@ class Search:
         self._study = optuna.create_study()
         self._rows: list[dict[str, float]] = []
         # In the form in which JSON gives it back.
-        settings = json.loads(
+        self._settings = json.loads(
             json.dumps(
                 {
                     "runs": runs,
@@ -198,19 +117,45 @@ class Search:
                     "penalty": self._tuning.penalty,
                     "startup": self._tuning.startup,
                     "Optuna": optuna.__version__,
+                    "code": self._code(),
                 }
             )
         )
-        beside = self.path.with_suffix(".json")
-        if self.path.exists():
-            earlier = json.loads(beside.read_text(encoding="utf-8"))
-            changed = [name for name in settings if settings[name] != earlier.get(name)]
-            if changed:
-                raise ValueError(f"{self.path} is of a search with other {', '.join(changed)}")
-            with self.path.open(encoding="utf-8", newline="") as file:
-                for row in csv.DictReader(file):
-                    self._add({name: float(value) for name, value in row.items()})
-        write_json(beside, settings)
+        self._kept = self.path.with_suffix(".json")
+        for row in self._earlier():
+            self._add(row)
+
+    def _code(self) -> str:
+        """Return a hash of the code that makes and judges the controller."""
+        maker = load(self._tuning.make or self._controller.factory)
+        judges = ("benchmarks.metrics", "benchmarks.rollout")
+        objective = code("benchmarks.tune.objective")  # and not all that it imports
+        return fingerprint(maker.__module__, *judges, objective=objective)
+
+    def _earlier(self) -> list[dict[str, float]]:
+        """Return the trials that are kept, if they are of this search."""
+        begin_anew = f"remove {self.path} and {self._kept}, or choose another folder"
+        try:
+            kept = unseal(self._kept.read_text(encoding="utf-8"))
+            earlier, rows = kept["settings"], kept["trials"]
+        except FileNotFoundError as error:
+            if self.path.exists():
+                raise ValueError(
+                    f"{self._kept}, which {self.path} goes on from, is missing: bring it back; "
+                    f"or, to begin anew, {begin_anew}"
+                ) from error
+            return []
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{self._kept} is damaged ({error}): to begin anew, {begin_anew}"
+            ) from error
+        changed = [name for name in self._settings if self._settings[name] != earlier.get(name)]
+        if changed:
+            raise ValueError(
+                f"{self._kept} is of a search with other {', '.join(changed)}: to begin anew, "
+                f"{begin_anew}"
+            )
+        return list(rows)
 
     @property
     def trials(self) -> pd.DataFrame:
@@ -231,6 +176,7 @@ class Search:
         with tqdm(total=trials, initial=len(self._rows), desc=self._controller.name) as bar:
             while len(self._rows) < trials:
                 self._add(self._try())
+                write_text(self._kept, seal({"settings": self._settings, "trials": self._rows}))
                 with replacing(self.path) as file:
                     self.trials.to_csv(file, index=False)
                 bar.set_postfix(best=f"{self._study.best_value:.3f}")

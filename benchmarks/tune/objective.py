@@ -1,0 +1,91 @@
+"""What gains are judged by: scenarios that no comparison uses, and one number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from benchmarks.controllers.roster import Factory, Tuning, build, observation
+from benchmarks.metrics import mean_error, settled, split
+from benchmarks.rollout import make_plants, rollout
+from benchmarks.scenarios import Scenario
+from mptc_gym import Parameters
+
+# Neighbours of the paper's cases, each with its first sample that counts: three that begin with
+# an untrained controller, and two that show what comes after learning.
+SCENARIOS: tuple[tuple[Scenario, int], ...] = (
+    (Scenario("constant", "constant set point", 600, {"setpoint": 4.8}), 0),
+    (
+        Scenario(
+            "dead zone", "square wave, dead zone 6.5 t/h", 1280,
+            {"setpoint_amplitude": 5.1, "setpoint_period": 640, "dead_zone": 6.5},
+        ),
+        0,
+    ),
+    (
+        Scenario(
+            "noise", "square wave, R = 0.4 °C²", 1040,
+            {"setpoint_amplitude": 4.9, "setpoint_period": 520, "noise_variance": 0.4},
+        ),
+        0,
+    ),
+    (
+        Scenario(
+            "learnt", "square wave", 2240, {"setpoint_amplitude": 5.2, "setpoint_period": 560}
+        ),
+        1120,
+    ),
+    (
+        Scenario(
+            "learnt, slow", "square wave", 1920,
+            {"setpoint_amplitude": 5.4, "setpoint_period": 640},
+        ),
+        1280,
+    ),
+)  # fmt: skip
+
+
+def score(
+    factory: Factory,
+    runs: int,
+    first_run: int,
+    penalty: float = Tuning.penalty,
+    plant: Mapping[str, Any] | None = None,
+) -> dict[str, float]:
+    """Judge a controller on the tuning scenarios.
+
+    Parameters
+    ----------
+    factory
+        Makes the controller, as `roster.build` calls it.
+    runs
+        Of each scenario.
+    first_run
+        Seed of the first; every scenario has seeds of its own.
+    penalty
+        For failing to settle, degC.
+    plant
+        Arguments of the environment, if it is not the paper's plant.
+
+    Returns
+    -------
+    dict
+        For each scenario the median over runs of the mean |e|, degC; `not converged`, the
+        share of runs at the constant set point that failed to; and `objective`: the mean of
+        the medians, plus the penalty times that share.
+    """
+    medians: dict[str, float] = {}
+    for i, (scenario, first_sample) in enumerate(SCENARIOS):
+        seed = first_run + i * 100_000
+        environment = {**(plant or {}), **scenario.arguments, **observation(factory)}
+        controller = build(factory, Parameters(**environment), runs, seed)
+        plants = make_plants(runs, scenario.samples, **environment)
+        trajectory = rollout(plants, controller, scenario.samples, seed)
+        _, counted = split(trajectory, first_sample)
+        medians[scenario.name] = float(np.median(mean_error(counted)))
+        if scenario.name == "constant":
+            failed = 1.0 - float(settled(trajectory).mean())
+    objective = float(np.mean(list(medians.values()))) + penalty * failed
+    return {**medians, "not converged": failed, "objective": objective}
