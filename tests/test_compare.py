@@ -532,6 +532,65 @@ class TestCompare:
         run_compare(tmp_path / "out", "--agents", "pi", "--runs", 2, "--scenarios", *scenarios)
         assert saved == [0, 2, 2, 4]  # the square wave is run twice
 
+    def test_a_second_interruption_while_the_report_is_written(
+        self, tmp_path, monkeypatch, capsys
+    ):
+        out = tmp_path / "out"
+
+        def interrupted(*arguments):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(comparison, "write_report", interrupted)
+        assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=3) == 130
+        assert "Interrupted" in capsys.readouterr().out
+        assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
+        assert json.loads((out / "provenance.json").read_text())["complete"] is False
+
+    @pytest.mark.parametrize("text", ["", "null", "[]", '{"files": 3}', "{", "\0\0"])
+    def test_damaged_provenance_is_named_and_written_anew(self, text, tmp_path, capsys):
+        out = tmp_path / "out"
+        out.mkdir()
+        (out / "provenance.json").write_text(text)
+        options = ("--agents", "pi", "--runs", 1, "--scenarios", "constant")
+        assert run_compare(out, *options) == 0
+        complaint = capsys.readouterr().err
+        assert f"{out / 'provenance.json'} is damaged" in complaint
+        assert "may stay" in complaint
+        assert json.loads((out / "provenance.json").read_text())["complete"] is True
+
+    def test_a_folder_that_cannot_be_written_to(self, tmp_path, monkeypatch, capsys):
+        (tmp_path / "file").write_text("in the way")
+        monkeypatch.setattr(comparison, "rollout", None)  # nothing is run before
+        for out in (tmp_path / "file", tmp_path / "file" / "below"):
+            with pytest.raises(SystemExit) as stop:
+                run_compare(out, "--agents", "pi", "--runs", 1)
+            assert stop.value.code == 2
+            assert f"--out: {out} cannot be written to" in capsys.readouterr().err
+
+        def read_only(dir):  # noqa: A002
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+        monkeypatch.setattr(storage.tempfile, "TemporaryFile", read_only)
+        with pytest.raises(SystemExit):
+            run_compare(tmp_path / "out", "--agents", "pi", "--runs", 1)
+        assert "Read-only file system" in capsys.readouterr().err
+
+    @pytest.mark.parametrize("name", ["runs.csv", "limits.png", "report.html"])
+    def test_a_disk_that_gets_full(self, name, tmp_path, monkeypatch, capsys):
+        real = Path.replace
+
+        def replace(self, target):
+            if Path(target).name == name:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return real(self, target)
+
+        monkeypatch.setattr(Path, "replace", replace)
+        options = ("--agents", "pi", "--runs", 1, "--scenarios", "constant")
+        assert run_compare(tmp_path / "out", *options) == 1
+        shown = capsys.readouterr().out
+        assert f"{name} could not be written: No space left on device" in shown
+        assert not list((tmp_path / "out").glob(".*"))
+
     def test_interrupted_before_anything_has_finished(self, tmp_path, monkeypatch):
         out = tmp_path / "out"
         out.mkdir()
@@ -555,13 +614,17 @@ class TestCompare:
             (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
             (["--agent", "pi=agents:PIController"], "NEW_NAME"),
             (["--agent", "x=agents:Nothing"], "agents:Nothing"),
+            (["--agent", "x=.:y"], "'.:y' must be module:factory"),
+            (["--agent", "x=..a:y"], "'..a:y' must be module:factory"),
+            (["--agent", "x=tests.cells:ObservesAList"], "observation of .* must be a dict"),
+            (["--agent", "x=tests.cells:ObservesText"], "observation of .* must be a dict"),
         ],
     )
     def test_bad_options(self, options, complaint, capsys, tmp_path):
         with pytest.raises(SystemExit) as stop:
             run_compare(tmp_path / "out", *options)
         assert stop.value.code == 2
-        assert complaint in capsys.readouterr().err
+        assert re.search(complaint, capsys.readouterr().err)
         assert not (tmp_path / "out").exists()
 
     def test_as_a_command(self, tmp_path):

@@ -40,6 +40,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     """Examine the claims and write the verdicts."""
     chosen = command_line.known("CLAIM", options.claims, list(CLAIMS))
     called = f"python -m benchmarks.claims --runs {options.runs}"
+    command_line.out_folder(options.out)
     batch = Batch(options.runs, SEED)
     entries: list[verdicts.Entry] = []
     try:

@@ -84,6 +84,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
         [plant.name] if plant.arguments else [],
         [f"{options.runs}-runs"] if options.runs != RUNS else [],
     )
+    out = command_line.out_folder(out)
     comparison = Comparison([scenarios[name] for name in names], options.runs, out, options)
     try:
         for controller in controllers.values():

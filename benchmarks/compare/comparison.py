@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
+import sys
 import time
 from collections.abc import Sequence
 from datetime import datetime, timezone
@@ -25,7 +25,7 @@ from benchmarks.controllers.roster import (
     observation,
 )
 from benchmarks.lib.report import Section, provenance_line, write_report
-from benchmarks.lib.storage import commit, replacing, versions, write_json
+from benchmarks.lib.storage import commit, read_object, replacing, versions, write_json
 from benchmarks.metrics import join, mean_error, measure
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import Scenario
@@ -268,10 +268,8 @@ class Comparison:
     def _path(self, name: str) -> Path:
         """Return where to write a file; the first time, remove what another run left there."""
         if not self._files:
-            earlier = self._out / "provenance.json"
-            if earlier.exists():
-                for stale in json.loads(earlier.read_text(encoding="utf-8")).get("files", []):
-                    (self._out / Path(stale).name).unlink(missing_ok=True)
+            for stale in _files_of_earlier_run(self._out / "provenance.json"):
+                (self._out / Path(stale).name).unlink(missing_ok=True)
         if name not in self._files:
             self._files.append(name)
         return self._out / name
@@ -294,6 +292,20 @@ class Comparison:
             "files": self._files,
         }
         write_json(self._path("provenance.json"), provenance)
+
+
+def _files_of_earlier_run(provenance: Path) -> list[str]:
+    """Return what an earlier comparison wrote; if that cannot be read, say so and go on."""
+    if not provenance.exists():
+        return []
+    try:
+        files = read_object(provenance).get("files", [])
+        if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
+            raise ValueError(f"{provenance} is damaged: it lists no files")
+    except ValueError as error:
+        tqdm.write(f"{error}. Other files of the earlier run may stay.", file=sys.stderr)
+        return []
+    return files
 
 
 def _plain(value: Any) -> Any:

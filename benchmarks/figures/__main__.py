@@ -114,6 +114,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, console: Console) -> str:
     """Run the cases and draw the figures."""
+    command_line.out_folder(options.out)
     curves: dict[str, pd.DataFrame] = {}
     for name in tqdm(CASES, unit="case"):
         trajectory = CASES[name].run(Batch(options.runs, SEED))

@@ -6,10 +6,12 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 from rich.console import Console
 
 from benchmarks.lib.fan_out import BACKENDS, CellsFailedError, FanOut
+from benchmarks.lib.storage import NotWrittenError, check_folder
 
 Main = Callable[[Sequence[str] | None], int]
 
@@ -46,8 +48,9 @@ def command(
     callable
         A decorator. The function that it takes is called with the options and a console, does
         the work and returns the closing line. The function that it returns takes the command
-        line without the program's name and returns the exit status: 0; 1 if cells failed; 130
-        if it was interrupted. A `UsageError` ends the program with status 2.
+        line without the program's name and returns the exit status: 0; 1 if cells failed or a
+        file could not be written; 130 if it was interrupted. A `UsageError` ends the program
+        with status 2.
     """
 
     def decorate(work: Callable[[argparse.Namespace, Console], str]) -> Main:
@@ -66,7 +69,7 @@ def command(
                 closing = work(options, console)
             except UsageError as error:
                 parser.error(str(error))
-            except CellsFailedError as error:
+            except (CellsFailedError, NotWrittenError) as error:
                 console.print(str(error))
                 return 1
             except KeyboardInterrupt:
@@ -90,6 +93,15 @@ def blame(option: str) -> Iterator[None]:
         raise
     except ValueError as error:
         raise UsageError(f"{option}: {error}") from error
+
+
+def out_folder(folder: Path) -> Path:
+    """Return the folder of `--out`, which is made; `UsageError` if it cannot be written to."""
+    try:
+        check_folder(folder)
+    except NotWrittenError as error:
+        raise UsageError(f"--out: {error}") from error
+    return folder
 
 
 def number(text: str) -> int:

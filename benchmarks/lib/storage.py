@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import subprocess
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib import metadata
@@ -46,6 +47,25 @@ def replacing(path: Path) -> Iterator[Path]:
     except OSError as error:
         reason = error.strerror or error
         raise NotWrittenError(f"{path} could not be written: {reason}") from error
+
+
+def check_folder(folder: Path) -> None:
+    """Make a folder, and see that files can be written to it, before anything is computed.
+
+    Raises
+    ------
+    NotWrittenError
+        If not.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(b"x")
+    except OSError as error:
+        reason = (
+            "it is no folder" if folder.exists() and not folder.is_dir() else error.strerror
+        )
+        raise NotWrittenError(f"{folder} cannot be written to: {reason}") from error
 
 
 def write_text(path: Path, text: str) -> None:

@@ -96,6 +96,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     fan_out = command_line.fan_out(options)
     out = getattr(options, "out", Path(f"results/sweep-{options.design}"))
+    out = command_line.out_folder(out)
     training = Training(
         fan_out,
         options.kept,
