@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import optimize
 
-from benchmarks.plots import STYLE, colours, save
-from benchmarks.step_test import nominal
+from benchmarks.controllers.step_test import nominal
+from benchmarks.lib.drawing import STYLE, colours, save
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]

@@ -10,9 +10,9 @@ from scipy import signal
 from agents import PIController, SmithPredictor
 from agents.pi import SEARCHED_GAINS
 from benchmarks.margins import Loop, margins, plot_margins
-from benchmarks.opponents import STEP_TEST
 from mptc_gym import Parameters
 
+STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
 PLANTS = {
     "paper": {},
     "long": {"delay": 35, "gain_factor": 1.1},
