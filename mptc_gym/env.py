@@ -327,9 +327,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         command, applied, output = self._plant.step(a, noise, load)
         error = setpoint - output
         scaled = error / error_scale
-        cost = scaled * scaled / 2.0 if quadratic else abs(scaled)  # (12)
+        reward = scaled * scaled * -0.5 if quadratic else -abs(scaled)  # (12)
         if move_weight:
-            cost += move_weight * abs(a - self._action)
+            reward -= move_weight * abs(a - self._action)
         self._action = a
 
         # All blocks move by one at once; what crosses into the next block is overwritten there.
@@ -358,7 +358,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         if self._record is not None:
             self._record.add(setpoint, output, command, applied)
             self._show()
-        return observation, -cost, False, False, info
+        return observation, reward, False, False, info
 
     def render(self) -> rendering.Frame | str | None:
         """Draw the last minutes of the episode.

@@ -330,7 +330,7 @@ class Parameters(PlantNumbers[Number]):
                     f"such that the factor is never below {rate:g}, where the slowest pole "
                     "comes to 0",
                 )
-        if self.is_disturbed and not np.all(np.abs(np.roots(self.a)) < 1.0):
+        if self.is_disturbed and not self.is_stable:
             reject(
                 "disturbance_amplitude, disturbance_walk_variance",
                 (self.disturbance_amplitude, self.disturbance_walk_variance),
@@ -346,6 +346,11 @@ class Parameters(PlantNumbers[Number]):
     def ranges(self) -> tuple[str, ...]:
         """Names of the plant numbers that are drawn at each reset."""
         return tuple(name for name in PLANT_NUMBERS if isinstance(getattr(self, name), tuple))
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether all poles of 1 / A lie within the unit circle."""
+        return bool(np.all(np.abs(np.roots(self.a)) < 1.0))
 
     @property
     def is_disturbed(self) -> bool:

@@ -6,6 +6,7 @@ and `PlantBatch` in arrays. Both do the same operations in the same order, and a
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from operator import mul
 from typing import Any, Final, cast
@@ -19,9 +20,36 @@ Values = NDArray[np.float64]  # one a plant, shape (n,)
 DRIFT_INTERVAL: Final = 10  # samples between two changes of drifting dynamics
 
 
-def action_from_command(command: float, u_min: Any, u_max: Any) -> Any:
-    """Scale a command (t/h) to a normalised action: -1 at `u_min`, 1 at `u_max`."""
+def action_from_command(command: Any, u_min: Any, u_max: Any) -> Any:
+    """Scale a command (t/h) to a normalised action in float64: -1 at `u_min`, 1 at `u_max`."""
     return 2.0 * (command - u_min) / (u_max - u_min) - 1.0
+
+
+def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
+    """Scale commands (t/h) to the float32 actions that an agent hands to the environment.
+
+    Rounding to float32 can move a command from the edge of the dead zone into it, where nothing
+    is applied: float32(0.7) stands for 6.99999988 t/h. Such an action is moved outwards by the
+    smallest step that float32 has near 1.
+
+    Parameters
+    ----------
+    command
+        u, t/h; any shape, as the other arguments, with which it is broadcast.
+    u_min, u_max, dead_zone
+        Of the actuator, t/h.
+
+    Returns
+    -------
+    ndarray, float32
+        Actions; the actuator passes each command that it would pass unrounded.
+    """
+    command, half_range = np.asarray(command, float), (u_max - u_min) / 2.0
+    action = np.asarray(action_from_command(command, u_min, u_max)).astype(np.float32)
+    rounded = (action.astype(float) + 1.0) * half_range + u_min  # as the plant does
+    swallowed = (np.abs(command) >= dead_zone) & ~(np.abs(rounded) >= dead_zone)
+    step = np.spacing(np.maximum(np.abs(action), np.float32(1.0)))
+    return np.where(swallowed, action + np.copysign(step, command).astype(np.float32), action)
 
 
 class Dynamics:
@@ -115,6 +143,7 @@ class Plant:
         self._actuator = numbers.dead_zone, u_min, u_max, (u_max - u_min) / 2.0
         self._numbers = numbers
         self._drifts = parameters.drifts
+        self._may_overflow = not parameters.is_stable
         self._age = 0
         self._dynamics = Dynamics(parameters)
         self._update_dynamics()
@@ -169,6 +198,8 @@ class Plant:
         output = noise + self._scale * response
         for lag, alpha in self._alpha:
             output += alpha * outputs[lag]  # A of (28)
+        if self._may_overflow and output != output:
+            output = math.nan  # processors differ in the sign of inf - inf
         outputs.appendleft(output)
         return command, applied, output
 
@@ -217,6 +248,7 @@ class PlantBatch:
 
         self._dynamics = Dynamics(parameters)
         self._drifts = parameters.drifts
+        self._may_overflow = not parameters.is_stable
         self._changes_dynamics = parameters.changes_dynamics
         self._clock = self._next_update = 0
         self._starts = np.zeros(num_envs if self._drifts else (), np.int64)
@@ -237,8 +269,13 @@ class PlantBatch:
         # Plants with a longer delay take their response from rows of earlier responses.
         self._shortest, self._longer = shortest, longest - shortest
         if self._longer:
-            self._earlier = np.zeros((self._longer + self._samples, num_envs))
-            self._taken = np.zeros(self._response.shape, np.intp)
+            # They lie in a window of these rows. It moves on with the samples, so that the rows
+            # have to be copied back only where the window has come to the end of them.
+            self._window_rows = self._longer + self._samples
+            self._first_row = 0
+            rows = self._window_rows + max(self._longer, self._samples)
+            self._earlier = np.zeros((rows, num_envs))
+            self._taken = np.zeros(self._response.shape, np.intp)  # places within the window
 
     def reset(self, which: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
         """Bring some of the plants to rest, with new numbers.
@@ -262,7 +299,7 @@ class PlantBatch:
                 limit[:] = values
             self._half_range[:] = (u_max - u_min) / 2.0
         if self._longer:
-            self._earlier[:, which] = 0.0
+            self._window()[:, which] = 0.0
             rows = np.arange(self._samples)[:, np.newaxis] + self._longer + self._shortest
             rows = rows - numbers.delay.astype(np.intp)
             self._taken[:, which] = rows * self._inputs.shape[1] + which
@@ -320,6 +357,8 @@ class PlantBatch:
         output: Values = noise + response
         for term in map(mul, self._alpha, self._outputs):  # A of (28)
             output += term
+        if self._may_overflow:
+            output[np.isnan(output)] = math.nan
         self._outputs.appendleft(output)
         return command, applied, output
 
@@ -331,9 +370,18 @@ class PlantBatch:
             self._response += beta * inputs[older - lag : older - lag + samples]
         inputs[:older] = inputs[samples:].copy()
         if self._longer:
-            self._earlier[: self._longer] = self._earlier[samples:].copy()
-            self._earlier[self._longer :] = self._response
-            self._earlier.take(self._taken, out=self._response, mode="clip")
+            first = self._first_row + samples
+            if first + self._window_rows > len(self._earlier):
+                self._earlier[: self._longer] = self._earlier[first : first + self._longer]
+                first = 0
+            self._first_row = first
+            window = self._window()
+            window[self._longer :] = self._response
+            window.take(self._taken, out=self._response, mode="clip")
+
+    def _window(self) -> NDArray[np.float64]:
+        """Return the earlier responses that are still to be taken, the oldest first."""
+        return self._earlier[self._first_row : self._first_row + self._window_rows]
 
     def _update_dynamics(self) -> None:
         """Bring the dynamics to the plants' ages."""

@@ -6,8 +6,10 @@ import pytest
 from scipy.signal import lfilter
 
 import mptc_gym
-from mptc_gym.plant import Plant, action_from_command
+from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
+from mptc_gym.plant import Plant, action_from_command, float32_action
 from mptc_gym.ranges import Ranges
+from mptc_gym.signals import EpisodeStream
 from tests.conftest import run
 
 A = [1, -0.45181, -0.47546]
@@ -124,6 +126,49 @@ def test_scaling_by_hand():
         assert action_from_command(command, -4.0, 8.0) == action
 
 
+EDGES = [
+    *((edge, -10.0, 10.0) for edge in (0.1, 4.1, 5.0, 6.3, 6.5, 7.0, 9.0, 9.9, 10.0)),
+    (2.0, -6.0, 8.0), (5.0, -5.0, 15.0), (0.3, -0.4, 0.7), (9.3, -10.1, 9.3),
+    (1e-3, -1.0, 1e6), (7.0, -1e9, 7.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("dead_zone", "u_min", "u_max"), EDGES)
+def test_a_command_on_the_edge_of_the_dead_zone_passes_in_float32(dead_zone, u_min, u_max):
+    arguments = {"dead_zone": dead_zone, "u_min": u_min, "u_max": u_max}
+    reached = [edge for edge in (-dead_zone, dead_zone) if u_min <= edge <= u_max]
+    for command in reached:
+        action = float32_action(command, u_min, u_max, dead_zone)
+        assert action.dtype == np.float32
+        env, envs = MiddlePointEnv(**arguments), MiddlePointVectorEnv(1, **arguments)
+        env.reset(seed=0), envs.reset(seed=0)
+        passed = env.step(action.reshape(1))[-1]["applied"]
+        # Rounding to float32 makes 1.2e-7 of the range, at the most.
+        assert passed == pytest.approx(command, abs=1.3e-7 * (u_max - u_min))
+        assert abs(passed) >= dead_zone
+        assert envs.step(action.reshape(1, 1))[-1]["applied"][0] == passed
+
+
+def test_only_commands_on_the_edge_are_moved(rng):
+    commands = rng.uniform(-12, 12, 1000)
+    plain = action_from_command(commands, -10.0, 10.0).astype(np.float32)
+    np.testing.assert_array_equal(float32_action(commands, -10.0, 10.0, 7.0), plain)
+    inside = np.nextafter(7.0, 0.0)  # stays inside
+    assert applied(7.0, dead_zone=7.0) == 7.0
+    assert step(float(float32_action(inside, -10, 10, 7.0)), dead_zone=7.0)[1] == 0.0
+    # Many at a time, each with limits of its own.
+    dead_zones = np.array([4.1, 6.3, 7.0])
+    for sign in (-1, 1):
+        actions = float32_action(
+            sign * dead_zones, -10.0, np.array([10.0, 11.0, 12.0]), dead_zones
+        )
+        for action, dead_zone, u_max in zip(
+            actions, dead_zones, (10.0, 11.0, 12.0), strict=True
+        ):
+            _, passed, _ = step(float(action), dead_zone=dead_zone, u_max=u_max)
+            assert passed == pytest.approx(sign * dead_zone, abs=2e-6)
+
+
 def test_more_feedwater_never_makes_it_hotter(rng):
     for _ in range(20):
         low = rng.uniform(-1, 1, 200)
@@ -148,3 +193,12 @@ def test_reachable_range_without_noise(rng):
     output = run(env, rng.choice([-5.0, 0.0, 5.0], 3000))["output"]
     # |y| <= 10 t/h times the sum of |impulse response| = 6.82524 + twice what is negative: none
     assert np.abs(output).max() < 6.826
+
+
+def test_episodes_of_a_seed_do_not_overlap_however_long_they_are():
+    stream = EpisodeStream(np.random.SeedSequence(0))
+    first = stream.next_episode().random(2_000_000)
+    second = stream.next_episode().random(10)
+    third = stream.next_episode().random(10)
+    assert not np.isin([second, third], first).any()
+    assert not np.isin(second, third).any()

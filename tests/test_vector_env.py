@@ -3,6 +3,7 @@
 import copy
 import inspect
 import pickle
+import time
 import tracemalloc
 from unittest.mock import patch
 
@@ -105,14 +106,48 @@ def test_spaces_are_those_of_gymnasium():
     assert native.metadata == {**sync.metadata, "render_modes": ["rgb_array"]}
 
 
-def test_a_plant_beyond_all_floats_equals_the_one_alone():
-    native, sync = make_both(2, "NextStep", None, a=[1.0, -3.0, 4.0], output_window=1)
+@pytest.mark.parametrize("reward", ["quadratic", "absolute"])
+@pytest.mark.parametrize(
+    "a", [[1.0, -3.0, 4.0], [1.0, -2.0, -3.0], [1.0, 1.5], [1.0, -3.0, 3.0, 2.0]]
+)
+def test_a_plant_beyond_all_floats_equals_the_one_alone(a, reward):
+    native, sync = make_both(
+        2, "NextStep", None, a=a, reward=reward, output_window=1, move_weight=0.1,
+        noise_variance=0.1, delay=[0, 3],
+    )  # fmt: skip
     native.reset(seed=0), sync.reset(seed=0)
     with np.errstate(all="ignore"):
-        for _ in range(1500):
-            ours, theirs = native.step(np.ones((2, 1))), sync.step(np.ones((2, 1)))
+        for action in 1500 * [1.0] + 500 * [-1.0]:
+            ours, theirs = (envs.step(np.full((2, 1), action)) for envs in (native, sync))
             np.testing.assert_array_equal(ours[0], theirs[0])
+            for name in ("output", "error"):
+                assert (
+                    ours[4][name].tobytes() == theirs[4][name].tobytes()
+                )  # of NaN the sign, too
+            assert ours[1].tobytes() == theirs[1].tobytes()
     assert not np.isfinite(ours[4]["output"]).any()
+
+
+def test_a_wide_range_of_delays_costs_little_more_than_one_delay():
+    def seconds(delay):
+        envs = MiddlePointVectorEnv(512, delay=delay)
+        envs.reset(seed=0)
+        actions, taken = np.ones((512, 1), np.float32), []
+        for _ in range(5):
+            start = time.process_time()
+            for _ in range(100):
+                envs.step(actions)
+            taken.append(time.process_time() - start)
+        return min(taken)
+
+    assert seconds([0, 1000]) < 8 * seconds(18)  # two or three times as long
+
+
+@pytest.mark.parametrize("delay", [[0, 7], [2, 40], [0, 100]])
+def test_ranges_of_delays_over_a_long_time(delay, rng):
+    native, sync = make_both(4, "NextStep", 150, delay=delay, b=[0.3, -0.2, 0.1])
+    assert_equal(native.reset(seed=5), sync.reset(seed=5))
+    compare(native, sync, steps=700, rng=rng, partial_resets=0.01)
 
 
 def test_time_limit_is_that_of_the_registration_unless_another_is_given():
