@@ -26,8 +26,9 @@ LEAST_NOISE = 0.02  # degC; smaller errors tell no model from another
 CAUTION = 0.5  # factor of the log-likelihood, as the errors are not quite white
 EXCITED = 0.05  # of half the range: the flow has to have moved by it to be learnt from
 MEMORY = 20  # samples before the longest delay, in which it has to have moved
-INTERVAL = 5  # samples between two designs
-BLEND = 0.3  # share of a design that is taken over
+DELAY_STEP = 2  # samples between two delays of the bank
+INTERVAL = 10  # samples between two designs
+BLEND = 0.5  # share of a design that is taken over
 BIAS_RATE = 0.005  # a sample, of the offset's estimate
 DISTURBANCE_POLE = 0.5  # of the filter of the disturbance
 CLEARANCE = 0.2  # t/h that a command passes a dead zone by
@@ -158,7 +159,7 @@ class SelfTuningController(Controller):
 
         # Responses without delay differ by dead zone and pole, models by delay, too: the
         # longest one first, as in the history of the responses.
-        self._delays = np.arange(longest, shortest - 1, -1)
+        self._delays = np.arange(longest, shortest - 1, -DELAY_STEP)
         constants = np.tile(samples * np.array(TIME_CONSTANTS), len(self._zones))
         self._constants = constants
         self._poles = np.exp(-1.0 / constants)
@@ -208,8 +209,6 @@ class SelfTuningController(Controller):
             )
         setpoint = rows[:, self.setpoint_index]
         output = setpoint - rows[:, self.error_index]
-        now, delays = self._now, len(self._delays)
-
         filtered = (
             PREFILTER_POLE * self._filtered_outputs[:, -1]
             + output
@@ -223,13 +222,12 @@ class SelfTuningController(Controller):
             self._learn()
             self._design(BLEND)
 
-        first = now - int(self._delays[0])
-        delayed = self._units[:, first : first + delays].reshape(self._loops, -1)
+        delayed = self._units[:, self._now - self._delays].reshape(self._loops, -1)
         off = output - _dot(self._gains, delayed)
         self._bias = self._bias + BIAS_RATE * (off - self._bias)
         fading = self._trust * (output - self._bias) - _dot(self._faded, delayed)
         self._disturbance += (1.0 - DISTURBANCE_POLE) * (fading - self._disturbance)
-        response = self._units[:, now]
+        response = self._units[:, self._now]
         foreseen = _dot(self._sums, response) + self._bias + self._disturbance
         command: Array = _dot(self._shares, response)
         command += self._feedback * (setpoint - foreseen)
@@ -256,24 +254,23 @@ class SelfTuningController(Controller):
 
     def _learn(self) -> None:
         """Add the last samples to the sums, of those loops whose flow has moved."""
-        now, delays = self._now, len(self._delays)
-        flows = self._flows[:, now - self._history : now]
+        flows = self._flows[:, self._now - self._history : self._now]
         moved = flows.max(1) - flows.min(1) > self._excited
         gate = moved.astype(float)[:, np.newaxis]
         kept = 1.0 - gate * (1.0 - self._forgetting**INTERVAL)
-        first = now - int(self._delays[0])
-        filtered = self._filtered[:, first - INTERVAL + 1 : first + delays]
         outputs = self._filtered_outputs * gate
-        squares = np.square(filtered) * gate[:, :, np.newaxis]
-        information, products = (
-            self._by_model(self._information),
-            self._by_model(self._products),
-        )
+        information = self._by_model(self._information)
+        products = self._by_model(self._products)
         self._information *= kept
         self._products *= kept
+        longest, shortest = int(self._delays[0]), int(self._delays[-1])
+        oldest = self._now - longest - INTERVAL + 1
+        filtered = self._filtered[:, oldest : self._now - shortest + 1]
+        squares = np.square(filtered) * gate[:, :, np.newaxis]
         for i in range(INTERVAL):
-            information += squares[:, i : i + delays]
-            products += filtered[:, i : i + delays] * outputs[:, i, np.newaxis, np.newaxis]
+            delayed = slice(i, i + longest - shortest + 1, DELAY_STEP)
+            products += filtered[:, delayed] * outputs[:, i, np.newaxis, np.newaxis]
+            information += squares[:, delayed]
         self._energy *= kept
         self._energy += np.square(outputs).sum(1, keepdims=True)
         self._seen *= kept
