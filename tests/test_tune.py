@@ -150,66 +150,6 @@ class TestSearch:
         assert "other runs" in capsys.readouterr().err
         assert len(pd.read_csv(tmp_path / "pi.csv")) == 6
 
-    @pytest.mark.parametrize(
-        ("edited", "goes_on"),
-        [
-            ("agents.pi", False), ("benchmarks.tune.objective", False),
-            ("benchmarks.metrics", False), ("agents.direct_nn", True),
-            ("benchmarks.tune.search", True),
-        ],
-    )  # fmt: skip
-    def test_trials_before_and_after_an_edit_are_not_mixed(
-        self, edited, goes_on, tmp_path, monkeypatch, capsys
-    ):
-        run_tune(tmp_path, trials=2)
-        real = fingerprint.code
-        for module in (fingerprint, tune):
-            monkeypatch.setattr(
-                module, "code", lambda name: "edited" if name == edited else real(name)
-            )
-        if goes_on:
-            assert run_tune(tmp_path, trials=3) == 0
-            assert len(pd.read_csv(tmp_path / "pi.csv")) == 3
-            return
-        with pytest.raises(SystemExit):
-            run_tune(tmp_path, trials=3)
-        complaint = capsys.readouterr().err
-        assert "pi.json is of a search with other code: to begin anew, remove" in complaint
-        assert len(pd.read_csv(tmp_path / "pi.csv")) == 2
-
-    def test_without_its_json_a_search_is_not_continued(self, tmp_path, capsys):
-        run_tune(tmp_path, trials=2)
-        (tmp_path / "pi.json").unlink()
-        with pytest.raises(SystemExit):
-            run_tune(tmp_path, trials=3)
-        assert "pi.json, which" in capsys.readouterr().err
-
-    @pytest.mark.parametrize("at", [0.0, 0.4, 0.99])
-    def test_a_damaged_search_is_named(self, at, tmp_path, capsys):
-        run_tune(tmp_path, trials=2)
-        kept = tmp_path / "pi.json"
-        text = kept.read_text()
-        digits = [i for i, letter in enumerate(text) if letter.isdigit()]
-        place = digits[int(at * len(digits))]
-        for damaged in (
-            text[:place] + str(9 - int(text[place])) + text[place + 1 :],
-            text[: int(at * len(text))], "null", "[]", "{}",
-        ):  # fmt: skip
-            kept.write_text(damaged)
-            with pytest.raises(SystemExit):
-                run_tune(tmp_path, trials=3)
-            complaint = capsys.readouterr().err
-            assert "pi.json is damaged" in complaint
-            assert "remove" in complaint
-        kept.write_text(text)
-        assert run_tune(tmp_path, trials=3) == 0
-
-    def test_the_table_for_readers_is_written_anew(self, tmp_path):
-        run_tune(tmp_path, trials=2)
-        (tmp_path / "pi.csv").write_bytes(b"\0\xff")
-        assert run_tune(tmp_path, trials=3) == 0
-        assert len(pd.read_csv(tmp_path / "pi.csv")) == 3
-
     def test_defaults_are_in_the_space(self):
         # Those of PPO are not from its search.
         defaults = {"nn": DirectNNController(), "pi": PIController(**SEARCHED_GAINS)}
@@ -234,3 +174,69 @@ class TestSearch:
         assert [arguments.seed for arguments in trained] == [*search * 2, *final * 2]
         table = pd.read_csv(tmp_path / "ppo.csv")
         assert list(table["gamma"]) == [trained[0].gamma, trained[2].gamma]
+
+
+@pytest.fixture
+def search(tmp_path, monkeypatch):
+    """Return a function that begins a search, or goes on with it, to a number of trials."""
+    short = [(replace(scenario, samples=30), 0) for scenario, _ in tune.SCENARIOS]
+    monkeypatch.setattr(objective, "SCENARIOS", short)
+
+    def go(trials):
+        search = tune.Search(ROSTER["pi"], 1, tmp_path, FanOut(1))
+        search.run(trials)
+        return search.trials
+
+    return go
+
+
+class TestKeptTrials:
+    @pytest.mark.parametrize(
+        "edited", ["agents.pi", "benchmarks.tune.objective", "benchmarks.metrics"]
+    )
+    def test_those_before_and_after_an_edit_are_not_mixed(self, search, edited, monkeypatch):
+        search(2)
+        self.edit(edited, monkeypatch)
+        with pytest.raises(ValueError, match="with other code: to begin anew, remove"):
+            search(3)
+
+    @pytest.mark.parametrize("edited", ["agents.direct_nn", "benchmarks.tune.search"])
+    def test_an_edit_elsewhere_does_not_matter(self, search, edited, monkeypatch):
+        before = search(2)
+        self.edit(edited, monkeypatch)
+        pd.testing.assert_frame_equal(search(3).head(2), before)
+
+    @staticmethod
+    def edit(edited, monkeypatch):
+        real = fingerprint.code
+        for module in (fingerprint, tune):
+            monkeypatch.setattr(
+                module, "code", lambda name: "edited" if name == edited else real(name)
+            )
+
+    def test_without_its_json_a_search_is_not_continued(self, search, tmp_path):
+        search(2)
+        (tmp_path / "pi.json").unlink()
+        with pytest.raises(ValueError, match=r"pi\.json, which .*pi\.csv .* is missing: bring"):
+            search(3)
+
+    def test_damage_is_named(self, search, tmp_path, rng):
+        search(2)
+        kept = tmp_path / "pi.json"
+        text = kept.read_text()
+        digits = [i for i, letter in enumerate(text) if letter.isdigit()]
+        flipped = [
+            text[:i] + str(9 - int(text[i])) + text[i + 1 :] for i in rng.choice(digits, 20)
+        ]
+        cut = [text[:i] for i in rng.integers(len(text), size=20)]
+        for damaged in (*flipped, *cut, "", "null", "[]", "{}", "\0\0"):
+            kept.write_text(damaged)
+            with pytest.raises(ValueError, match=r"pi\.json is damaged .* remove"):
+                search(3)
+        kept.write_text(text)
+        assert len(search(3)) == 3
+
+    def test_the_table_for_readers_is_written_anew(self, search, tmp_path):
+        search(2)
+        (tmp_path / "pi.csv").write_bytes(b"\0\xff")
+        pd.testing.assert_frame_equal(search(3), pd.read_csv(tmp_path / "pi.csv"))
