@@ -1,0 +1,140 @@
+"""What no controller can do better: `python -m benchmarks.limits`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from tqdm import tqdm
+
+from benchmarks import command_line
+from benchmarks.limits.bounds import CACHE, EPISODES, LeastPossible, least_possible
+from benchmarks.limits.reference import minimum_variance, scenario_limit
+from benchmarks.limits.verify import mpc_errors, verify
+from benchmarks.scenarios import SCENARIOS
+from benchmarks.statistics import bootstrap
+from benchmarks.tables import on_screen
+from mptc_gym import PRESETS
+
+SAMPLES = 1200  # of an episode of a preset
+
+NOTE = (
+    "With preview: no controller does better on average, even one that knows the set point "
+    "beforehand. Without: none to which a change of the set point is news; for random set points "
+    "alone, which have a law. Reference: without preview, if each change finds the plant "
+    "settled; a controller that counts samples can come below it. Where a set point never "
+    "changes, the three are the same. 95 % intervals over drawn episodes."
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the bounds of the scenarios and of the presets.
+
+    Parameters
+    ----------
+    arguments
+        The command line without the program's name.
+
+    Returns
+    -------
+    int
+        0; with `--verify` 1 if a controller beats a bound beyond its interval.
+    """
+    parser = command_line.parser("limits", __doc__)
+    parser.add_argument(
+        "--mpc",
+        type=int,
+        default=0,
+        metavar="RUNS",
+        help="run the predictive controller on each preset, too, so many times",
+    )
+    parser.add_argument(
+        "--verify",
+        action="store_true",
+        help="run every controller against the bounds instead",
+    )
+    parser.add_argument("--runs", type=command_line.number, default=300, help="of --verify")
+    parser.add_argument(
+        "--episodes", type=command_line.number, default=EPISODES, help="that a mean is taken over"
+    )
+    parser.add_argument(
+        "--cache", type=Path, default=CACHE, help="where bounds are kept once they are known"
+    )
+    options = parser.parse_args(arguments)
+    console = command_line.console(130)
+    if options.verify:
+        table, beaten = verify(options.runs, options.cache)
+        console.print(on_screen(table))
+        console.print(
+            f"Beaten beyond the interval: {', '.join(beaten)}."
+            if beaten
+            else "No controller beats the bound that applies to it, beyond its interval."
+        )
+        return 1 if beaten else 0
+    console.print("The scenarios of `python -m benchmarks.compare`, °C:")
+    console.print(on_screen(scenarios(options.cache)))
+    console.print("The presets, mean |e| in °C:")
+    console.print(on_screen(presets(options.episodes, options.mpc, options.cache)))
+    console.print(NOTE)
+    return 0
+
+
+def scenarios(cache: Path) -> pd.DataFrame:
+    """Return the table of the scenarios."""
+    rows = []
+    for name, scenario in tqdm(SCENARIOS.items(), unit="scenario"):
+        known = least_possible(samples=scenario.samples, folder=cache, **scenario.arguments)
+        limit = scenario_limit(scenario)
+        variance = minimum_variance(scenario.parameters)
+        rows.append(
+            {
+                "scenario": name,
+                "with preview": f"{known.value:.4f}",
+                "reference": f"{limit.mae:.4f}",
+                "reference, rms": f"{np.sqrt(limit.mse):.4f}",
+                "set point held, rms": f"{np.sqrt(variance):.4f}",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def presets(episodes: int, runs: int, cache: Path) -> pd.DataFrame:
+    """Return the table of the presets, with the predictive controller's errors if `runs`."""
+    rows = []
+    for name, arguments in tqdm(PRESETS.items(), unit="preset"):
+        found = {
+            kind: least_possible(
+                samples=SAMPLES, kind=kind, episodes=episodes, folder=cache, **arguments
+            )
+            for kind in ("preview", "news", "reference")
+            if kind != "news" or arguments.get("setpoint") == "random"
+        }
+        idle = found["preview"]
+        row = {
+            "preset": name,
+            "valve left alone": _cell(idle.idle, idle.idle_low, idle.idle_high),
+            "with preview": _shown(found["preview"]),
+            "without preview": _shown(found["news"]) if "news" in found else "",
+            "reference": _shown(found["reference"]),
+        }
+        if runs:
+            error = bootstrap(mpc_errors(runs, SAMPLES, **arguments), 0)
+            row["MPC"] = _cell(error.value, error.low, error.high)
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _shown(least: LeastPossible) -> str:
+    return _cell(least.value, least.low, least.high)
+
+
+def _cell(value: float, low: float, high: float) -> str:
+    if f"{low:.3f}" == f"{high:.3f}":
+        return f"{value:.3f}"
+    return f"{value:.3f} ({low:.3f} to {high:.3f})"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,301 @@
+"""The least possible mean error of any case of the environment, and the score that it gives.
+
+Two bounds are theorems; the third number is a reference under a condition.
+
+"preview"
+    No controller at all does better on average, even one that knows the whole set point and
+    the drawn plant beforehand. Valid for every set point, however short it is held.
+"news"
+    No controller does better to which a change of the set point is news. For random set points
+    only, whose law it takes (`benchmarks.limits.news`). A controller between the two bounds
+    uses the future.
+"reference"
+    What is possible without preview if each change finds the plant settled and no other is
+    reckoned with (`benchmarks.limits.reference`). For the square wave and for lists. It is no
+    bound: a controller that counts samples can come below it.
+
+Where the set point never changes, all three are the same. Each is the mean over the episodes
+that the environment draws: for each, the programme of `benchmarks.limits.programme` with what
+`benchmarks.limits.unknown` leaves. All rest on this: the plant is (28) and (29), a controller
+knows at k what the transmitter has shown up to k, and any set points, plant numbers and loads
+up to k besides; the dead zone may be undone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from benchmarks.lib.fingerprint import fingerprint
+from benchmarks.limits.course import Course, course
+from benchmarks.limits.news import News
+from benchmarks.limits.programme import Plan, plan
+from benchmarks.limits.reference import SMOOTH, TAIL, held, reference
+from benchmarks.limits.unknown import Unknown, unknown
+from benchmarks.rollout import make_plants, rollout
+from benchmarks.lib.statistics import CONFIDENCE
+from benchmarks.lib.storage import ROOT, seal, unseal, write_text
+from mptc_gym import Parameters
+from mptc_gym.plant import action_from_command
+from mptc_gym.ranges import Ranges
+
+Array = NDArray[np.float64]
+
+KINDS = ("preview", "news", "reference")
+EPISODES = 100  # that the mean is taken over where an episode is drawn
+IDLE_RUNS = 300  # of the plant that is left alone
+SEED = 7_000_000  # of the first episode; no controller was tuned on these
+CACHE = ROOT / "results" / "limits"
+PRICES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # of travel, for the frontier
+
+
+@dataclass(frozen=True)
+class LeastPossible:
+    """The least possible mean |e| of a case, with a 95 % interval over drawn episodes.
+
+    Attributes
+    ----------
+    value, low, high
+        degC. The ends are `value` where nothing is drawn.
+    kind
+        One of `KINDS`.
+    idle, idle_low, idle_high
+        Mean |e| of the same plants if the valve is left alone, degC, with its interval.
+    episodes
+        The terms of the mean, degC; element i is for the episode of seed `seed + i`. Those of
+        the kind "news" are bounds in their mean alone.
+    seed
+        Of the first episode.
+    """
+
+    value: float
+    low: float
+    high: float
+    kind: str
+    idle: float
+    idle_low: float
+    idle_high: float
+    episodes: tuple[float, ...]
+    seed: int
+
+    @property
+    def holds_for(self) -> str:
+        """For which controllers nothing better is possible."""
+        return {
+            "preview": "every controller, even one that knows the set point beforehand",
+            "news": "controllers to which a change of the set point is news",
+            "reference": "none for certain: a reference, if each change finds the plant settled",
+        }[self.kind]
+
+    def score(self, errors: ArrayLike) -> Array:
+        """Return 0 for the mean error of a valve that is left alone, 1 for `value`.
+
+        Parameters
+        ----------
+        errors
+            Mean |e| of runs, degC, any shape. Scores of single runs may exceed 1 by chance.
+
+        Raises
+        ------
+        ValueError
+            If leaving the valve alone is as good as anything.
+        """
+        room = self.idle - self.value
+        if room <= 1e-9 * max(self.idle, 1.0):
+            raise ValueError(f"there is nothing to gain: doing nothing gives {self.idle:g} °C")
+        scores: Array = (self.idle - np.asarray(errors, dtype=np.float64)) / room
+        return scores
+
+
+def least_possible(
+    *,
+    samples: int,
+    kind: str | None = None,
+    episodes: int = EPISODES,
+    seed: int = SEED,
+    folder: Path | None = CACHE,
+    **arguments: Any,
+) -> LeastPossible:
+    """Return the least possible mean |e| over the samples k = 0 to samples - 1.
+
+    Parameters
+    ----------
+    samples
+        Length of an episode.
+    kind
+        One of `KINDS`. None: "news" for random set points, "preview" otherwise.
+    episodes
+        How many are drawn, if anything but noise and load is.
+    seed
+        Episode i is the one that the environment draws with seed `seed + i`.
+    folder
+        Where the result is kept, under a name made of the arguments and of the code that
+        computes it. None: it is computed anew.
+    **arguments
+        Of the environment.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range; or for the kind "news" if set points are not random; or
+        for the kind "reference" if a set point changes before the plant has settled.
+    """
+    parameters = Parameters(**arguments)
+    for name, count in (("samples", samples), ("episodes", episodes)):
+        if not isinstance(count, int) or count < 1:
+            raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
+    random = parameters.setpoint == "random"
+    kind = kind or ("news" if random else "preview")
+    if kind not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
+    if kind == "news" and not random:
+        raise ValueError(f'kind must not be "news" for the set point {parameters.setpoint!r}')
+    file = None
+    if folder is not None:
+        file = folder / f"{_key(parameters, samples, kind, episodes, seed)}.json"
+        with suppress(OSError, ValueError, TypeError):  # not there, or damaged: made again
+            kept = unseal(file.read_text(encoding="utf-8"))
+            return LeastPossible(**{**kept, "episodes": tuple(kept["episodes"])})
+    cases, idle = _draw(parameters, samples, episodes, seed)
+    values = [case.solve(kind).value / samples for case in cases]
+    value, low, high = _interval(values)
+    found = LeastPossible(value, low, high, kind, *_interval(idle), tuple(values), seed)
+    if file is not None:
+        write_text(file, seal(asdict(found)))
+    return found
+
+
+def frontier(
+    *,
+    samples: int,
+    kind: str | None = None,
+    prices: Sequence[float] = PRICES,
+    episodes: int = 20,
+    seed: int = SEED,
+    **arguments: Any,
+) -> list[tuple[float, float]]:
+    """Return the least mean error for a given mean travel of the valve.
+
+    For each price p of travel the programme minimises mean error plus p times mean travel. No
+    controller comes below its value, so none lies below the line error = value - p * travel.
+    The points are where these lines touch their envelope; between two points the bound is the
+    straight line, by convexity. The travel is that of the applied flow, which may jump over the
+    dead zone: a mean of such flows travels no more than they do on average. It is loose where
+    noise asks for moves that the mean does not show.
+
+    Parameters
+    ----------
+    samples, kind, episodes, seed, **arguments
+        As of `least_possible`. With "reference", it has the condition of that.
+    prices
+        Of a t/h of travel, degC times samples.
+
+    Returns
+    -------
+    list of tuple of float
+        Travel, t/h a sample (the sum of |u_a(k) - u_a(k-1)| over `samples`), and error, degC,
+        by descending travel; at the end a valve that does not move.
+    """
+    parameters = Parameters(**arguments)
+    kind = kind or ("news" if parameters.setpoint == "random" else "preview")
+    cases, idle = _draw(parameters, samples, episodes, seed)
+    points = []
+    for price in sorted(prices):
+        plans = [case.solve(kind, price) for case in cases]
+        travel = float(np.mean([p.travel.sum() for p in plans])) / samples
+        value = float(np.mean([p.value for p in plans])) / samples
+        points.append((travel, value - price * travel))
+    return [*points, (0.0, float(np.mean(idle)))]
+
+
+@dataclass(frozen=True)
+class _Case:
+    """An episode: its plant, what is unknown in it, and its set point."""
+
+    parameters: Parameters
+    course: Course
+    unknown: Unknown
+    setpoint: Array
+
+    def solve(self, kind: str, price: float = 0.0) -> Plan:
+        if kind == "reference":
+            return reference(
+                self.course, self.unknown, self.setpoint, price=max(price, SMOOTH)
+            )
+        samples = len(self.setpoint)
+        now, unknown = self.course.first(samples), self.unknown.of(0, samples)
+        toll = None
+        if kind == "news" and self.parameters.setpoint_amplitude > 0.0:
+            starts = np.array([start for start, _ in held(self.setpoint)])
+            toll = News(self.parameters, now, unknown).toll(self.setpoint, starts)
+        return plan(now, unknown, self.setpoint, price=price, toll=toll)
+
+
+class _Idle:
+    """Leaves the valve at 0 t/h."""
+
+    def __init__(self, numbers: Mapping[str, Array]) -> None:
+        action = action_from_command(0.0, numbers["u_min"], numbers["u_max"])
+        self._actions = np.asarray(action)[:, np.newaxis]
+
+    def reset(self) -> None:
+        """Do nothing."""
+
+    def act(self, observation: Any) -> Array:
+        return self._actions
+
+
+def _draw(
+    parameters: Parameters, samples: int, episodes: int, seed: int
+) -> tuple[list[_Case], Array]:
+    """Return episodes as the environment draws them, and mean |e| with the valve left alone."""
+    drawn = bool(parameters.ranges) or parameters.setpoint == "random"
+    noisy = parameters.range_of("noise_variance")[1] > 0.0 or parameters.is_disturbed
+    count = episodes if drawn else 1
+    runs = max(count, IDLE_RUNS) if drawn or noisy else 1
+    plants = make_plants(runs, samples, **asdict(parameters))
+    _, info = plants.reset(seed=seed)
+    given = Ranges(parameters).given
+    numbers = {
+        name: np.array(info[name]) if name in parameters.ranges else np.full(runs, value)
+        for name, value in given.items()
+    }
+    trajectory = rollout(plants, _Idle(numbers), samples, seed)
+    plants.close()
+    solver = partial(_case, parameters, samples)
+    cases = [
+        solver({name: float(n[i]) for name, n in numbers.items()}, trajectory.setpoint[:, i])
+        for i in range(count)
+    ]
+    return cases, np.abs(trajectory.setpoint - trajectory.output).mean(axis=0)
+
+
+def _case(
+    parameters: Parameters, samples: int, numbers: Mapping[str, float], setpoint: Array
+) -> _Case:
+    longer = course(parameters, numbers, samples + int(numbers["delay"]) + 50 + TAIL)
+    return _Case(parameters, longer, unknown(longer), setpoint.copy())
+
+
+def _interval(values: ArrayLike) -> tuple[float, float, float]:
+    """Return the mean and its interval, that of Student."""
+    numbers = np.asarray(values, dtype=np.float64)
+    mean = float(numbers.mean())
+    if len(numbers) < 2 or np.ptp(numbers) == 0.0:
+        return mean, mean, mean
+    error = numbers.std(ddof=1) / np.sqrt(len(numbers))
+    half = float(stats.t.ppf((1.0 + CONFIDENCE) / 2.0, len(numbers) - 1) * error)
+    return mean, mean - half, mean + half
+
+
+def _key(parameters: Parameters, samples: int, kind: str, episodes: int, seed: int) -> str:
+    case = [repr(parameters), samples, kind, episodes, seed]
+    return fingerprint("benchmarks.limits.bounds", case=case)

@@ -1,0 +1,172 @@
+"""What it costs not to know the next set point: a toll on flows that use the future.
+
+With `setpoint="random"` the set point has a law: levels are independent and uniform in
+[-A, A], and each is held for a number of samples that is uniform from S to L. To a controller
+without preview a change is news. So u_a(j) depends on the set points up to j alone, and for
+every pi(j) that vanishes in the mean over the future, E[pi(j) | set points up to j] = 0,
+
+    E[sum_j pi(j) u_a(j)] = 0.
+
+Hence the mean error of such a controller is the mean of the sum of |e(k)| and pi(k) u_a(k), and
+that is at least the mean, over the set points, of its minimum over all flows, even those that
+know the future (D. B. Brown, J. E. Smith and P. Sun, "Information relaxations and duality in
+stochastic dynamic programs", Operations Research 58, 2010, 785-801). Every pi gives a bound; a
+good one takes from the programme what it would gain by the future. Here it is
+
+    pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
+
+G[k, j] is what u_a(j) does to y(k), and g(k) a guess of the slope of E|e(k)|: after a change
+its sign, until the output can have followed; and in the long run of a hold a number between
+-1 and 1, odd in the level, that weighs staying against going ahead to where the next level is
+to be expected. The guess is one that lets the conditional means be worked out in closed form.
+A poor guess makes the bound loose, never wrong.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from benchmarks.limits.course import Course
+from benchmarks.limits.unknown import Unknown
+from mptc_gym import Parameters
+
+Array = NDArray[np.float64]
+
+THRESHOLDS = 8  # that stand for the noise in the guess
+
+
+class News:
+    """The law of random set points, and the guess for it on one course.
+
+    Parameters
+    ----------
+    parameters
+        With `setpoint="random"`.
+    course
+        The plant. The guess takes its dynamics at the start.
+    unknown
+        What no command can answer in time.
+    """
+
+    def __init__(self, parameters: Parameters, course: Course, unknown: Unknown) -> None:
+        self._course = course
+        self._amplitude = parameters.setpoint_amplitude
+        self._shortest = max(1, -(-parameters.setpoint_period // 6))
+        self._longest = max(self._shortest, parameters.setpoint_period // 2)
+        alpha, beta = course.alpha[0], course.beta[0]
+        gain = float(np.abs(beta.sum() / (1.0 - alpha.sum())))
+        pace = float(np.abs(np.roots([1.0, *-alpha])).max(initial=0.0))
+        self._reach = gain * min(-course.low, course.high)
+        # Noise blurs the sign of a small error: as many thresholds for it, equally probable.
+        deviation = unknown.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
+        blur = stats.halfnorm.ppf((np.arange(THRESHOLDS) + 0.5) / THRESHOLDS)
+        self._blur = deviation * blur if deviation > 0.0 else np.zeros(1)
+        # After a change the output stands still for `lag` samples. From then on it nears what
+        # the limits let it come to: which share of the way it has made, by age of the level.
+        samples = len(course.load)
+        age = np.arange(samples)
+        self._share = 1.0 - pace ** np.maximum(age - course.lag + 1, 0)
+        # From here on the largest change that is in reach has been made.
+        far = 2.0 * self._amplitude / max(self._reach + self._amplitude, 1e-9)
+        slowly = 1.0 - np.exp(-4.0)
+        self._settled = int(np.searchsorted(self._share, min(far, slowly)))
+        # The chance that a level is still held at an age, if it began for certain.
+        self._left = np.clip(
+            (self._longest - age) / (self._longest - self._shortest + 1), 0.0, 1.0
+        )
+        impulse = np.eye(1, samples)[0]
+        self._impulse = np.zeros(samples)  # response to one t/h, after as many samples
+        delayed = np.convolve(impulse, [*[0.0] * (course.delay + 1), *beta])[:samples]
+        for k in range(samples):
+            past = self._impulse[max(k - len(alpha), 0) : k][::-1]
+            self._impulse[k] = delayed[k] + alpha[: len(past)] @ past
+
+    def toll(self, setpoint: Array, starts: NDArray[np.intp]) -> Array:
+        """Return pi, degC times samples for each t/h, shape (samples,).
+
+        Parameters
+        ----------
+        setpoint
+            One draw of y_d(k), degC, shape (samples,).
+        starts
+            The samples at which its levels begin, 0 first.
+        """
+        samples = len(setpoint)
+        ends = [*starts[1:], samples]
+        levels = setpoint[starts]
+        stays = []  # g of each level by its age, were it held for ever
+        changed = []  # what a change adds to the mean of g, by age, summed up
+        for i, level in enumerate(levels):
+            before = levels[i - 1] if i else 0.0
+            changed.append(np.cumsum(self._mean_slope(level) * self._left))
+            stays.append(self._slope(before, level) + self._lean(changed[-1]))
+        guess = np.concatenate(
+            [stay[: end - start] for stay, start, end in zip(stays, starts, ends, strict=True)]
+        )
+        surprise = np.zeros((samples, samples))  # [k, j]: g(k) - E[g(k) | up to j]
+        for stay, change, start, end in zip(stays, changed, starts, ends, strict=True):
+            for j in range(start, end):
+                ages = np.arange(j + 1 - start, samples - start)
+                expected = self._expected(ages, j - start, stay, change)
+                surprise[j + 1 :, j] = guess[j + 1 :] - expected
+        tolls: Array = (self._course.response() * surprise).sum(axis=0)
+        return tolls
+
+    def _expected(
+        self, ages: NDArray[np.intp], now: int, stay: Array | float, change: Array
+    ) -> Array:
+        """Return the mean of g at later ages of a level that is held at age `now`."""
+        # The next level begins at one of these ages, each as probable as the others.
+        first, last = max(self._shortest, now + 1), self._longest
+        count = last - first + 1
+        gone = np.clip((ages - first + 1) / count, 0.0, 1.0)
+        recent, old = ages - first, ages - last - 1
+        expected: Array = (1.0 - gone) * (stay[ages] if isinstance(stay, np.ndarray) else stay)
+        expected += np.where(recent >= 0, change[np.maximum(recent, 0)], 0.0) / count
+        expected -= np.where(old >= 0, change[np.maximum(old, 0)], 0.0) / count
+        # After one more change g is positive as often as negative: levels are symmetric.
+        return expected
+
+    def _slope(self, before: float, after: float) -> Array:
+        """Return g by age, from a change until the output can have followed."""
+        change = after - before
+        room = max(self._reach - np.sign(change) * before, 0.0)
+        left = np.abs(change) - room * self._share[:, np.newaxis]
+        slope: Array = np.sign(change) * (left > self._blur).mean(axis=1)
+        slope[self._settled :] = 0.0
+        return slope
+
+    def _mean_slope(self, before: float) -> Array:
+        """Return the mean of `_slope` over all levels that may follow."""
+        A = self._amplitude
+        share, blur = self._share[:, np.newaxis], self._blur
+        up = A - before - max(self._reach - before, 0.0) * share - blur
+        down = A + before - max(self._reach + before, 0.0) * share - blur
+        mean: Array = (np.maximum(up, 0.0) - np.maximum(down, 0.0)).mean(axis=1) / (2.0 * A)
+        mean[self._settled :] = 0.0
+        return mean
+
+    def _lean(self, change: Array) -> Array:
+        """Return g by age in the long run of a hold, for which it pays to stay.
+
+        At every age what a flow does is worth nothing in the mean then: the sum over later
+        ages of its response times the mean of g vanishes. Solved from the last age on.
+        """
+        lean = np.zeros(len(change))
+        lag = self._course.lag
+        first_response = self._impulse[lag : lag + 1]
+        if not first_response.any():
+            return lean
+        for age in range(min(self._longest, len(change)) - 1, self._settled - 1, -1):
+            now = age - lag
+            ages = np.arange(age, min(len(change), age + 200))
+            mean = self._expected(ages, now, lean, change)
+            worth = float(self._impulse[lag : lag + len(ages)] @ mean)
+            count = self._longest - max(self._shortest, now + 1) + 1
+            still = min(1.0, (self._longest - age) / count)
+            if still > 0.0:
+                needed = -worth / (float(first_response[0]) * still)
+                lean[age] = np.clip(needed, -1.0, 1.0)
+        return lean

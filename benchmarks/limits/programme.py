@@ -1,0 +1,194 @@
+"""The linear programme behind every bound: the best mean flow for a course and a set point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, sparse
+
+from benchmarks.limits.course import Course
+from benchmarks.limits.unknown import Unknown
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the programme found. All arrays have the shape (samples,).
+
+    Attributes
+    ----------
+    error
+        The bound of E|e(k)|, degC.
+    output, flow
+        The means of y(k) and u_a(k), degC and t/h.
+    value
+        The least value of what was minimised, degC times samples.
+    """
+
+    error: Array
+    output: Array
+    flow: Array
+    value: float
+
+    @property
+    def travel(self) -> Array:
+        """|u_a(k) - u_a(k-1)| of the mean flow, t/h; 0 before k = 0."""
+        moves: Array = np.abs(np.diff(self.flow, prepend=0.0))
+        return moves
+
+
+def plan(
+    course: Course,
+    unknown: Unknown,
+    setpoint: Array,
+    *,
+    before: Plan | None = None,
+    start: int = 0,
+    price: float = 0.0,
+    toll: Array | None = None,
+    least_slope: float = 0.0,
+) -> Plan:
+    """Minimise the sum of the bounds of E|e(k)| over the mean flow.
+
+    Let a controller be given, causal or not, and let y and u_a stand for their means over all
+    noise, load and own randomness of the controller. As (28) is linear, the means obey it
+    without noise; as u_a(k) always lies within [low, high], so does its mean; and as E|m - n|
+    is convex in m, its mean over everything that may be known is at least that for the mean of
+    m, which is y_d - y (Jensen). So what the controller comes to is at least the minimum over
+    all mean flows within the limits: a linear programme, as the bounds of E|m - n| are highest
+    lines. The mean travel of a flow is at least the travel of the mean flow, by Jensen again.
+
+    It is loose where the flow that is needed lies within the dead zone or on both sides of a
+    limit by turns: the mean of 0 and 5 t/h is 2.5 t/h, and that of what the noise asks for may
+    lie within limits that single demands exceed.
+
+    Parameters
+    ----------
+    course
+        The plant, for as many samples as there are set points, or more.
+    unknown
+        What no command can answer in time.
+    setpoint
+        y_d(k), degC, shape (samples,).
+    before, start
+        Outputs up to sample `start`, and flows before it, are those of this plan. Without it,
+        the plant has been at rest before k = 0, and `start` is 0.
+    price
+        Of valve travel, degC times samples for each t/h.
+    toll
+        What each t/h of u_a(k) costs in addition, shape (samples,).
+    least_slope
+        Of the bounds of E|m - n|, while planning: above 0, of all plans that are as good by the
+        bounds, which are level near 0, one that comes to the set point is taken.
+
+    Returns
+    -------
+    Plan
+        `value` counts the samples from `start` on.
+
+    Raises
+    ------
+    RuntimeError
+        If the solver fails.
+    """
+    samples = len(setpoint)
+    output, flow = np.zeros(samples), np.zeros(samples)
+    if before is not None:
+        output[: start + 1], flow[:start] = before.output[: start + 1], before.flow[:start]
+    n = samples - 1 - start  # outputs after `start`, and flows from it on
+    of_now = unknown.of(start, samples)
+    if n:
+        solved = _solve(course, of_now, setpoint, output, flow, start, price, toll, least_slope)
+        output[start + 1 :], flow[start:-1] = solved[:n], solved[n : 2 * n]
+    # The last flow shows in no output; without a move it costs nothing either.
+    flow[-1] = flow[-2] if samples > 1 else 0.0
+    error = np.zeros(samples)
+    error[start:] = of_now.mean_error(setpoint[start:] - output[start:])
+    moves = np.abs(np.diff(flow, prepend=0.0))[start:]
+    value = error[start:].sum() + price * moves.sum()
+    if toll is not None:
+        value += float(toll[start:] @ flow[start:])
+    return Plan(error, output, flow, float(value))
+
+
+def _solve(
+    course: Course,
+    unknown: Unknown,
+    setpoint: Array,
+    output: Array,
+    flow: Array,
+    start: int,
+    price: float,
+    toll: Array | None,
+    least_slope: float,
+) -> Array:
+    """Return outputs after `start`, then flows from it on."""
+    samples = len(setpoint)
+    n = samples - 1 - start
+    eye, nothing = sparse.eye_array(n), sparse.csr_array((n, n))
+    ones, zeros = np.ones(n), np.zeros(n)
+
+    # (28) without noise: A y = B u, rows from start + 1 on; what is past goes to the right.
+    A = sparse.eye_array(samples) - _lagged(course.alpha, samples, 1)
+    B = _lagged(course.beta, samples, course.delay + 1)
+    A, B = A.tocsr()[start + 1 :], B.tocsr()[start + 1 :]
+    past = B[:, :start] @ flow[:start] - A[:, : start + 1] @ output[: start + 1]
+    A, B = A[:, start + 1 :], B[:, start:-1]
+
+    # E|m - n| as a sum of pieces of |m|, each with its slope; between lines there are corners.
+    slopes, intercepts = unknown.slopes, unknown.intercepts[1:]
+    corners = (intercepts[:, :-1] - intercepts[:, 1:]) / np.diff(slopes)
+    corners = np.maximum.accumulate(corners, axis=1)
+    ends = np.column_stack([corners, np.full(n, np.inf)])
+    lengths = np.diff(ends, axis=1, prepend=0.0) if len(slopes) > 1 else ends
+    pieces = [(s, sign, length) for s, length in zip(slopes, lengths.T, strict=True)
+              for sign in (1.0, -1.0)]  # fmt: skip
+
+    # Columns: y, u, the pieces; then the moves up and down, if they have a price.
+    cost = [zeros, zeros if toll is None else toll[start:-1]]
+    cost += [max(slope, least_slope) * ones for slope, _, _ in pieces]
+    bounds = [_bounds(-np.inf * ones, np.inf * ones)]
+    bounds += [_bounds(course.low * ones, course.high * ones)]
+    bounds += [_bounds(zeros, length) for _, _, length in pieces]
+    rows = [
+        [A, -B, *[nothing] * len(pieces)],
+        [eye, nothing, *(sign * eye for _, sign, _ in pieces)],
+    ]
+    right = [past, setpoint[start + 1 :]]
+    if price:
+        moves = eye - sparse.eye_array(n, k=-1)
+        rows = [[*row, nothing, nothing] for row in rows]
+        rows.append([nothing, moves, *[nothing] * len(pieces), -eye, eye])
+        first = np.zeros(n)
+        first[0] = flow[start - 1] if start else 0.0
+        right.append(first)
+        cost += [price * ones] * 2
+        bounds += [_bounds(zeros, np.inf * ones)] * 2
+    solved = optimize.linprog(
+        np.concatenate(cost),
+        A_eq=sparse.vstack([sparse.hstack(row) for row in rows]).tocsc(),
+        b_eq=np.concatenate(right),
+        bounds=np.concatenate(bounds),
+        method="highs-ds",
+    )
+    if not solved.success:
+        raise RuntimeError(f"the linear programme was not solved: {solved.message}")
+    found: Array = solved.x
+    return found
+
+
+def _lagged(coefficients: Array, samples: int, lag: int) -> sparse.sparray:
+    """Return the matrix that adds up coefficients[k, i] times x(k - lag - i)."""
+    inside = [i for i in range(coefficients.shape[1]) if lag + i < samples]
+    if not inside:
+        return sparse.csr_array((samples, samples))
+    diagonals = [coefficients[lag + i : samples, i] for i in inside]
+    offsets = [-(lag + i) for i in inside]
+    return sparse.diags_array(diagonals, offsets=offsets, shape=(samples, samples))
+
+
+def _bounds(low: Array, high: Array) -> Array:
+    return np.column_stack([low, high])

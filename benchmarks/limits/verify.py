@@ -1,0 +1,156 @@
+"""Every controller against the bound that applies to it, on cases that nothing was tuned on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from benchmarks import roster
+from benchmarks.limits.bounds import SEED, LeastPossible, least_possible
+from benchmarks.mpc import PredictiveController
+from benchmarks.rollout import Agent, make_plants, rollout
+from mptc_gym import PRESETS, Parameters
+from mptc_gym.plant import action_from_command
+
+Array = NDArray[np.float64]
+
+SAMPLES = 1200
+ODD: dict[str, Any] = {"delay": 30, "u_min": -12.0, "u_max": 6.0, "dead_zone": 4.0}
+CASES: dict[str, dict[str, Any]] = {
+    **PRESETS,
+    "constant": {"setpoint": 5.0},
+    "constant, noise": {"setpoint": 5.0, "noise_variance": 0.5},
+    **{
+        f"square, held {period / 2:g}": {"setpoint_period": period}
+        for period in (20, 38, 40, 76, 100, 152, 160, 200, 320)
+    },
+    "random": {"setpoint": "random"},
+    "random, noise": {"setpoint": "random", "noise_variance": 0.5},
+    "random, held 20 to 60": {"setpoint": "random", "setpoint_period": 120},
+    "odd limits": {**ODD, "setpoint_amplitude": 3.0},
+    "odd limits, random": {**ODD, "setpoint": "random", "setpoint_amplitude": 3.0},
+    "odd limits, noise": {**ODD, "setpoint_amplitude": 3.0, "noise_variance": 0.5},
+}
+
+
+class Nothing:
+    """Leaves the valve at 0 t/h."""
+
+    def __init__(self, parameters: Parameters, num_envs: int) -> None:
+        u_min, u_max = (np.mean(parameters.range_of(name)) for name in ("u_min", "u_max"))
+        self._action = np.full((num_envs, 1), action_from_command(0.0, u_min, u_max))
+
+    def reset(self) -> None:
+        """Do nothing."""
+
+    def act(self, observation: Any) -> Array:
+        """Return actions of 0 t/h, shape (runs, 1)."""
+        return self._action
+
+
+class Counting:
+    """Counts samples: it knows when the square wave changes, and changes the flow before.
+
+    The flow is that which holds the set point of `lead` samples later. So it is a controller
+    with preview, though nobody shows it the future.
+    """
+
+    def __init__(self, parameters: Parameters, num_envs: int, lead: int | None = None) -> None:
+        self._p = parameters
+        self._runs = num_envs
+        self._lead = parameters.range_of("delay")[0] + 10 if lead is None else lead
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin to count."""
+        self._k = 0
+
+    def act(self, observation: Array) -> Array:
+        """Return actions for observations, both of a row for each run."""
+        p = self._p
+        level = np.asarray(observation, dtype=np.float64)[:, 0]
+        if p.setpoint == "square":
+            first_half = (self._k + self._lead) % p.setpoint_period < (p.setpoint_period + 1) // 2
+            level = np.full(self._runs, p.setpoint_amplitude * (1.0 if first_half else -1.0))
+        self._k += 1
+        u_min, u_max = (float(np.mean(p.range_of(name))) for name in ("u_min", "u_max"))
+        command = level * sum(p.a) / sum(p.b)
+        action: Array = action_from_command(command, u_min, u_max)[:, np.newaxis]
+        return action
+
+
+def controllers() -> dict[str, Any]:
+    """Return the factories of all controllers, by name."""
+    known = {name: roster.load_factory(place) for name, place in roster.BUILT_IN.items()}
+    return {"nothing": Nothing, "counting": Counting, **known}
+
+
+def errors(factory: Any, runs: int, samples: int, **arguments: Any) -> Array:
+    """Return mean |e| of runs with seeds from `SEED` on, degC, shape (runs,)."""
+    arguments = {**arguments, **roster.observation(factory)}
+    plants = make_plants(runs, samples, **arguments)
+    agent: Agent = roster.build(factory, Parameters(**arguments), runs, SEED)
+    trajectory = rollout(plants, agent, samples, SEED)
+    plants.close()
+    mean: Array = np.abs(trajectory.setpoint - trajectory.output).mean(axis=0)
+    return mean
+
+
+def mpc_errors(runs: int, samples: int, **arguments: Any) -> Array:
+    """Return mean |e| of runs of the predictive controller, degC, shape (runs,)."""
+    return errors(PredictiveController, runs, samples, **arguments)
+
+
+def beats(found: Array, least: LeastPossible) -> bool:
+    """Return whether runs lie below a bound beyond the interval of the difference.
+
+    Parameters
+    ----------
+    found
+        Mean |e| of runs, degC; run i has the seed `least.seed + i`.
+    least
+        The bound. Where it is the mean over as many episodes, run i is compared with episode i.
+    """
+    paired = len(least.episodes) == len(found)
+    difference = found - (np.array(least.episodes) if paired else least.value)
+    error = difference.std(ddof=1) / np.sqrt(len(found)) if len(found) > 1 else 0.0
+    return bool(difference.mean() + 1.96 * error < -1e-6 * least.value)
+
+
+def verify(runs: int, cache: Path | None) -> tuple[pd.DataFrame, list[str]]:
+    """Run every controller on every case.
+
+    Parameters
+    ----------
+    runs
+        How many of each.
+    cache
+        Where bounds are kept.
+
+    Returns
+    -------
+    DataFrame, list of str
+        A row a case: the bound that applies and the mean error of each controller, degC. And
+        the controllers that beat it, with the case.
+    """
+    rows, beaten = [], []
+    factories = controllers()
+    bar = tqdm(total=len(CASES) * len(factories), unit="case")
+    for case, arguments in CASES.items():
+        least = least_possible(samples=SAMPLES, episodes=runs, folder=cache, **arguments)
+        row = {"case": case, "bound": f"{least.value:.3f}", "kind": least.kind}
+        for name, factory in factories.items():
+            found = errors(factory, runs, SAMPLES, **arguments)
+            row[name] = f"{found.mean():.3f}"
+            if beats(found, least):
+                beaten.append(f"{name} in {case} ({found.mean():.4f}, bound {least.value:.4f})")
+                row[name] += " !"
+            bar.update()
+        rows.append(row)
+    bar.close()
+    return pd.DataFrame(rows), beaten
