@@ -37,7 +37,7 @@ def action_from_command(
     """
     exact = 2.0 * (command - u_min) / (u_max - u_min) - 1.0
     action = np.asarray(exact, dtype=np.float32)
-    if dead_zone > 0.0:
+    if np.any(np.asarray(dead_zone) > 0.0):
         arrives = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0
         lost = (np.abs(command) >= dead_zone) & (np.abs(arrives) < dead_zone)
         # Below 1, floats are finer than what is left of them once the plant has added 1.

@@ -60,6 +60,6 @@ def smith(parameters: Parameters, u_min: float, u_max: float) -> SmithPredictor:
     )
 
 
-def mpc(parameters: Parameters, num_envs: int) -> PredictiveController:
+def mpc(parameters: Parameters, num_envs: int, seed: int = 0) -> PredictiveController:
     """Return the predictive controller that knows all but the future."""
-    return PredictiveController(parameters, num_envs)
+    return PredictiveController(parameters, num_envs, seed)

@@ -5,30 +5,36 @@ It shows how near the bounds of `benchmarks.limits` a controller can come.
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import action_from_command
-from benchmarks.scenarios import plain
+from benchmarks.rollout import make_plants
 from mptc_gym import Parameters
+from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
+from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
+from mptc_gym.ranges import Ranges
+from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 
 HORIZON = 5  # commands that are planned; the first is given, then all are planned anew
 SWEEPS, TOLERANCE = 100, 1e-4  # of coordinate descent: how many at most, and t/h to stop at
+TINY = 1e-9  # degC^2, added to the variance of xi: then the filter believes the readings
 
 
 class PredictiveController:
     """Plans, at each sample, the inputs that bring the expected output to the set point.
 
-    Of the plant (28) it knows A, B, C and d, so that it recovers xi from what it measures, and
+    Of the plant (28) it knows A, B, C and d, also where they are drawn, and the course of their
+    drift. A Kalman filter tells it the output, xi and the load from what the transmitter shows;
+    for the jumps of the load, which are not normal, it is the best linear one. From these it
     predicts the output that is to be expected without further commands. Over the samples that
     the planned commands reach first it minimises the sum of the squared errors, the set point
     staying as it is, with inputs within the limits. A first input inside the dead zone becomes
     0 or what a command on the edge brings about, whichever the rest of a plan makes better.
-
-    The roots of C must lie within the unit circle, as the paper's do; else xi cannot be told
-    from what is measured.
 
     Parameters
     ----------
@@ -36,68 +42,151 @@ class PredictiveController:
         All arguments of the environment.
     num_envs
         Number of loops.
-
-    Raises
-    ------
-    ValueError
-        If the plant has what (28) and (29) have not: see `benchmarks.scenarios.plain`.
+    seed
+        Where plant numbers are ranges, it is told those that loop i draws with seed `seed + i`,
+        in its first episode.
     """
 
-    def __init__(self, parameters: Parameters, num_envs: int) -> None:
-        self._p = parameters = plain(parameters)
+    def __init__(self, parameters: Parameters, num_envs: int, seed: int = 0) -> None:
+        self._p = parameters
         self._num_envs = num_envs
-        self._predict = _prediction(parameters)
-        self._one_step = _one_step(parameters)
-        impulse = _impulse_response(parameters, HORIZON)
-        self._G = np.array(
-            [
-                [impulse[i - j] if i >= j else 0.0 for j in range(HORIZON)]
-                for i in range(HORIZON)
-            ]
-        )
-        self._Q = self._G.T @ self._G
+        self._dynamics = Dynamics(parameters)
+        self._numbers = numbers = _numbers(parameters, num_envs, seed)
+        self._delay = numbers.delay.astype(np.intp)
+        self._u_min, self._u_max = numbers.u_min, numbers.u_max
+        self._dead_zone = numbers.dead_zone
+        self._load = _Load.of(numbers)
+        # The state: y(k), y(k-1), ...; xi(k), xi(k-1), ...; the steps of the load and its walk.
+        self._n_y = max(len(parameters.a) - 1, 1)
+        self._size = self._n_y + len(parameters.c) - 1 + 2
+        # For each sample ahead and each b, which of the past inputs shows; beyond: none.
+        ahead = np.arange(1, int(self._delay.max()) + HORIZON + 1)
+        lag = np.arange(len(parameters.b))
+        self._shows = self._delay[:, np.newaxis, np.newaxis] + lag - ahead[:, np.newaxis] + 1
+        self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON)
         self.reset()
 
     def reset(self) -> None:
         """Forget the episode: the plant is at rest."""
-        # Outputs, disturbances xi and inputs, each newest first, those of the last sample too.
-        n_y, n_xi, n_u = _memory(self._p)
-        self._state = np.zeros((self._num_envs, n_y + n_xi + n_u))
-        self._plan = np.zeros((self._num_envs, HORIZON))
+        n = self._num_envs
+        self._k = 0
+        self._state = np.zeros((n, self._size))
+        self._covariance = np.zeros((n, self._size, self._size))
+        # u(k-1), u(k-2), ..., after a 0 that stands for inputs to come.
+        self._inputs = np.zeros((n, 1 + int(self._delay.max()) + len(self._p.b)))
+        self._plan = np.zeros((n, HORIZON))
+        self._models: dict[int, _Model] = {}
 
     def act(self, observation: Array) -> NDArray[np.float32]:
         """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
-        n_y, n_xi, _ = _memory(self._p)
         seen = np.asarray(observation, dtype=np.float64)
         setpoint = seen[:, 0]
-        output = setpoint - seen[:, self._p.setpoint_window]
-        xi = output - self._state @ self._one_step
-        y, old_xi, u = np.split(self._state, [n_y, n_y + n_xi], axis=1)
-        y = np.column_stack([output, y[:, :-1]])
-        old_xi = np.column_stack([xi, old_xi[:, :-1]])
-
-        free = np.hstack([y, old_xi, u]) @ self._predict.T
-        target = (setpoint[:, np.newaxis] - free) @ self._G
-        plan = self._optimise(target, np.column_stack([self._plan[:, 1:], self._plan[:, -1]]))
-        inside = np.abs(plan[:, 0]) < self._p.dead_zone
+        if self._k:
+            self._filter(setpoint - seen[:, self._p.setpoint_window])
+        model = self._model(self._k)
+        free = np.take_along_axis(self._predict(), self._reached, axis=1)
+        target = np.einsum("ni,nij->nj", setpoint[:, np.newaxis] - free, model.G)
+        start = np.column_stack([self._plan[:, 1:], self._plan[:, -1]])
+        plan = self._optimise(model.Q, target, start)
+        inside = np.abs(plan[:, 0]) < self._dead_zone
         if inside.any():
-            edge = np.copysign(self._p.dead_zone, plan[:, 0])
-            edge = edge.clip(self._p.u_min, self._p.u_max)
+            edge = np.copysign(self._dead_zone, plan[:, 0]).clip(self._u_min, self._u_max)
             plans = [
-                self._optimise(target, plan, first) for first in (np.zeros_like(edge), edge)
+                self._optimise(model.Q, target, plan, first)
+                for first in (np.zeros_like(edge), edge)
             ]
-            costs = [self._cost(target, p) for p in plans]
+            costs = [_cost(model.Q, target, p) for p in plans]
             best = np.where((costs[0] <= costs[1])[:, np.newaxis], *plans)
             plan = np.where(inside[:, np.newaxis], best, plan)
         applied = plan[:, 0]
         self._plan = plan
-        self._state = np.hstack([y, old_xi, applied[:, np.newaxis], u[:, :-1]])
+        self._inputs[:, 2:] = self._inputs[:, 1:-1].copy()
+        self._inputs[:, 1] = applied
+        self._k += 1
         # A limit inside the dead zone is reached by a command on the edge.
-        needed = np.copysign(np.maximum(np.abs(applied), self._p.dead_zone), applied)
+        needed = np.copysign(np.maximum(np.abs(applied), self._dead_zone), applied)
         command = np.where(applied == 0.0, 0.0, needed)
-        return action_from_command(command, self._p.u_min, self._p.u_max, self._p.dead_zone)
+        return action_from_command(command, self._u_min, self._u_max, self._dead_zone)
 
-    def _optimise(self, target: Array, start: Array, first: Array | None = None) -> Array:
+    def _filter(self, output: Array) -> None:
+        """Move the state from k - 1 to k, and correct it by the reading y(k)."""
+        k, b = self._k, len(self._p.b)
+        model = self._model(k)
+        F, Q = self._transition(k, model)
+        x = np.einsum("nij,nj->ni", F, self._state)
+        past = np.take_along_axis(
+            self._inputs[:, 1:], self._delay[:, np.newaxis] + np.arange(b), axis=1
+        )
+        x[:, 0] += (past * model.beta).sum(axis=1)
+        P = F @ self._covariance @ F.transpose(0, 2, 1) + Q
+        variance = P[:, 0, 0] + self._numbers.measurement_noise_variance
+        gain = P[:, :, 0] / variance[:, np.newaxis]
+        self._state = x + gain * (output - x[:, 0])[:, np.newaxis]
+        self._covariance = P - gain[:, :, np.newaxis] * P[:, np.newaxis, 0]
+
+    def _transition(self, k: int, model: _Model) -> tuple[Array, Array]:
+        """Return what moves the state from k - 1 to k, and the covariance of what is added."""
+        load, n_y = self._load, self._n_y
+        changes = k % LOAD_INTERVAL == 0
+        F = np.zeros((self._num_envs, self._size, self._size))
+        F[:, 0, : len(self._p.a) - 1] = model.alpha
+        F[:, 0, n_y:-2] = self._p.c[1:]
+        for i in range(1, self._size - 2):
+            if i != n_y:
+                F[:, i, i - 1] = 1.0
+        F[:, -2, -2] = load.stays if changes else 1.0
+        F[:, -1, -1] = 1.0
+        F[:, 0, -2:] = model.load[:, np.newaxis] * F[:, [-2, -1], [-2, -1]]
+        xi, steps, walk = np.zeros((3, self._num_envs, self._size))
+        xi[:, 0] = 1.0
+        xi[:, n_y : min(n_y + 1, self._size - 2)] = 1.0
+        steps[:, 0], steps[:, -2] = model.load, 1.0
+        walk[:, 0], walk[:, -1] = model.load, 1.0
+        Q = _outer(xi, self._numbers.noise_variance + TINY)
+        if changes:
+            Q = Q + _outer(steps, load.steps) + _outer(walk, load.walk)
+        return F, Q
+
+    def _predict(self) -> Array:
+        """Return the outputs to be expected from k + 1 on, if no command follows."""
+        c, n_y = self._p.c, self._n_y
+        past = self._shows.clip(0)
+        moved = self._inputs[np.arange(self._num_envs)[:, np.newaxis, np.newaxis], past]
+        outputs = [self._state[:, i] for i in range(n_y - 1, -1, -1)]
+        xi = self._state[:, n_y:-2]
+        steps, walk = self._state[:, -2], self._state[:, -1]
+        for i in range(moved.shape[1]):
+            k = self._k + 1 + i
+            model = self._model(k)
+            if k % LOAD_INTERVAL == 0:
+                steps = steps * self._load.stays
+            output = (moved[:, i] * model.beta).sum(axis=1) + model.load * (steps + walk)
+            for j in range(len(self._p.a) - 1):
+                output = output + model.alpha[:, j] * outputs[-1 - j]
+            for j in range(i + 1, len(c)):
+                output = output + c[j] * xi[:, j - i - 1]
+            outputs.append(output)
+        return np.stack(outputs[n_y:], axis=1)
+
+    def _model(self, k: int) -> _Model:
+        """Return the plant's coefficients for the step to sample k."""
+        age = k // DRIFT_INTERVAL * DRIFT_INTERVAL if self._p.drifts else 0
+        if age not in self._models:
+            gain, time_constant = self._dynamics.factors(self._numbers, age)
+            alpha, scale, load = self._dynamics.coefficients(gain, time_constant)
+            ones = np.ones(self._num_envs)
+            self._models[age] = _Model.of(
+                np.stack([ones * a for a in alpha], axis=1)
+                if alpha
+                else np.zeros((len(ones), 0)),
+                (ones * scale)[:, np.newaxis] * np.array(self._p.b),
+                ones * load,
+            )
+        return self._models[age]
+
+    def _optimise(
+        self, Q: Array, target: Array, start: Array, first: Array | None = None
+    ) -> Array:
         """Minimise u Q u / 2 - target u within the limits, one coordinate after the other."""
         plan = start.copy()
         if first is not None:
@@ -105,56 +194,81 @@ class PredictiveController:
         for _ in range(SWEEPS):
             before = plan.copy()
             for i in range(0 if first is None else 1, HORIZON):
-                slope = target[:, i] - plan @ self._Q[i]
-                step = slope / self._Q[i, i]
-                plan[:, i] = (plan[:, i] + step).clip(self._p.u_min, self._p.u_max)
+                slope = target[:, i] - (plan * Q[:, i]).sum(axis=1)
+                step = slope / Q[:, i, i]
+                plan[:, i] = (plan[:, i] + step).clip(self._u_min, self._u_max)
             if np.abs(plan - before).max() < TOLERANCE:
                 break
         return plan
 
-    def _cost(self, target: Array, plan: Array) -> Array:
-        cost: Array = ((plan @ self._Q) * plan).sum(axis=1) / 2 - (target * plan).sum(axis=1)
-        return cost
+
+@dataclass(frozen=True)
+class _Model:
+    """Coefficients of the loops at a time; G and Q weigh planned inputs."""
+
+    alpha: Array
+    beta: Array
+    load: Array
+    G: Array
+    Q: Array
+
+    @classmethod
+    def of(cls, alpha: Array, beta: Array, load: Array) -> _Model:
+        # The response to a unit input, from the first sample on in which it shows.
+        y = np.zeros((len(beta), HORIZON))
+        for k in range(HORIZON):
+            if k < beta.shape[1]:
+                y[:, k] = beta[:, k]
+            for i in range(min(alpha.shape[1], k)):
+                y[:, k] += alpha[:, i] * y[:, k - 1 - i]
+        G = np.zeros((len(beta), HORIZON, HORIZON))
+        for j in range(HORIZON):
+            G[:, j:, j] = y[:, : HORIZON - j]
+        return cls(alpha, beta, load, G, G.transpose(0, 2, 1) @ G)
 
 
-def _memory(p: Parameters) -> tuple[int, int, int]:
-    """Return how many outputs, disturbances and inputs the next output depends on."""
-    return max(len(p.a) - 1, 1), max(len(p.c) - 1, 1), p.delay + len(p.b)
+@dataclass(frozen=True)
+class _Load:
+    """How the load goes on at a change: what of the steps stays, and the variances added."""
+
+    stays: Array
+    steps: Array
+    walk: Array
+
+    @classmethod
+    def of(cls, numbers: PlantNumbers[Array]) -> _Load:
+        jump = np.minimum(LOAD_INTERVAL / numbers.disturbance_interval, 1.0)
+        level = np.square(numbers.disturbance_amplitude) / 3.0  # uniform
+        # Of a level x there remains (1 - p) x in the mean, and its variance remains the same.
+        return cls(
+            1.0 - jump,
+            level * (1.0 - np.square(1.0 - jump)),
+            LOAD_INTERVAL * numbers.disturbance_walk_variance,
+        )
 
 
-def _impulse_response(p: Parameters, samples: int) -> Array:
-    """Return the response to a unit input, from the first sample on in which it shows."""
-    y = np.zeros(samples)
-    for k in range(samples):
-        y[k] = p.b[k] if k < len(p.b) else 0.0
-        y[k] -= sum(a * y[k - i] for i, a in enumerate(p.a[1:], 1) if k >= i)
-    return y
+def _numbers(parameters: Parameters, num_envs: int, seed: int) -> PlantNumbers[Array]:
+    """Return the plant numbers of each loop, as the environment draws them."""
+    numbers = Ranges(parameters).given_arrays.chosen(tuple(PLANT_NUMBERS))
+    if parameters.ranges:
+        plants = make_plants(num_envs, 1, **asdict(parameters))
+        _, info = plants.reset(seed=seed)
+        plants.close()
+        numbers |= {name: np.array(info[name]) for name in parameters.ranges}
+    return PlantNumbers(
+        **{name: np.broadcast_to(value, num_envs).copy() for name, value in numbers.items()}
+    )
 
 
-def _one_step(p: Parameters) -> Array:
-    """Return the row from the state at the end of a sample to the output expected next."""
-    n_y, n_xi, n_u = _memory(p)
-    row = np.zeros(n_y + n_xi + n_u)
-    row[: len(p.a) - 1] = np.negative(p.a[1:])
-    row[n_y : n_y + len(p.c) - 1] = p.c[1:]
-    row[n_y + n_xi + p.delay :] = p.b
-    return row
+def _cost(Q: Array, target: Array, plan: Array) -> Array:
+    cost: Array = np.einsum("ni,nij,nj->n", plan, Q, plan) / 2 - (target * plan).sum(axis=1)
+    return cost
 
 
-def _prediction(p: Parameters) -> Array:
-    """Return the matrix from the state to the outputs that commands from now on reach.
-
-    The state is that of y(k) and xi(k) with the inputs up to u(k - 1). The outputs are those
-    expected from y(k + d + 1) on, if no command follows.
-    """
-    n_y, n_xi, n_u = _memory(p)
-    nothing = np.zeros(n_y + n_xi + n_u)
-    y, xi, u = np.split(np.eye(len(nothing)), [n_y, n_y + n_xi])  # rows over the state
-    outputs = []
-    for _ in range(p.delay + HORIZON):
-        u = np.vstack([nothing, u[:-1]])  # the sample goes by without a command ...
-        output = _one_step(p) @ np.vstack([y, xi, u])  # ... and the next one comes
-        y = np.vstack([output, y[:-1]])
-        xi = np.vstack([nothing, xi[:-1]])
-        outputs.append(output)
-    return np.array(outputs[p.delay :])
+def _outer(vectors: Array, variances: Array) -> Array:
+    outer: Array = (
+        variances[:, np.newaxis, np.newaxis]
+        * vectors[:, :, np.newaxis]
+        * vectors[:, np.newaxis]
+    )
+    return outer

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from rich.console import Console
 from tqdm import tqdm
 
-from benchmarks import command_line
+from benchmarks.lib import command_line
+from benchmarks.lib.statistics import bootstrap
+from benchmarks.lib.tables import on_screen
 from benchmarks.limits.bounds import CACHE, EPISODES, LeastPossible, least_possible
 from benchmarks.limits.reference import minimum_variance, scenario_limit
 from benchmarks.limits.verify import mpc_errors, verify
 from benchmarks.scenarios import SCENARIOS
-from benchmarks.statistics import bootstrap
-from benchmarks.tables import on_screen
 from mptc_gym import PRESETS
 
 SAMPLES = 1200  # of an episode of a preset
@@ -29,56 +31,52 @@ NOTE = (
 )
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Print the bounds of the scenarios and of the presets.
-
-    Parameters
-    ----------
-    arguments
-        The command line without the program's name.
-
-    Returns
-    -------
-    int
-        0; with `--verify` 1 if a controller beats a bound beyond its interval.
-    """
-    parser = command_line.parser("limits", __doc__)
+def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mpc",
-        type=int,
-        default=0,
+        type=command_line.number,
         metavar="RUNS",
         help="run the predictive controller on each preset, too, so many times",
     )
     parser.add_argument(
-        "--verify",
-        action="store_true",
-        help="run every controller against the bounds instead",
+        "--verify", action="store_true", help="run every controller against the bounds instead"
     )
     parser.add_argument("--runs", type=command_line.number, default=300, help="of --verify")
     parser.add_argument(
-        "--episodes", type=command_line.number, default=EPISODES, help="that a mean is taken over"
+        "--episodes",
+        type=command_line.number,
+        default=EPISODES,
+        help="that a mean is taken over",
     )
     parser.add_argument(
         "--cache", type=Path, default=CACHE, help="where bounds are kept once they are known"
     )
-    options = parser.parse_args(arguments)
-    console = command_line.console(130)
+
+
+@command_line.command(
+    "limits",
+    __doc__,
+    _add_options,
+    width=150,
+    interrupted="bounds that are known are kept.",
+)
+def main(options: argparse.Namespace, console: Console) -> str:
+    """Print the bounds of the scenarios and of the presets, or test them.
+
+    With `--verify` the exit status is 1 if a controller beats a bound beyond its interval.
+    """
     if options.verify:
         table, beaten = verify(options.runs, options.cache)
         console.print(on_screen(table))
-        console.print(
-            f"Beaten beyond the interval: {', '.join(beaten)}."
-            if beaten
-            else "No controller beats the bound that applies to it, beyond its interval."
-        )
-        return 1 if beaten else 0
+        if beaten:
+            console.print(f"Beaten beyond the interval: {'; '.join(beaten)}.")
+            raise SystemExit(1)
+        return "No controller beats the bound that applies to it, beyond its interval."
     console.print("The scenarios of `python -m benchmarks.compare`, °C:")
     console.print(on_screen(scenarios(options.cache)))
     console.print("The presets, mean |e| in °C:")
     console.print(on_screen(presets(options.episodes, options.mpc, options.cache)))
-    console.print(NOTE)
-    return 0
+    return NOTE
 
 
 def scenarios(cache: Path) -> pd.DataFrame:
@@ -100,7 +98,7 @@ def scenarios(cache: Path) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def presets(episodes: int, runs: int, cache: Path) -> pd.DataFrame:
+def presets(episodes: int, runs: int | None, cache: Path) -> pd.DataFrame:
     """Return the table of the presets, with the predictive controller's errors if `runs`."""
     rows = []
     for name, arguments in tqdm(PRESETS.items(), unit="preset"):
@@ -137,4 +135,4 @@ def _cell(value: float, low: float, high: float) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(None))

@@ -23,29 +23,30 @@ up to k besides; the dead zone may be undone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from benchmarks.lib.fingerprint import fingerprint
+from benchmarks.lib.statistics import CONFIDENCE
+from benchmarks.lib.storage import ROOT, seal, unseal, write_text
 from benchmarks.limits.course import Course, course
 from benchmarks.limits.news import News
 from benchmarks.limits.programme import Plan, plan
 from benchmarks.limits.reference import SMOOTH, TAIL, held, reference
 from benchmarks.limits.unknown import Unknown, unknown
 from benchmarks.rollout import make_plants, rollout
-from benchmarks.lib.statistics import CONFIDENCE
-from benchmarks.lib.storage import ROOT, seal, unseal, write_text
 from mptc_gym import Parameters
+from mptc_gym.parameters import PlantNumbers
 from mptc_gym.plant import action_from_command
-from mptc_gym.ranges import Ranges
+from mptc_gym.ranges import Ranges, numbers_of_plant
 
 Array = NDArray[np.float64]
 
@@ -227,9 +228,7 @@ class _Case:
 
     def solve(self, kind: str, price: float = 0.0) -> Plan:
         if kind == "reference":
-            return reference(
-                self.course, self.unknown, self.setpoint, price=max(price, SMOOTH)
-            )
+            return reference(self.course, self.unknown, self.setpoint, price=max(price, SMOOTH))
         samples = len(self.setpoint)
         now, unknown = self.course.first(samples), self.unknown.of(0, samples)
         toll = None
@@ -242,9 +241,9 @@ class _Case:
 class _Idle:
     """Leaves the valve at 0 t/h."""
 
-    def __init__(self, numbers: Mapping[str, Array]) -> None:
-        action = action_from_command(0.0, numbers["u_min"], numbers["u_max"])
-        self._actions = np.asarray(action)[:, np.newaxis]
+    def __init__(self, numbers: PlantNumbers[Array], runs: int) -> None:
+        action = action_from_command(0.0, numbers.u_min, numbers.u_max)
+        self._actions = np.full((runs, 1), np.asarray(action).reshape(-1, 1))
 
     def reset(self) -> None:
         """Do nothing."""
@@ -263,26 +262,21 @@ def _draw(
     runs = max(count, IDLE_RUNS) if drawn or noisy else 1
     plants = make_plants(runs, samples, **asdict(parameters))
     _, info = plants.reset(seed=seed)
-    given = Ranges(parameters).given
-    numbers = {
-        name: np.array(info[name]) if name in parameters.ranges else np.full(runs, value)
-        for name, value in given.items()
-    }
-    trajectory = rollout(plants, _Idle(numbers), samples, seed)
+    drawn_numbers = {name: np.array(info[name]) for name in parameters.ranges}
+    numbers = replace(Ranges(parameters).given_arrays, **drawn_numbers)
+    trajectory = rollout(plants, _Idle(numbers, runs), samples, seed)
     plants.close()
-    solver = partial(_case, parameters, samples)
     cases = [
-        solver({name: float(n[i]) for name, n in numbers.items()}, trajectory.setpoint[:, i])
+        _case(parameters, numbers_of_plant(numbers, i), trajectory.setpoint[:, i].copy())
         for i in range(count)
     ]
     return cases, np.abs(trajectory.setpoint - trajectory.output).mean(axis=0)
 
 
-def _case(
-    parameters: Parameters, samples: int, numbers: Mapping[str, float], setpoint: Array
-) -> _Case:
-    longer = course(parameters, numbers, samples + int(numbers["delay"]) + 50 + TAIL)
-    return _Case(parameters, longer, unknown(longer), setpoint.copy())
+def _case(parameters: Parameters, numbers: PlantNumbers[float], setpoint: Array) -> _Case:
+    beyond = int(numbers.delay) + len(parameters.b) + TAIL
+    longer = course(parameters, numbers, len(setpoint) + beyond)
+    return _Case(parameters, longer, unknown(longer), setpoint)
 
 
 def _interval(values: ArrayLike) -> tuple[float, float, float]:
@@ -298,4 +292,4 @@ def _interval(values: ArrayLike) -> tuple[float, float, float]:
 
 def _key(parameters: Parameters, samples: int, kind: str, episodes: int, seed: int) -> str:
     case = [repr(parameters), samples, kind, episodes, seed]
-    return fingerprint("benchmarks.limits.bounds", case=case)
+    return fingerprint("benchmarks.limits.bounds", case=case, scipy=scipy.__version__)

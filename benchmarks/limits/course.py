@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mptc_gym import Parameters
-from mptc_gym.parameters import SLOW
-from mptc_gym.plant import Dynamics
+from mptc_gym.parameters import PlantNumbers
+from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
 
 Array = NDArray[np.float64]
 
@@ -45,7 +44,7 @@ class Course:
     delay: int
     low: float
     high: float
-    numbers: Mapping[str, float]
+    numbers: PlantNumbers[float]
 
     @property
     def lag(self) -> int:
@@ -71,7 +70,7 @@ class Course:
         return G
 
 
-def course(parameters: Parameters, numbers: Mapping[str, float], samples: int) -> Course:
+def course(parameters: Parameters, numbers: PlantNumbers[float], samples: int) -> Course:
     """Return the course of an episode.
 
     Parameters
@@ -84,18 +83,18 @@ def course(parameters: Parameters, numbers: Mapping[str, float], samples: int) -
         Length of the course.
     """
     dynamics = Dynamics(parameters)
-    age = np.arange(samples) // SLOW * SLOW  # the dynamics change every SLOW samples
+    age = np.arange(samples) // DRIFT_INTERVAL * DRIFT_INTERVAL
     gain, time_constant = dynamics.factors(numbers, age)
     alpha, scale, load = dynamics.coefficients(gain, time_constant)
     ones = np.ones(samples)
-    rest = [0.0] if numbers["dead_zone"] > 0.0 else []
+    rest = [0.0] if numbers.dead_zone > 0.0 else []
     return Course(
         alpha=np.stack([ones * a for a in alpha], axis=1) if alpha else np.zeros((samples, 0)),
         beta=(ones * scale)[:, np.newaxis] * np.array(parameters.b),
         c=tuple(parameters.c),
         load=ones * load,
-        delay=int(numbers["delay"]),
-        low=min([numbers["u_min"], *rest]),
-        high=max([numbers["u_max"], *rest]),
-        numbers=dict(numbers),
+        delay=int(numbers.delay),
+        low=min([numbers.u_min, *rest]),
+        high=max([numbers.u_max, *rest]),
+        numbers=numbers,
     )

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from benchmarks.limits.course import Course
-from mptc_gym.parameters import SLOW
+from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 
@@ -74,15 +74,15 @@ def unknown(course: Course) -> Unknown:
     numbers, samples = course.numbers, len(course.load)
     deviation = np.sqrt(noise_variance(course))
     inside, weights = _load_weights(course)  # of the changes in a window, the latest first
-    walk = np.sqrt(3.0 * SLOW * numbers["disturbance_walk_variance"])
-    amplitude = numbers["disturbance_amplitude"]
+    walk = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
+    amplitude = numbers.disturbance_amplitude
     if not deviation.any() and not ((walk or amplitude) and inside.any()):
         return Unknown(np.ones(1), np.zeros((samples, 1)))
 
     # Means of slices of the standard normal distribution that are equally probable.
     edges = stats.norm.pdf(stats.norm.ppf(np.linspace(0.0, 1.0, ATOMS + 1)))
     atoms = deviation[:, np.newaxis] * (-np.diff(edges) * ATOMS)
-    jump = min(1.0, SLOW / numbers["disturbance_interval"]) if amplitude else 0.0
+    jump = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval) if amplitude else 0.0
     for place in range(weights.shape[1] if walk else 0):
         atoms = _plus_uniform(atoms, walk * weights[:, place])
     probability = np.ones(samples)  # that no later change was a jump
@@ -110,8 +110,8 @@ def noise_variance(course: Course) -> Array:
         At the beginning of an episode less noise has come.
     """
     samples, order = course.alpha.shape
-    R = course.numbers["noise_variance"]
-    V = course.numbers["measurement_noise_variance"]
+    R = course.numbers.noise_variance
+    V = course.numbers.measurement_noise_variance
     if R == 0.0:
         return np.zeros(samples)
     # State: the noise in y at k, k-1, ..., then xi at k, k-1, ...
@@ -159,7 +159,7 @@ def _load_weights(course: Course) -> tuple[NDArray[np.bool_], Array]:
     """
     samples, order = course.alpha.shape
     lag = min(course.lag, samples)
-    changes = np.arange(SLOW, samples, SLOW)
+    changes = np.arange(LOAD_INTERVAL, samples, LOAD_INTERVAL)
     answers: list[Array] = []  # to a unit step at each change, after 0, 1, ... samples
     for t in range(lag):
         at = np.minimum(changes + t, samples - 1)
@@ -168,11 +168,11 @@ def _load_weights(course: Course) -> tuple[NDArray[np.bool_], Array]:
             answer += course.alpha[at, i] * answers[t - 1 - i]
         answers.append(answer)
     k = np.arange(samples)
-    weights = np.zeros((samples, -(-lag // SLOW)))
+    weights = np.zeros((samples, -(-lag // LOAD_INTERVAL)))
     inside = np.zeros(weights.shape, np.bool_)
     for place in range(weights.shape[1]):
-        change = k // SLOW - place  # 1 is the first
-        after = k - change * SLOW
+        change = k // LOAD_INTERVAL - place  # 1 is the first
+        after = k - change * LOAD_INTERVAL
         there = (change >= 1) & (after < lag)
         weights[there, place] = np.array(answers)[after[there], change[there] - 1]
         inside[:, place] = there

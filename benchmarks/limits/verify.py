@@ -10,9 +10,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks import roster
+from benchmarks.controllers.mpc import PredictiveController
+from benchmarks.controllers.roster import ROSTER, Factory, build, load_factory, observation
 from benchmarks.limits.bounds import SEED, LeastPossible, least_possible
-from benchmarks.mpc import PredictiveController
 from benchmarks.rollout import Agent, make_plants, rollout
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.plant import action_from_command
@@ -38,21 +38,6 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-class Nothing:
-    """Leaves the valve at 0 t/h."""
-
-    def __init__(self, parameters: Parameters, num_envs: int) -> None:
-        u_min, u_max = (np.mean(parameters.range_of(name)) for name in ("u_min", "u_max"))
-        self._action = np.full((num_envs, 1), action_from_command(0.0, u_min, u_max))
-
-    def reset(self) -> None:
-        """Do nothing."""
-
-    def act(self, observation: Any) -> Array:
-        """Return actions of 0 t/h, shape (runs, 1)."""
-        return self._action
-
-
 class Counting:
     """Counts samples: it knows when the square wave changes, and changes the flow before.
 
@@ -75,7 +60,9 @@ class Counting:
         p = self._p
         level = np.asarray(observation, dtype=np.float64)[:, 0]
         if p.setpoint == "square":
-            first_half = (self._k + self._lead) % p.setpoint_period < (p.setpoint_period + 1) // 2
+            first_half = (self._k + self._lead) % p.setpoint_period < (
+                p.setpoint_period + 1
+            ) // 2
             level = np.full(self._runs, p.setpoint_amplitude * (1.0 if first_half else -1.0))
         self._k += 1
         u_min, u_max = (float(np.mean(p.range_of(name))) for name in ("u_min", "u_max"))
@@ -84,17 +71,21 @@ class Counting:
         return action
 
 
-def controllers() -> dict[str, Any]:
-    """Return the factories of all controllers, by name."""
-    known = {name: roster.load_factory(place) for name, place in roster.BUILT_IN.items()}
-    return {"nothing": Nothing, "counting": Counting, **known}
+def controllers() -> dict[str, Factory]:
+    """Return factories by name: of the roster but what has to be trained first, and one more."""
+    known = {
+        name: load_factory(controller.factory)
+        for name, controller in ROSTER.items()
+        if controller.factory
+    }
+    return {**known, "counting": Counting}
 
 
-def errors(factory: Any, runs: int, samples: int, **arguments: Any) -> Array:
+def errors(factory: Factory, runs: int, samples: int, **arguments: Any) -> Array:
     """Return mean |e| of runs with seeds from `SEED` on, degC, shape (runs,)."""
-    arguments = {**arguments, **roster.observation(factory)}
+    arguments = {**arguments, **observation(factory)}
     plants = make_plants(runs, samples, **arguments)
-    agent: Agent = roster.build(factory, Parameters(**arguments), runs, SEED)
+    agent: Agent = build(factory, Parameters(**arguments), runs, SEED)
     trajectory = rollout(plants, agent, samples, SEED)
     plants.close()
     mean: Array = np.abs(trajectory.setpoint - trajectory.output).mean(axis=0)
