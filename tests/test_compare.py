@@ -17,7 +17,7 @@ import pytest
 from agents import DirectNNController, PIController
 from benchmarks.compare import __main__ as compare
 from benchmarks.compare import comparison
-from benchmarks.compare.estimates import beaten, estimate
+from benchmarks.compare.estimates import beaten, estimate, scale_of, verdict
 from benchmarks.controllers.roster import ROSTER, build, chosen, load_factory, observation
 from benchmarks.lib import storage, tables
 from benchmarks.lib.command_line import UsageError
@@ -129,9 +129,10 @@ def some_runs(**errors):
 
 class TestEstimates:
     def test_by_hand(self):
-        limit = scenario_limit(SCENARIOS["constant"]).mae
+        scales = {"constant": scale_of(SCENARIOS["constant"], 3)}
+        limit = scales["constant"].least.value
         runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
-        nn, ppo_ = estimate(runs, {"constant": limit}, "nn").to_dict("records")
+        nn, ppo_ = estimate(runs, scales, "nn").to_dict("records")
         assert (nn["mean"], nn["limit"], nn["ratio"]) == (2.0, limit, 2.0 / limit)
         assert ppo_["mean"] == pytest.approx(1.5)
         assert ppo_["difference"] == pytest.approx(-0.5)
@@ -140,11 +141,30 @@ class TestEstimates:
         assert nn["mean_low"] < nn["mean"] < nn["mean_high"]
 
     def test_who_beats_a_limit_is_named(self):
-        limit = scenario_limit(SCENARIOS["constant"]).mae
+        scales = {"constant": scale_of(SCENARIOS["constant"], 2)}
+        limit = scales["constant"].least.value
         runs = some_runs(
             a=[[limit, limit]], b=[[0.9 * limit] * 2], c=[[0.9 * limit, 1.2 * limit]]
         )
-        assert list(beaten(estimate(runs, {"constant": limit}, "a"))["agent"]) == ["b"]
+        assert list(beaten(estimate(runs, scales, "a"))["agent"]) == ["b"]
+
+    def test_one_run_of_many_cannot_tell(self):
+        scales = {"constant-noise": scale_of(SCENARIOS["constant-noise"], 1)}
+        runs = some_runs(a=[[0.5]], b=[[2.0]]).assign(scenario="constant-noise")
+        found = estimate(runs, scales, "a")
+        assert found["mean"].iloc[0] < scales["constant-noise"].least.value
+        assert beaten(found).empty
+        assert verdict(found).startswith("No controller")
+
+    def test_who_uses_the_future_is_told_so(self):
+        scales = {"square": scale_of(SCENARIOS["square"], 3)}
+        square = scales["square"]
+        assert square.preview.value < 0.95 * square.least.value
+        between = (square.preview.value + square.least.value) / 2
+        runs = some_runs(a=[[2.0] * 3], b=[[between] * 3]).assign(scenario="square")
+        assert "uses the future" in verdict(estimate(runs, scales, "a"))
+        runs = some_runs(a=[[2.0] * 3], b=[[0.1] * 3]).assign(scenario="square")
+        assert "bound of every controller" in verdict(estimate(runs, scales, "a"))
 
     def test_no_controller_does(self, tmp_path):
         # All runs of all controllers but PPO, which is trained elsewhere.
@@ -155,7 +175,7 @@ class TestEstimates:
         best = estimates[estimates["agent"] == "mpc"]
         assert best["ratio"].between(0.97, 1.05).all()
         report = (tmp_path / "out/report.md").read_text()
-        assert "No controller beats a limit" in report
+        assert "No controller comes below" in report
 
 
 class TestReport:
@@ -360,7 +380,7 @@ class TestCompare:
             assert f"{nn.median():.3f}" in shown
             assert f"{limit:.3f}" in shown
             assert f"{pi['mae'].iloc[0] / limit:.2f}" in shown
-            assert "No controller beats a limit" in shown
+            assert "No controller comes below" in shown
         assert "not settled" in page
 
         provenance = json.loads((out / "provenance.json").read_text())

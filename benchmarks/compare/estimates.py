@@ -4,46 +4,88 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import pandas as pd
 
 from benchmarks.lib.statistics import Estimate, bootstrap, improvement, interquartile_mean
-from benchmarks.limits import scenario_limit
+from benchmarks.limits import LeastPossible, least_possible
 from benchmarks.scenarios import Scenario
 
-SEED = 0  # of the bootstraps
+SEED = 0  # of the first run, and of the bootstraps
+EPISODES = 100  # at most, that a bound of drawn plants is the mean over
+SAME = 1e-6  # degC
 
 
-def limit_of(scenario: Scenario) -> float:
-    """Return the least possible mean |e| of a scenario, degC; NaN if it is not known."""
+@dataclass(frozen=True)
+class Scale:
+    """What the errors of a scenario are measured against.
+
+    Attributes
+    ----------
+    least
+        The least possible error that applies, of the kind "reference" or "news" where the set
+        point changes, or "preview"; see `benchmarks.limits`.
+    preview
+        The least possible error of any controller at all.
+    drawn
+        Whether runs differ: whether anything is random.
+    """
+
+    least: LeastPossible
+    preview: LeastPossible
+    drawn: bool
+
+
+def scale_of(scenario: Scenario, runs: int) -> Scale:
+    """Return what the errors of a scenario are measured against.
+
+    The bounds of drawn plants and set points are the means over the episodes that are run.
+    """
+    case: dict[str, Any] = {
+        "samples": scenario.samples,
+        "seed": SEED,
+        "episodes": min(runs, EPISODES),
+        **scenario.arguments,
+    }
+    preview = least_possible(kind="preview", **case)
+    random = scenario.parameters.setpoint == "random"
     try:
-        return scenario_limit(scenario).mae
-    except ValueError:
-        return math.nan
+        least = least_possible(kind="news" if random else "reference", **case)
+    except ValueError:  # it does not settle between changes
+        least = preview
+    # What cannot be foreseen makes no difference where nothing changes.
+    if abs(least.value - preview.value) < SAME:
+        least = preview
+    return Scale(least, preview, preview.idle_low < preview.idle_high)
 
 
-def estimate(runs: pd.DataFrame, limits: Mapping[str, float], reference: str) -> pd.DataFrame:
+def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) -> pd.DataFrame:
     """Return one row for each scenario and agent: estimates with 95 % intervals.
 
     Parameters
     ----------
     runs
         One row a run, with `scenario`, `agent`, `policy`, `seed` and `mae`.
-    limits
-        The least possible error of each scenario, degC; NaN where it is not known.
+    scales
+        The least possible errors of each scenario.
     reference
         The agent that the others are compared with, run by run.
 
     Returns
     -------
     DataFrame
-        The mean and the interquartile mean of |e|, degC; the least that is possible; the mean
-        as a multiple of that; the mean difference to the reference; and the probability of
-        doing better than it. `_low` and `_high` are the ends of intervals.
+        The mean and the interquartile mean of |e|, degC; `limit`, the least possible error
+        that applies, and `preview`, that of any controller; the mean as a multiple of `limit`;
+        the mean difference to the reference; and the probability of doing better than it.
+        `_low` and `_high` are the ends of intervals. They are infinite where runs differ and
+        there is only one.
     """
     rows = []
     for scenario, cases in runs.groupby("scenario", sort=False):
-        limit = limits[scenario]
+        scale = scales[scenario]
+        limit = scale.least.value
         errors = {
             agent: group.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
             for agent, group in cases.groupby("agent", sort=False)
@@ -51,7 +93,15 @@ def estimate(runs: pd.DataFrame, limits: Mapping[str, float], reference: str) ->
         base = errors[reference].mean(axis=0) if reference in errors else None
         for agent, values in errors.items():
             mean = bootstrap(values, SEED)
-            row = {"scenario": scenario, "agent": agent, "limit": limit, **_ends("mean", mean)}
+            if scale.drawn and values.size == 1:
+                mean = replace(mean, low=-math.inf, high=math.inf)
+            row = {
+                "scenario": scenario,
+                "agent": agent,
+                "limit": limit,
+                "preview": scale.preview.value,
+                **_ends("mean", mean),
+            }
             iqm = bootstrap(values, SEED, interquartile_mean)
             row |= _ends("interquartile_mean", iqm)
             row |= {f"ratio{end}": row[f"mean{end}"] / limit for end in ("", "_low", "_high")}
@@ -66,6 +116,34 @@ def _ends(name: str, found: Estimate) -> dict[str, float]:
     return {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
 
 
-def beaten(estimates: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows whose mean error lies below the limit, the whole interval included."""
-    return estimates[estimates["ratio_high"] < 1.0 - 1e-6]
+def beaten(estimates: pd.DataFrame, bound: str = "limit") -> pd.DataFrame:
+    """Return the rows whose mean error lies below a bound, the whole interval included.
+
+    Parameters
+    ----------
+    estimates
+        As `estimate` returns them.
+    bound
+        "limit" or "preview".
+    """
+    return estimates[estimates["mean_high"] < estimates[bound] * (1.0 - 1e-6)]
+
+
+def verdict(estimates: pd.DataFrame) -> str:
+    """Say in a sentence whether anyone came below a bound, and what that means."""
+    below, impossible = beaten(estimates), beaten(estimates, "preview")
+
+    def cases(rows: pd.DataFrame) -> str:
+        return ", ".join(f"{row.agent} in {row.scenario}" for row in rows.itertuples())
+
+    if len(impossible):
+        return (
+            f"Below the bound of every controller, beyond the interval: {cases(impossible)}. "
+            "The plant or the bound is another one than was run."
+        )
+    if len(below):
+        return (
+            f"Below what is possible without knowing the set point beforehand: {cases(below)}. "
+            "Such a controller uses the future, or reckons with the next change."
+        )
+    return "No controller comes below the least possible error, in any scenario."

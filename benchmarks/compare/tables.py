@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
+from benchmarks.compare.estimates import Scale
 from benchmarks.controllers.roster import label
 from benchmarks.lib.tables import PERCENTILES, percentiles
 from benchmarks.metrics import METRICS
@@ -16,7 +17,6 @@ from benchmarks.scenarios import Scenario
 
 NOT_SETTLED = "not settled"
 NO_MEASURE = "not measured"
-NO_LIMIT = "not known"
 STEP_METRICS = ("overshoot", "settling_time")  # which mean nothing in noise
 
 
@@ -77,13 +77,19 @@ def mae_table(summary: pd.DataFrame) -> pd.DataFrame:
     return _by_agent(rows, rows.apply(format_cell, axis=1))
 
 
-def ratio_table(estimates: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean errors as multiples of the least possible, and what that is."""
+def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
+    """Return the mean errors as multiples of the least possible error, and what that is."""
     table = _by_agent(estimates, estimates.apply(_format_ends, axis=1, name="ratio"))
-    limits = estimates.drop_duplicates("scenario").set_index("scenario")["limit"]
-    shown = limits.map(lambda limit: NO_LIMIT if math.isnan(limit) else f"{limit:.3f}")
-    least = {"agent": "least possible (°C)"} | shown.to_dict()
-    return pd.concat([pd.DataFrame([least]), table], ignore_index=True)
+    rows = [
+        {"agent": "least possible (°C)"}
+        | {
+            name: f"{scale.least.value:.3f}" + "*" * (scale.least.kind == "reference")
+            for name, scale in scales.items()
+        },
+        {"agent": "with preview (°C)"}
+        | {name: f"{scale.preview.value:.3f}" for name, scale in scales.items()},
+    ]
+    return pd.concat([pd.DataFrame(rows), table], ignore_index=True)
 
 
 def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
@@ -98,9 +104,9 @@ def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
 
 
 def _format_ends(row: pd.Series, name: str, form: str = ".2f") -> str:
-    if math.isnan(row[name]):
-        return NO_LIMIT
     value, low, high = (format(row[n], form) for n in (name, f"{name}_low", f"{name}_high"))
+    if math.isinf(row[f"{name}_high"]):
+        return f"{value} (one run)"
     return value if low == high else f"{value} ({low} to {high})"
 
 
