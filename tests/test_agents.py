@@ -10,6 +10,7 @@ from agents import Controller, DirectNNController, PIController, SmithPredictor,
 from agents.controller import action_from_command
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
+from mptc_gym.parameters import PlantNumbers
 from mptc_gym.plant import Plant
 
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
@@ -41,11 +42,10 @@ class TestActions:
     def test_a_command_on_the_edge_has_an_effect(self, u_min, reach, dead_zone, beyond):
         u_max = u_min + reach
         edge = dead_zone * (1.0 + beyond)
-        limits = {"dead_zone": dead_zone, "u_min": u_min, "u_max": u_max, "delay": 0.0}
-        factors = ("gain_factor", "gain_drift", "time_constant_factor", "time_constant_drift")
+        numbers = PlantNumbers(delay=0.0, dead_zone=dead_zone, u_min=u_min, u_max=u_max)
         for command in (np.float64(-edge), np.float64(edge)):
             (action,) = action_from_command(command, u_min, u_max, dead_zone)
-            plant = Plant(Parameters(), {**limits, **dict.fromkeys(factors, 1.0)})
+            plant = Plant(Parameters(), numbers)
             arrived, applied, _ = plant.step(float(action), 0.0, 0.0)
             assert applied == np.clip(arrived, u_min, u_max)  # and not 0
             assert arrived == pytest.approx(command, abs=1e-5)
