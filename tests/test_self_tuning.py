@@ -50,6 +50,15 @@ def test_before_it_has_learnt_it_is_what_the_step_test_says():
     assert found["dead_zone"] == 3.5
 
 
+def test_noise_before_the_first_response_moves_the_gain_little():
+    # The first input shows in sample 31, and there is noise of 1 degC a sample.
+    controller = SelfTuningController(**STEP_TEST)
+    control(controller, samples=40, runs=20, delay=30, noise_variance=1.0, setpoint=0.5)
+    ratio = controller.estimates["gain"] / -0.6825
+    assert ratio.min() > 0.6
+    assert ratio.max() < 1.4
+
+
 @pytest.mark.parametrize("gain", [(1.5, 0.85), (0.85, 1.5)])
 def test_it_follows_a_plant_that_drifts(gain):
     first, last = gain
