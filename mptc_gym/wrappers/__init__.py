@@ -17,14 +17,11 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from mptc_gym.parameters import Parameters
-from mptc_gym.plant import action_from_command
+from mptc_gym.plant import action_from_command, float32_action
 
 __all__ = ["IncrementalAction"]
 
 NUMBERS = "dead_zone", "u_min", "u_max"  # that describe an actuator
-# Of half the range: so far beyond the edge of the dead zone a command is that is to pass it, so
-# that no rounding to float32 puts it back.
-_CLEARANCE = 1e-6
 
 
 class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructorArgs):
@@ -153,7 +150,7 @@ class Actuator:
         self.move = max_move * half_range
         self._undoes = undo_dead_zone is not False
         z = own if undo_dead_zone is True else undo_dead_zone
-        self._edge = z + _CLEARANCE * half_range * (z > 0.0)
+        self._zone = z
         # A limit within the dead zone is reached by a command on its edge, which (29) limits.
         self._above, self._below = (
             np.maximum(limit - z, 0.0) / np.where(limit > 0.0, limit, 1.0)
@@ -162,12 +159,13 @@ class Actuator:
 
     def action(self, flow: Any) -> Any:
         """Return the environment's action for a wanted flow in t/h, a float or an array."""
-        if self._undoes:
-            above, below = flow > 0.0, flow < 0.0
-            flow = above * (self._edge + self._above * flow) - below * (
-                self._edge - self._below * flow
-            )
-        return action_from_command(flow, self.u_min, self.u_max)
+        if not self._undoes:
+            return action_from_command(flow, self.u_min, self.u_max)
+        above, below = flow > 0.0, flow < 0.0
+        flow = above * (self._zone + self._above * flow) - below * (
+            self._zone - self._below * flow
+        )
+        return float32_action(flow, self.u_min, self.u_max, self._zone)
 
 
 def check_arguments(max_move: Any, undo_dead_zone: Any) -> None:
