@@ -1,5 +1,6 @@
 """The robustness study: its plants, its cells, and what it makes of them."""
 
+import argparse
 import json
 
 import numpy as np
@@ -131,15 +132,24 @@ class TestSweep:
         ours, theirs = (pd.read_csv(tmp_path / name / "runs.csv") for name in ("one", "two"))
         pd.testing.assert_frame_equal(ours, theirs)
 
-    def test_every_option_that_shapes_a_cell_is_in_the_key(self):
-        keys = [
-            sweep._key(sweep._parser().parse_args(options), {})
-            for options in (
-                [], ["--design", "random"], ["--plants", "3"], ["--runs", "1"],
-                ["--samples", "650"],
-            )
+    def test_everything_that_shapes_a_cell_is_in_the_key(self):
+        class Member:
+            def __init__(self, provenance):
+                self.provenance = provenance
+
+        common = {
+            "plants": [{"delay": 18}], "nominal": {}, "members": {"pi": [Member("a")]},
+            "options": argparse.Namespace(runs=2, samples=700),
+            "controllers": {"pi": ROSTER["pi"]},
+        }  # fmt: skip
+        changes = [
+            {}, {"plants": [{"delay": 19}]}, {"nominal": {"dead_zone": 7.0}},
+            {"members": {"pi": [Member("b")]}}, {"controllers": {"nn": ROSTER["nn"]}},
+            {"options": argparse.Namespace(runs=3, samples=700)},
+            {"options": argparse.Namespace(runs=2, samples=650)},
         ]  # fmt: skip
-        assert len(set(keys)) == len(keys)
+        keys = {sweep._key(**{**common, **change}) for change in changes}
+        assert len(keys) == len(changes)
 
     def test_grid(self, tmp_path, monkeypatch):
         monkeypatch.setitem(plants.GRID, "delay", range(10, 22, 10))
