@@ -35,6 +35,57 @@ def test_layers_import_downwards_only(package):
         assert imported(path) <= ALLOWED[package] | STDLIB, path
 
 
+UNPICKLERS = {"pickle", "cloudpickle", "dill", "shelve", "marshal"}
+SAFELY = {"np.load": ("allow_pickle", False), "torch.load": ("weights_only", True)}
+
+
+def unpickles(code: str) -> list[str]:
+    """Return what in a module would run code that a file holds, if it was planted there."""
+    tree, found = ast.parse(code), []
+    learners = {
+        alias.asname or alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module == "stable_baselines3"
+        for alias in node.names
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = {getattr(node, "module", "") or "", *(alias.name for alias in node.names)}
+            found += sorted(names & UNPICKLERS)
+        if not isinstance(node, ast.Call):
+            continue
+        called = ast.unparse(node.func)
+        given = [
+            (each.arg, each.value.value)
+            for each in node.keywords
+            if isinstance(each.value, ast.Constant)
+        ]
+        unsafe = called in SAFELY and SAFELY[called] not in given
+        if unsafe or called in {"joblib.load", *(f"{name}.load" for name in learners)}:
+            found.append(called)
+    return found
+
+
+def test_no_file_is_unpickled():
+    for package in ("mptc_gym", "agents", "benchmarks"):
+        for path in (ROOT / package).rglob("*.py"):
+            assert not unpickles(path.read_text(encoding="utf-8")), path
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import pickle", "from pickle import load", "def f():\n    import cloudpickle as c",
+        "np.load(file)", "np.load(file, allow_pickle=True)", "torch.load(file)",
+        "torch.load(file, weights_only=False)", "joblib.load(file)",
+        "from stable_baselines3 import PPO as P\nP.load(file)",
+    ],
+)  # fmt: skip
+def test_unpickling_is_noticed(code):
+    assert unpickles(code)
+    assert not unpickles("np.load(f, allow_pickle=False)\ntorch.load(f, weights_only=True)")
+
+
 def test_the_environment_has_no_import_circle():
     files = {path.stem: path for path in (ROOT / "mptc_gym").glob("[!_]*.py")}
     graph = {

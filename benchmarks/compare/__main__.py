@@ -57,7 +57,12 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         help=f"folder to write to (default: {OUT}, and a name of its own beside that for a "
         "comparison of other controllers or cases)",
     )
-    add("--kept", type=Path, default=POLICIES, help="folder where trained policies are kept")
+    add(
+        "--kept",
+        type=Path,
+        default=POLICIES,
+        help="folder where trained policies are kept; no code in its files is run",
+    )
 
 
 @command_line.command("compare", __doc__, _add_options, width=170)

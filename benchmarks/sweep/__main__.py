@@ -77,7 +77,12 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         default=argparse.SUPPRESS,
         help="folder to write to (default: results/sweep-DESIGN)",
     )
-    add("--kept", type=Path, default=POLICIES, help="folder where trained policies are kept")
+    add(
+        "--kept",
+        type=Path,
+        default=POLICIES,
+        help="folder where trained policies are kept; no code in its files is run",
+    )
 
 
 @command_line.command(
