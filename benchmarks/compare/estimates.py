@@ -15,7 +15,8 @@ from benchmarks.scenarios import Scenario
 
 SEED = 0  # of the first run, and of the bootstraps
 EPISODES = 100  # at most, that a bound of drawn plants is the mean over
-SAME = 1e-6  # degC
+SAME = 1e-4  # degC; of two bounds that differ by less, that of every controller is shown
+TOLERANCE = 1e-4  # share of a bound that it may be off by
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ def beaten(estimates: pd.DataFrame, bound: str = "limit") -> pd.DataFrame:
     bound
         "limit" or "preview".
     """
-    return estimates[estimates["mean_high"] < estimates[bound] * (1.0 - 1e-6)]
+    return estimates[estimates["mean_high"] < estimates[bound] * (1.0 - TOLERANCE)]
 
 
 def verdict(estimates: pd.DataFrame) -> str:

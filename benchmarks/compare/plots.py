@@ -48,13 +48,13 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
         above.legend(loc="upper right", ncols=len(palette) + 1)
         low, high = above.get_ylim()
         above.set_ylim(low, high + 0.15 * (high - low))  # room for the legend
-        below.axhspan(
-            -parameters.dead_zone, parameters.dead_zone, color="0.5", alpha=0.15, linewidth=0
-        )
+        # Of drawn actuators, what none of them lets pass, and what none of them exceeds.
+        zone, _ = parameters.range_of("dead_zone")
+        below.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0)
         below.text(
             1.005, 0.5, "dead\nzone", transform=below.transAxes, va="center", color="0.4"
         )
-        for limit in (parameters.u_min, parameters.u_max):
+        for limit in (parameters.range_of("u_min")[0], parameters.range_of("u_max")[1]):
             below.axhline(limit, color="0.4", linestyle=":", linewidth=1)
         below.set_ylabel("applied flow u_a (t/h)")
         below.set_xlabel("time (min)")
