@@ -26,7 +26,7 @@ from benchmarks.limits import scenario_limit
 from benchmarks.metrics import METRICS, measure
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
-from benchmarks.train import ppo
+from benchmarks.train import ppo, ppo_training
 from mptc_gym import Parameters
 from tests.small_training import SMALL
 
@@ -446,13 +446,13 @@ class TestCompare:
         assert list(runs["policy"]) == [0, 1]
 
         with monkeypatch.context() as patch:
-            patch.setattr(ppo.PPO, "learn", None)  # training again would raise
+            patch.setattr(ppo_training.PPO, "learn", None)  # training again would raise
             assert run_compare(tmp_path / "two", *options) == 0
         assert (tmp_path / "one/runs.csv").read_text() == (
             tmp_path / "two/runs.csv"
         ).read_text()
         with monkeypatch.context() as patch:
-            patch.setattr(ppo.PPO, "learn", None)
+            patch.setattr(ppo_training.PPO, "learn", None)
             assert run_compare(tmp_path / "three", *options, "--retrain") == 1
             assert "seed 0: TypeError" in capsys.readouterr().out
 

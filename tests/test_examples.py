@@ -3,17 +3,15 @@
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from stable_baselines3 import PPO
 
-from agents import PIController
 from benchmarks.examples import cleanrl_style, sb3
+from benchmarks.train import defaults
 
 ROOT = Path(__file__).parent.parent
 
@@ -29,73 +27,36 @@ def weights(network):
 
 
 class TestSB3:
-    @pytest.fixture(autouse=True)
-    def small(self, monkeypatch):
-        quick = partial(PPO, n_steps=32, batch_size=32, n_epochs=1)
-        monkeypatch.setitem(sb3.ALGORITHMS, "ppo", quick)
-        monkeypatch.setattr(sb3, "SAMPLES", 30)
+    def test_it_runs_as_one_file_of_its_own(self, tmp_path):
+        page = tmp_path / "page.py"
+        page.write_text((ROOT / "benchmarks/examples/sb3.py").read_text(encoding="utf-8"))
+        quick = (
+            "import runpy, sys; sys.modules['benchmarks'] = sys.modules['agents'] = None; "
+            f"sys.argv = ['page', '--steps', '1']; runpy.run_path({str(page)!r}, "
+            "run_name='__main__')"
+        )
+        done = run("-c", quick)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith("mean |e| on the square wave: ")
 
-    def test_curves_are_shown_kept_and_drawn(self, tmp_path, capsys):
-        command = ["--steps", "64", "--interval", "32", "--out", str(tmp_path)]
-        sb3.main([*command, "--seed", "3", "--seeds", "2"])
-        assert capsys.readouterr().out.count("mae") == 4
-        sb3.main([*command, "--seed", "4"])  # in place of the same curve
-        sb3.main([*command, "--seed", "4", "--env", "error_scale=50", "setpoint=random"])
-        curves = pd.read_csv(tmp_path / "default_sb3.csv")
-        assert curves.groupby("arguments")["seed"].apply(list).to_dict() == {
-            "{}": [3, 3, 4, 4],
-            '{"error_scale": 50, "setpoint": "random"}': [4, 4],
-        }
-        assert list(curves["steps"]) == [32, 64] * 3
-        picture = tmp_path / "default_sb3.png"
-        assert picture.stat().st_size > 10_000
-        picture.unlink()
-        sb3.main([*command, "--plot"])
-        assert picture.exists()
-        pd.testing.assert_frame_equal(curves, pd.read_csv(tmp_path / "default_sb3.csv"))
+    def test_it_is_the_plant_of_the_study(self):
+        plant, studied = sb3.make_plant(), defaults.CASES["ppo-velocity"]
+        other = studied.train_on()
+        assert plant.action_space == other.action_space
+        trained_on = sb3.make_plant(**sb3.SET_POINTS)
+        assert trained_on.unwrapped.parameters == other.unwrapped.parameters
+        for k, action in enumerate((0.3, -1.0, 0.5)):
+            if k == 0:
+                trained_on.reset(seed=1), other.reset(seed=1)
+            one, two = (each.step(np.array([action])) for each in (trained_on, other))
+            assert one[4] == two[4]
 
-    def test_sac_learns_from_it_too(self, capsys):
-        sb3.main(["--algorithm", "sac", "--steps", "110", "--interval", "55"])
-        assert [line.split()[7] for line in capsys.readouterr().out.splitlines()] == [
-            "55",
-            "110",
-        ]
-
-    def test_arguments_reach_the_plant(self):
-        with pytest.raises(ValueError, match="error_scale must be"):
-            sb3.main(["--steps", "32", "--env", "error_scale=-1"])
-
-    def test_nothing_is_drawn_from_nowhere(self, capsys):
-        with pytest.raises(SystemExit):
-            sb3.main(["--plot"])
-        assert "--plot needs --out" in capsys.readouterr().err
-
-    def test_looking_does_not_disturb_the_training(self, monkeypatch):
-        models, quick = [], sb3.ALGORITHMS["ppo"]
-
-        def remember(*arguments, **options):
-            models.append(quick(*arguments, **options))
-            return models[-1]
-
-        monkeypatch.setitem(sb3.ALGORITHMS, "ppo", remember)
-        for interval in (7, 1000):
-            sb3.train("ppo", 64, seed=0, interval=interval, arguments={})
-        assert torch.equal(*(weights(model.policy) for model in models))
-
-
-def test_what_policies_are_compared_with():
-    class Idle:
-        def reset(self):
-            pass
-
-        def act(self, observation):
-            return np.zeros((1, 1))
-
-    assert sb3.square_error(Idle()) == sb3.DOING_NOTHING
-    runs = pd.read_csv(ROOT / "benchmarks/published/estimates.csv")
-    runs = runs[runs["scenario"] == "square"].set_index("agent")
-    assert sb3.square_error(PIController()) == pytest.approx(runs["mean"]["pi"])
-    assert pytest.approx(runs["limit"]["pi"], abs=5e-4) == sb3.POSSIBLE
+    def test_the_error_is_that_of_the_study(self):
+        model = PPO("MlpPolicy", sb3.make_plant(), device="cpu", n_steps=8, batch_size=8)
+        plant = defaults.CASES["ppo-velocity"].test_on()
+        studied = defaults.square_error(defaults.PolicyController(model), plant)
+        # One counts the error from k = 0, the other from k = 1, when it is as large.
+        assert sb3.mean_error(model) == pytest.approx(studied, abs=0.02)
 
 
 class TestOnOnePage:

@@ -1,5 +1,7 @@
-"""Training PPO: resumed, cached, validated, and seeded."""
+"""Training PPO: resumed, cached, validated, seeded, and kept in NumPy."""
 
+import os
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -7,207 +9,396 @@ import pandas as pd
 import pytest
 import torch
 
+from agents import PolicyNetwork
 from benchmarks.controllers.roster import Training
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.train import ppo
+from benchmarks.rollout import make_plants, rollout
+from benchmarks.train import ppo, ppo_training
 from mptc_gym import Parameters
+from mptc_gym.wrappers.vector import IncrementalAction
 from tests.small_training import SMALL
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setattr(ppo, "CHECKPOINT_INTERVAL", 256)
-    monkeypatch.setattr(ppo, "PROBE", replace(ppo.PROBE, samples=20))
-    monkeypatch.setattr(ppo, "VALIDATION_SAMPLES", 20)
-    monkeypatch.setattr(ppo, "HELD", ppo.HELD[:20])
+    monkeypatch.setattr(ppo_training, "CHECKPOINT_INTERVAL", 256)
+    monkeypatch.setattr(ppo_training, "PROBE", replace(ppo_training.PROBE, samples=20))
+    monkeypatch.setattr(ppo_training, "HELD", ppo_training.HELD[:20])
 
 
 def train(folder, arguments=SMALL, *, retrain=False):
     return ppo.trained_policy(arguments, folder, retrain=retrain, progress=False)
 
 
-def weights(model):
+def weights(network):
+    return np.concatenate([array.ravel() for layer in network.layers for array in layer])
+
+
+def parameters_of(model):
     return torch.cat([p.detach().flatten() for p in model.policy.parameters()])
+
+
+def interrupt_at(calls, monkeypatch, folder):
+    """Train until a step, and be interrupted there."""
+    keep = ppo_training.Keeper._on_step
+    count = 0
+
+    def interrupt(self):
+        nonlocal count
+        count += 1
+        if count == calls:
+            raise KeyboardInterrupt
+        return keep(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo_training.Keeper, "_on_step", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            train(folder)
 
 
 class TestPPO:
     def test_a_finished_policy_is_loaded(self, tmp_path, monkeypatch):
         trained = train(tmp_path)
         with monkeypatch.context() as patch:
-            patch.setattr(ppo.PPO, "learn", None)  # training again would raise
+            patch.setattr(ppo_training, "train", None)  # training again would raise
             loaded = train(tmp_path)
-        assert torch.equal(weights(loaded), weights(trained))
-        stamp = (tmp_path / "policy.zip").stat().st_mtime_ns
+        assert np.array_equal(weights(loaded), weights(trained))
+        stamp = (tmp_path / "policy.npz").stat().st_mtime_ns
         train(tmp_path, retrain=True)
-        assert (tmp_path / "policy.zip").stat().st_mtime_ns > stamp
+        assert (tmp_path / "policy.npz").stat().st_mtime_ns > stamp
 
-    @pytest.mark.parametrize("name", ["policy.zip", "checkpoint.pkl"])
-    def test_a_damaged_file_is_named(self, tmp_path, name):
-        (tmp_path / "learning.csv").write_text("")
-        (tmp_path / name).write_bytes(b"half of it")
-        with pytest.raises(ValueError, match=r"damaged.*--retrain") as error:
-            train(tmp_path)
-        assert str(tmp_path) in str(error.value)
-        train(tmp_path, retrain=True)
-
-    def test_learning_curve_is_kept(self, tmp_path):
+    def test_learning_curve_and_provenance_are_kept(self, tmp_path):
         train(tmp_path)
-        curve = pd.read_csv(tmp_path / "learning.csv")
+        provenance = PolicyNetwork.load(tmp_path / "policy.npz").provenance
+        curve = pd.DataFrame(provenance["curve"])
         assert list(curve["steps"]) == [256, 512, 768, 1024]
         assert (curve[["training_mae", "validation_mae", "square_mae"]] > 0).all(axis=None)
         assert curve["seconds"].is_monotonic_increasing
+        assert provenance["arguments"]["n_envs"] == SMALL.n_envs
+        assert {"python", "torch", "stable_baselines3"} <= set(provenance["versions"])
 
     @pytest.mark.parametrize("calls", [65, 100, 140])
     def test_interrupted_training_resumes_to_the_same_policy(
         self, tmp_path, monkeypatch, calls
     ):
         whole = train(tmp_path / "whole")
-        keep = ppo.Keeper._on_step
-        count = 0
-
-        def interrupt(self):
-            nonlocal count
-            count += 1
-            if count == calls:
-                raise KeyboardInterrupt
-            return keep(self)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(ppo.Keeper, "_on_step", interrupt)
-            with pytest.raises(KeyboardInterrupt):
-                train(tmp_path / "parts")
-        assert [path.name for path in (tmp_path / "parts").iterdir()] == ["checkpoint.pkl"]
+        interrupt_at(calls, monkeypatch, tmp_path / "parts")
+        assert [path.name for path in (tmp_path / "parts").iterdir()] == ["checkpoint.npz"]
         np.random.seed(0)  # noqa: NPY002 (whatever happens between)
         torch.manual_seed(0)
         parts = train(tmp_path / "parts")
-        assert torch.equal(weights(parts), weights(whole))
+        assert np.array_equal(weights(parts), weights(whole))
         columns = ["steps", "training_mae", "validation_mae", "square_mae"]
-        curves = [
-            pd.read_csv(tmp_path / n / "learning.csv")[columns] for n in ("whole", "parts")
-        ]
+        curves = [pd.DataFrame(each.provenance["curve"])[columns] for each in (whole, parts)]
         pd.testing.assert_frame_equal(*curves)
-        assert not (tmp_path / "parts" / "checkpoint.pkl").exists()
+        assert not (tmp_path / "parts" / "checkpoint.npz").exists()
+
+    def test_all_that_is_learnt_resumes(self, tmp_path, monkeypatch):
+        # The value function and what Adam remembers are no part of the policy that is kept.
+        ends = []
+        begin = ppo_training.begin
+
+        def remember(arguments):
+            ends.append(begin(arguments))
+            return ends[-1]
+
+        monkeypatch.setattr(ppo_training, "begin", remember)
+        train(tmp_path / "whole")
+        interrupt_at(100, monkeypatch, tmp_path / "parts")
+        train(tmp_path / "parts")
+        whole, _, parts = (model.policy.optimizer.state_dict()["state"] for model in ends)
+        assert whole.keys() == parts.keys()
+        for i, moments in whole.items():
+            for name, value in moments.items():
+                assert torch.equal(value, parts[i][name])
 
     def test_seed_is_honoured(self, tmp_path):
         first, again, other = (
             weights(train(tmp_path / name, replace(SMALL, steps=256, seed=seed)))
             for name, seed in (("first", 3), ("again", 3), ("other", 4))
         )
-        assert torch.equal(first, again)
-        assert not torch.equal(first, other)
+        assert np.array_equal(first, again)
+        assert not np.array_equal(first, other)
 
-    def test_key_names_all_that_shapes_a_policy(self, monkeypatch):
+    def test_key_names_all_that_shapes_a_policy(self):
         keys = {
             ppo.policy_key(arguments)
             for arguments in (
                 SMALL, replace(SMALL, seed=1), replace(SMALL, gamma=0.9),
-                replace(SMALL, noise_variance=0.1),
+                replace(SMALL, noise_variance=0.1), replace(SMALL, max_move=0.3),
             )
         }  # fmt: skip
-        assert len(keys) == 4
+        assert len(keys) == 5
         assert ppo.policy_key(SMALL) == ppo.policy_key(replace(SMALL))
-        monkeypatch.setattr(ppo, "versions", lambda: {"torch": "another"})
-        assert ppo.policy_key(SMALL) not in keys
 
-    def test_it_is_trained_on_random_set_points_with_past_actions(self):
+    def test_it_is_trained_on_random_set_points_with_past_moves(self):
         parameters = Parameters(**SMALL.training)
         assert parameters.setpoint == "random"
-        assert parameters.action_window == parameters.delay + 2
+        assert parameters.action_window == parameters.delay + 3
         assert parameters.noise_variance == SMALL.noise_variance
+        assert (Parameters().delay, Parameters().dead_zone) == (ppo.DELAY, ppo.DEAD_ZONE)
 
     def test_some_of_the_plants_are_calm(self):
-        arguments = replace(SMALL, n_envs=8, calm=0.75)
-        assert [count for count, _ in arguments.plants] == [2, 6]
-        plants = ppo.begin(arguments).get_env()
+        arguments = replace(SMALL, n_envs=8, calm=0.75, squares=(4.6,))
+        assert [count for count, _ in arguments.plants] == [2, 3, 3]
+        plants = ppo_training.begin(arguments).get_env()
         plants.seed(0)
         plants.reset()
         plants.step(np.zeros((8, 1), np.float32))
         assert [noise != 0.0 for noise in plants.infos["noise"]] == [True] * 2 + [False] * 6
-        assert [count for count, _ in replace(SMALL, calm=0.0).plants] == [4]
-        assert [count for count, _ in replace(SMALL, calm=1.0).plants] == [4]
+        followed = plants.infos["setpoint"]
+        assert list(followed[5:]) == [4.6] * 3
+        assert len(set(followed[:5])) == 5  # random ones
+        assert [count for count, _ in replace(arguments, calm=0.0).plants] == [8]
+        assert [count for count, _ in replace(arguments, calm=1.0).plants] == [4, 4]
+
+    def test_square_waves_are_others_than_those_of_a_comparison(self):
+        arguments = ppo.PPOArguments()
+        assert 5.0 not in arguments.squares
+        assert arguments.square_period != Parameters().setpoint_period
+        flows = np.array(arguments.squares) * 0.07273 / 0.04964  # t/h, that hold them
+        low, high = arguments.plant["dead_zone"]
+        assert low < Parameters().dead_zone < high < flows.min()
+        assert flows.max() < Parameters().u_max
+
+    def test_the_action_changes_the_flow_and_the_dead_zone_is_undone(self):
+        plants = ppo_training.begin(replace(SMALL, max_move=0.2)).get_env()
+        plants.seed(0)
+        plants.reset()
+        flows = []
+        for action in (1.0, 1.0, -1.0):
+            plants.step(np.full((SMALL.n_envs, 1), action, np.float32))
+            flows.append(plants.infos["applied"][0])
+        # 0.2, 0.4 and 0.2 of the 5 t/h between dead zone and limit.
+        assert flows == pytest.approx([6.0, 7.0, 6.0], abs=1e-4)
+
+    def test_each_stretch_begins_at_rest_with_seeds_of_its_own(self, tmp_path, monkeypatch):
+        seeds, rests = [], []
+        stretch = ppo_training.Keeper._begin_stretch
+
+        def spy(keeper):
+            stretch(keeper)
+            plants = keeper.training_env
+            seeds.append([batch.unwrapped.np_random_seed for batch in plants.batches])
+            rests.append(np.abs(plants.infos["output"]).max())
+
+        monkeypatch.setattr(ppo_training.Keeper, "_begin_stretch", spy)
+        train(tmp_path)
+        assert len(seeds) == 4
+        assert rests == [0.0] * 4
+        each = [seed for stretch in seeds for batch in stretch for seed in batch]
+        assert len(set(each)) == 4 * SMALL.n_envs
+        assert min(each) >= 1 << 32  # no comparison has any so large
 
     def test_a_policy_for_many_plants(self, tmp_path):
         arguments = replace(SMALL, steps=256, **ppo.RANDOMISED)
         train(tmp_path, arguments)
-        kept = ppo.Policy(arguments, tmp_path)
+        kept = ppo.Policy(arguments, tmp_path / "policy.npz")
         assert kept.observation == arguments.observation
-        assert kept.observation["action_window"] == 38
+        assert kept.observation["action_window"] == 39
         size = Parameters(**arguments.training).observation_size
         assert kept().act(np.zeros((5, size), np.float32)).shape == (5, 1)
         assert ppo.policy_key(arguments) != ppo.policy_key(replace(SMALL, steps=256))
 
     def test_set_points_of_validation_are_met_nowhere_else(self):
-        flows = np.abs(ppo.HELD) * 0.07273 / 0.04964  # t/h, by the steady-state gain
-        assert flows.min() > Parameters().dead_zone
+        flows = np.abs(ppo_training.HELD) * 0.07273 / 0.04964  # t/h, by the steady-state gain
+        assert flows.min() > ppo_training.VALIDATION_DEAD_ZONE > Parameters().dead_zone
         assert flows.max() < Parameters().u_max
-        assert not {5.0, -5.0} & set(ppo.HELD)
+        assert not {5.0, -5.0} & set(ppo_training.HELD)
+        assert ppo_training.VALIDATION_DEAD_ZONE != 7.0
 
     def test_the_best_in_validation_is_kept(self, tmp_path, monkeypatch):
         seen = []
 
         def scores(keeper, arguments, runs, samples, seed):
-            if seed == ppo.VALIDATION_SEED and arguments["noise_variance"]:
-                seen.append(weights(keeper.model))
+            if seed == ppo_training.VALIDATION_SEED:
+                seen.append(ppo_training.exported(keeper.model, SMALL))
                 return [1.0, 2.0, 1.0, 2.5][len(seen) - 1]
+            if arguments.get("dead_zone") == 6.5:
+                return [3.0, 2.0, 1.5, 2.5][len(seen) - 1]
             return [5.0, 0.0, 3.0, 0.5][len(seen) - 1]
 
-        monkeypatch.setattr(ppo.Keeper, "_mae", scores)
-        kept = weights(train(tmp_path))
+        monkeypatch.setattr(ppo_training.Keeper, "_mae", scores)
+        kept = weights(train(tmp_path))  # sums are 9, 4, 5.5 and 5.5
         assert len(seen) == 4
-        assert torch.equal(kept, seen[1])
-        assert not torch.equal(kept, seen[3])
+        assert np.array_equal(kept, weights(seen[1]))
+        assert not np.array_equal(kept, weights(seen[3]))
 
     def test_exploration_falls_as_set(self, tmp_path, monkeypatch):
         spreads = {}
-        record = ppo.Keeper.record
+        record = ppo_training.Keeper.record
 
         def spy(keeper):
             record(keeper)
             spreads[keeper.num_timesteps] = keeper.model.policy.log_std.item()
 
-        monkeypatch.setattr(ppo.Keeper, "record", spy)
-        train(tmp_path, replace(SMALL, log_std=(-1.0, -3.0), log_std_falls=(0.25, 0.75)))
+        monkeypatch.setattr(ppo_training.Keeper, "record", spy)
+        train(tmp_path, replace(SMALL, log_std=(-1.0, -3.0)))
         # Recorded after the value for the coming rollout is set, but for the last.
-        assert spreads[256] == pytest.approx(-1.0)
+        assert spreads[256] == pytest.approx(-1.5)
         assert spreads[512] == pytest.approx(-2.0)
-        assert spreads[768] == pytest.approx(-3.0)
+        assert spreads[768] == pytest.approx(-2.5)
 
-    def test_inputs_are_scaled_by_fixed_numbers(self):
-        model = ppo.begin(SMALL)
-        observation = torch.arange(1.0, 29.0)
-        scaled = model.policy.features_extractor(observation)
-        assert scaled[:8].tolist() == pytest.approx([0.2 * i for i in range(1, 9)])  # degC
-        assert scaled[8:].tolist() == list(range(9, 29))  # actions
+    def test_what_the_networks_see(self):
+        parameters = Parameters(error_window=3, action_window=4)
+        observation = np.array([5, 5, -4, 2, 1, -1, 0.5, 0.2, 0.1, -0.3])
+        assert ppo_training.features(parameters) @ observation == pytest.approx([
+            2.0, 1.0, 0.5,  # error, a fifth of the set point, flow
+            0.0, 0.9,  # a tenth of the change of the set point
+            0.5, 1.0,  # half the change of the error
+            0.6, 0.2, 0.8,  # twice the moves
+        ])  # fmt: skip
+
+    def test_a_policy_is_as_good_upside_down(self):
+        model = ppo_training.begin(SMALL)
+        moments = torch.optim.Adam(model.policy.parameters())  # as training changes them
+        observations = torch.randn(50, 27, generator=torch.Generator().manual_seed(0))
+        loss = model.policy.get_distribution(observations).log_prob(torch.ones(50, 1)).sum()
+        loss.backward()
+        moments.step()
+        up, _ = model.predict(observations.numpy(), deterministic=True)
+        down, _ = model.predict(-observations.numpy(), deterministic=True)
+        assert np.abs(up).max() > 0.01
+        np.testing.assert_allclose(up, -down, atol=1e-6)
 
 
-class TestTrained:
+class TestExported:
+    def test_it_is_the_policy_without_torch(self, tmp_path):
+        train(tmp_path)
+        model = ppo_training.begin(replace(SMALL, seed=5))
+        with torch.no_grad():  # so that the limits of the action matter, too
+            model.policy.action_net.weight.mul_(100.0)
+        network = ppo_training.exported(model, SMALL)
+        plants = make_plants(20, 100, noise_variance=0.5, **SMALL.observation)
+        observations, _ = plants.reset(seed=0)
+        generator = np.random.default_rng(0)
+        moves = []
+        for _ in range(60):
+            moves.append(model.predict(observations, deterministic=True)[0][:, 0])
+            network.reset()
+            position = SMALL.max_move * moves[-1]  # from rest
+            flow = np.sign(position) * (5.0 + 5.0 * np.abs(position))
+            np.testing.assert_allclose(network.act(observations)[:, 0], flow / 10.0, atol=1e-5)
+            observations, *_ = plants.step(generator.uniform(-1, 1, (20, 1)))
+        assert np.max(moves) == 1.0
+        assert 0.1 < np.mean(np.abs(moves)) < 0.9
+
+    def test_a_run_is_that_of_the_wrapped_environment(self):
+        model = ppo_training.begin(SMALL)
+        arguments = {"setpoint": 5.0, "noise_variance": 0.5, **SMALL.observation}
+        run = rollout(
+            make_plants(3, 80, **arguments), ppo_training.exported(model, SMALL), 80, seed=1
+        )
+        wrapped = IncrementalAction(
+            make_plants(3, 80, **arguments), max_move=SMALL.max_move, undo_dead_zone=5.0
+        )
+        observations, info = wrapped.reset(seed=1)
+        for k in range(80):
+            np.testing.assert_allclose(run.output[k], info["output"], atol=1e-3)
+            observations, *_, info = wrapped.step(
+                model.predict(observations, deterministic=True)[0]
+            )
+            np.testing.assert_allclose(run.applied[k], info["applied"], atol=1e-3)
+        assert np.ptp(run.applied) > 1.0
+
+
+class TestDamage:
+    @pytest.mark.parametrize("name", ["policy.npz", "checkpoint.npz"])
+    @pytest.mark.parametrize("content", [b"", b"half of it"])
+    def test_a_file_that_is_none_is_named(self, tmp_path, name, content):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=r"damaged.*remove it, or --retrain") as error:
+            train(tmp_path)
+        assert str(tmp_path / name) in str(error.value)
+        train(tmp_path, retrain=True)
+
+    def opened(self, file, content, tmp_path):
+        """Return the weights that come of what a file holds, or the complaint."""
+        file.write_bytes(content)
+        try:
+            return weights(train(tmp_path)), ""
+        except ValueError as error:
+            return None, str(error)
+
+    @pytest.mark.parametrize("name", ["policy.npz", "checkpoint.npz"])
+    def test_damage_is_noticed_or_does_no_harm(self, tmp_path, monkeypatch, name):
+        if name == "policy.npz":
+            train(tmp_path)
+        else:
+            interrupt_at(100, monkeypatch, tmp_path)
+        file = tmp_path / name
+        whole = file.read_bytes()
+        file.unlink()
+        right, _ = self.opened(file, whole, tmp_path)
+        generator = np.random.default_rng(0)
+        refused = 0
+        for i in range(40):
+            for left in tmp_path.iterdir():
+                left.unlink()
+            if i < 4:
+                bad = whole[: len(whole) * i // 4]
+            else:
+                flipped = bytearray(whole)
+                flipped[generator.integers(len(whole))] ^= 1 << generator.integers(8)
+                bad = bytes(flipped)
+            found, complaint = self.opened(file, bad, tmp_path)
+            if found is None:
+                refused += 1
+                assert str(file) in complaint
+                assert "remove it, or --retrain" in complaint
+            else:  # a bit of no meaning was wrong, such as one of the time of writing
+                assert np.array_equal(found, right)
+        assert refused > 30
+
+    def test_a_planted_file_runs_nothing(self, tmp_path):
+        class Planted:
+            def __reduce__(self):
+                return os.mkdir, (str(tmp_path / "ran"),)
+
+        for name in ("policy.npz", "checkpoint.npz"):
+            for content in (
+                lambda file: pickle.dump(Planted(), file),
+                lambda file: np.savez(file, about=np.array([Planted()], object)),
+            ):
+                with (tmp_path / name).open("wb") as file:
+                    content(file)
+                with pytest.raises(ValueError, match="damaged"):
+                    train(tmp_path)
+                (tmp_path / name).unlink()
+        assert not (tmp_path / "ran").exists()
+
+    def test_a_checkpoint_of_another_training_is_refused(self, tmp_path, monkeypatch):
+        interrupt_at(100, monkeypatch, tmp_path)
+        with pytest.raises(ValueError, match="of another training"):
+            train(tmp_path, replace(SMALL, gamma=0.5))
+
+
+class TestMembers:
     def members(self, folder, jobs, *, retrain=False):
-        training = Training(FanOut(jobs), folder, members=2, retrain=retrain)
-        ppo._loaded.cache_clear()
-        return ppo.members(training, SMALL)
+        return ppo.members(Training(FanOut(jobs), folder, members=2, retrain=retrain), SMALL)
 
     def test_side_by_side_is_one_after_the_other(self, tmp_path, monkeypatch):
         monkeypatch.undo()  # other processes would not know of it
         ones = self.members(tmp_path / "one", jobs=1)
         twos = self.members(tmp_path / "two", jobs=2)
-        first, second, third, fourth = (weights(policy()._model) for policy in (*ones, *twos))
-        assert torch.equal(first, third)
-        assert torch.equal(second, fourth)
-        assert not torch.equal(first, second)
+        first, second, third, fourth = (weights(policy()) for policy in (*ones, *twos))
+        assert np.array_equal(first, third)
+        assert np.array_equal(second, fourth)
+        assert not np.array_equal(first, second)
         assert [policy.provenance["arguments"]["seed"] for policy in ones] == [0, 1]
         assert [len(policy.curve) for policy in ones] == [1, 1]
         assert "0.001024 M a policy" in ones[0].account.samples
 
-    def test_only_what_is_missing_is_trained(self, tmp_path, monkeypatch):
-        folders = [policy.folder for policy in self.members(tmp_path, jobs=1)]
-        stamps = [(folder / "policy.zip").stat().st_mtime_ns for folder in folders]
-        (folders[1] / "policy.zip").unlink()
+    def test_only_what_is_missing_is_trained(self, tmp_path):
+        files = [policy.file for policy in self.members(tmp_path, jobs=1)]
+        stamps = [file.stat().st_mtime_ns for file in files]
+        files[1].unlink()
         self.members(tmp_path, jobs=1)
-        again = [(folder / "policy.zip").stat().st_mtime_ns for folder in folders]
+        again = [file.stat().st_mtime_ns for file in files]
         assert again[0] == stamps[0]
         assert again[1] > stamps[1]
         self.members(tmp_path, jobs=1, retrain=True)
-        assert (folders[0] / "policy.zip").stat().st_mtime_ns > stamps[0]
+        assert files[0].stat().st_mtime_ns > stamps[0]
 
     def test_policies_that_were_trained_elsewhere_are_missed(self, tmp_path, monkeypatch):
         monkeypatch.setattr(
@@ -215,3 +406,28 @@ class TestTrained:
         )  # as on a machine with folders of its own
         with pytest.raises(FileNotFoundError, match="must share"):
             self.members(tmp_path, jobs=1)
+
+    def test_published_policies_are_taken_if_they_were_trained_like_this(
+        self, tmp_path, monkeypatch
+    ):
+        monkeypatch.setattr(ppo, "PRETRAINED", tmp_path / "shipped")
+        trained = self.members(tmp_path / "kept", jobs=1)
+        ppo.publish(trained, tmp_path / "shipped")
+        shipped = self.members(tmp_path / "none", jobs=1)
+        assert [policy.file.name for policy in shipped] == ["ppo-0.npz", "ppo-1.npz"]
+        for one, other in zip(trained, shipped, strict=True):
+            assert np.array_equal(weights(one()), weights(other()))
+        # Those that were trained here come first, and others are trained where asked for.
+        files = {
+            policy.file.parent.parent for policy in self.members(tmp_path / "kept", jobs=1)
+        }
+        assert files == {tmp_path / "kept"}
+        anew = self.members(tmp_path / "anew", jobs=1, retrain=True)
+        assert anew[0].file.parent.parent == tmp_path / "anew"
+        other = ppo.members(Training(FanOut(1), tmp_path / "o", steps=256, members=1), SMALL)
+        assert other[0].file.parent.parent == tmp_path / "o"
+
+    def test_the_policies_of_the_project_are_those_of_the_defaults(self):
+        for policy in ppo.members(Training()):
+            assert policy.file.parent.name == "pretrained"
+            assert policy.curve[-1]["steps"] >= policy.arguments.steps

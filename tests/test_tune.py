@@ -16,7 +16,7 @@ from benchmarks.compare import comparison
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import fingerprint, storage
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.train import ppo
+from benchmarks.train import ppo, ppo_training
 from benchmarks.tune import __main__ as command
 from benchmarks.tune import objective
 from benchmarks.tune import search as tune
@@ -164,7 +164,8 @@ class TestSearch:
             trained.append(arguments)
 
         monkeypatch.setattr(ppo, "_train", train)
-        monkeypatch.setattr(ppo, "_loaded", lambda folder: ppo.begin(SMALL))
+        network = ppo_training.exported(ppo_training.begin(SMALL), SMALL)
+        monkeypatch.setattr(ppo, "_loaded", lambda file: network)
         monkeypatch.setattr(
             objective, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
         )
