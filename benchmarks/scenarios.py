@@ -59,6 +59,30 @@ SCENARIOS: dict[str, Scenario] = {
     )
     for setpoint, setpoint_title, samples, arguments in SETPOINTS
     for suffix, preset, plant_title in _PLANTS
+} | {
+    # What a boiler does all day. At 5 degC the flow that is needed stays outside the dead zone.
+    "load": Scenario(
+        "load",
+        "load steps within ±1.5 °C at a held set point, dead zone 5 t/h, no noise",
+        1200,
+        {"setpoint": 5.0, "disturbance_amplitude": 1.5, "disturbance_interval": 200.0},
+    )
+}
+
+
+PRESET_SCENARIOS: dict[str, Scenario] = {
+    name: Scenario(name, f"preset {name}", 1200, dict(arguments))
+    for name, arguments in PRESETS.items()
+}
+
+
+# What plants differ in that are drawn for a sweep, or to train on. A gain below 0.74 puts 5 degC beyond the limits.
+SPANS = {
+    "delay": (6, 36),
+    "dead_zone": (0.0, 8.0),
+    "noise_variance": (0.0, 1.0),
+    "gain_factor": (0.75, 1.6),
+    "time_constant_factor": (0.5, 2.0),
 }
 
 

@@ -18,15 +18,9 @@ from PIL import Image
 from rich.console import Console
 
 from benchmarks import plants
-from benchmarks.controllers.roster import (
-    ROSTER,
-    Controller,
-    Factory,
-    Training,
-    build,
-    observation,
-    own_controller,
-)
+from benchmarks.controllers.factories import Factory, build, observation
+from benchmarks.controllers.records import Controller, Training
+from benchmarks.controllers.roster import ROSTER, own_controller
 from benchmarks.lib import command_line
 from benchmarks.lib.storage import replacing
 from benchmarks.metrics import mean_error

@@ -18,7 +18,8 @@ from agents import DirectNNController, PIController
 from benchmarks.compare import __main__ as compare
 from benchmarks.compare import comparison
 from benchmarks.compare.estimates import beaten, estimate, scale_of, verdict
-from benchmarks.controllers.roster import ROSTER, build, chosen, load_factory, observation
+from benchmarks.controllers.factories import build, load_factory, observation
+from benchmarks.controllers.roster import ROSTER, chosen
 from benchmarks.lib import storage, tables
 from benchmarks.lib.command_line import UsageError
 from benchmarks.lib.report import Section, write_report
@@ -219,7 +220,9 @@ class TestScenarios:
         }
         assert plants == {(5.0, 0.0), (7.0, 0.0), (5.0, 0.5)}
         assert {s.parameters.setpoint for s in SCENARIOS.values()} == {"square", 5.0}
-        assert len(SCENARIOS) == 6
+        disturbed = [name for name, s in SCENARIOS.items() if s.parameters.is_disturbed]
+        assert disturbed == ["load"]
+        assert len(SCENARIOS) == 7
         assert all(name == scenario.name for name, scenario in SCENARIOS.items())
 
 

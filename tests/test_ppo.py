@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from agents import PolicyNetwork
-from benchmarks.controllers.roster import Training
+from benchmarks.controllers.records import Training
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.train import ppo, ppo_training

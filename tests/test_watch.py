@@ -148,7 +148,7 @@ def test_a_policy(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("option", "value", "named"),
     [
-        ("--agent", "lqr", "no 'lqr'; there are nn, pi"),
+        ("--agent", "lqr", "no 'lqr'; there are nothing, nn"),
         ("--agent", "agents:Nobody", "Nobody"),
         ("--scenario", "triangle", "constant-noise"),
         ("--video", "film.avi", ".mp4 or .gif"),

@@ -11,10 +11,11 @@ from rich.console import Console
 
 from benchmarks import plants
 from benchmarks.compare.comparison import Comparison
-from benchmarks.controllers.roster import POLICIES, ROSTER, Training, chosen
+from benchmarks.controllers.records import POLICIES, Training
+from benchmarks.controllers.roster import ROSTER, chosen
 from benchmarks.lib import command_line
 from benchmarks.lib.tables import on_screen
-from benchmarks.scenarios import SCENARIOS, scenarios_of
+from benchmarks.scenarios import PRESET_SCENARIOS, SCENARIOS, scenarios_of
 
 OUT = Path("results/compare")
 COMPARED = [name for name, controller in ROSTER.items() if controller.compared]
@@ -35,6 +36,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
     add("--scenarios", default=argparse.SUPPRESS, help="cases (default: all)", **names)
     plants.add_options(parser)
+    add(
+        "--presets",
+        action="store_true",
+        help="run all presets of the environment in place of the paper's cases",
+    )
     add("--runs", type=command_line.number, default=RUNS, help="number of runs of each case")
     add(
         "--training-steps",
@@ -65,13 +71,17 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-@command_line.command("compare", __doc__, _add_options, width=170)
+@command_line.command("compare", __doc__, _add_options, width=190)
 def main(options: argparse.Namespace, console: Console) -> str:
     """Run the comparison and write what it finds."""
     controllers = chosen(options.agents, options.agent)
     options.agents = list(controllers)
     plant = plants.chosen(options)
-    scenarios = scenarios_of(plant.name, plant.arguments) if plant.arguments else SCENARIOS
+    if options.presets and plant.arguments:
+        raise command_line.UsageError("--presets: goes without --plant, --preset and --set")
+    scenarios = PRESET_SCENARIOS if options.presets else SCENARIOS
+    if plant.arguments:
+        scenarios = scenarios_of(plant.name, plant.arguments)
     names = getattr(options, "scenarios", list(scenarios))
     names = command_line.known("--scenarios", names, list(scenarios))
     if not names:
@@ -86,7 +96,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     out = getattr(options, "out", None) or _folder(
         [*controllers] if [*controllers] != COMPARED else [],
         names if names != [*scenarios] else [],
-        [plant.name] if plant.arguments else [],
+        [plant.name] if plant.arguments else ["presets"] if options.presets else [],
         [f"{options.runs}-runs"] if options.runs != RUNS else [],
     )
     out = command_line.out_folder(out)

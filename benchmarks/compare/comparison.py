@@ -14,16 +14,10 @@ import pandas as pd
 from tqdm import tqdm
 
 from benchmarks.compare import plots, tables
-from benchmarks.compare.estimates import SEED, Scale, estimate, scale_of, verdict
-from benchmarks.controllers.roster import (
-    Account,
-    Controller,
-    Factory,
-    Training,
-    build,
-    label,
-    observation,
-)
+from benchmarks.compare.estimates import SEED, Scale, estimate, scale_of, scores, verdict
+from benchmarks.controllers.factories import Factory, build, observation
+from benchmarks.controllers.records import Account, Controller, Training
+from benchmarks.controllers.roster import label
 from benchmarks.lib.report import Section, provenance_line, write_report
 from benchmarks.lib.storage import commit, read_object, replacing, versions, write_json
 from benchmarks.metrics import join, mean_error, measure
@@ -38,6 +32,10 @@ BOUNDS_TEXT = (
     "plant settled and is not foreseen; of random set points it supposes that their law is "
     "known. With preview of the whole set point, no controller at all does better than the "
     "second row says."
+)
+SCORE_TEXT = (
+    "The first column is the interquartile mean over all scenarios and runs, with its 95 % "
+    "interval; the others are means. Below 0, doing nothing is better."
 )
 LIMITS_CAPTION = (
     "A point is the mean over all runs, a bar its 95 % interval. Each axis begins at the least "
@@ -212,6 +210,11 @@ class Comparison:
                 [verdict(estimates), BOUNDS_TEXT, LIMITS_CAPTION],
                 tables.ratio_table(estimates, scales),
                 ["limits.png"],
+            ),
+            Section(
+                "Score: 0 for leaving the valve alone, 1 for the least possible error",
+                [SCORE_TEXT],
+                tables.score_table(scores(runs, scales)),
             ),
             Section("Error against valve travel", [TRAVEL_CAPTION], pictures=["travel.png"]),
             Section("What each controller costs", [ACCOUNTS_TEXT], self._accounts()),

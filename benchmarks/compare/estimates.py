@@ -9,7 +9,13 @@ from typing import Any
 
 import pandas as pd
 
-from benchmarks.lib.statistics import Estimate, bootstrap, improvement, interquartile_mean
+from benchmarks.lib.statistics import (
+    Estimate,
+    bootstrap,
+    improvement,
+    interquartile_mean,
+    stratified,
+)
 from benchmarks.limits import LeastPossible, least_possible
 from benchmarks.scenarios import Scenario
 
@@ -110,6 +116,31 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) ->
                 row |= _ends("difference", bootstrap(values - base, SEED))
                 row |= _ends("improvement", improvement(values, base, SEED))
             rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def scores(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
+    """Return how much of what is possible each agent achieves, over all scenarios.
+
+    The score of a run is 0 for the mean error of a valve that is left alone and 1 for the least
+    possible error. Scenarios weigh the same, however hard they are.
+
+    Returns
+    -------
+    DataFrame
+        A row an agent: `score`, the interquartile mean over the runs of all scenarios, with a
+        95 % interval from drawing policies and runs within each scenario; and the mean score in
+        each scenario.
+    """
+    rows = []
+    for agent, cases in runs.groupby("agent", sort=False):
+        tables, means = [], {}
+        for scenario, group in cases.groupby("scenario", sort=False):
+            errors = group.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
+            tables.append(scales[scenario].least.score(errors))
+            means[scenario] = float(tables[-1].mean())
+        found = stratified(tables, SEED, interquartile_mean)
+        rows.append({"agent": agent, **_ends("score", found), **means})
     return pd.DataFrame(rows)
 
 

@@ -92,6 +92,18 @@ def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.Data
     return pd.concat([pd.DataFrame(rows), table], ignore_index=True)
 
 
+def score_table(scores: pd.DataFrame) -> pd.DataFrame:
+    """Return the scores: a row for each agent, the overall score first."""
+    scenarios = [
+        n for n in scores.columns if n not in ("agent", "score", "score_low", "score_high")
+    ]
+    cells = {
+        "agent": scores["agent"].map(label),
+        "score": scores.apply(_format_ends, axis=1, name="score"),
+    }
+    return pd.DataFrame(cells | {name: scores[name].map("{:.2f}".format) for name in scenarios})
+
+
 def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
     """Return differences to the reference: a row for each other agent."""
     others = estimates.dropna(subset=["difference"])

@@ -7,7 +7,7 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from agents import PIController, SmithPredictor
+from agents import PIController, SelfTuningController, SmithPredictor
 from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.step_test import step_test
@@ -54,6 +54,16 @@ def smith(parameters: Parameters, u_min: float, u_max: float) -> SmithPredictor:
     return SmithPredictor(
         **asdict(tested),
         closed_loop_time_constant=float(f"{tested.time_constant / 2:.2g}"),
+        dead_zone=sum(parameters.range_of("dead_zone")) / 2,
+        u_min=u_min,
+        u_max=u_max,
+    )
+
+
+def self_tuning(parameters: Parameters, u_min: float, u_max: float) -> SelfTuningController:
+    """Return a self-tuning controller that starts from what a step test shows."""
+    return SelfTuningController(
+        **asdict(step_test(parameters)),
         dead_zone=sum(parameters.range_of("dead_zone")) / 2,
         u_min=u_min,
         u_max=u_max,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -156,6 +156,41 @@ def bootstrap(
     drawn = statistic(table[member, run].reshape(RESAMPLES, -1), axis=-1)
     low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Estimate(value, float(low), float(high), table.size)
+
+
+def stratified(
+    tables: Sequence[NDArray[np.float64]], seed: int, statistic: Callable[..., Any] = np.mean
+) -> Estimate:
+    """Estimate a statistic over several groups of runs, each drawn from by itself.
+
+    Parameters
+    ----------
+    tables
+        One for each group, shape (members, runs). Within a group members and runs are drawn as
+        in `bootstrap`; the same draws serve all groups of a shape, whose runs are the same.
+    seed
+        Of the draws.
+    statistic
+        Called with an array and `axis`, the last.
+
+    Returns
+    -------
+    Estimate
+        Of all values together; `runs` counts them.
+    """
+    value = float(
+        statistic(np.concatenate([table.ravel() for table in tables])[None], axis=-1)[0]
+    )
+    drawn = []
+    for table in tables:
+        generator = np.random.default_rng(seed)
+        members, runs = table.shape
+        member = generator.integers(members, size=(RESAMPLES, members, 1))
+        run = generator.integers(runs, size=(RESAMPLES, 1, runs))
+        drawn.append(table[member, run].reshape(RESAMPLES, -1))
+    resampled = statistic(np.concatenate(drawn, axis=1), axis=-1)
+    low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Estimate(value, float(low), float(high), sum(table.size for table in tables))
 
 
 def improvement(

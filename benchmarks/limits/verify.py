@@ -10,8 +10,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.controllers.factories import Factory, build, load_factory, observation
 from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.controllers.roster import ROSTER, Factory, build, load_factory, observation
+from benchmarks.controllers.roster import ROSTER
 from benchmarks.limits.bounds import SEED, LeastPossible, least_possible
 from benchmarks.rollout import Agent, make_plants, rollout
 from mptc_gym import PRESETS, Parameters

@@ -14,14 +14,9 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks import plants as plant_options
-from benchmarks.controllers.roster import (
-    POLICIES,
-    ROSTER,
-    Controller,
-    Factory,
-    Training,
-    chosen,
-)
+from benchmarks.controllers.factories import Factory
+from benchmarks.controllers.records import POLICIES, Controller, Training
+from benchmarks.controllers.roster import ROSTER, chosen
 from benchmarks.lib import command_line
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.report import provenance_line, write_report

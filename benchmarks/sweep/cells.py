@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.controllers.roster import Factory, build, observation
+from benchmarks.controllers.factories import Factory, build, observation
 from benchmarks.limits import least_possible, steady_stretches
 from benchmarks.metrics import mean_error
 from benchmarks.rollout import make_plants, rollout

@@ -21,10 +21,10 @@ import numpy as np
 
 from agents import PolicyNetwork
 from agents.policy_network import PRETRAINED
-from benchmarks.controllers.roster import Account, Training
+from benchmarks.controllers.records import Account, Training
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import replacing
-from benchmarks.sweep.plants import SPANS
+from benchmarks.scenarios import SPANS
 
 POLICIES = 5  # are trained and compared, from seeds in sequence
 TUNING_SEED, FINAL_SEED = 1000, 2000  # of policies in a search, others than a comparison uses

@@ -27,7 +27,7 @@ from tqdm import tqdm
 from agents import PolicyNetwork
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import commit, replacing, versions
-from benchmarks.sweep.plants import SPANS
+from benchmarks.scenarios import SPANS
 from mptc_gym import Parameters
 
 NOMINAL = Parameters()

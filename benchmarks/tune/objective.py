@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.controllers.roster import Factory, Tuning, build, observation
+from benchmarks.controllers.factories import Factory, build, observation
+from benchmarks.controllers.records import Tuning
 from benchmarks.metrics import mean_error, settled, split
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import Scenario

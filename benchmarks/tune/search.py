@@ -14,14 +14,9 @@ import pandas as pd
 from optuna.distributions import FloatDistribution
 from tqdm import tqdm
 
-from benchmarks.controllers.roster import (
-    ROSTER,
-    Controller,
-    Tuning,
-    label,
-    load,
-    load_factory,
-)
+from benchmarks.controllers.factories import load, load_factory
+from benchmarks.controllers.records import Controller, Tuning
+from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import code, fingerprint
 from benchmarks.lib.storage import replacing, seal, unseal, write_text
