@@ -35,6 +35,7 @@ GAIN = sum(NOMINAL.b) / sum(NOMINAL.a)  # steady-state, degC per t/h; limits are
 HOLDS = 0.1 / GAIN  # action that holds the output, per degC
 VALIDATION_PLANTS, VALIDATION_SAMPLES = 64, 600
 VALIDATION_SEED = 3_000_000  # met neither in training nor by any comparison
+DRIFT_SAMPLES = 1200  # of plants that drift, as in the random design
 LAST_RATE = 0.01  # what the learning rate falls to, as a share of the first
 
 Signals = dict[str, Tensor]
@@ -80,8 +81,8 @@ class Training:
 TRAININGS: dict[str, Training] = {
     "nn-dpc": Training(),
     "nn-adaptive": Training(
-        plants="many", steps=600, batch=128, samples=500, window=64, hidden=128,
-        learning_rate=2e-3, move_price=0.02, averaging=0.98,
+        plants="many", steps=450, batch=128, samples=400, window=64, hidden=128,
+        learning_rate=2e-3, averaging=0.98,
     ),
 }  # fmt: skip
 
@@ -171,7 +172,7 @@ def make_plants(training: Training, count: int, samples: int) -> MiddlePointTorc
         for name in ("gain", "time_constant"):
             low, high = SPANS[f"{name}_factor"]
             ranges[f"{name}_drift"] = (low / high, high / low)
-        ranges["drift_samples"] = samples
+        ranges["drift_samples"] = DRIFT_SAMPLES
     ranges["noise_variance"] = 0.0  # handed in, too
     return MiddlePointTorchEnv(
         count,

@@ -1,0 +1,138 @@
+"""Train the networks that learn by the gradient through the plant.
+
+`nn-dpc` is for the paper's plant, `nn-adaptive` for many plants. Several networks are trained,
+which differ in their seeds, and validation chooses one. What is finished is kept; the same
+command goes on with what was interrupted, and ends in the same networks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pandas as pd
+from rich.console import Console
+
+from agents import PolicyNetwork
+from agents.policy_network import PRETRAINED
+from benchmarks.lib import command_line, drawing
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.storage import replacing
+from benchmarks.lib.tables import on_screen
+from benchmarks.train.through_plant import TRAININGS, Training, train, training_key
+
+NETWORKS = 5  # are trained, from seeds in sequence
+
+
+def _price(text: str) -> float:
+    """Read a price; argparse shows this function's name in its complaints."""
+    value = float(text)
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be a number of at least 0, got {text}")
+    return value
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("network", choices=TRAININGS, help="what to train")
+    add("--networks", type=command_line.number, default=NETWORKS, help="how many")
+    add("--steps", type=command_line.number, default=argparse.SUPPRESS,
+        help="of the optimiser (default: the network's own)")  # fmt: skip
+    add("--prices", type=_price, nargs="+", metavar="PRICE", default=[],
+        help="of valve travel: train with each, and draw what it buys")  # fmt: skip
+    add("--retrain", action="store_true", help="train even what is finished")
+    add("--keep", action="store_true", help="put the chosen network into agents/pretrained")
+    add("--out", type=Path, default=Path("results/networks"), help="folder to write to")
+    command_line.add_fan_out(parser, "trainings")
+
+
+@command_line.command(
+    "train", __doc__, _add_options, interrupted="the same command goes on from here."
+)
+def main(options: argparse.Namespace, console: Console) -> str:
+    """Train, say how the networks do in validation, and choose one."""
+    training = TRAININGS[options.network]
+    if "steps" in options:
+        training = replace(training, steps=options.steps)
+    seeds = range(training.seed, training.seed + options.networks)
+    trainings = [
+        replace(training, seed=seed, move_price=price)
+        for price in options.prices or [training.move_price]
+        for seed in seeds
+    ]
+    fan_out = command_line.fan_out(options)
+    out = command_line.out_folder(options.out)
+    networks = run(trainings, out, fan_out, retrain=options.retrain)
+    table = summary(networks)
+    console.print(on_screen(table.map("{:.4g}".format)))
+    if options.prices:
+        files = [out / f"{options.network}-prices.{suffix}" for suffix in ("csv", "png")]
+        with replacing(files[0]) as file:
+            table.to_csv(file, index=False)
+        draw_prices(table, files[1])
+        return f"Error against valve travel is in {files[0]} and {files[1]}"
+    best = networks[int(table["score"].argmin())]
+    target = (PRETRAINED if options.keep else out) / f"{options.network}.npz"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    best.save(target)
+    return f"Validation chooses seed {best.provenance['training']['seed']}: it is in {target}"
+
+
+def run(
+    trainings: Sequence[Training], out: Path, fan_out: FanOut, *, retrain: bool = False
+) -> list[PolicyNetwork]:
+    """Train side by side, each in a folder of its own below `out`, and return the networks."""
+    # Absolute, as workers may have been started elsewhere.
+    folders = [(out / training_key(training)).absolute() for training in trainings]
+    bars = fan_out.backend == "loky"  # those of other machines do not come here
+    cells = {
+        f"{folder.name}": partial(_train, training, folder, retrain=retrain, progress=bars)
+        for training, folder in zip(trainings, folders, strict=True)
+    }
+    fan_out.run(cells, title="training", progress=not bars)
+    return [PolicyNetwork.load(folder / "network.npz") for folder in folders]
+
+
+def _train(training: Training, folder: Path, *, retrain: bool, progress: bool) -> None:
+    """Train a network, which lies in its folder then."""
+    train(training, folder, retrain=retrain, progress=progress)
+
+
+def summary(networks: Sequence[PolicyNetwork]) -> pd.DataFrame:
+    """Return how each network does in validation."""
+    return pd.DataFrame(
+        {
+            "price": network.provenance["training"]["move_price"],
+            "seed": network.provenance["training"]["seed"],
+            "best step": network.provenance["validation"]["step"],
+            "mean |e| (°C)": network.provenance["validation"]["validation_mae"],
+            "travel (t/h a sample)": network.provenance["validation"]["validation_travel"],
+            "score": network.provenance["validation"]["score"],
+            "CPU (s)": network.provenance["cpu_seconds"],
+        }
+        for network in networks
+    )
+
+
+def draw_prices(table: pd.DataFrame, path: Path) -> None:
+    """Draw the error against the valve travel: networks as points, medians as a line."""
+    error, travel = "mean |e| (°C)", "travel (t/h a sample)"
+    medians = table.groupby("price")[[travel, error]].median()
+    with plt.rc_context(drawing.STYLE):
+        figure, axes = plt.subplots(figsize=(6.0, 4.0))
+        axes.plot(table[travel], table[error], ".", color="0.6")
+        axes.plot(medians[travel], medians[error], "o-", color=drawing.COLOURS[0])
+        for price, point in zip(medians.index, medians.to_numpy(), strict=True):
+            axes.annotate(f"{price:g}", point, (4, 4), textcoords="offset points")
+        axes.set(xlabel=travel, ylabel=error, title="What a price of valve travel buys")
+        drawing.save(figure, path)
+        plt.close(figure)
+
+
+if __name__ == "__main__":
+    sys.exit(main(None))
