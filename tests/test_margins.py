@@ -12,7 +12,7 @@ from agents.pi import SEARCHED_GAINS
 from benchmarks.margins import Loop, margins, plot_margins
 from mptc_gym import Parameters
 
-STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
+STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of the paper's plant
 PLANTS = {
     "paper": {},
     "long": {"delay": 35, "gain_factor": 1.1},

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +90,8 @@ class Model:
         The criterion of each choice of orders that was tried, the lower the better.
     errors
         The prediction errors xi, one a row of the log, NaN where they are not known, degC.
+    covariance
+        Of the coefficients of A, B and C, in this order, without the leading 1s.
     profile
         Twice the log likelihood that each delay falls short of the best one.
     notes
@@ -109,6 +110,7 @@ class Model:
     sampling_interval: float
     criteria: dict[Orders, float]
     errors: Array
+    covariance: Array
     profile: dict[int, float]
     notes: list[str] = field(default_factory=list)
 
@@ -351,13 +353,14 @@ class _Search:
         a, b, c, constant = _polynomials(chosen.solution, orders)
         self._check_stable(a)
         within = [fit for fit in fits if fit.deviance - least < THRESHOLD]
+        covariance = self._covariance(chosen, orders)
         estimates = {
             "delay": delay,
             "dead_zone": dead_zone,
             "gain": self._profile(within, chosen, least, orders, _gain, self._with_gain),
             "time_constant": self._time_constant(within, chosen, least, orders),
             "noise_variance": self._variance(chosen.solution, orders),
-            **self._coefficients(chosen, orders),
+            **_coefficients(chosen.solution, orders, covariance),
         }
         errors = np.full(len(self.output), np.nan)
         errors[self.rows.index] = chosen.solution.errors
@@ -376,6 +379,7 @@ class _Search:
             sampling_interval=self.interval,
             criteria=criteria,
             errors=errors,
+            covariance=covariance,
             profile=dict(sorted(profile.items())),
             notes=self.notes,
         )  # fmt: skip
@@ -406,21 +410,6 @@ class _Search:
         low, high = stats.chi2.ppf([(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], freedom)
         square = solution.square
         return Interval(square / freedom, square / float(high), square / float(low))
-
-    def _coefficients(self, chosen: _Candidate, orders: Orders) -> dict[str, Interval]:
-        """Return the intervals of A, B and C, from the curvature of the likelihood."""
-        covariance = self._covariance(chosen, orders)
-        values = np.concatenate([chosen.solution.linear[:-1], chosen.solution.c])
-        spreads = stats.norm.ppf((1 + CONFIDENCE) / 2) * np.sqrt(np.diag(covariance))
-        names = [
-            f"{letter}{i}"
-            for letter, count in (("a", orders.a), ("b", orders.b), ("c", orders.c))
-            for i in range(1, count + 1)
-        ]
-        return {
-            name: Interval(float(value), float(value - spread), float(value + spread))
-            for name, value, spread in zip(names, values, spreads, strict=True)
-        }
 
     def _covariance(self, chosen: _Candidate, orders: Orders) -> Array:
         """Return the covariance of the coefficients of A, B and C, without the constant."""
@@ -599,6 +588,23 @@ def _polynomials(
     return a, b, (1.0, *solution.c.tolist()), linear[-1]
 
 
+def _coefficients(
+    solution: Solution, orders: Orders, covariance: Array
+) -> dict[str, Interval]:
+    """Return the intervals of A, B and C, from the curvature of the likelihood."""
+    values = np.concatenate([solution.linear[:-1], solution.c])
+    spreads = stats.norm.ppf((1 + CONFIDENCE) / 2) * np.sqrt(np.diag(covariance))
+    names = [
+        f"{letter}{i}"
+        for letter, count in (("a", orders.a), ("b", orders.b), ("c", orders.c))
+        for i in range(1, count + 1)
+    ]
+    return {
+        name: Interval(float(value), float(value - spread), float(value + spread))
+        for name, value, spread in zip(names, values, spreads, strict=True)
+    }
+
+
 def _gain(solution: Solution, orders: Orders) -> float:
     a, b, *_ = _polynomials(solution, orders)
     return sum(b) / sum(a)
@@ -653,19 +659,18 @@ def _of_dead_zone(fits: list[_Candidate], weights: Array) -> Interval:
         shares[fit.gap] = shares.get(fit.gap, 0.0) + float(weight)
     gaps = sorted(shares, key=lambda gap: gap.low)
 
-    def quantile(probability: float) -> float:
+    def at(probability: float) -> tuple[_Gap, float]:
         below = 0.0
         for gap in gaps:
             if below + shares[gap] >= probability:
-                return gap.low + gap.width * (probability - below) / shares[gap]
+                inside = gap.width * (probability - below) / shares[gap]
+                return gap, gap.low + inside
             below += shares[gap]
-        return gaps[-1].high
+        return gaps[-1], gaps[-1].high
 
-    median = quantile(0.5)
-    low, high = quantile((1 - CONFIDENCE) / 2), quantile((1 + CONFIDENCE) / 2)
-    if shares.get(gaps[0], 0.0) > 0.5 and gaps[0].low == 0.0:
+    # The likelihood is the same all over a gap: the interval takes gaps as a whole.
+    low = at((1 - CONFIDENCE) / 2)[0].low
+    high = at((1 + CONFIDENCE) / 2)[0].high
+    if gaps[0].low == 0.0 and shares[gaps[0]] > 0.5:
         return Interval(0.0, 0.0, high)  # every command has had an effect
-    return Interval(median, low, high)
-
-
-Arguments = dict[str, Any]
+    return Interval(at(0.5)[1], low, high)

@@ -1,0 +1,103 @@
+"""Pictures of an identification."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from benchmarks.controllers.step_test import StepTest
+from benchmarks.identify.fit import Model
+from benchmarks.identify.log import Log
+from benchmarks.identify.plant import simulation, step_band
+from benchmarks.lib.drawing import COLOURS, STYLE, save
+
+Array = NDArray[np.float64]
+
+LAGS = 40  # of the autocorrelation
+DRAWS = 300  # of the step response's band
+SHOWN = 3_000  # rows of a log: more cannot be told apart
+
+
+def autocorrelation(errors: Array, lags: int = LAGS) -> Array:
+    """Return the autocorrelation of the errors that are known, from lag 0 on."""
+    known = np.isfinite(errors)
+    centred = np.where(known, errors - np.mean(errors[known]), 0.0)
+    pairs = [np.sum(centred[lag:] * centred[: len(centred) - lag]) for lag in range(lags + 1)]
+    result: Array = np.array(pairs) / pairs[0]
+    return result
+
+
+def plot_log(log: Log, model: Model, path: Path) -> None:
+    """Draw what was recorded, and what the model makes of the flow alone."""
+    stop = min(len(log.flow), SHOWN)
+    minutes = np.arange(stop) * log.sampling_interval / 60.0
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(10, 6))
+        above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
+        above.plot(minutes, log.temperature[:stop], color="0.5", linewidth=1, label="recorded")
+        above.plot(
+            minutes, simulation(model, log)[:stop], color=COLOURS[1], label="model, without noise"
+        )
+        above.set_ylabel("temperature (°C)")
+        above.legend(loc="upper right", ncols=2)
+        below.step(minutes, log.flow[:stop], where="post", color=COLOURS[0], linewidth=1)
+        zone = model.estimates["dead_zone"].value
+        if zone:
+            below.axhspan(
+                model.operating_flow - zone, model.operating_flow + zone,
+                color="0.5", alpha=0.15, linewidth=0, label="dead zone",
+            )  # fmt: skip
+            below.legend(loc="upper right")
+        below.set_ylabel("flow (t/h)")
+        below.set_xlabel("time (min)")
+        save(figure, path)
+
+
+def plot_residuals(model: Model, path: Path) -> None:
+    """Draw the prediction errors and their autocorrelation."""
+    known = np.isfinite(model.errors)
+    correlation = autocorrelation(model.errors)
+    chance = 1.96 / np.sqrt(known.sum())
+    minutes = np.arange(len(model.errors)) * model.sampling_interval / 60.0
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(10, 3.6))
+        left, right = figure.subplots(1, 2)
+        left.plot(minutes[:SHOWN], model.errors[:SHOWN], color=COLOURS[0], linewidth=0.6)
+        left.set(xlabel="time (min)", ylabel="prediction error (°C)")
+        lags = np.arange(1, len(correlation))
+        right.bar(lags, correlation[1:], width=0.5, color=COLOURS[0])
+        right.axhspan(-chance, chance, color="0.5", alpha=0.2, linewidth=0, label="by chance, 95 %")
+        right.set(xlabel="lag (samples)", ylabel="autocorrelation")
+        right.legend(loc="upper right")
+        save(figure, path)
+
+
+def plot_step(model: Model, tested: StepTest, path: Path) -> None:
+    """Draw the step response with its band, and the first-order model of the step test."""
+    length = tested.delay + 6.0 * tested.time_constant
+    samples = int(np.ceil(length / model.sampling_interval)) + 1
+    response, low, high = step_band(model, samples, DRAWS, seed=0)
+    times = np.arange(samples) * model.sampling_interval
+    since = np.maximum(times - tested.delay + model.sampling_interval, 0.0)
+    first_order = np.where(
+        times >= tested.delay, -tested.gain * np.expm1(-since / tested.time_constant), 0.0
+    )
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(8, 4))
+        axes = figure.subplots()
+        axes.fill_between(
+            times / 60, low, high, color=COLOURS[0], alpha=0.25, linewidth=0,
+            label="95 % of what the log leaves open",
+        )  # fmt: skip
+        axes.plot(times / 60, response, color=COLOURS[0], label="model")
+        axes.plot(
+            times / 60, first_order, "--", color=COLOURS[1],
+            label="first order with delay, of the step test",
+        )  # fmt: skip
+        axes.set(xlabel="time after the step (min)", ylabel="temperature (°C per t/h)")
+        axes.legend()
+        save(figure, path)
