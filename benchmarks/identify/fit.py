@@ -17,13 +17,12 @@ from benchmarks.identify.log import Log
 CONFIDENCE = 0.95
 THRESHOLD = float(stats.chi2.ppf(CONFIDENCE, 1))  # of twice a difference of log likelihoods
 FIRST_ORDERS = Orders(2, 1, 2)  # to look for the delay with, before the orders are known
-ALL_ORDERS = tuple(
-    Orders(a, b, c) for a in (1, 2, 3) for b in (1, 2, 3) for c in (0, 1, 2, 3)
-)
+ALL_ORDERS = tuple(Orders(a, b, c) for a in (1, 2, 3) for b in (1, 2, 3) for c in (0, 1, 2, 3))
 WORTH_A_FIT = 16.0  # candidates that the search leaves this far behind get no fit of their own
 MOST_FITS = 60
 MAGNITUDES = 40  # most dead zones that are tried at once
 LEAST_SAMPLES = 100  # beside those that the longest delay takes
+WEAK = 100.0  # twice the log likelihood, below which a log may be the wrong way round
 CHANCE = 0.01  # that a flow without effect is taken for one with effect
 FOLLOWS = 0.98  # share of the flow's moves that, explained by the temperature, is feedback
 
@@ -161,15 +160,26 @@ def identify(log: Log, options: Options | None = None) -> Model:
     ValueError
         If the options do not fit to the log.
     """
-    search = _Search(log, options or Options())
-    return search.model()
+    return _Search(log, options or Options()).model()
+
+
+def _gained_when_swapped(log: Log, options: Options) -> float:
+    """Return what the temperature adds to the likelihood of the flow."""
+    swapped = Log(log.temperature, log.flow, log.sampling_interval)
+    plain = Options(longest_delay=options.longest_delay, find_dead_zone=False)
+    try:
+        search = _Search(swapped, plain)
+    except ValueError:
+        return 0.0
+    _, delay, gap = search.scan(FIRST_ORDERS, np.zeros(0), search.gaps())[0]
+    return search.gained(search.fit(delay, gap, FIRST_ORDERS), FIRST_ORDERS)
 
 
 class _Search:
     """The data of a log, and the steps of the search."""
 
     def __init__(self, log: Log, options: Options) -> None:
-        self.options = options
+        self.log, self.options = log, options
         self.notes: list[str] = []
         self.interval = log.sampling_interval
         self.operating_flow = _operating_flow(log.flow, options)
@@ -280,13 +290,17 @@ class _Search:
         found.sort(key=lambda entry: entry[0])
         return found
 
-    def choose_orders(self, best: list[tuple[float, int, _Gap]], c: Array) -> dict[Orders, float]:
+    def choose_orders(
+        self, best: list[tuple[float, int, _Gap]], c: Array
+    ) -> dict[Orders, float]:
         """Return the criterion of all orders, the best first."""
         places = {(delay, gap) for _, delay, gap in best[:3]}
         criteria = {}
         for orders in self._orders():
             # More coefficients of B can stand for a longer delay.
-            tried = places | {(delay - 1, gap) for delay, gap in places if delay and orders.b > 1}
+            tried = places | {
+                (delay - 1, gap) for delay, gap in places if delay and orders.b > 1
+            }
             least = min(self.fit(delay, gap, orders, c).deviance for delay, gap in tried)
             criteria[orders] = least + orders.count * math.log(len(self.rows))
         return dict(sorted(criteria.items(), key=lambda entry: entry[1]))
@@ -309,17 +323,30 @@ class _Search:
         # Without the longest delays, rows at the beginning and after gaps are known, too.
         self.longest_delay = max(delay for _, delay, _ in _near(best))
         self.rows = self._rows()
-        fits = [self.fit(delay, gap, orders, c) for _, delay, gap in _near(self.scan(orders, c, gaps))]
+        fits = [
+            self.fit(delay, gap, orders, c)
+            for _, delay, gap in _near(self.scan(orders, c, gaps))
+        ]
         fits.sort(key=lambda fit: fit.deviance)
         self._check_answer(fits[0], orders)
         return self._summarise(fits, orders, criteria)
 
-    def _check_answer(self, best: _Candidate, orders: Orders) -> None:
-        """Refuse a log in which the flow does nothing that can be told from noise."""
+    def gained(self, best: _Candidate, orders: Orders) -> float:
+        """Return what the flow adds to twice the log likelihood."""
         target, columns = self.regressors(best.delay, best.gap, orders)
         without = np.delete(columns, np.s_[orders.a : orders.a + orders.b], axis=1)
         none = self.rows.solve(target, without, orders.c, best.solution.c)
-        gained = self.deviance(none.square) - best.deviance
+        return self.deviance(none.square) - best.deviance
+
+    def _check_answer(self, best: _Candidate, orders: Orders) -> None:
+        """Refuse a log in which the flow does nothing that can be told from noise."""
+        gained = self.gained(best, orders)
+        if gained < WEAK and _gained_when_swapped(self.log, self.options) > 2.0 * WEAK:
+            raise CannotTellError(
+                "the direction is unusual: the flow answers the temperature rather than the "
+                "temperature the flow. The two columns seem to be swapped; name them with "
+                "--flow and --temperature"
+            )
         # As many delays and dead zones have been tried, the best of them gains by chance.
         tried = (self.options.longest_delay + 1) * len(self.gaps())
         least = float(stats.chi2.isf(CHANCE / tried, orders.b))
@@ -327,8 +354,8 @@ class _Search:
             raise CannotTellError(
                 "the temperature does not answer the flow in this log: a model without the "
                 f"flow explains it as well (twice the log likelihood differs by {gained:.1f}, "
-                f"and {ANSWERS:g} are asked for). Move the flow further or longer, look for a "
-                "longer delay with --longest-delay, or see whether the columns are swapped"
+                f"and {least:.1f} are asked for). Move the flow further or longer, or look for "
+                "a longer delay with --longest-delay"
             )
 
     # What is made of it -------------------------------------------------------------------
@@ -529,23 +556,32 @@ def check_excitation(command: Array, output: Array, options: Options) -> None:
 
 
 def _explained_by_feedback(command: Array, output: Array) -> float:
-    """Return which share of the flow's moves the temperature explains, linearly."""
+    """Return which share of the flow's moves the temperature explains, linearly.
+
+    It is a share of what the flow's own past leaves open.
+    """
     lags = 3
     index = np.arange(lags, len(command))
-    columns = [output[index - i] for i in range(lags)]
-    columns += [command[index - i] for i in (1, 2)]
-    table = np.column_stack([*columns, np.ones(len(index)), command[index] - command[index - 1]])
+    moves = command[index] - command[index - 1]
+    own = [command[index - i] for i in (1, 2)] + [np.ones(len(index))]
+    temperatures = [output[index - i] for i in range(lags)]
+    table = np.column_stack([*own, *temperatures, moves])
     # Where a limit holds the flow, it does not follow anything.
     free = np.isfinite(table).all(axis=1)
     free &= (command[index] > np.nanmin(command)) & (command[index] < np.nanmax(command))
     table = table[free]
-    moves = table[:, -1]
-    total = float(moves @ moves)
-    if len(table) < LEAST_SAMPLES or total == 0.0:
+    if len(table) < LEAST_SAMPLES:
         return 0.0
-    fitted, *_ = np.linalg.lstsq(table[:, :-1], moves, rcond=None)
-    left = moves - table[:, :-1] @ fitted
-    return 1.0 - float(left @ left) / total
+
+    def left(columns: int) -> float:
+        fitted, *_ = np.linalg.lstsq(table[:, :columns], table[:, -1], rcond=None)
+        errors = table[:, -1] - table[:, :columns] @ fitted
+        return float(errors @ errors)
+
+    alone, total = left(len(own)), float(table[:, -1] @ table[:, -1])
+    if alone <= 1e-9 * total:  # it goes on as it has gone, whatever the temperature does
+        return 0.0
+    return 1.0 - left(table.shape[1] - 1) / alone
 
 
 def _operating_flow(flow: Array, options: Options) -> float:
@@ -588,9 +624,7 @@ def _polynomials(
     return a, b, (1.0, *solution.c.tolist()), linear[-1]
 
 
-def _coefficients(
-    solution: Solution, orders: Orders, covariance: Array
-) -> dict[str, Interval]:
+def _coefficients(solution: Solution, orders: Orders, covariance: Array) -> dict[str, Interval]:
     """Return the intervals of A, B and C, from the curvature of the likelihood."""
     values = np.concatenate([solution.linear[:-1], solution.c])
     spreads = stats.norm.ppf((1 + CONFIDENCE) / 2) * np.sqrt(np.diag(covariance))

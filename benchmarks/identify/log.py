@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -30,6 +31,7 @@ TEMPERATURE_UNITS = {
 }
 CHUNK = 200_000  # rows that are read at once
 MOST_ROWS = 20_000  # that are kept by default, the latest
+PROGRESS_AFTER = 1.0  # s
 UNEVEN = 0.1  # of the sampling interval: what a time step may be off
 LONGEST_GAP = 2_000  # rows that a gap is filled with: beyond, what came before is forgotten
 MOST_MISSING = 0.5  # share of the rows
@@ -108,7 +110,7 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) 
     kept: deque[Array] = deque()
     clock = _Clock(columns.sampling_interval)
     read = 0
-    with tqdm(unit="row", unit_scale=True, desc="reading", delay=1.0) as progress:
+    with tqdm(unit="row", unit_scale=True, desc="reading", delay=PROGRESS_AFTER) as progress:
         for table in layout.tables():
             read += len(table)
             kept.append(clock.spread(table, first_line=read - len(table) + 2))
@@ -141,6 +143,13 @@ class _Layout:
         comma = r'"-?\d+,\d+"' if self.separator == "," else r"\d,\d"
         self.decimal = "," if any(re.search(comma, line) for line in lines[1:]) else "."
         names = [str(name) for name in self._read(nrows=0).columns]
+        for number, fields in enumerate(csv.reader(lines, delimiter=self.separator), 1):
+            if any(field.strip() for field in fields[len(names) :]):
+                raise ValueError(
+                    f"{path}, line {number}: {len(fields)} fields where the heading has "
+                    f"{len(names)}. With decimal commas, the separator must be a semicolon or a "
+                    "tab, or the numbers in quotes"
+                )
         wanted = [columns.flow, columns.temperature]
         units: list[tuple[dict[str, tuple[float, float]], str | None, str, str]] = [
             (FLOW_UNITS, columns.flow_unit, "t/h", "flow"),
@@ -156,9 +165,7 @@ class _Layout:
         if len(set(found)) < len(found):
             raise ValueError(f"each column can be one thing only, got {', '.join(found)}")
         self.names = found
-        self.scales = [
-            _scale(name, *unit) for name, unit in zip(found, units, strict=True)
-        ]
+        self.scales = [_scale(name, *unit) for name, unit in zip(found, units, strict=True)]
 
     def _read(self, **options: Any) -> Any:
         return pd.read_csv(
@@ -169,6 +176,7 @@ class _Layout:
             encoding_errors="replace",
             skipinitialspace=True,
             skip_blank_lines=False,
+            index_col=False,
             **options,
         )
 
@@ -190,15 +198,16 @@ class _Layout:
         """Return the file piece by piece: flow, temperature and time if there is one."""
         line = 2
         try:
-            for chunk in self._read(usecols=self.names, chunksize=CHUNK):
-                values = [
-                    factor * self._numbers(chunk[name], line, is_time=i == 2) + offset
-                    for i, (name, (factor, offset)) in enumerate(
-                        zip(self.names, self.scales, strict=True)
-                    )
-                ]
-                line += len(chunk)
-                yield np.column_stack(values)
+            with self._read(chunksize=CHUNK) as chunks:
+                for chunk in chunks:
+                    values = [
+                        factor * self._numbers(chunk[name], line, is_time=i == 2) + offset
+                        for i, (name, (factor, offset)) in enumerate(
+                            zip(self.names, self.scales, strict=True)
+                        )
+                    ]
+                    line += len(chunk)
+                    yield np.column_stack(values)
         except pd.errors.ParserError as error:
             raise ValueError(f"{self.path} is not a table: {error}") from error
 
@@ -216,10 +225,12 @@ class _Layout:
         if is_time and not len(bad):
             bad = np.flatnonzero(np.isnan(values))
         if len(bad):
-            allowed = "a number, or a date such as 2026-01-31T12:00:00" if is_time else "a number"
+            allowed = (
+                "a number, or a date such as 2026-01-31T12:00:00" if is_time else "a number"
+            )
             raise ValueError(
                 f"{self.path}, line {line + bad[0]}: {column.name} must be {allowed}, got "
-                f"{column.iloc[bad[0]]!r}"
+                f"{str(column.iloc[bad[0]])!r}"
             )
         return values
 
@@ -273,7 +284,8 @@ class _Clock:
         if not len(gaps):
             return table[:, :2]
         counts = np.minimum(whole, LONGEST_GAP).astype(np.intp)
-        places = np.cumsum(np.concatenate([[0] * (len(times) - len(steps)), counts]))
+        start = np.zeros(len(times) - len(steps), np.intp)
+        places = np.cumsum(np.concatenate([start, counts]))
         first = 0 if len(times) > len(steps) else 1  # a gap before the first row of a piece
         result = np.full((int(places[-1]) + 1 - first, 2), np.nan)
         result[places - first] = table[:, :2]
@@ -304,7 +316,9 @@ def _missing(flow: Array, temperature: Array) -> list[str]:
     }
     for name, count in counts.items():
         if count > MOST_MISSING * len(flow):
-            raise ValueError(f"{count} of {len(flow)} rows have no {name}: too many are missing")
+            raise ValueError(
+                f"{count} of {len(flow)} rows have no {name}: too many are missing"
+            )
     if not any(counts.values()):
         return []
     return [

@@ -40,7 +40,10 @@ def plot_log(log: Log, model: Model, path: Path) -> None:
         above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
         above.plot(minutes, log.temperature[:stop], color="0.5", linewidth=1, label="recorded")
         above.plot(
-            minutes, simulation(model, log)[:stop], color=COLOURS[1], label="model, without noise"
+            minutes,
+            simulation(model, log)[:stop],
+            color=COLOURS[1],
+            label="model, without noise",
         )
         above.set_ylabel("temperature (°C)")
         above.legend(loc="upper right", ncols=2)
@@ -70,7 +73,9 @@ def plot_residuals(model: Model, path: Path) -> None:
         left.set(xlabel="time (min)", ylabel="prediction error (°C)")
         lags = np.arange(1, len(correlation))
         right.bar(lags, correlation[1:], width=0.5, color=COLOURS[0])
-        right.axhspan(-chance, chance, color="0.5", alpha=0.2, linewidth=0, label="by chance, 95 %")
+        right.axhspan(
+            -chance, chance, color="0.5", alpha=0.2, linewidth=0, label="by chance, 95 %"
+        )
         right.set(xlabel="lag (samples)", ylabel="autocorrelation")
         right.legend(loc="upper right")
         save(figure, path)

@@ -1,0 +1,459 @@
+"""Identification: known plants are found again, and a log that cannot tell is refused."""
+
+import json
+import tracemalloc
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import signal
+
+from agents import PIController
+from benchmarks.identify import log as log_module
+from benchmarks.identify.__main__ import main
+from benchmarks.identify.armax import Orders
+from benchmarks.identify.fit import CannotTellError, Options, identify
+from benchmarks.identify.log import Columns, Log, read_log
+from benchmarks.identify.plant import plant_arguments, plant_ranges, simulation
+from benchmarks.identify.study import cell, synthetic_plants, table
+from benchmarks.rollout import make_plants, rollout
+from mptc_gym import Parameters
+
+PAPER = Parameters()
+
+
+def steps(generator, samples, low=-10.0, high=10.0):
+    """Return a flow in steps that are held for 30 to 120 samples."""
+    flow = []
+    while len(flow) < samples:
+        flow += [generator.uniform(low, high)] * int(generator.integers(30, 121))
+    return np.array(flow[:samples])
+
+
+def answer(flow, generator, *, b=PAPER.b, delay=18, dead_zone=5.0, noise=0.05):
+    """Return the temperature of the paper's plant, by SciPy's filters."""
+    applied = np.where(np.abs(flow) < dead_zone, 0.0, flow)
+    xi = generator.normal(0.0, np.sqrt(noise), len(flow))
+    driven = signal.lfilter([0.0] * (delay + 1) + list(b), PAPER.a, applied)
+    return driven + signal.lfilter(PAPER.c, PAPER.a, xi)
+
+
+def recorded(samples=1200, seed=700, **plant):
+    generator = np.random.default_rng(seed)
+    flow = steps(generator, samples)
+    return Log(flow, answer(flow, generator, **plant), 8.0)
+
+
+@pytest.fixture(scope="module")
+def good():
+    """Return a log of the paper's plant, and what is found in it."""
+    log = recorded()
+    return log, identify(log)
+
+
+class TestFit:
+    def test_paper_plant_is_found(self, good):
+        _, model = good
+        found = model.estimates
+        assert found["delay"].value == 18
+        assert found["dead_zone"].value == pytest.approx(5.0, abs=1.0)
+        assert found["gain"].value == pytest.approx(-0.6825, rel=0.1)
+        assert found["time_constant"].value == pytest.approx(161.0, rel=0.2)
+        assert found["noise_variance"].value == pytest.approx(0.05, rel=0.1)
+        truths = {
+            "delay": 18, "dead_zone": 5.0, "gain": -0.6825, "time_constant": 161.0,
+            "a1": -0.45181, "a2": -0.47546, "b1": -0.0456,
+        }  # fmt: skip
+        for name, truth in truths.items():
+            assert found[name].low <= truth <= found[name].high, name
+
+    def test_without_noise_the_coefficients_are_exact(self):
+        log = recorded(dead_zone=0.0, noise=1e-8)
+        model = identify(log, Options(orders=Orders(2, 2, 2), find_dead_zone=False))
+        np.testing.assert_allclose(model.a, PAPER.a, atol=2e-3)
+        np.testing.assert_allclose(model.b, PAPER.b, atol=2e-4)
+        assert model.estimates["delay"].value == 18
+
+    def test_operating_point_is_found_and_deviations_are_from_it(self, good):
+        log, plain = good
+        shifted = Log(log.flow + 480.0, log.temperature + 385.0, 8.0)
+        model = identify(shifted, Options(operating_flow=480.0))
+        np.testing.assert_allclose(model.a, plain.a, rtol=1e-4)
+        assert model.operating_flow == 480.0
+        assert model.operating_temperature == pytest.approx(385.0, abs=0.5)
+        by_itself = identify(shifted, Options(find_dead_zone=False))
+        assert by_itself.operating_flow == shifted.flow[0]
+
+    def test_dead_zone_is_known_up_to_the_gap_between_commands(self):
+        # Magnitudes 3 and 7 only: the dead zone may be anything from 3 to 7.
+        generator = np.random.default_rng(701)
+        levels = generator.choice([-7.0, -3.0, 3.0, 7.0], 40)
+        flow = np.repeat(levels, 40)
+        found = identify(Log(flow, answer(flow, generator), 8.0)).estimates["dead_zone"]
+        assert (found.low, found.high) == (3.0, 7.0)
+        assert 3.0 < found.value < 7.0
+
+    def test_flow_behind_the_actuator_needs_no_dead_zone(self, good):
+        log, _ = good
+        applied = np.where(np.abs(log.flow) < 5.0, 0.0, log.flow)
+        model = identify(Log(applied, log.temperature, 8.0), Options(find_dead_zone=False))
+        assert model.estimates["dead_zone"].value == 0.0
+        assert model.estimates["delay"].value == 18
+
+    def test_gaps_are_left_out(self, good):
+        log, whole = good
+        flow, temperature = log.flow.copy(), log.temperature.copy()
+        temperature[[200, 201, 500, 777]] = np.nan
+        flow[900:905] = np.nan
+        model = identify(Log(flow, temperature, 8.0))
+        assert np.isnan(model.errors[[200, 202, 500, 777, 925]]).all()
+        assert model.estimates["delay"].value == 18
+        assert model.estimates["gain"].value == pytest.approx(
+            whole.estimates["gain"].value, rel=0.05
+        )
+
+    def test_gap_in_the_middle_is_no_bridge(self):
+        # Two logs, one after the other, with another level of temperature in between.
+        first, second = recorded(700), recorded(700, seed=702)
+        hole = np.full(80, np.nan)
+        flow = np.concatenate([first.flow, hole, second.flow])
+        temperature = np.concatenate([first.temperature, hole, second.temperature])
+        model = identify(Log(flow, temperature, 8.0))
+        assert model.estimates["delay"].value == 18
+        assert model.estimates["noise_variance"].value == pytest.approx(0.05, rel=0.1)
+
+    def test_unusual_direction_is_said(self):
+        model = identify(recorded(b=[-b for b in PAPER.b]))
+        assert model.estimates["gain"].value > 0
+        assert any("direction is unusual" in note for note in model.notes)
+
+    def test_longer_delay_than_looked_for_is_said(self):
+        model = identify(recorded(noise=0.02), Options(longest_delay=17))
+        assert any("longer --longest-delay" in note for note in model.notes)
+
+    def test_closed_loop_with_set_points_that_move_can_tell(self):
+        plants = make_plants(1, 1200, noise_variance=0.1, dead_zone=0.0)
+        run = rollout(plants, PIController.simc(gain=-0.68, time_constant=160.0, delay=150.0),
+                      1200, seed=7)  # fmt: skip
+        log = Log(run.command[:, 0], run.output[:, 0], 8.0)
+        found = identify(log, Options(find_dead_zone=False)).estimates
+        assert found["delay"].value == pytest.approx(18, abs=1)
+        assert found["gain"].value == pytest.approx(-0.6825, rel=0.15)
+
+
+class TestRefusal:
+    def refuse(self, flow, temperature, match, **options):
+        with pytest.raises(CannotTellError, match=match):
+            identify(Log(np.asarray(flow), np.asarray(temperature), 8.0), Options(**options))
+
+    def test_constant_flow(self):
+        noise = np.random.default_rng(0).normal(size=500)
+        self.refuse(np.full(500, 3.0), noise, "the flow is constant")
+
+    def test_constant_temperature(self):
+        log = recorded()
+        self.refuse(log.flow, np.full(1200, 385.0), "the temperature is constant")
+
+    def test_too_few_rows(self):
+        log = recorded(150)
+        self.refuse(log.flow[:10], log.temperature[:10], "too short: 10 rows")
+        self.refuse(log.flow, log.temperature, "too short: 150 rows .* --longest-delay")
+
+    def test_flow_that_stays_inside_the_dead_zone(self):
+        generator = np.random.default_rng(703)
+        flow = steps(generator, 1200, -4.0, 4.0)
+        self.refuse(flow, answer(flow, generator), "does not answer the flow")
+
+    def test_closed_loop_with_nothing_else_moving(self):
+        plants = make_plants(1, 1200, noise_variance=0.1, setpoint=0.0)
+        run = rollout(plants, PIController(1.0, 0.05), 1200, seed=7)
+        self.refuse(run.command[:, 0], run.output[:, 0], "the loop is closed")
+
+    @pytest.mark.parametrize("noise", [1e-4, 0.3])
+    def test_swapped_columns(self, noise):
+        log = recorded(noise=noise)
+        self.refuse(log.temperature, log.flow, "direction is unusual: .* swapped")
+
+    def test_temperature_that_does_not_settle(self):
+        generator = np.random.default_rng(704)
+        flow = steps(generator, 1200)
+        drifts = np.cumsum(0.05 * flow)
+        self.refuse(flow, drifts + generator.normal(size=1200), "does not show where")
+
+
+class TestPlant:
+    def test_plant_is_the_environment_s(self, good):
+        # At rest before k = 0: the environment does what the simulation of the log shows.
+        log, model = good
+        arguments = json.loads(json.dumps(plant_arguments(model)))
+        assert arguments["delay"] == 18
+        calm = {**arguments, "noise_variance": 0.0}
+        env = gymnasium.make("MiddlePoint-v0", max_episode_steps=1200, **calm)
+        env.reset()
+        low, high = arguments["u_min"], arguments["u_max"]
+        outputs = [0.0]
+        for u in log.flow[:-1]:
+            action = 2.0 * (u - low) / (high - low) - 1.0
+            outputs.append(env.step(np.array([action], np.float32))[-1]["output"])
+        started = Log(log.flow, np.array(outputs) + model.operating_temperature, 8.0)
+        simulated = simulation(model, started)
+        known = np.isfinite(simulated)
+        assert known.sum() > 1150
+        np.testing.assert_allclose(simulated[known], started.temperature[known], atol=1e-3)
+
+    def test_ranges_hold_the_plant_and_can_be_drawn_from(self, good):
+        _, model = good
+        plant, ranges = plant_arguments(model), plant_ranges(model)
+        env = gymnasium.make("MiddlePoint-v0", **json.loads(json.dumps(ranges)))
+        env.reset(seed=0)
+        factors = {"gain_factor": 1.0, "time_constant_factor": 1.0}
+        names = [name for name, value in ranges.items()
+                 if isinstance(value, list) and name not in "abc"]  # fmt: skip
+        assert {"dead_zone", "noise_variance", *factors} <= set(names)
+        for name in names:
+            low, high = ranges[name]
+            assert low <= {**plant, **factors}[name] <= high
+        # The ends of the time constant, as the environment counts it: 1 / (1 - pole) samples.
+        low, high = model.estimates["time_constant"].low, model.estimates["time_constant"].high
+        ends = [1.0 / -np.expm1(-8.0 / t) for t in (low, high)]
+        middle = 1.0 / -np.expm1(-8.0 / model.estimates["time_constant"].value)
+        np.testing.assert_allclose(ranges["time_constant_factor"], np.array(ends) / middle)
+
+    def test_set_point_is_within_reach(self):
+        model = identify(recorded(b=[b / 10.0 for b in PAPER.b], noise=1e-3))
+        arguments = plant_arguments(model)
+        reach = 0.068 * min(-model.u_min, model.u_max)
+        assert 0.6 * reach < arguments["setpoint_amplitude"] < reach
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Return a function that writes a log as a file, and its path."""
+
+    def write(text=None, name="log.csv", **columns):
+        path = tmp_path / name
+        if text is None:
+            log = recorded(400)
+            table = {"time": 8.0 * np.arange(400), "flow": log.flow,
+                     "temperature": log.temperature}  # fmt: skip
+            text = pd.DataFrame(table | columns).to_csv(index=False)
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+class TestLog:
+    def same(self, first, second):
+        np.testing.assert_allclose(first.flow, second.flow, rtol=1e-9)
+        np.testing.assert_allclose(first.temperature, second.temperature, rtol=1e-9)
+        assert first.sampling_interval == second.sampling_interval
+
+    def table(self):
+        log = recorded(400)
+        return pd.DataFrame(
+            {"time": 8.0 * np.arange(400), "flow": log.flow, "temperature": log.temperature}
+        )
+
+    def test_plain(self, written):
+        log = read_log(written())
+        self.same(log, recorded(400))
+        assert log.notes == []
+
+    @pytest.mark.parametrize(
+        "options",
+        [
+            {"sep": ";"},
+            {"sep": "\t"},
+            {"sep": ";", "decimal": ","},
+            {"sep": "\t", "decimal": ","},
+            {"sep": ",", "decimal": ",", "quoting": 2},
+        ],
+    )
+    def test_separators_and_decimal_marks(self, written, options):
+        table = self.table()
+        if options.get("quoting"):
+            table = table.map(lambda value: f"{value!r}".replace(".", ","))
+        self.same(read_log(written(table.to_csv(index=False, **options))), recorded(400))
+
+    def test_dates(self, written):
+        dates = pd.date_range("2026-01-31T12:00:00", periods=400, freq="8s").strftime(
+            "%Y-%m-%dT%H:%M:%S"
+        )
+        self.same(read_log(written(time=dates)), recorded(400))
+
+    def test_sampling_interval_in_place_of_times(self, written):
+        path = written(self.table().drop(columns="time").to_csv(index=False))
+        self.same(read_log(path, Columns(sampling_interval=8.0)), recorded(400))
+        with pytest.raises(ValueError, match=r"no column 'time'.* or give --sampling-interval"):
+            read_log(path)
+
+    def test_units_of_headings_and_options(self, written):
+        plain = self.table()
+        other = pd.DataFrame(
+            {
+                "Time (min)": plain["time"] / 60.0,
+                "Flow [kg/s]": plain["flow"] / 3.6,
+                "temperature": plain["temperature"] * 1.8 + 32.0,
+            }
+        )
+        path = written(other.to_csv(index=False))
+        log = read_log(path, Columns(temperature_unit="degF"))
+        np.testing.assert_allclose(log.flow, plain["flow"])
+        np.testing.assert_allclose(log.temperature, plain["temperature"], atol=1e-9)
+        assert log.sampling_interval == pytest.approx(8.0)
+
+    def test_missing_rows_and_numbers_are_gaps(self, written):
+        table = self.table().drop(index=[100, 101, 102])
+        table.loc[50, "temperature"] = np.nan
+        log = read_log(written(table.to_csv(index=False)))
+        assert len(log.flow) == 400
+        assert np.isnan(log.temperature[[50, 100, 101, 102]]).all()
+        assert any("3 rows are missing" in note for note in log.notes)
+        assert any("4 temperatures" in note for note in log.notes)
+        # The flow was held on both sides, and so in between.
+        expected = recorded(400).flow
+        held = expected[99] == expected[103]
+        assert np.isfinite(log.flow[[100, 101, 102]]).all() == held
+
+    def test_pieces_make_no_difference(self, written, monkeypatch):
+        table = self.table().drop(index=[70, 100])
+        path = written(table.to_csv(index=False))
+        whole = read_log(path)
+        monkeypatch.setattr(log_module, "CHUNK", 10)
+        for rows in (20_000, 57):
+            log = read_log(path, rows=rows)
+            np.testing.assert_array_equal(log.flow, whole.flow[-rows:])
+            np.testing.assert_array_equal(log.temperature, whole.temperature[-rows:])
+
+    def test_long_log_is_read_in_bounded_memory(self, tmp_path, monkeypatch, capsys):
+        rows = 400_000
+        flow = np.repeat(np.arange(rows // 100) % 7, 100)
+        path = tmp_path / "long.csv"
+        pd.DataFrame({"time": 8 * np.arange(rows), "flow": flow, "temperature": flow}).to_csv(
+            path, index=False
+        )
+        monkeypatch.setattr(log_module, "CHUNK", 10_000)
+        monkeypatch.setattr(log_module, "PROGRESS_AFTER", 0.0)
+        tracemalloc.start()
+        log = read_log(path, rows=5_000)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert len(log.flow) == 5_000
+        assert any("400,000 rows, the last 5,000" in note for note in log.notes)
+        assert peak < 4e6  # two columns of all rows take 6.4 MB
+        assert "400k" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        ("change", "complaint"),
+        [
+            ({"flow": "flown"}, "no column 'flow'; it has 'time', 'flown', 'temperature'"),
+            ({"temperature": "temp"}, "no column 'temperature'"),
+        ],
+    )
+    def test_missing_column_is_named(self, written, change, complaint):
+        path = written(self.table().rename(columns=change).to_csv(index=False))
+        with pytest.raises(ValueError, match=complaint):
+            read_log(path)
+
+    @pytest.mark.parametrize(
+        ("line", "complaint"),
+        [
+            ("16,broken,1.0", "line 4: flow must be a number, got 'broken'"),
+            ("16,1.0,inf", "line 4: temperature must be a number, got 'inf'"),
+            ("16,1.0,1.2.3", "line 4: temperature must be a number, got '1.2.3'"),
+            ("soon,1.0,1.0", "line 4: time must be a number, or a date"),
+            (",1.0,1.0", "line 4: time must be a number, or a date"),
+            ("4,1.0,1.0", "line 4: the time must increase, and goes from 8 s by -4 s"),
+            ("8,1.0,1.0", "line 4: the time must increase"),
+            ("19,1.0,1.0", "line 4: the time steps are unequal, 11 s here where most are 8 s"),
+            ("16,1,0,1,5", "line 4: 5 fields where the heading has 3. With decimal commas"),
+        ],
+    )
+    def test_bad_line_is_named(self, written, line, complaint):
+        lines = ["time,flow,temperature", "0,1.0,1.0", "8,1.0,1.0", line]
+        lines += [f"{8 * k},1.0,1.0" for k in range(3, 50)]
+        with pytest.raises(ValueError, match=complaint):
+            read_log(written("\n".join(lines)))
+
+    def test_other_faults_are_named(self, written, tmp_path):
+        with pytest.raises(ValueError, match="is empty"):
+            read_log(written(""))
+        with pytest.raises(ValueError, match="cannot be read: No such file"):
+            read_log(tmp_path / "none.csv")
+        with pytest.raises(ValueError, match="unit of 'flow' must be one of .* got 'gpm'"):
+            read_log(written(), Columns(flow_unit="gpm"))
+        with pytest.raises(ValueError, match="unit of .* got 'furlongs'"):
+            table = self.table().rename(columns={"flow": "flow (furlongs)"})
+            read_log(written(table.to_csv(index=False)))
+        with pytest.raises(ValueError, match="one thing only"):
+            read_log(written(), Columns(temperature="flow"))
+        with pytest.raises(ValueError, match="sampling_interval must be above 0"):
+            read_log(written(), Columns(sampling_interval=0.0))
+        with pytest.raises(ValueError, match="rows have no flow: too many are missing"):
+            read_log(written(flow=np.where(np.arange(400) < 250, np.nan, np.arange(400))))
+
+
+class TestCommand:
+    def test_everything_is_written(self, written, tmp_path, capsys):
+        out = tmp_path / "out"
+        log = recorded()
+        table = {"time": 8.0 * np.arange(1200), "flow": log.flow,
+                 "temperature": log.temperature}  # fmt: skip
+        path = written(pd.DataFrame(table).to_csv(index=False))
+        assert main([str(path), "--out", str(out), "--longest-delay", "30"]) == 0
+        plant = json.loads((out / "plant.json").read_text())
+        gymnasium.make("MiddlePoint-v0", **plant).reset(seed=0)
+        gymnasium.make("MiddlePoint-v0", **json.loads((out / "ranges.json").read_text()))
+        text = (out / "report.md").read_text()
+        for word in ("gain margin", "least possible", "autocorrelations", "operating point"):
+            assert word in text
+        assert (out / "report.html").read_text().count("data:image/png") == 4
+        assert "time constant" in capsys.readouterr().out
+
+    def test_reason_is_said(self, written, tmp_path, capsys):
+        path = written(flow=np.full(400, 3.0))
+        with pytest.raises(SystemExit) as ended:
+            main([str(path), "--out", str(tmp_path / "out")])
+        assert ended.value.code == 2
+        assert "the flow is constant" in capsys.readouterr().err
+        assert not (tmp_path / "out" / "plant.json").exists()
+
+
+class TestStudy:
+    def test_log_of_a_known_plant(self):
+        found = cell({"delay": 12, "dead_zone": 3.0, "noise_variance": 0.02}, 1200, seed=705)
+        truth, value, low, high = found["delay"]
+        assert truth == 12
+        assert abs(value - 12) <= 1
+        assert low <= value <= high
+        assert found["gain"][0] == pytest.approx(-0.6825, rel=1e-4)
+        assert found["time_constant"][0] == pytest.approx(160.9, rel=1e-3)
+        assert found["seconds"] < 10.0
+
+    def test_plants_do_not_drift_and_have_noise(self):
+        plants = synthetic_plants(20, 706, 1200)
+        assert not any("gain_drift" in plant for plant in plants)
+        noise = [plant["noise_variance"] for plant in plants]
+        assert 0.02 <= min(noise) < 0.1
+        assert 0.4 < max(noise) <= 0.5
+
+    def test_table_counts_by_hand(self):
+        right = {
+            "refused": "", "seconds": 1.0, "delay": [10.0, 11.0, 10.0, 12.0],
+            "dead_zone": [3.0, 3.5, 2.0, 4.0], "gain": [-1.0, -1.05, -1.2, -0.9],
+            "time_constant": [100.0, 110.0, 90.0, 130.0],
+            "noise_variance": [0.1, 0.1, 0.05, 0.2],
+        }  # fmt: skip
+        wrong = {
+            "refused": "", "seconds": 1.0, "delay": [10.0, 12.0, 11.0, 13.0],
+            "dead_zone": [1.0, 8.0, 7.0, 9.0], "gain": [-1.0, -1.2, -1.3, -1.1],
+            "time_constant": [100.0, 130.0, 110.0, 150.0],
+            "noise_variance": [0.1, 0.3, 0.2, 0.4],
+        }  # fmt: skip
+        shares = table([right, wrong, {"refused": "no", "seconds": 0.1}])["how often"]
+        assert list(shares[:3]) == ["33 % of 3"] * 3
+        # Of the dead zones, one is too small to count.
+        assert shares[3] == "50 % of 2"
+        assert list(shares[4:7]) == ["33 % of 3"] * 3
