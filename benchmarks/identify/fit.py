@@ -166,7 +166,7 @@ def identify(log: Log, options: Options | None = None) -> Model:
 def _gained_when_swapped(log: Log, options: Options) -> float:
     """Return what the temperature adds to the likelihood of the flow."""
     swapped = Log(log.temperature, log.flow, log.sampling_interval)
-    plain = Options(longest_delay=options.longest_delay, find_dead_zone=False)
+    plain = Options(longest_delay=options.longest_delay)
     try:
         search = _Search(swapped, plain)
     except ValueError:
@@ -341,7 +341,7 @@ class _Search:
     def _check_answer(self, best: _Candidate, orders: Orders) -> None:
         """Refuse a log in which the flow does nothing that can be told from noise."""
         gained = self.gained(best, orders)
-        if gained < WEAK and _gained_when_swapped(self.log, self.options) > 2.0 * WEAK:
+        if gained < WEAK and _gained_when_swapped(self.log, self.options) > WEAK:
             raise CannotTellError(
                 "the direction is unusual: the flow answers the temperature rather than the "
                 "temperature the flow. The two columns seem to be swapped; name them with "
