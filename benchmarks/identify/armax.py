@@ -126,10 +126,11 @@ class Rows:
             latest[key] = errors, basis, linear
             return latest[key]
 
+        def invertible(c: Array) -> bool:
+            return bool(np.max(np.abs(np.roots([1.0, *c])), initial=0.0) <= INVERTIBLE)
+
         def residuals(c: Array) -> Array:
-            if np.max(np.abs(np.roots([1.0, *c]))) > INVERTIBLE:
-                return np.full(len(target), np.inf)
-            return project(c)[0]
+            return project(c)[0] if invertible(c) else np.full(len(target), np.inf)
 
         def jacobian(c: Array) -> Array:
             errors, basis, _ = project(c)
@@ -145,6 +146,8 @@ class Rows:
             first = np.zeros(order)
             if start is not None:
                 first[: len(start)] = start[:order]
+                if not invertible(first):  # a part of an invertible C need not be
+                    first[:] = 0.0
             found = optimize.least_squares(
                 residuals, first, jacobian, method="trf", ftol=1e-7, xtol=1e-6, max_nfev=40
             )

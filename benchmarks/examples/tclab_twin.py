@@ -1,0 +1,139 @@
+"""Identify a plant that no one here wrote, TCLab's digital twin, and control it.
+
+`python -m benchmarks.examples.tclab_twin`, after `pip install tclab`. The Temperature Control Lab is a
+small heater with a sensor, for teaching; its package holds a simulation of it, with four
+temperatures inside, a sensor that counts in steps of 0.32 degC, and noise. Here heater 1, in
+percent, stands for the flow. The page
+
+1. moves the heater in steps and records what the sensor shows,
+2. identifies (28) from the record,
+3. tunes a PI controller by SIMC's rule and a Smith predictor from the result,
+4. and runs both on the twin, beside the PI tuning that courses with this lab hand out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import random
+from collections.abc import Sequence
+
+import numpy as np
+import tclab
+from numpy.typing import NDArray
+
+from agents import PIController, SmithPredictor
+from benchmarks.identify.fit import Model, Options, identify
+from benchmarks.identify.log import Log
+from benchmarks.identify.plant import plant_arguments
+from benchmarks.identify.report import tuned
+from mptc_gym import Parameters
+
+INTERVAL = 4.0  # s
+HEATER = 40.0  # %, the operating point
+SETTLING = 1200.0  # s at the operating point before anything is recorded
+LEVELS = (55.0, 30.0, 65.0, 45.0, 25.0, 50.0, 35.0, 60.0)  # %, of the experiment
+HELD = 100  # samples that each is held
+SETPOINTS = (8.0, -6.0, 4.0, -8.0)  # degC from the operating point
+EACH = 200  # samples that a set point is held
+
+# Kc = 6 %/degC and tau_I = 75 s, without derivative action: the PI controller in the PID lesson
+# of the course that came with the hardware (J. D. Hedengren, APMonitor), and in many pages since.
+COURSE = {"kp": -6.0, "ki": -6.0 * INTERVAL / 75.0}
+
+
+class Twin:
+    """TCLab's digital twin as a plant in deviations from an operating point.
+
+    Its clock is turned by hand, so that a run takes milliseconds and is the same every time.
+
+    Parameters
+    ----------
+    seed
+        Of the sensor's noise.
+    """
+
+    def __init__(self, seed: int) -> None:
+        random.seed(seed)  # the twin draws from Python's own generator
+        make = tclab.setup(connected=False)
+        with contextlib.redirect_stdout(io.StringIO()):  # it greets
+            self._lab = make(synced=False)
+        self._time = 0.0
+        self._move(HEATER, SETTLING)
+        self.rest = float(np.mean([self._lab.T1 for _ in range(20)]))
+
+    def _move(self, heater: float, seconds: float) -> None:
+        self._lab.Q1(heater)
+        self._time += seconds
+        self._lab.update(self._time)
+
+    def temperature(self) -> float:
+        """Return what the sensor shows, degC from the operating point."""
+        return float(self._lab.T1) - self.rest
+
+    def step(self, command: float) -> None:
+        """Hold a heater power for a sample, in percent from the operating point."""
+        self._move(float(np.clip(HEATER + command, 0.0, 100.0)), INTERVAL)
+
+
+def experiment(seed: int = 0) -> Log:
+    """Move the heater in steps, and return the record."""
+    twin = Twin(seed)
+    commands = np.repeat(LEVELS, HELD) - HEATER
+    temperatures = np.empty(len(commands))
+    for k, command in enumerate(commands):
+        temperatures[k] = twin.temperature()
+        twin.step(command)
+    return Log(HEATER + commands, twin.rest + temperatures, INTERVAL)
+
+
+def model_of(log: Log) -> Model:
+    """Return what the record shows. The heater has no dead zone."""
+    known = Options(
+        longest_delay=20,
+        find_dead_zone=False,
+        u_min=-HEATER,
+        u_max=100.0 - HEATER,
+        operating_flow=HEATER,
+    )
+    return identify(log, known)
+
+
+def controllers(model: Model) -> dict[str, PIController]:
+    """Return those that are tuned from the model, and the course's."""
+    parameters = Parameters(**plant_arguments(model))
+    limits = {"u_min": -HEATER, "u_max": 100.0 - HEATER}
+    return {**tuned(parameters), "PI, course": PIController(**COURSE, anti_windup=True, **limits)}
+
+
+def run(controller: PIController | SmithPredictor, seed: int = 1) -> NDArray[np.float64]:
+    """Return set point, temperature and heater, from the operating point, a row a sample."""
+    twin = Twin(seed)
+    controller.reset()
+    rows = []
+    for setpoint in np.repeat(SETPOINTS, EACH):
+        temperature = twin.temperature()
+        controller.act([0.0, 0.0, 0.0, setpoint - temperature])  # it reads the error alone
+        command = float(np.clip(controller.command, -HEATER, 100.0 - HEATER))
+        rows.append((setpoint, temperature, command))
+        twin.step(command)
+    return np.array(rows)
+
+
+def main(_: Sequence[str] | None = None) -> None:
+    """Print what was identified, and what the controllers make of the twin."""
+    log = experiment()
+    model = model_of(log)
+    for name in ("delay", "gain", "time_constant"):
+        found = model.estimates[name]
+        print(f"{name:14s} {found.value:8.3g}   95 %: {found.low:.3g} to {found.high:.3g}")
+    print("controller      mean |e| (°C)   heater travel (%)")
+    for name, controller in controllers(model).items():
+        setpoint, temperature, heater = run(controller).T
+        error = np.abs(setpoint - temperature).mean()
+        travel = np.abs(np.diff(heater, prepend=0.0)).sum()
+        print(f"{name:14s} {error:13.3f} {travel:19.0f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""The page of TCLab's twin: what is identified, and what the controllers make of it."""
+
+import numpy as np
+import pytest
+
+from benchmarks.examples import tclab_twin
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tclab_twin.model_of(tclab_twin.experiment())
+
+
+def test_a_run_of_the_twin_is_the_same_every_time():
+    first, second, other = (tclab_twin.experiment(seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first.temperature, second.temperature)
+    assert not np.array_equal(first.temperature, other.temperature)
+
+
+def test_identified_plant_is_the_twin_s(model):
+    # In the steady state the two heaters, at x and y above the room, obey
+    # 200 Q / 5720 = x / 20 + (x - y) / 100 and y / 20 = (x - y) / 100, and sensors follow them.
+    gain = np.linalg.solve([[0.06, -0.01], [-0.01, 0.06]], [200 / 5720, 0.0])[0]
+    assert model.estimates["gain"].value == pytest.approx(gain, rel=0.03)
+    # A sensor follows its heater with 140 s, the slowest time constant.
+    assert model.estimates["time_constant"].value == pytest.approx(140.0, rel=0.1)
+    assert model.estimates["delay"].value <= 2
+    assert model.operating_flow == tclab_twin.HEATER
+
+
+def test_tuned_controllers_control_the_twin(model):
+    def error(run):
+        return np.abs(run[:, 0] - run[:, 1]).mean()
+
+    errors = {
+        name: error(tclab_twin.run(agent))
+        for name, agent in tclab_twin.controllers(model).items()
+    }
+    uncontrolled = np.abs(tclab_twin.SETPOINTS).mean()
+    assert errors["PI, SIMC"] < 1.3 * errors["PI, course"]
+    assert errors["Smith"] < 1.7 * errors["PI, course"]
+    assert max(errors.values()) < 0.3 * uncontrolled
+
+
+def test_page_prints_its_table(capsys):
+    tclab_twin.main()
+    printed = capsys.readouterr().out
+    assert [line.split("  ")[0] for line in printed.splitlines()[4:]] == [
+        "PI, SIMC", "Smith", "PI, course",
+    ]  # fmt: skip
