@@ -76,7 +76,8 @@ PRESET_SCENARIOS: dict[str, Scenario] = {
 }
 
 
-# What plants differ in that are drawn for a sweep, or to train on. A gain below 0.74 puts 5 degC beyond the limits.
+# What drawn plants differ in, to sweep over or to train on. A gain below 0.74 puts 5 degC
+# beyond the limits.
 SPANS = {
     "delay": (6, 36),
     "dead_zone": (0.0, 8.0),

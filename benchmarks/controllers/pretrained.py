@@ -7,7 +7,6 @@ from functools import cache
 from typing import Any
 
 from agents import PolicyNetwork
-from benchmarks.controllers.records import Training
 
 
 @dataclass(frozen=True)
@@ -43,11 +42,5 @@ def _loaded(name: str) -> PolicyNetwork:
     return PolicyNetwork.pretrained(name)
 
 
-def nn_dpc(_: Training) -> list[Pretrained]:
-    """Return the network for the paper's plant."""
-    return [Pretrained("nn-dpc")]
-
-
-def nn_adaptive(_: Training) -> list[Pretrained]:
-    """Return the network for many plants."""
-    return [Pretrained("nn-adaptive")]
+nn_dpc = Pretrained("nn-dpc")
+nn_adaptive = Pretrained("nn-adaptive")

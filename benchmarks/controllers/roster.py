@@ -143,7 +143,7 @@ ROSTER: dict[str, Controller] = {
         Controller(
             "nn-dpc",
             "NN, trained through the plant",
-            trained="benchmarks.controllers.pretrained:nn_dpc",
+            "benchmarks.controllers.pretrained:nn_dpc",
             account=Account("the paper's plant: its equations, ranges of dead zone and noise"),
             swept=True,
             drawn=True,
@@ -151,7 +151,7 @@ ROSTER: dict[str, Controller] = {
         Controller(
             "nn-adaptive",
             "NN, trained on many plants",
-            trained="benchmarks.controllers.pretrained:nn_adaptive",
+            "benchmarks.controllers.pretrained:nn_adaptive",
             account=Account("the class of plants: equations, and ranges of their numbers"),
             swept=True,
             drawn=True,
