@@ -141,7 +141,9 @@ class PolicyNetwork(Controller):
             for name in WINDOWS
         }
         dead_zone = 0.0 if increments is None else increments.dead_zone
-        super().__init__(n_obs=sum(self.observation.values()), u_min=u_min, u_max=u_max)
+        super().__init__(
+            n_obs=sum(self.observation.values()), u_min=u_min, u_max=u_max, dead_zone=dead_zone
+        )
         if dead_zone >= min(-self.u_min, self.u_max) and dead_zone > 0.0:
             raise ValueError(
                 f"increments.dead_zone must be inside the limits {u_min!r} and {u_max!r}, "

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from agents import Increments, PolicyNetwork
+from mptc_gym import MiddlePointEnv
 
 WINDOWS = {"setpoint_window": 1, "output_window": 2, "action_window": 2}
 
@@ -121,6 +122,15 @@ class TestIncrements:
         down = constant(-0.5, increments=Increments(max_move=0.4, dead_zone=5.0))
         down.act([0.0])
         assert down.command == pytest.approx(-6.0)
+
+    @pytest.mark.parametrize("side", [-1.0, 1.0])
+    def test_the_smallest_flow_beyond_the_dead_zone_is_applied(self, side):
+        # float32(0.7) stands for less than 7 t/h.
+        network = constant(1e-12 * side, increments=Increments(max_move=0.4, dead_zone=7.0))
+        env = MiddlePointEnv(dead_zone=7.0)
+        env.reset(seed=0)
+        info = env.step(network.act([0.0]))[-1]
+        assert info["applied"] == pytest.approx(7.0 * side, abs=1e-5)
 
     def test_another_batch_within_an_episode_is_refused(self):
         network = constant(0.5, increments=Increments(max_move=0.8))
