@@ -445,6 +445,7 @@ def train(
         training=asdict(training),
         validation={"seed": VALIDATION_SEED, "plants": VALIDATION_PLANTS, **best},
         cpu_seconds=trainer.curve[-1]["cpu_seconds"],
+        curve=trainer.curve,
         code=training_key(training),
         versions=versions(),
         commit=commit(),
