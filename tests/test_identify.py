@@ -218,7 +218,7 @@ class TestPlant:
         low, high = model.estimates["time_constant"].low, model.estimates["time_constant"].high
         ends = [1.0 / -np.expm1(-8.0 / t) for t in (low, high)]
         middle = 1.0 / -np.expm1(-8.0 / model.estimates["time_constant"].value)
-        np.testing.assert_allclose(ranges["time_constant_factor"], np.array(ends) / middle)
+        np.testing.assert_allclose(ranges["time_constant_factor"], np.array(ends) / middle, rtol=1e-6)
 
     def test_set_point_is_within_reach(self):
         model = identify(recorded(b=[b / 10.0 for b in PAPER.b], noise=1e-3))

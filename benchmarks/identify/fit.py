@@ -293,7 +293,11 @@ class _Search:
     def choose_orders(
         self, best: list[tuple[float, int, _Gap]], c: Array
     ) -> dict[Orders, float]:
-        """Return the criterion of all orders, the best first."""
+        """Return the Bayesian information criterion of all orders, the best first.
+
+        A coefficient of B beyond the first counts twice: it is chosen, as the delay is, from
+        several places, and one before or behind the right ones gains by chance.
+        """
         places = {(delay, gap) for _, delay, gap in best[:3]}
         criteria = {}
         for orders in self._orders():
@@ -302,7 +306,7 @@ class _Search:
                 (delay - 1, gap) for delay, gap in places if delay and orders.b > 1
             }
             least = min(self.fit(delay, gap, orders, c).deviance for delay, gap in tried)
-            criteria[orders] = least + orders.count * math.log(len(self.rows))
+            criteria[orders] = least + (orders.count + orders.b - 1) * math.log(len(self.rows))
         return dict(sorted(criteria.items(), key=lambda entry: entry[1]))
 
     def model(self) -> Model:

@@ -52,7 +52,7 @@ def plant_arguments(model: Model) -> dict[str, Any]:
     settled = (tested.delay + 5.0 * tested.time_constant) / model.sampling_interval
     if 2.0 * settled > defaults.setpoint_period:
         arguments["setpoint_period"] = 2 * math.ceil(settled)
-    return arguments
+    return _rounded(arguments)
 
 
 def plant_ranges(model: Model) -> dict[str, Any]:
@@ -77,8 +77,18 @@ def plant_ranges(model: Model) -> dict[str, Any]:
         low, high = (rates.value / rates.high, rates.value / max(rates.low, 1e-12))
         if low < high:
             arguments["time_constant_factor"] = [low, min(high, LARGEST_FACTOR)]
+    arguments = _rounded(arguments)
     Parameters(**arguments)
     return arguments
+
+
+def _rounded(value: Any) -> Any:
+    """Return numbers with eight digits, which is more than any log tells."""
+    if isinstance(value, dict):
+        return {name: _rounded(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_rounded(each) for each in value]
+    return float(f"{value:.8g}") if isinstance(value, float) else value
 
 
 def _ordered(interval: Interval) -> tuple[float, float, float]:

@@ -46,6 +46,7 @@ def plot_log(log: Log, model: Model, path: Path) -> None:
             label="model, without noise",
         )
         above.set_ylabel("temperature (°C)")
+        above.margins(y=0.15)  # room for the legend
         above.legend(loc="upper right", ncols=2)
         below.step(minutes, log.flow[:stop], where="post", color=COLOURS[0], linewidth=1)
         zone = model.estimates["dead_zone"].value
@@ -54,6 +55,7 @@ def plot_log(log: Log, model: Model, path: Path) -> None:
                 model.operating_flow - zone, model.operating_flow + zone,
                 color="0.5", alpha=0.15, linewidth=0, label="dead zone",
             )  # fmt: skip
+            below.margins(y=0.2)
             below.legend(loc="upper right")
         below.set_ylabel("flow (t/h)")
         below.set_xlabel("time (min)")
