@@ -76,17 +76,6 @@ PRESET_SCENARIOS: dict[str, Scenario] = {
 }
 
 
-# What drawn plants differ in, to sweep over or to train on. A gain below 0.74 puts 5 degC
-# beyond the limits.
-SPANS = {
-    "delay": (6, 36),
-    "dead_zone": (0.0, 8.0),
-    "noise_variance": (0.0, 1.0),
-    "gain_factor": (0.75, 1.6),
-    "time_constant_factor": (0.5, 2.0),
-}
-
-
 def scenarios_of(name: str, arguments: Mapping[str, Any]) -> dict[str, Scenario]:
     """Return the cases of a plant that is not the paper's.
 

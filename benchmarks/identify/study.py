@@ -28,7 +28,7 @@ from benchmarks.lib.statistics import share
 from benchmarks.lib.storage import replacing, write_text
 from benchmarks.lib.tables import on_screen
 from benchmarks.scenarios import plain
-from benchmarks.sweep.plants import Plant, random_design
+from benchmarks.designs import Plant, random_design
 from mptc_gym import Parameters
 
 NOISE = 0.02, 0.5  # R of the logs, degC^2

@@ -17,13 +17,13 @@ from benchmarks import plants as plant_options
 from benchmarks.controllers.factories import Factory
 from benchmarks.controllers.records import POLICIES, Controller, Training
 from benchmarks.controllers.roster import ROSTER, chosen
+from benchmarks.designs import Plant, grid, random_design
 from benchmarks.lib import command_line
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.report import provenance_line, write_report
 from benchmarks.lib.storage import commit, replacing, versions, write_json
 from benchmarks.lib.tables import on_screen
 from benchmarks.sweep.cells import agent_cell, limit_cell
-from benchmarks.sweep.plants import Plant, grid, random_design
 from benchmarks.sweep.report import report, table
 
 SWEPT = [name for name, controller in ROSTER.items() if controller.swept]

@@ -6,11 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.controllers.factories import Factory, build, observation
+from benchmarks.designs import Plant
 from benchmarks.limits import least_possible, steady_stretches
 from benchmarks.metrics import mean_error
 from benchmarks.rollout import make_plants, rollout
-from benchmarks.sweep.plants import SETPOINT, Plant
 from mptc_gym import Parameters
+
+SETPOINT: Plant = {"setpoint": "square", "setpoint_period": 600}
 
 
 def limit_cell(plant: Plant, samples: int) -> dict[str, float | None]:

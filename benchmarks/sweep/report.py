@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.controllers.roster import label
+from benchmarks.designs import Plant
 from benchmarks.lib.report import Section
 from benchmarks.lib.statistics import Estimate, bootstrap, improvement
 from benchmarks.sweep import maps
-from benchmarks.sweep.plants import Plant
 
 SEED = 0  # of the bootstraps
 OSCILLATES = 1.0  # degC that the swing on steady stretches exceeds that without control by

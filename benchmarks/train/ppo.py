@@ -22,9 +22,9 @@ import numpy as np
 from agents import PolicyNetwork
 from agents.policy_network import PRETRAINED
 from benchmarks.controllers.records import Account, Training
+from benchmarks.designs import SPANS
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import replacing
-from benchmarks.scenarios import SPANS
 
 POLICIES = 5  # are trained and compared, from seeds in sequence
 TUNING_SEED, FINAL_SEED = 1000, 2000  # of policies in a search, others than a comparison uses

@@ -25,9 +25,9 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from agents import PolicyNetwork
+from benchmarks.designs import SPANS
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import commit, replacing, versions
-from benchmarks.scenarios import SPANS
 from mptc_gym import Parameters
 
 NOMINAL = Parameters()
