@@ -175,10 +175,9 @@ class PredictiveController:
             gain, time_constant = self._dynamics.factors(self._numbers, age)
             alpha, scale, load = self._dynamics.coefficients(gain, time_constant)
             ones = np.ones(self._num_envs)
+            poles = [ones * coefficient for coefficient in alpha]
             self._models[age] = _Model.of(
-                np.stack([ones * a for a in alpha], axis=1)
-                if alpha
-                else np.zeros((len(ones), 0)),
+                np.stack(poles, axis=1) if poles else np.zeros((len(ones), 0)),
                 (ones * scale)[:, np.newaxis] * np.array(self._p.b),
                 ones * load,
             )
@@ -266,9 +265,5 @@ def _cost(Q: Array, target: Array, plan: Array) -> Array:
 
 
 def _outer(vectors: Array, variances: Array) -> Array:
-    outer: Array = (
-        variances[:, np.newaxis, np.newaxis]
-        * vectors[:, :, np.newaxis]
-        * vectors[:, np.newaxis]
-    )
+    outer: Array = np.einsum("n,ni,nj->nij", variances, vectors, vectors)
     return outer

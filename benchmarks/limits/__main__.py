@@ -24,8 +24,8 @@ SAMPLES = 1200  # of an episode of a preset
 
 NOTE = (
     "With preview: no controller does better on average, even one that knows the set point "
-    "beforehand. Without: none to which a change of the set point is news; for random set points "
-    "alone, which have a law. Reference: without preview, if each change finds the plant "
+    "beforehand. Without: none to which a change of the set point is news; for random set "
+    "points alone, which have a law. Reference: without preview, if each change finds the plant "
     "settled; a controller that counts samples can come below it. Where a set point never "
     "changes, the three are the same. 95 % intervals over drawn episodes."
 )
@@ -46,7 +46,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--episodes",
         type=command_line.number,
         default=EPISODES,
-        help="that a mean is taken over",
+        help="that the mean is taken over where they are drawn",
     )
     parser.add_argument(
         "--cache", type=Path, default=CACHE, help="where bounds are kept once they are known"

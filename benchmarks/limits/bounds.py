@@ -51,7 +51,7 @@ from mptc_gym.ranges import Ranges, numbers_of_plant
 Array = NDArray[np.float64]
 
 KINDS = ("preview", "news", "reference")
-EPISODES = 100  # that the mean is taken over where an episode is drawn
+EPISODES = 64  # that the mean is taken over where an episode is drawn
 IDLE_RUNS = 300  # of the plant that is left alone
 SEED = 7_000_000  # of the first episode; no controller was tuned on these
 CACHE = ROOT / "results" / "limits"
@@ -93,7 +93,7 @@ class LeastPossible:
         return {
             "preview": "every controller, even one that knows the set point beforehand",
             "news": "controllers to which a change of the set point is news",
-            "reference": "none for certain: a reference, if each change finds the plant settled",
+            "reference": "none: a reference, if each change finds the plant settled",
         }[self.kind]
 
     def score(self, errors: ArrayLike) -> Array:

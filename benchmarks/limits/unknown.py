@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 ATOMS = 128  # that stand for a distribution, equally probable
 SLICES = 4  # of each uniform one that is added to them
 # How many atoms lie below the point where a tangent touches: slopes from 0 to 1.
-BELOW = (64, 58, 52, 46, 40, 34, 28, 22, 17, 12, 8, 5, 3, 1, 0)
+BELOW = (64, 53, 42, 31, 22, 14, 8, 4, 1, 0)
 
 
 @dataclass(frozen=True)

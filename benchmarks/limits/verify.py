@@ -73,7 +73,7 @@ class Counting:
 
 
 def controllers() -> dict[str, Factory]:
-    """Return factories by name: of the roster but what has to be trained first, and one more."""
+    """Return factories by name: of the roster, but what has to be trained, and one more."""
     known = {
         name: load_factory(controller.factory)
         for name, controller in ROSTER.items()
