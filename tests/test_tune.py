@@ -164,7 +164,8 @@ class TestSearch:
             trained.append(arguments)
 
         monkeypatch.setattr(ppo, "_train", train)
-        network = ppo_training.exported(ppo_training.begin(SMALL), SMALL)
+        state = ppo_training.begin(SMALL).policy.state_dict()
+        network = ppo_training.exported(state, SMALL)
         monkeypatch.setattr(ppo, "_loaded", lambda file: network)
         monkeypatch.setattr(
             objective, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]

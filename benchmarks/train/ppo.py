@@ -17,8 +17,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
-
 from agents import PolicyNetwork
 from agents.policy_network import PRETRAINED
 from benchmarks.controllers.records import Account, Training
@@ -38,7 +36,7 @@ class PPOArguments:
 
     seed: int = 10_000
     """Of the initial policy, the exploration, and what the plants meet in training."""
-    steps: int = 600_000
+    steps: int = 400_000
     """Samples of experience, all plants together."""
     max_move: float = 1.0
     """How far an action of 1 moves the flow, as a share of half its range."""
@@ -50,15 +48,10 @@ class PPOArguments:
     and does better with another dead zone than one trained on that plant."""
     calm: float = 0.75
     """Share of the plants that have no noise. In noise, small offsets hardly cost anything."""
-    plant: dict[str, Any] = field(default_factory=lambda: {"dead_zone": [4.0, 6.7]})
+    plant: dict[str, Any] = field(default_factory=dict)
     """Arguments of the environment trained on, where it is not the nominal plant."""
     setpoint_amplitude: float = 6.0
     """Random set points are uniform within this, degC."""
-    squares: tuple[float, ...] = (4.6, 5.4, 6.2)
-    """Amplitudes of square waves, degC. Most random set points need a flow in the dead zone,
-    and so cannot be held; all of these can. Each is for as many of the plants without noise."""
-    square_period: int = 400
-    """Period of the square waves, samples."""
     reward: str = "absolute"
     """The environment's; "absolute" is what the comparison measures."""
     error_scale: float = 50.0
@@ -88,6 +81,9 @@ class PPOArguments:
     log_std: tuple[float, float] = (-1.0, -3.0)
     """Logarithm of the standard deviation of the action, at first and at last. Left to itself
     it stays high, and a mean that is right with the exploration is wrong without it."""
+    averaging: float = 0.9
+    """The policy that is validated and kept is a moving average of the weights: what an update
+    leaves of it. The policies of single updates err to one side and to the other."""
     hidden: tuple[int, ...] = (64, 64)
     """Nodes of the hidden layers, of policy and value function alike."""
 
@@ -113,14 +109,10 @@ class PPOArguments:
     def plants(self) -> list[tuple[int, dict[str, Any]]]:
         """How many plants to train on, and their arguments: the noisy ones, then the calm."""
         calm = round(self.calm * self.n_envs)
-        quiet = {**self.training, "noise_variance": 0.0}
-        square = {**quiet, "setpoint": "square", "setpoint_period": self.square_period}
-        kinds = [
-            quiet,
-            *({**square, "setpoint_amplitude": amplitude} for amplitude in self.squares),
+        groups = [
+            (self.n_envs - calm, self.training),
+            (calm, {**self.training, "noise_variance": 0.0}),
         ]
-        shares = [len(part) for part in np.array_split(np.arange(calm), len(kinds))]
-        groups = [(self.n_envs - calm, self.training), *zip(shares, kinds, strict=True)]
         return [(count, arguments) for count, arguments in groups if count]
 
 
@@ -128,7 +120,6 @@ class PPOArguments:
 RANDOMISED: dict[str, Any] = {
     "plant": {name: list(span) for name, span in SPANS.items() if name != "noise_variance"},
     "action_window": 39,
-    "squares": (),
 }
 
 

@@ -6,7 +6,8 @@ import copy
 import json
 import math
 import time
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -76,10 +77,9 @@ def train(
         If the checkpoint is damaged; the message names it.
     """
     model = begin(arguments)
-    curve: list[dict[str, float]] = []
-    best: dict[str, torch.Tensor] = {}
+    kept = Progress()
     if checkpoint is not None and checkpoint.exists():
-        curve, best = _resume(model, arguments, checkpoint)
+        kept = _resume(model, arguments, checkpoint)
     bar = tqdm(
         desc=f"training PPO, seed {arguments.seed}",
         total=arguments.steps,
@@ -89,18 +89,17 @@ def train(
         disable=not progress,
     )
     with bar:
-        keeper = Keeper(arguments, curve, best, bar, checkpoint)
+        keeper = Keeper(arguments, kept, bar, checkpoint)
         left = arguments.steps - model.num_timesteps
         model.learn(left, callback=keeper, reset_num_timesteps=False)
-        keeper.record()
-    model.policy.load_state_dict(keeper.best)
+        keeper.finish()
     provenance = {
         "algorithm": "PPO of Stable-Baselines3",
         "arguments": asdict(arguments),
         "versions": versions(),
-        "curve": keeper.curve,
+        "curve": kept.curve,
     }
-    return exported(model, arguments, provenance)
+    return exported(kept.best, arguments, provenance)
 
 
 def features(parameters: Parameters) -> NDArray[np.float64]:
@@ -233,41 +232,59 @@ def _incremental(plants: VectorEnv[Any, Any, Any], arguments: PPOArguments) -> V
 
 
 def exported(
-    model: PPO, arguments: PPOArguments, provenance: dict[str, Any] | None = None
+    state: Mapping[str, torch.Tensor],
+    arguments: PPOArguments,
+    provenance: dict[str, Any] | None = None,
 ) -> PolicyNetwork:
-    """Return the mean of a model's policy as a controller that needs NumPy alone.
+    """Return the mean of a policy as a controller that needs NumPy alone.
 
     Parameters
     ----------
-    model
-        What `begin` made, trained or not.
+    state
+        The policy's parameters, by their names in PyTorch.
     arguments
         How it was made.
     provenance
         Where its weights come from.
     """
-    policy = model.policy
-    linear = [
-        layer
-        for layer in (*policy.mlp_extractor.policy_net, policy.action_net)
-        if isinstance(layer, nn.Linear)
-    ]
-    layers = [
-        (layer.weight.detach().double().numpy(), layer.bias.detach().double().numpy())
-        for layer in linear
+    # Stable-Baselines3 has an activation after each hidden layer, which counts as one, too.
+    names = [f"mlp_extractor.policy_net.{2 * i}" for i in range(len(arguments.hidden))]
+    (first, bias), *others = [
+        (state[f"{name}.weight"].double().numpy(), state[f"{name}.bias"].double().numpy())
+        for name in (*names, "action_net")
     ]
     parameters = Parameters(**arguments.training)
-    matrix = features(parameters)
-    (first, bias), *others = layers
-    names = "setpoint_window", "error_window", "output_window", "action_window"
+    windows = "setpoint_window", "error_window", "output_window", "action_window"
     return PolicyNetwork(
-        [(first @ matrix, bias), *others],
-        observation=dict(zip(names, parameters.windows, strict=True)),
+        [(first @ features(parameters), bias), *others],
+        observation=dict(zip(windows, parameters.windows, strict=True)),
         input_scale=np.ones(parameters.observation_size),
         activation="tanh",
         increments=Increments(arguments.max_move, arguments.undo_dead_zone),
         provenance=provenance,
     )
+
+
+State = dict[str, torch.Tensor]
+
+
+@dataclass
+class Progress:
+    """How far a training got, apart from its model.
+
+    Attributes
+    ----------
+    curve
+        The learning curve, a row a point.
+    average
+        The moving average of the policy's parameters.
+    best
+        What that was when it did best in validation.
+    """
+
+    curve: list[dict[str, float]] = field(default_factory=list)
+    average: State = field(default_factory=dict)
+    best: State = field(default_factory=dict)
 
 
 class Keeper(BaseCallback):
@@ -281,12 +298,10 @@ class Keeper(BaseCallback):
     ----------
     arguments
         How the policy is trained.
-    curve
-        The learning curve up to now; more points are added to it.
-    best
-        The parameters of the policy that did best in validation up to now.
+    progress
+        How far the training got; it is carried on.
     bar
-        Shows the progress.
+        Shows it.
     checkpoint
         Where to keep the training after each stretch, if anywhere.
     """
@@ -294,19 +309,18 @@ class Keeper(BaseCallback):
     def __init__(
         self,
         arguments: PPOArguments,
-        curve: list[dict[str, float]],
-        best: dict[str, torch.Tensor],
+        progress: Progress,
         bar: tqdm[Any],
         checkpoint: Path | None,
     ) -> None:
         super().__init__()
-        self.curve = curve
-        self.best = best
+        self.progress = progress
         self._bar = bar
         self.arguments = arguments
         self._checkpoint = checkpoint
         self._errors: list[float] = []
-        self._began = time.process_time() - (curve[-1]["seconds"] if curve else 0.0)
+        spent = progress.curve[-1]["seconds"] if progress.curve else 0.0
+        self._began = time.process_time() - spent
 
     @property
     def _plants(self) -> GymnasiumVecEnv:
@@ -319,11 +333,13 @@ class Keeper(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
+        self._average()
         done = self.num_timesteps / self.arguments.steps
         with torch.no_grad():
             log_std = np.interp(done, (0.0, 1.0), self.arguments.log_std)
             cast("torch.Tensor", self.model.policy.log_std).fill_(float(log_std))
-        before = self.curve[-1]["steps"] if self.curve else 0
+        curve = self.progress.curve
+        before = curve[-1]["steps"] if curve else 0
         if self.num_timesteps - before >= CHECKPOINT_INTERVAL:
             self.record()
             if self._checkpoint is not None:
@@ -332,14 +348,27 @@ class Keeper(BaseCallback):
         elif not self._errors:
             self._begin_stretch()
 
+    def _average(self) -> None:
+        """Take an update into the moving average."""
+        keeps, state = self.arguments.averaging, self.model.policy.state_dict()
+        average = self.progress.average or copy.deepcopy(state)
+        self.progress.average = {
+            name: value.lerp(state[name], 1.0 - keeps) for name, value in average.items()
+        }
+
     def _begin_stretch(self) -> None:
         """Bring the plants to rest, and start all random numbers anew."""
-        seeds = np.random.SeedSequence([self.arguments.seed, len(self.curve)])
+        seeds = np.random.SeedSequence([self.arguments.seed, len(self.progress.curve)])
         plants, numbers = seeds.generate_state(2).tolist()
         set_random_seed(numbers)
         self._plants.seed(TRAINING_SEEDS + plants)
         self.model._last_obs = self._plants.reset()
         self.model._last_episode_starts = np.ones(self._plants.num_envs, np.bool_)
+
+    def finish(self) -> None:
+        """Take in and record what the last update brought."""
+        self._average()
+        self.record()
 
     def record(self) -> None:
         """Add a point to the learning curve, and keep the policy if it is the best so far."""
@@ -352,10 +381,11 @@ class Keeper(BaseCallback):
                 self._mae({**held, "dead_zone": VALIDATION_DEAD_ZONE}, 1, len(HELD), 0),
             ]
         )
-        if not self.curve or validation < min(point["validation_mae"] for point in self.curve):
-            self.best = copy.deepcopy(self.model.policy.state_dict())
+        curve = self.progress.curve
+        if not curve or validation < min(point["validation_mae"] for point in curve):
+            self.progress.best = self.progress.average
         square = {**self.arguments.observation, **PROBE.arguments}
-        self.curve.append(
+        curve.append(
             {
                 "steps": self.num_timesteps,
                 "seconds": time.process_time() - self._began,  # of the processor
@@ -369,15 +399,20 @@ class Keeper(BaseCallback):
 
     def _mae(self, arguments: dict[str, Any], runs: int, samples: int, seed: int) -> float:
         plants = make_plants(runs, samples, **arguments)
-        agent = exported(cast("PPO", self.model), self.arguments)
+        agent = exported(self.progress.average, self.arguments)
         return float(mean_error(rollout(plants, agent, samples, seed)).mean())
 
 
 def _save(keeper: Keeper, path: Path) -> None:
     """Write all that a training needs to go on after a stretch."""
     arrays: dict[str, NDArray[Any]] = {}
-    parameters = {"policy": keeper.model.policy.state_dict(), "best": keeper.best}
-    for kind, state in parameters.items():
+    progress = keeper.progress
+    states = {
+        "policy": keeper.model.policy.state_dict(),
+        "average": progress.average,
+        "best": progress.best,
+    }
+    for kind, state in states.items():
         arrays |= {f"{kind} {name}": value.numpy() for name, value in state.items()}
     moments = keeper.model.policy.optimizer.state_dict()["state"]
     for i, moment in moments.items():
@@ -386,16 +421,14 @@ def _save(keeper: Keeper, path: Path) -> None:
         "arguments": asdict(keeper.arguments),
         "steps": keeper.num_timesteps,
         "moments": sorted(moments),
-        "curve": keeper.curve,
+        "curve": progress.curve,
     }
     with replacing(path) as file:
         np.savez(file, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
 
 
-def _resume(
-    model: PPO, arguments: PPOArguments, path: Path
-) -> tuple[list[dict[str, float]], dict[str, torch.Tensor]]:
-    """Bring a new model to where a checkpoint was kept; return the curve and the best."""
+def _resume(model: PPO, arguments: PPOArguments, path: Path) -> Progress:
+    """Bring a new model to where a checkpoint was kept."""
     try:
         # All of it is read, as that is when the checksums are looked at.
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
@@ -405,9 +438,9 @@ def _resume(
             about = json.loads(str(file["about"]))
         if about["arguments"] != json.loads(json.dumps(asdict(arguments))):
             raise ValueError("it is of another training")
-        policy, best = (
+        policy, average, best = (
             {name: arrays[f"{kind} {name}"] for name in model.policy.state_dict()}
-            for kind in ("policy", "best")
+            for kind in ("policy", "average", "best")
         )
         moments = {
             i: {name: arrays[f"moment {i} {name}"] for name in _MOMENTS}
@@ -417,10 +450,10 @@ def _resume(
         model.policy.load_state_dict(policy)
         model.policy.optimizer.load_state_dict({"state": moments, "param_groups": groups})
         model.num_timesteps = int(about["steps"])
-        curve = [dict(point) for point in about["curve"]]
+        progress = Progress([dict(point) for point in about["curve"]], average, best)
     except Exception as error:  # damage shows in zip, zlib, NumPy, JSON or the shapes
         raise ValueError(
             f"{path} is no checkpoint of this training, or is damaged: {error}: "
             "remove it, or --retrain"
         ) from error
-    return curve, best
+    return progress
