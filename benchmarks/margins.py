@@ -11,6 +11,7 @@ from typing import Protocol
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 from scipy import optimize
 
@@ -105,9 +106,9 @@ class Loop:
     def response(self, frequency: Array) -> Complex:
         """Return L at frequencies, rad/s."""
         back = np.exp(-1j * np.asarray(frequency) * self.sampling_interval)  # z^-1
-        values: Complex = np.polynomial.polynomial.polyval(back, self.numerator)
-        values = values / np.polynomial.polynomial.polyval(back, self.denominator)
-        return values
+        up, down = (polyval(back, part) for part in (self.numerator, self.denominator))
+        ratio: Complex = np.asarray(up / down)
+        return ratio
 
     def frequencies(self) -> Array:
         """Return frequencies up to Nyquist's, rad/s, dense enough to see every crossing."""

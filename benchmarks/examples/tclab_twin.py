@@ -17,9 +17,10 @@ import contextlib
 import io
 import random
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-import tclab
+import tclab  # type: ignore[import-untyped, unused-ignore]
 from numpy.typing import NDArray
 
 from agents import PIController, SmithPredictor
@@ -102,8 +103,11 @@ def model_of(log: Log) -> Model:
 def controllers(model: Model) -> dict[str, PIController]:
     """Return those that are tuned from the model, and the course's."""
     parameters = Parameters(**plant_arguments(model))
-    limits = {"u_min": -HEATER, "u_max": 100.0 - HEATER}
-    return {**tuned(parameters), "PI, course": PIController(**COURSE, anti_windup=True, **limits)}
+    limits: Any = {"u_min": -HEATER, "u_max": 100.0 - HEATER}
+    return {
+        **tuned(parameters),
+        "PI, course": PIController(**COURSE, anti_windup=True, **limits),
+    }
 
 
 def run(controller: PIController | SmithPredictor, seed: int = 1) -> NDArray[np.float64]:

@@ -141,10 +141,12 @@ def identify(log: Log, options: Options | None = None) -> Model:
 
     The delay and the dead zone are searched: every delay, and every gap between two neighbours
     among the magnitudes of the commands, since the likelihood is the same all over a gap.
-    For each pair that is any good, A, B and C are those of maximum likelihood. Delay and dead
-    zone are then the medians of their posterior, with no preference beforehand, and their
-    intervals hold 95 % of it. The intervals of gain and time constant are where the likelihood,
-    at its maximum over all else, is within what chance would explain.
+    For each pair that is any good, A, B and C are those of maximum likelihood.
+
+    The delay is then the one with most of the posterior within one sample, with no preference
+    beforehand, and the dead zone is the median of its posterior. Their intervals hold 95 % of
+    it; that of the dead zone takes gaps as a whole. The intervals of gain and time constant are
+    where the likelihood, at its maximum over all else, is within what chance would explain.
 
     Parameters
     ----------
@@ -680,14 +682,19 @@ def _edge(shortfall: Callable[[float], float], centre: float, direction: float) 
 
 
 def _of_delay(fits: list[_Candidate], weights: Array) -> Interval:
+    """Return the delay that has most of the posterior within one sample, and its interval."""
     delays = np.array([fit.delay for fit in fits])
-    order = np.argsort(delays, kind="stable")
-    sums = np.cumsum(weights[order])
-    median, low, high = (
-        float(delays[order][min(int(np.searchsorted(sums, share)), len(sums) - 1)])
-        for share in (0.5, (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
+    tried = np.unique(delays)
+    shares = np.array([weights[delays == delay].sum() for delay in tried])
+    near = np.abs(tried[:, np.newaxis] - tried) <= 1
+    # Of equal ones, the delay that is itself the likelier.
+    value = tried[np.lexsort((shares, (near @ shares).round(6)))[-1]]
+    sums = np.cumsum(shares)
+    low, high = (
+        float(tried[min(int(np.searchsorted(sums, share)), len(tried) - 1)])
+        for share in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
     )
-    return Interval(median, low, high)
+    return Interval(float(value), min(low, float(value)), max(high, float(value)))
 
 
 def _of_dead_zone(fits: list[_Candidate], weights: Array) -> Interval:

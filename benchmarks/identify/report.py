@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -191,13 +190,13 @@ def _on_the_plant(arguments: dict[str, Any]) -> Section:
     except (RuntimeError, ValueError) as error:
         limit = math.nan
         least = f"The least possible error is not known: {error}."
-    for name, agent in tuned(replace(parameters)).items():
+    for name, agent in tuned(parameters).items():
         run = rollout(make_plants(RUNS, samples, **arguments), agent, samples, SEED)
-        error = float(mean_error(run).mean())
+        mean = float(mean_error(run).mean())
         moves = np.abs(np.diff(run.applied, axis=0, prepend=0.0)).sum(axis=0).mean()
         turns = reversals(run.applied, parameters.sampling_interval).mean()
         rows.append(
-            (name, f"{error:.4g}", f"{error / limit:.2f}", f"{moves:.0f}", f"{turns:.2f}")
+            (name, f"{mean:.4g}", f"{mean / limit:.2f}", f"{moves:.0f}", f"{turns:.2f}")
         )
     columns = [
         "controller", "mean |e| (°C)", "of the least possible", "valve travel (t/h)",

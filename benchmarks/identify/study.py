@@ -173,7 +173,7 @@ def table(found: list[dict[str, Any]]) -> pd.DataFrame:
         ("interval of the dead zone covers, of 2 and more", "dead_zone", covers, "90 %"),
         ("interval of R covers", "noise_variance", covers, ""),
     ]
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for question, name, right, aim in questions:
         flags = []
         for each in found:
