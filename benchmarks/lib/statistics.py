@@ -158,41 +158,6 @@ def bootstrap(
     return Estimate(value, float(low), float(high), table.size)
 
 
-def stratified(
-    tables: Sequence[NDArray[np.float64]], seed: int, statistic: Callable[..., Any] = np.mean
-) -> Estimate:
-    """Estimate a statistic over several groups of runs, each drawn from by itself.
-
-    Parameters
-    ----------
-    tables
-        One for each group, shape (members, runs). Within a group members and runs are drawn as
-        in `bootstrap`; the same draws serve all groups of a shape, whose runs are the same.
-    seed
-        Of the draws.
-    statistic
-        Called with an array and `axis`, the last.
-
-    Returns
-    -------
-    Estimate
-        Of all values together; `runs` counts them.
-    """
-    value = float(
-        statistic(np.concatenate([table.ravel() for table in tables])[None], axis=-1)[0]
-    )
-    drawn = []
-    for table in tables:
-        generator = np.random.default_rng(seed)
-        members, runs = table.shape
-        member = generator.integers(members, size=(RESAMPLES, members, 1))
-        run = generator.integers(runs, size=(RESAMPLES, 1, runs))
-        drawn.append(table[member, run].reshape(RESAMPLES, -1))
-    resampled = statistic(np.concatenate(drawn, axis=1), axis=-1)
-    low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return Estimate(value, float(low), float(high), sum(table.size for table in tables))
-
-
 def improvement(
     errors: NDArray[np.float64], reference: NDArray[np.float64], seed: int
 ) -> Estimate:
@@ -214,3 +179,51 @@ def improvement(
     """
     better = (errors < reference) + 0.5 * (errors == reference)
     return bootstrap(better, seed)
+
+
+def stratified(
+    tables: Sequence[NDArray[np.float64]],
+    seed: int,
+    statistic: Callable[..., Any] = interquartile_mean,
+) -> Estimate:
+    """Estimate a statistic over several tasks, with a stratified bootstrap interval.
+
+    Parameters
+    ----------
+    tables
+        One a task, all of one shape: (runs,), or (members, runs) as in `bootstrap`. Runs and
+        members are drawn within each task; the tasks are those that there are.
+    seed
+        Of the draws.
+    statistic
+        Called with an array and `axis`, the last.
+
+    Returns
+    -------
+    Estimate
+        Of all values of all tasks together.
+
+    Raises
+    ------
+    ValueError
+        If there is no task, the shapes differ, or a value is not finite.
+    """
+    arrays = [np.atleast_2d(np.asarray(table, dtype=np.float64)) for table in tables]
+    if not arrays or len({array.shape for array in arrays}) > 1 or arrays[0].ndim != 2:
+        raise ValueError(
+            f"tables must be of one shape, got {[array.shape for array in arrays]}"
+        )
+    if not arrays[0].size or not np.isfinite(arrays).all():
+        raise ValueError(f"tables must hold finite values, got {tables!r}")
+    members, runs = arrays[0].shape
+    generator = np.random.default_rng(seed)
+    drawn = []
+    for array in arrays:
+        member = generator.integers(members, size=(RESAMPLES, members, 1))
+        run = generator.integers(runs, size=(RESAMPLES, 1, runs))
+        drawn.append(array[member, run].reshape(RESAMPLES, -1))
+    together = np.concatenate([array.ravel() for array in arrays])
+    value = float(statistic(together[np.newaxis], axis=-1)[0])
+    ends = [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]
+    low, high = np.quantile(statistic(np.hstack(drawn), axis=-1), ends)
+    return Estimate(value, float(low), float(high), together.size)
