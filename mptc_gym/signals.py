@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,31 +33,49 @@ class EpisodeStream:
 
     Parameters
     ----------
-    seeds
-        Where the stream starts.
+    entropy, spawn_key, pool_size
+        Of the `SeedSequence` that starts the stream. It is made with the first episode: many
+        plants have streams that are never used.
     """
 
-    def __init__(self, seeds: np.random.SeedSequence) -> None:
-        self._seeds = seeds
-        self._generator: np.random.Generator | None = None  # made if it is ever used
-        self._origin: Any = None
+    __slots__ = (
+        "_episode",
+        "_generator",
+        "_origin",
+        "_seeds",
+    )  # one of 100,000 plants is small
+
+    def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
+        self._seeds = entropy, spawn_key, pool_size
+        self._generator: np.random.Generator | None = None
+        self._origin = 0, 0  # state and increment of the bit generator at the start
         self._episode = 0
 
     def next_episode(self) -> np.random.Generator:
         """Move to the start of the next episode and return the generator there."""
         if self._generator is None:
-            self._generator = np.random.Generator(np.random.PCG64(self._seeds))
-            self._origin = self._generator.bit_generator.state
-        # Found through the generator, as a copy of it may have a bit generator of its own.
-        bit_generator = cast("np.random.PCG64", self._generator.bit_generator)
-        bit_generator.state = self._origin
-        bit_generator.advance(self._episode << 64)
+            entropy, spawn_key, pool_size = self._seeds
+            seeds = np.random.SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size)
+            self._generator = np.random.Generator(np.random.PCG64(seeds))
+            origin: Any = self._generator.bit_generator.state["state"]
+            self._origin = origin["state"], origin["inc"]
+        else:
+            # Found through the generator, as a copy of it may have a bit generator of its own.
+            bit_generator = cast("np.random.PCG64", self._generator.bit_generator)
+            state, increment = self._origin
+            bit_generator.state = {
+                "bit_generator": "PCG64",
+                "state": {"state": state, "inc": increment},
+                "has_uint32": 0,
+                "uinteger": 0,
+            }
+            bit_generator.advance(self._episode << 64)
         self._episode += 1
         return self._generator
 
 
 class Streams(NamedTuple):
-    """All streams of one plant."""
+    """All streams of one plant; a new one comes last, and changes none before it."""
 
     noise: EpisodeStream
     setpoint: EpisodeStream
@@ -66,8 +84,19 @@ class Streams(NamedTuple):
 
     @classmethod
     def spawn(cls, seeds: np.random.SeedSequence) -> Streams:
-        """Make the streams of a seed; a new one comes last, and changes none before it."""
-        return cls(*map(EpisodeStream, seeds.spawn(len(cls._fields))))
+        """Make the streams of a seed sequence, each of a child of it."""
+        children = seeds.spawn(len(cls._fields))
+        return cls(
+            *(EpisodeStream(each.entropy, each.spawn_key, each.pool_size) for each in children)
+        )
+
+    @classmethod
+    def of_seed(cls, seed: int) -> Streams:
+        """Make the streams that `spawn` makes of `SeedSequence(seed)`."""
+        return cls(*(EpisodeStream(seed, key) for key in _SPAWN_KEYS))
+
+
+_SPAWN_KEYS: Final = tuple((place,) for place in range(len(Streams._fields)))
 
 
 class Noise:

@@ -34,6 +34,7 @@ Indices = NDArray[np.intp]
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")
 _FLOAT64 = np.dtype(np.float64)  # quicker to pass on than the type
+_NOISE_BYTES = 1 << 27  # of a block of noise, unless a single sample of all plants takes more
 _STEPS_PER_SHIFT = 64  # steps until the window of the observations is moved back
 
 
@@ -139,8 +140,10 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         self._streams: dict[int, Streams] = {}  # of every plant, once they have been reset
         self._clock = 0  # samples since the plants were made
         self._plants = PlantBatch(parameters, num_envs)
-        # Blocks of noise that come out even at the end of an episode.
-        block = math.ceil(self._limit / math.ceil(self._limit / BLOCK))
+        # Blocks of noise that come out even at the end of an episode; short ones, which take
+        # longer to make, where the memory of many plants would be large.
+        longest = max(1, min(BLOCK, _NOISE_BYTES // (8 * num_envs)))
+        block = math.ceil(self._limit / math.ceil(self._limit / longest))
         self._noise = NoiseBatch(
             parameters.c, parameters.range_of("noise_variance"), num_envs, block
         )
@@ -449,10 +452,12 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
 
     def _seed(self, which: Indices, seeds: Sequence[int | None]) -> None:
         for i in which.tolist():
-            if seeds[i] is not None or i not in self._streams:
-                root = np.random.SeedSequence(seeds[i])
-                self._seeds[i] = cast("int", root.entropy)
-                self._streams[i] = Streams.spawn(root)
+            seed = seeds[i]
+            if seed is None and i not in self._streams:
+                seed = cast("int", np.random.SeedSequence().entropy)
+            if seed is not None:
+                self._seeds[i] = seed
+                self._streams[i] = Streams.of_seed(seed)
 
     def _checked_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
         n = self.num_envs

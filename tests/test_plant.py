@@ -196,7 +196,7 @@ def test_reachable_range_without_noise(rng):
 
 
 def test_episodes_of_a_seed_do_not_overlap_however_long_they_are():
-    stream = EpisodeStream(np.random.SeedSequence(0))
+    stream = EpisodeStream(0, (0,))
     first = stream.next_episode().random(2_000_000)
     second = stream.next_episode().random(10)
     third = stream.next_episode().random(10)

@@ -143,6 +143,22 @@ def test_a_wide_range_of_delays_costs_little_more_than_one_delay():
     assert seconds([0, 1000]) < 8 * seconds(18)  # two or three times as long
 
 
+def test_many_plants_share_a_bounded_memory_for_noise(rng):
+    def made(num_bytes):
+        with patch.multiple("mptc_gym.vector_env", _NOISE_BYTES=num_bytes):
+            return MiddlePointVectorEnv(
+                50, noise_variance=1.0, measurement_noise_variance=1.0, max_episode_steps=900
+            )
+
+    tracemalloc.start()
+    long, large = made(1 << 27), tracemalloc.get_traced_memory()[0]
+    short, small = made(8 * 50 * 10), tracemalloc.get_traced_memory()[0] - large
+    tracemalloc.stop()
+    assert large - small > 2 * 8 * 50 * 400  # two signals, 450 samples or 10 at a time
+    assert_equal(long.reset(seed=3), short.reset(seed=3))
+    compare(long, short, steps=30, rng=rng, partial_resets=0.05)
+
+
 @pytest.mark.parametrize("delay", [[0, 7], [2, 40], [0, 100]])
 def test_ranges_of_delays_over_a_long_time(delay, rng):
     native, sync = make_both(4, "NextStep", 150, delay=delay, b=[0.3, -0.2, 0.1])
