@@ -110,9 +110,9 @@ class TestSweep:
         # The limit is one of the mean over all noise; single runs may have luck.
         assert (runs["ratio"] > 0.8).all()
         assert runs["ratio"].mean() > 1.1
-        for name in ("plants.png", "drift.png", "report.html", "report.md"):
+        for name in ("plants.png", "drift_learning.png", "report.html", "report.md"):
             assert (tmp_path / name).stat().st_size > 1000
-        assert "Does learning help when the plant drifts?" in capsys.readouterr().out
+        assert "Does online learning help when the plant drifts?" in capsys.readouterr().out
         assert json.loads((tmp_path / "provenance.json").read_text())["seconds"] > 0
 
         # Again: nothing is run, and nothing changes.
@@ -197,13 +197,14 @@ class TestFindings:
                         {
                             "agent": agent, "plant": plant, "run": run, "gain_drift": drift,
                             "late": late + 2.0 * better, "mae": late, "ratio": late,
-                            "oscillates": plant == 0, "useless": False, "delay": 18,
+                            "oscillates": plant == 0, "travel": 10.0, "useless": False,
+                            "delay": 18,
                         }
                     )  # fmt: skip
         return pd.DataFrame(rows)
 
     def test_differences(self):
-        table = report._differences(self.runs()).set_index("plants")
+        table = report._differences(self.runs(), report.LEARNING, "late").set_index("plants")
         pair = "NN - PI, SIMC"
         assert table.loc["no drift", pair] == "-0.500 [-0.500, -0.500] (100 %)"
         assert table.loc["gain falls to less than 0.8 times", pair].startswith("-0.500")
@@ -215,5 +216,5 @@ class TestFindings:
 
     def test_overview(self):
         table = report._overview(self.runs()).set_index("controller")
-        assert table.loc["NN, frozen", "ratio, median"] == "2.00"
+        assert table.loc["NN, frozen", "ratio, median"] == "2.000"
         assert table.loc["NN", "oscillates (%)"] == "5.0"

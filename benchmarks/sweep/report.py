@@ -26,7 +26,14 @@ GROUPS = (  # of the plants that drift, by which the answer is split: half-open 
     ("delay from 14 to 22 samples", "delay", 14, 23),
     ("delay above 22 samples", "delay", 23, np.inf),
 )
-PAIRS = (("nn", "pi-simc"), ("nn", "nn-frozen"), ("nn-frozen", "pi-simc"))
+# What is asked of two controllers at a time: whether the first makes the smaller error.
+LEARNING = (("nn", "pi-simc"), ("nn", "nn-frozen"), ("nn-frozen", "pi-simc"))
+ADAPTING = (
+    ("nn-adaptive", "smith"),
+    ("nn-adaptive", "self-tuning"),
+    ("self-tuning", "smith"),
+    ("nn-adaptive", "nn-dpc"),
+)
 
 
 def table(
@@ -61,6 +68,31 @@ def table(
     return pd.concat(rows, ignore_index=True)
 
 
+MEASURES = {"mae": "over a whole run", "late": "over the second half of a run"}
+QUESTIONS = (
+    (
+        "Does online learning help when the plant drifts?",
+        "All were made for the nominal plant: the networks learnt on it, the PI is tuned by "
+        "rule from its step test.",
+        LEARNING,
+        "drift_learning.png",
+    ),
+    (
+        "What does adaptation buy?",
+        "The network trained on many plants adapts by what it remembers, the self-tuning "
+        "controller by identification. The Smith predictor and the network trained through "
+        "the plant are made for the nominal plant.",
+        ADAPTING,
+        "drift_adapting.png",
+    ),
+)
+DIFFERENCES_TEXT = (
+    "Differences of the mean error (°C), run by run in the same noise, with 95 % intervals "
+    "over plants and runs: below 0 the first of the two is better. In parentheses: the share "
+    "of runs in which it is."
+)
+
+
 def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
     """Draw the maps, and return what there is to say.
 
@@ -77,13 +109,13 @@ def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
         Section(
             "How many plants each controller works on",
             [
-                "Ratio: mean error as a multiple of the least possible, median and 90th "
-                "percentile over the plants whose limit is known (the median run of each). "
-                f"Oscillates: on steady stretches the error swings, by its deviation, "
-                f"{OSCILLATES:g} °C more than with no control at all. The actuator is limited "
-                "and the plant stable, so instability can come to no more than that here. "
-                "Useless: the mean error is no smaller than with no control. Both are shares "
-                "of the runs. PPO's policies take the plants in turn."
+                "Ratio: mean error as a multiple of the least possible error, median and 90th "
+                "percentile over the plants (the median run of each). Travel: of the valve in "
+                "a run, the median. Oscillates: on steady stretches the standard deviation of "
+                f"the error is {OSCILLATES:g} °C larger than with no control at all. The "
+                "actuator is limited and the plant stable, so that an unstable loop comes to "
+                "no more than that. Useless: the mean error is no smaller than with no "
+                "control. Both are shares of the runs. PPO's policies take the plants in turn."
             ],
             _overview(runs),
         )
@@ -93,23 +125,21 @@ def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
         sections[0] = replace(sections[0], pictures=["map.png"])
         return sections
     maps.plot_plants(runs, out / "plants.png")
-    maps.plot_drift(runs, PAIRS[0], out / "drift.png")
     sections[0] = replace(sections[0], pictures=["plants.png"])
-    if {agent for pair in PAIRS for agent in pair} <= set(runs["agent"]):
-        sections.append(
-            Section(
-                "Does learning help when the plant drifts?",
-                [
-                    "Differences of the mean error over the second half of a run (°C), run by "
-                    "run in the same noise, with 95 % intervals over plants and runs: below 0 "
-                    "the first of the two is better; in parentheses, the share of runs in "
-                    "which it is. All were made for the nominal plant: the networks learnt on "
-                    "it, the PI is tuned by rule from its step test."
-                ],
-                _differences(runs),
-                ["drift.png"],
+    for title, text, pairs, picture in QUESTIONS:
+        asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
+        if not asked:
+            continue
+        maps.plot_drift(runs, asked[0], out / picture)
+        for measure, when in MEASURES.items():
+            sections.append(
+                Section(
+                    f"{title} Mean error {when}",
+                    [text, DIFFERENCES_TEXT],
+                    _differences(runs, asked, measure),
+                )
             )
-        )
+        sections[-1] = replace(sections[-1], pictures=[picture])
     return sections
 
 
@@ -120,8 +150,9 @@ def _overview(runs: pd.DataFrame) -> pd.DataFrame:
         rows.append(
             {
                 "controller": label(agent),
-                "ratio, median": f"{ratio.median():.2f}",
-                "ratio, 90 %": f"{ratio.quantile(0.9):.2f}",
+                "ratio, median": f"{ratio.median():.3f}",
+                "ratio, 90 %": f"{ratio.quantile(0.9):.3f}",
+                "travel (t/h)": f"{group['travel'].median():,.0f}",
                 "oscillates (%)": f"{100 * group['oscillates'].mean():.1f}",
                 "useless (%)": f"{100 * group['useless'].mean():.1f}",
             }
@@ -129,7 +160,9 @@ def _overview(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _differences(runs: pd.DataFrame) -> pd.DataFrame:
+def _differences(
+    runs: pd.DataFrame, pairs: Sequence[tuple[str, str]], measure: str
+) -> pd.DataFrame:
     drifting = runs[runs["gain_drift"].notna()]
     groups = {"no drift": runs[runs["gain_drift"].isna()], "all that drift": drifting}
     for name, column, low, high in GROUPS:
@@ -137,10 +170,10 @@ def _differences(runs: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for name, group in groups.items():
         row = {"plants": name, "number": str(group["plant"].nunique())}
-        for pair in PAIRS:
+        for pair in pairs:
             ours, theirs = (
                 group[group["agent"] == agent]
-                .pivot_table(index="plant", columns="run", values="late")
+                .pivot_table(index="plant", columns="run", values=measure)
                 .to_numpy()
                 for agent in pair
             )
