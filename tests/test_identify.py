@@ -75,6 +75,15 @@ class TestFit:
         np.testing.assert_allclose(model.b, PAPER.b, atol=2e-4)
         assert model.estimates["delay"].value == 18
 
+    def test_log_without_noise_needs_no_higher_orders(self):
+        log = recorded(noise=0.0)
+        model = identify(log)
+        assert (model.orders.a, model.orders.b) == (2, 2)
+        for name in ("gain", "time_constant"):
+            found = model.estimates[name]
+            assert found.high - found.low < 0.01 * abs(found.value)
+        Parameters(**plant_ranges(model))
+
     def test_operating_point_is_found_and_deviations_are_from_it(self, good):
         log, plain = good
         shifted = Log(log.flow + 480.0, log.temperature + 385.0, 8.0)

@@ -1,6 +1,6 @@
 """Identify a plant that no one here wrote, TCLab's digital twin, and control it.
 
-`python -m benchmarks.examples.tclab_twin`, after `pip install tclab`. The Temperature Control Lab is a
+`python -m benchmarks.examples.tclab_twin`, after `pip install tclab`. The lab is a
 small heater with a sensor, for teaching; its package holds a simulation of it, with four
 temperatures inside, a sensor that counts in steps of 0.32 degC, and noise. Here heater 1, in
 percent, stands for the flow. The page
@@ -17,7 +17,6 @@ import contextlib
 import io
 import random
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import tclab  # type: ignore[import-untyped, unused-ignore]
@@ -39,7 +38,7 @@ SETPOINTS = (8.0, -6.0, 4.0, -8.0)  # degC from the operating point
 EACH = 200  # samples that a set point is held
 
 # Kc = 6 %/degC and tau_I = 75 s, without derivative action: the PI controller in the PID lesson
-# of the course that came with the hardware (J. D. Hedengren, APMonitor), and in many pages since.
+# of the course that came with the hardware (J. D. Hedengren, APMonitor), and widely used since.
 COURSE = {"kp": -6.0, "ki": -6.0 * INTERVAL / 75.0}
 
 
@@ -103,11 +102,10 @@ def model_of(log: Log) -> Model:
 def controllers(model: Model) -> dict[str, PIController]:
     """Return those that are tuned from the model, and the course's."""
     parameters = Parameters(**plant_arguments(model))
-    limits: Any = {"u_min": -HEATER, "u_max": 100.0 - HEATER}
-    return {
-        **tuned(parameters),
-        "PI, course": PIController(**COURSE, anti_windup=True, **limits),
-    }
+    course = PIController(
+        COURSE["kp"], COURSE["ki"], anti_windup=True, u_min=-HEATER, u_max=100.0 - HEATER
+    )
+    return {**tuned(parameters), "PI, course": course}
 
 
 def run(controller: PIController | SmithPredictor, seed: int = 1) -> NDArray[np.float64]:

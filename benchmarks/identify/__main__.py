@@ -1,4 +1,4 @@
-"""From a recorded log to a plant and its controllers: `python -m benchmarks.identify --help`."""
+"""From a log to a plant and its controllers: `python -m benchmarks.identify --help`."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -66,7 +67,7 @@ class Rows:
         # Stretches without a gap: the recursion for xi starts anew in each.
         breaks = np.flatnonzero(np.diff(self.index) > 1) + 1
         bounds = [0, *breaks.tolist(), len(self.index)]
-        self._stretches = list(zip(bounds[:-1], bounds[1:], strict=True))
+        self._stretches = list(itertools.pairwise(bounds))
 
     def __len__(self) -> int:
         return len(self.index)
@@ -139,7 +140,8 @@ class Rows:
             for i in range(order):
                 for begin, end in self._stretches:
                     lags[begin + i + 1 : end, i] = slope[begin : end - i - 1, 0]
-            return lags - basis @ (basis.T @ lags)
+            projected: Array = lags - basis @ (basis.T @ lags)
+            return projected
 
         c = np.zeros(0)
         if order:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ WORTH_A_FIT = 16.0  # candidates that the search leaves this far behind get no f
 MOST_FITS = 60
 MAGNITUDES = 40  # most dead zones that are tried at once
 LEAST_SAMPLES = 100  # beside those that the longest delay takes
+FINEST = 1e-6  # of the temperature's deviation, what its numbers tell
 WEAK = 100.0  # twice the log likelihood, below which a log may be the wrong way round
 CHANCE = 0.01  # that a flow without effect is taken for one with effect
 FOLLOWS = 0.98  # share of the flow's moves that, explained by the temperature, is feedback
@@ -190,6 +192,8 @@ class _Search:
         self.command = np.clip(command, self.u_min, self.u_max)
         self.level = float(np.nanmean(log.temperature)) if len(log.temperature) else 0.0
         self.output = log.temperature - self.level
+        # Smaller errors than this are rounding, and no reason for higher orders.
+        self.resolution = FINEST**2 * float(np.nanvar(self.output)) if len(self.output) else 0.0
         check_excitation(self.command, self.output, options)
         magnitudes = np.unique(np.abs(self.command[np.isfinite(self.command)]))
         self.magnitudes = magnitudes[magnitudes > 0.0]
@@ -247,7 +251,8 @@ class _Search:
 
     def deviance(self, square: float) -> float:
         """Return twice the negative log likelihood, but for a constant."""
-        return len(self.rows) * math.log(max(square, 1e-300))
+        count = len(self.rows)
+        return count * math.log(max(square, count * self.resolution))
 
     # The search ---------------------------------------------------------------------------
 
@@ -264,10 +269,7 @@ class _Search:
         if len(edges) > MAGNITUDES:
             places = np.linspace(0, len(edges) - 1, MAGNITUDES).round().astype(int)
             edges = edges[places]
-        return [
-            _Gap(float(low), float(high))
-            for low, high in zip(edges[:-1], edges[1:], strict=True)
-        ]
+        return [_Gap(low, high) for low, high in itertools.pairwise(edges.tolist())]
 
     def scan(self, orders: Orders, c: Array, gaps: list[_Gap]) -> list[tuple[float, int, _Gap]]:
         """Return the deviance of every delay and gap with a given C, the best first."""

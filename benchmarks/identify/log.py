@@ -147,8 +147,8 @@ class _Layout:
             if any(field.strip() for field in fields[len(names) :]):
                 raise ValueError(
                     f"{path}, line {number}: {len(fields)} fields where the heading has "
-                    f"{len(names)}. With decimal commas, the separator must be a semicolon or a "
-                    "tab, or the numbers in quotes"
+                    f"{len(names)}. With decimal commas, the separator must be a semicolon "
+                    "or a tab, or the numbers in quotes"
                 )
         wanted = [columns.flow, columns.temperature]
         units: list[tuple[dict[str, tuple[float, float]], str | None, str, str]] = [
@@ -217,10 +217,11 @@ class _Layout:
             dates = pd.to_datetime(column, errors="coerce", format="ISO8601", utc=True)
             if dates.notna().all():
                 since = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
-                return since.to_numpy(dtype=np.float64)
+                seconds: Array = since.to_numpy(dtype=np.float64)
+                return seconds
         if numbers is None:
             numbers = pd.to_numeric(column, errors="coerce")
-        values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
+        values: Array = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
         bad = np.flatnonzero(~np.isfinite(values) & column.notna().to_numpy())
         if is_time and not len(bad):
             bad = np.flatnonzero(np.isnan(values))
@@ -303,8 +304,8 @@ def _scale(
     unit = given or (bracket.group(1) if bracket else default)
     if unit not in units:
         raise ValueError(
-            f"the unit of {name!r} must be one of {', '.join(units)}, got {unit!r}. Say it with "
-            f"--{option}-unit"
+            f"the unit of {name!r} must be one of {', '.join(units)}, got {unit!r}. Say it "
+            f"with --{option}-unit"
         )
     return units[unit]
 

@@ -52,7 +52,8 @@ def plant_arguments(model: Model) -> dict[str, Any]:
     settled = (tested.delay + 5.0 * tested.time_constant) / model.sampling_interval
     if 2.0 * settled > defaults.setpoint_period:
         arguments["setpoint_period"] = 2 * math.ceil(settled)
-    return _rounded(arguments)
+    rounded: dict[str, Any] = _rounded(arguments)
+    return rounded
 
 
 def plant_ranges(model: Model) -> dict[str, Any]:
@@ -68,7 +69,7 @@ def plant_ranges(model: Model) -> dict[str, Any]:
     if gain[0] < gain[1]:
         arguments["gain_factor"] = gain
     constant = estimates["time_constant"]
-    pole = complex(slowest_pole(model.a))
+    pole = complex(slowest_pole(model.a) or 0.0)
     if math.isfinite(constant.low) and pole.imag == 0.0 and 0.0 < pole.real < 1.0:
         # The environment's time constant is 1 / (1 - pole) samples.
         rates = Interval(
@@ -77,9 +78,9 @@ def plant_ranges(model: Model) -> dict[str, Any]:
         low, high = (rates.value / rates.high, rates.value / max(rates.low, 1e-12))
         if low < high:
             arguments["time_constant_factor"] = [low, min(high, LARGEST_FACTOR)]
-    arguments = _rounded(arguments)
-    Parameters(**arguments)
-    return arguments
+    ranges: dict[str, Any] = _rounded(arguments)
+    Parameters(**ranges)
+    return ranges
 
 
 def _rounded(value: Any) -> Any:

@@ -155,8 +155,8 @@ def _controllers(parameters: Parameters, out: Path) -> Section:
         [
             "u = -Kp e - Ki (sum of e). SIMC's PI has its closed-loop time constant at the "
             "delay, the Smith predictor at half the plant's time constant. The margins are "
-            "those of the loop while no limit and no dead zone is met: by which factor the gain "
-            "may rise, and by how much phase and delay may shift, until the loop is unstable. "
+            "those of the loop while no limit and no dead zone is met: by which factor the "
+            "gain may rise, and by how much phase and delay may shift, before it is unstable. "
             "Ms is the most that the loop amplifies a disturbance; 1.4 to 2 is usual."
         ],
         pd.DataFrame(rows, columns=columns),

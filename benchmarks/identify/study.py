@@ -193,7 +193,9 @@ def table(found: list[dict[str, Any]]) -> pd.DataFrame:
                 aim,
             )
         )
-    return pd.DataFrame(rows, columns=["what", "how often", "95 % (%)", "aim"])
+    columns = ["what", "how often", "95 % (%)", "aim"]
+    shown: pd.DataFrame = pd.DataFrame(rows, columns=columns)
+    return shown
 
 
 def _row(plant: Plant, found: dict[str, Any]) -> dict[str, Any]:
