@@ -87,18 +87,19 @@ ODD = [
 ]
 
 
-class TestSetPointChanges:
-    FIRST_ORDER = {
-        "a": (1.0, -0.5), "b": (1.0,), "c": (1.0,), "delay": 0, "dead_zone": 0.0,
-        "u_min": -1.0, "u_max": 1.0,
-    }  # fmt: skip
+FIRST_ORDER = {
+    "a": (1.0, -0.5), "b": (1.0,), "c": (1.0,), "delay": 0, "dead_zone": 0.0,
+    "u_min": -1.0, "u_max": 1.0,
+}  # fmt: skip
 
+
+class TestSetPointChanges:
     def test_a_plant_of_first_order_by_hand(self):
         # y(k+1) = 0.5 y(k) + u(k), |u| <= 1, from 0 to 1.9: full input gives 1, 1.5, 1.75,
         # 1.875, 1.9375; so 1.9 is reached with the fifth. Errors 1.9, 0.9, 0.4, 0.15, 0.025.
         by_hand = [1.9, 0.9, 0.4, 0.15, 0.025]
-        assert change(0.0, 1.9, 12, **self.FIRST_ORDER) == pytest.approx(sum(by_hand))
-        least = least_square(Parameters(**self.FIRST_ORDER), 0.0, 1.9, 12)
+        assert change(0.0, 1.9, 12, **FIRST_ORDER) == pytest.approx(sum(by_hand))
+        least = least_square(Parameters(**FIRST_ORDER), 0.0, 1.9, 12)
         assert least == pytest.approx(sum(e * e for e in by_hand))
 
     def test_with_preview_a_plant_of_first_order_by_hand(self):
@@ -107,7 +108,7 @@ class TestSetPointChanges:
         # at the change leaves 1.5 and 0.5; half of 1 before, and 1.25 after, 0.5 and 0.25.
         setpoint = [0.0] * 3 + [1.5] * 9
         # y(2) = v, y(3) = v / 2 + 1, so the errors are v and 0.5 - v / 2: least for v = 0.
-        assert best_plan(setpoint, **self.FIRST_ORDER).value == pytest.approx(0.5)
+        assert best_plan(setpoint, **FIRST_ORDER).value == pytest.approx(0.5)
 
     @pytest.mark.parametrize(("before", "after"), [(0.0, 5.0), (5.0, -5.0), (-4.0, 6.0)])
     def test_no_input_of_many_does_better(self, before, after, rng):
@@ -304,7 +305,8 @@ class TestUnknown:
             found = np.abs(m - y).mean()
             error = np.abs(m - y).std() / np.sqrt(draws)
             (least,) = bound.of(k, k + 1).mean_error(np.array([m]))
-            assert 0.85 * found < least < found + 3 * error
+            # Looser without noise, as then all that is unknown are jumps, here frequent ones.
+            assert (0.85 if R else 0.7) * found < least < found + 3 * error
 
     def test_slopes_are_tangents_of_the_folded_normal(self):
         bound = unknown(course_of(60, noise_variance=0.5))
@@ -315,16 +317,17 @@ class TestUnknown:
             assert least == pytest.approx(np.abs(m + draws).mean(), rel=0.01)
 
 
-class TestNews:
-    ARGUMENTS = {"setpoint": "random", "setpoint_period": 120}
+RANDOM = {"setpoint": "random", "setpoint_period": 120}
 
+
+class TestNews:
     def test_the_toll_is_0_in_the_mean_over_the_future(self):
         # The mean over the future of pi(j) times anything that is known at j.
         samples, runs = 150, 300
-        parameters = Parameters(**self.ARGUMENTS)
-        of_plant = course_of(samples, **self.ARGUMENTS)
+        parameters = Parameters(**RANDOM)
+        of_plant = course_of(samples, **RANDOM)
         law = News(parameters, of_plant, unknown(of_plant))
-        plants = make_plants(runs, samples, **self.ARGUMENTS)
+        plants = make_plants(runs, samples, **RANDOM)
         setpoints = rollout(plants, PIController(0.0, 0.0), samples, seed=1).setpoint
         starts = [np.array([0, *(np.flatnonzero(np.diff(s)) + 1)]) for s in setpoints.T]
         tolls = np.array([law.toll(s, b) for s, b in zip(setpoints.T, starts, strict=True)])
@@ -343,7 +346,7 @@ class TestNews:
             kind: least_possible(samples=900, kind=kind, episodes=25, folder=None, **arguments)
             for kind in ("preview", "news", "reference")
         }
-        found = errors(PredictiveController, 25, 900, **arguments)
+        found = errors(PredictiveController, 10, 600, **arguments)
         assert not beats(found, kinds["news"])
         assert kinds["preview"].value < 0.5 * kinds["news"].value
         assert kinds["news"].value < kinds["reference"].value
@@ -396,6 +399,7 @@ class TestLeastPossible:
     def test_drawn_episodes_are_those_of_the_environment(self):
         # Without noise, a run and the bound of its plant and set point can be compared.
         arguments = {"delay": [5, 30], "gain_factor": [0.8, 1.4], "setpoint": 4.0}
+        arguments["dead_zone"] = 0.0
         least = least_possible(samples=400, episodes=8, folder=None, **arguments)
         found = errors(PredictiveController, 8, 400, **arguments)
         assert np.all(found > np.array(least.episodes) * (1 - 1e-6))
@@ -465,7 +469,8 @@ class TestFrontier:
         assert travel * 600 == pytest.approx(steady, rel=0.02)
         plants = make_plants(1, 600, setpoint=5.0)
         moved = rollout(plants, Plan(np.full(600, -steady)), 600, seed=0)
-        assert error == pytest.approx(mean_error(moved)[0], rel=0.02)
+        worth = mean_error(moved)[0] + 25.0 * steady / 600
+        assert 0.98 * worth < error + 25.0 * travel <= worth * (1 + 1e-6)
 
 
 def test_stratified_bootstrap():

@@ -26,8 +26,8 @@ NOTE = (
     "With preview: no controller does better on average, even one that knows the set point "
     "beforehand. Without: none to which a change of the set point is news; for random set "
     "points alone, which have a law. Reference: without preview, if each change finds the "
-    "plant settled; a controller that counts samples can come below it. Where a set point never "
-    "changes, the three are the same. 95 % intervals over drawn episodes."
+    "plant settled; a controller that counts samples can come below it. Where a set point "
+    "never changes, the three are the same. 95 % intervals over drawn episodes."
 )
 
 

@@ -122,7 +122,7 @@ def reference(
         error[start:stop] = found.error[start:stop]
         begun = max(stop - course.lag, start)
         if not last and (
-            stop - start < course.lag or np.ptp(found.flow[begun - 1 : stop]) > settled
+            stop - start < course.lag or np.ptp(found.flow[max(begun - 1, 0) : stop]) > settled
         ):
             raise ValueError(
                 "setpoint must be held until the plant has settled, or there is no reference; "
