@@ -84,18 +84,17 @@ def scenarios(cache: Path) -> pd.DataFrame:
     rows = []
     for name, scenario in tqdm(SCENARIOS.items(), unit="scenario"):
         known = least_possible(samples=scenario.samples, folder=cache, **scenario.arguments)
-        limit = scenario_limit(scenario)
-        variance = minimum_variance(scenario.parameters)
-        rows.append(
-            {
-                "scenario": name,
-                "with preview": f"{known.value:.4f}",
+        row = {"scenario": name, "with preview": f"{known.value:.4f}"}
+        if not scenario.parameters.is_disturbed:
+            limit = scenario_limit(scenario)
+            variance = minimum_variance(scenario.parameters)
+            row |= {
                 "reference": f"{limit.mae:.4f}",
                 "reference, rms": f"{np.sqrt(limit.mse):.4f}",
                 "set point held, rms": f"{np.sqrt(variance):.4f}",
             }
-        )
-    return pd.DataFrame(rows)
+        rows.append(row)
+    return pd.DataFrame(rows).fillna("")
 
 
 def presets(episodes: int, runs: int | None, cache: Path) -> pd.DataFrame:
