@@ -653,8 +653,14 @@ def _gain(solution: Solution, orders: Orders) -> float:
 
 
 def _slowest(solution: Solution, orders: Orders) -> complex:
+    """Return the pole that a step response ends with: the largest real one above 0, if any.
+
+    Poles below 0, whose responses change sign at every sample, tell how the noise is made.
+    """
     poles = np.roots(_polynomials(solution, orders)[0])
-    return complex(poles[np.argmax(np.abs(poles))])
+    settling = poles[np.isreal(poles) & (poles.real > 0.0)]
+    chosen = settling if len(settling) else poles
+    return complex(chosen[np.argmax(np.abs(chosen))])
 
 
 def _slowest_is_real(solution: Solution, orders: Orders) -> bool:
