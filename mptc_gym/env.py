@@ -64,8 +64,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     the plant from sample k to k+1 and returns the observation at k+1 and the reward of e(k+1).
     So u(0) first shows in y(19).
 
-    Section 1 of the paper names more that makes the loop hard and is not in (28). It is off by
-    default, and `mptc_gym.PRESETS` has variants with it:
+    Section 1 of the paper names further difficulties, which (28) does not contain. They are off
+    by default, and `mptc_gym.PRESETS` has variants with them:
 
     - Noise of the transmitter: the observation shows y + v, v ~ N(0, measurement_noise_variance),
       white, from k = 1 on. Reward and `info["output"]` are those of the true y.
@@ -116,15 +116,16 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     | "absolute" | -abs(e(k+1)) / error_scale - move_weight * abs(a(k) - a(k-1)) |
 
     "quadratic" is the negative of the paper's cost (12), scaled. The best possible reward of a
-    step is 0; at the default set point, a plant that is left alone earns -0.5 a step. There is
-    no lower bound: e is the error of the true temperature, which no transmitter limits.
+    step is 0. At the default set point, a plant without any input earns -0.5 a step. There is
+    no lower bound, since e is the error of the true temperature, which the transmitter's range
+    does not limit.
 
     ## Starting state
 
     Before k = 0 the plant has been at rest: y, y_d, e, u, u_a and xi are all 0, so y(0) = 0.
-    All that is drawn is drawn from the seed alone, in separate streams, so that every
-    controller meets the same noise, set point, disturbance and plant. The j-th episode after a
-    seed is the same however long the episodes before it were. `reset` knows no options.
+    All randomness comes from the seed, in separate streams, so that every controller meets the
+    same noise, set point, disturbance and plant. The j-th episode after a seed does not depend
+    on how long the episodes before it were. `reset` has no options.
 
     ## Episode end
 
@@ -312,7 +313,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         ResetNeeded
             If the environment has never been reset.
         """
-        # This is the hot path: built-ins and function calls only where they are rarely reached.
+        # This is the hot path: what runs in every step avoids function calls.
         try:
             a = float(action.item() - 0.0)  # text is no number, even where float() reads one
         except (AttributeError, TypeError, ValueError, OverflowError):

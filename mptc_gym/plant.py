@@ -122,8 +122,8 @@ class Plant:
 
     The scaling is the last formula of Section 4, for actions from -1 to 1 in place of network
     outputs from 0 to 1. As printed, (29) compares the magnitude of u with U_min in one of its
-    cases. Meant is: no effect inside the dead zone, otherwise the command limited to
-    [U_min, U_max]. A command on the edge of the dead zone passes.
+    cases. The intended meaning is: a command inside the dead zone has no effect, and any other
+    is limited to [U_min, U_max]. A command on the edge of the dead zone passes.
 
     Parameters
     ----------
@@ -228,8 +228,8 @@ class PlantBatch:
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
-        # An array of one number costs less in arithmetic than a number does. Where arrays are
-        # compared, full ones cost less still.
+        # In arithmetic with arrays, an array of one number costs less than a number. In
+        # comparisons, an array of full length costs still less.
         self._drawn = parameters.ranges
         self._numbers: PlantNumbers[Values] = PlantNumbers(
             **{
@@ -338,8 +338,8 @@ class PlantBatch:
         command += offset
         applied = np.minimum(command, u_max)  # (29) from here on
         np.maximum(applied, u_min, out=applied)
-        # A product, as processors are slow at masks, whose bits they cannot foresee. It turns
-        # some numbers into -0, which + 0 turns into 0.
+        # A product is faster than a mask, whose branches processors cannot predict. It makes -0
+        # of some numbers, and adding 0 makes 0 of that.
         applied *= np.abs(command) >= dead_zone
         applied += zero
         place = self._place

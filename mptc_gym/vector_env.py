@@ -55,7 +55,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         An `AutoresetMode` or its value. "NextStep": the step after the end of an episode resets
         the plant, and its action is ignored. "SameStep": the step that ends an episode resets
         the plant, and returns the last observation and info in `final_obs` and `final_info`.
-        "Disabled": whoever steps has to reset, by `reset(options={"reset_mask": mask})`.
+        "Disabled": the caller resets ended plants by `reset(options={"reset_mask": mask})`.
     render_mode
         None, or "rgb_array": `render` returns a picture of each plant.
     **arguments
@@ -70,13 +70,13 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
 
     Notes
     -----
-    All plants share one clock, so that a step is array arithmetic alone. Single plants are
-    looked at only where their own generators are: at the start of an episode, once in some 600
-    samples of noise, and when a random set point changes. So a plant needs the same few KiB
-    however long an episode lasts.
+    All plants share one clock, so that a step is array arithmetic alone. There is a Python loop
+    over plants only where each draws from its own generators: at the start of an episode, once
+    in some 600 samples of noise, and when a random set point changes. A plant needs the same few
+    KiB however long an episode lasts.
 
-    Where `MiddlePointEnv` goes on in silence after y has left the range of floats, as it may
-    with an unstable `a`, or with actions beyond 1e154, NumPy warns here.
+    With an unstable `a`, or with actions beyond 1e154, y may leave the range of floats. NumPy
+    then warns here, while `MiddlePointEnv` continues without a warning.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (as in VectorEnv)
@@ -159,7 +159,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         self._ends = np.zeros(num_envs, np.int64)  # by the clock, of the episodes
         self._first_end = 0
         self._ended: NDArray[np.bool_] | None = None  # those still to be reset, if any
-        # Arrays in place of numbers, as in `PlantBatch`.
+        # Arrays instead of numbers, as in `PlantBatch`.
         span = parameters.temperature_span
         self._span = np.full(num_envs, -span), np.full(num_envs, span), span * span
         self._reward_terms = (
@@ -267,7 +267,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             If the environments have never been reset, or, with autoreset disabled, if one has
             ended.
         """
-        # This is the hot path: for few plants, what counts is the number of calls.
+        # This is the hot path: for few plants, the number of calls determines its speed.
         a = self._checked_actions(actions)
         if self._ended is not None and self._ended.all():
             observations, infos = self.reset()
