@@ -42,6 +42,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--verify", action="store_true", help="run every controller against the bounds instead"
     )
     parser.add_argument("--runs", type=command_line.number, default=300, help="of --verify")
+    command_line.add_fan_out(parser, "runs of --verify")
     parser.add_argument(
         "--episodes",
         type=command_line.number,
@@ -66,7 +67,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     With `--verify` the exit status is 1 if a controller beats a bound beyond its interval.
     """
     if options.verify:
-        table, beaten = verify(options.runs, options.cache)
+        table, beaten = verify(options.runs, options.cache, command_line.fan_out(options))
         console.print(on_screen(table))
         if beaten:
             console.print(f"Beaten beyond the interval: {'; '.join(beaten)}.")

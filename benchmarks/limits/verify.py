@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from benchmarks.controllers.factories import Factory, build, load_factory, observation
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.limits.bounds import SEED, LeastPossible, least_possible
 from benchmarks.rollout import Agent, make_plants, rollout
 from mptc_gym import PRESETS, Parameters
@@ -114,15 +118,21 @@ def beats(found: Array, least: LeastPossible) -> bool:
     return bool(difference.mean() + 1.96 * error < -1e-6 * least.value)
 
 
-def verify(runs: int, cache: Path | None) -> tuple[pd.DataFrame, list[str]]:
+def verify(
+    runs: int, folder: Path, fan_out: FanOut, cases: Sequence[str] = ()
+) -> tuple[pd.DataFrame, list[str]]:
     """Run every controller on every case.
 
     Parameters
     ----------
     runs
         How many of each.
-    cache
-        Where bounds are kept.
+    folder
+        Where bounds and runs are kept as soon as they are known.
+    fan_out
+        Where to run them.
+    cases
+        Which of `CASES`; none for all.
 
     Returns
     -------
@@ -130,19 +140,34 @@ def verify(runs: int, cache: Path | None) -> tuple[pd.DataFrame, list[str]]:
         A row a case: the bound that applies and the mean error of each controller, degC. And
         the controllers that beat it, with the case.
     """
-    rows, beaten = [], []
+    cases = cases or tuple(CASES)
     factories = controllers()
-    bar = tqdm(total=len(CASES) * len(factories), unit="case")
-    for case, arguments in CASES.items():
-        least = least_possible(samples=SAMPLES, episodes=runs, folder=cache, **arguments)
+    cells: dict[str, Callable[[], Any]] = {}
+    for case in cases:
+        cells[f"bound, {case}"] = partial(_bound, case, runs)
+        cells |= {f"{name}, {case}": partial(_errors, name, case, runs) for name in factories}
+    sources = [factory.__module__ for factory in factories.values()]
+    kept = folder / f"verify-{fingerprint('benchmarks.limits.verify', *sources, runs=runs)}"
+    results = fan_out.run(cells, kept, title="verify")
+    rows, beaten = [], []
+    for case in cases:
+        least = LeastPossible(**results[f"bound, {case}"])
         row = {"case": case, "bound": f"{least.value:.3f}", "kind": least.kind}
-        for name, factory in factories.items():
-            found = errors(factory, runs, SAMPLES, **arguments)
+        for name in factories:
+            found = np.array(results[f"{name}, {case}"])
             row[name] = f"{found.mean():.3f}"
             if beats(found, least):
                 beaten.append(f"{name} in {case} ({found.mean():.4f}, bound {least.value:.4f})")
                 row[name] += " !"
-            bar.update()
         rows.append(row)
-    bar.close()
     return pd.DataFrame(rows), beaten
+
+
+def _bound(case: str, runs: int) -> dict[str, Any]:
+    found = least_possible(samples=SAMPLES, episodes=runs, folder=None, **CASES[case])
+    return asdict(found)
+
+
+def _errors(name: str, case: str, runs: int) -> list[float]:
+    found: list[float] = errors(controllers()[name], runs, SAMPLES, **CASES[case]).tolist()
+    return found
