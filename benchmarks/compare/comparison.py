@@ -14,7 +14,15 @@ import pandas as pd
 from tqdm import tqdm
 
 from benchmarks.compare import plots, tables
-from benchmarks.compare.estimates import SEED, Scale, estimate, scale_of, scores, verdict
+from benchmarks.compare.estimates import (
+    SEED,
+    Scale,
+    estimate,
+    scale_of,
+    scores,
+    travel_frontier,
+    verdict,
+)
 from benchmarks.controllers.factories import Factory, build, observation
 from benchmarks.controllers.records import Account, Controller, Training
 from benchmarks.controllers.roster import label
@@ -43,7 +51,8 @@ LIMITS_CAPTION = (
 )
 TRAVEL_CAPTION = (
     "A point is the median run of a controller: its error against the distance that it moves "
-    "the valve. Down and left is better. The dashed line is the least possible error."
+    "the valve. Down and left is better. The line is the least possible error for a given "
+    "travel, the dashed one for any travel."
 )
 RUNS_CAPTION = (
     "A point is one run. It shows what the NN makes of unlucky initial weights, and PPO of an "
@@ -161,8 +170,9 @@ class Comparison:
         self._write_csv("summary.csv", summary)
         self._write_csv("estimates.csv", estimates)
         plots.plot_limits(estimates, self._path("limits.png"))
+        frontiers = {name: travel_frontier(self._scenarios[name]) for name in names}
         limits = {name: scale.least.value for name, scale in scales.items()}
-        plots.plot_travel(summary, limits, self._path("travel.png"))
+        plots.plot_travel(summary, limits, frontiers, self._path("travel.png"))
         plots.plot_runs(self.runs, self._path("runs.png"))
         for name, responses in self._responses.items():
             self._write_csv(f"{name}.csv", responses)

@@ -20,7 +20,7 @@ from benchmarks.lib.statistics import (
     interquartile_mean,
     stratified,
 )
-from benchmarks.limits import LeastPossible, least_possible
+from benchmarks.limits import LeastPossible, frontier, least_possible
 from benchmarks.scenarios import Scenario
 
 SEED = 0  # of the first run, and of the bootstraps
@@ -70,6 +70,22 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
     if abs(least.value - preview.value) < SAME:
         least = preview
     return Scale(least, preview, preview.idle_low < preview.idle_high)
+
+
+def travel_frontier(scenario: Scenario) -> list[tuple[float, float]]:
+    """Return the least error for a given travel of the valve, t/h and degC; empty if drawn.
+
+    Between two points the bound is the straight line.
+    """
+    parameters = scenario.parameters
+    if parameters.ranges or parameters.setpoint == "random":
+        return []  # as many programmes as episodes: more than a picture is worth
+    case: dict[str, Any] = {"samples": scenario.samples, **scenario.arguments}
+    try:
+        points = frontier(kind="reference", **case)
+    except ValueError:  # it does not settle between changes
+        points = frontier(**case)
+    return [(travel * scenario.samples, error) for travel, error in points]
 
 
 def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) -> pd.DataFrame:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -136,7 +136,12 @@ def _scenario_panels(
     return figure, panels[: len(names)]
 
 
-def plot_travel(summary: pd.DataFrame, limits: Mapping[str, float], path: Path) -> None:
+def plot_travel(
+    summary: pd.DataFrame,
+    limits: Mapping[str, float],
+    frontiers: Mapping[str, Sequence[tuple[float, float]]],
+    path: Path,
+) -> None:
     """Draw the error of every agent against its valve travel, a panel for each scenario.
 
     Parameters
@@ -144,7 +149,9 @@ def plot_travel(summary: pd.DataFrame, limits: Mapping[str, float], path: Path) 
     summary
         Rows as `tables.summarise` makes them.
     limits
-        The least possible error of each scenario, degC, or NaN.
+        The least possible error of each scenario, degC.
+    frontiers
+        The least possible error for a given travel: t/h and degC, by descending travel.
     path
         The PNG file to write.
     """
@@ -160,7 +167,14 @@ def plot_travel(summary: pd.DataFrame, limits: Mapping[str, float], path: Path) 
             for _, row in rows.iterrows():
                 agent, travel = row["agent"], max(row["total_variation"], 1.0)
                 axes.plot(travel, row["mae"], "o", color=shades[agent], label=label(agent))
+            left, right = axes.get_xlim()
+            top = axes.get_ylim()[1]
+            if frontiers[name]:
+                travel, error = zip(*frontiers[name], strict=True)
+                axes.plot(travel, error, color="0.4", linewidth=1)
             axes.axhline(limits[name], color="0.4", linewidth=1, linestyle="--")
+            axes.set_xlim(max(left, 0.5 * rows["total_variation"].clip(1.0).min()), right)
+            axes.set_ylim(top=top)
             axes.set_xscale("log")
             axes.set_yscale("log")
             for axis in (axes.xaxis, axes.yaxis):
