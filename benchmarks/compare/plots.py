@@ -164,23 +164,26 @@ def plot_travel(
         for axes, (name, rows) in zip(
             panels, medians.groupby("scenario", sort=False), strict=True
         ):
-            for _, row in rows.iterrows():
-                agent, travel = row["agent"], max(row["total_variation"], 1.0)
-                axes.plot(travel, row["mae"], "o", color=shades[agent], label=label(agent))
-            left, right = axes.get_xlim()
-            top = axes.get_ylim()[1]
+            # A valve that never moves has no place on this axis.
+            moving = rows[rows["total_variation"] > 0.0]
+            for _, row in moving.iterrows():
+                agent = row["agent"]
+                axes.plot(
+                    row["total_variation"], row["mae"], "o", color=shades[agent],
+                    label=label(agent),
+                )  # fmt: skip
+            limit, travels = limits[name], moving["total_variation"]
+            across = np.geomspace(0.7 * travels.min(), 1.4 * travels.max(), 200)
             if frontiers[name]:
-                travel, error = zip(*frontiers[name], strict=True)
-                axes.plot(travel, error, color="0.4", linewidth=1)
-            axes.axhline(limits[name], color="0.4", linewidth=1, linestyle="--")
-            axes.set_xlim(max(left, 0.5 * rows["total_variation"].clip(1.0).min()), right)
-            axes.set_ylim(top=top)
+                travel, error = np.transpose(frontiers[name][::-1])
+                axes.plot(across, np.interp(across, travel, error), color="0.4", linewidth=1)
+            axes.axhline(limit, color="0.4", linewidth=1, linestyle="--")
             axes.set_xscale("log")
-            axes.set_yscale("log")
-            for axis in (axes.xaxis, axes.yaxis):
-                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-                axis.set_major_formatter("{x:g}")
-                axis.set_minor_formatter("")
+            axes.set_xlim(across[0], across[-1])
+            axes.set_ylim(0.9 * min(limit, moving["mae"].min()), 1.1 * moving["mae"].max())
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter("")
             axes.set_xlabel("valve travel (t/h)")
             axes.set_ylabel("mean |e| (°C)")
         handles, names = panels[0].get_legend_handles_labels()
