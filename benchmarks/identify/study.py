@@ -20,6 +20,7 @@ import pandas as pd
 from rich.console import Console
 
 import mptc_gym  # noqa: F401 (registers the environment)
+from benchmarks.designs import Plant, random_design
 from benchmarks.identify.fit import CannotTellError, Interval, identify
 from benchmarks.identify.log import Log
 from benchmarks.lib import command_line
@@ -28,7 +29,6 @@ from benchmarks.lib.statistics import share
 from benchmarks.lib.storage import replacing, write_text
 from benchmarks.lib.tables import on_screen
 from benchmarks.scenarios import plain
-from benchmarks.designs import Plant, random_design
 from mptc_gym import Parameters
 
 NOISE = 0.02, 0.5  # R of the logs, degC^2
