@@ -12,7 +12,7 @@ from scipy import signal
 from agents import PIController
 from benchmarks.identify import log as log_module
 from benchmarks.identify.__main__ import main
-from benchmarks.identify.armax import Orders
+from benchmarks.identify.armax import Orders, Rows
 from benchmarks.identify.fit import CannotTellError, Options, identify
 from benchmarks.identify.log import Columns, Log, read_log
 from benchmarks.identify.plant import plant_arguments, plant_ranges, simulation
@@ -149,6 +149,32 @@ class TestFit:
         found = identify(log, Options(find_dead_zone=False)).estimates
         assert found["delay"].value == pytest.approx(18, abs=1)
         assert found["gain"].value == pytest.approx(-0.6825, rel=0.15)
+
+
+class TestRows:
+    def test_recursion_starts_anew_after_a_gap(self):
+        known = np.ones(12, dtype=bool)
+        known[[0, 5, 6]] = False
+        values = np.arange(12.0)
+        rows = Rows(known)
+        column = rows.lagged(values, [1])
+        np.testing.assert_array_equal(column[:, 0], [0, 1, 2, 3, 6, 7, 8, 9, 10])
+        # xi(k) = w(k) - 0.5 xi(k-1), from 0: 0, 1, 1.5, 2.25; then 6, 4, 6, 6, 7.
+        white = rows.whitened(column, np.array([0.5]))
+        np.testing.assert_allclose(white[:, 0], [0, 1, 1.5, 2.25, 6, 4, 6, 6, 7])
+
+    def test_least_squares_over_a_gap_finds_what_made_the_errors(self):
+        generator = np.random.default_rng(707)
+        xi = generator.normal(size=(2, 4000))
+        noise = signal.lfilter([1.0, -0.6], [1.0], xi, axis=1)  # two stretches, each from rest
+        regressor = generator.normal(size=8000)
+        known = np.ones(8001, dtype=bool)
+        known[4000] = False
+        target = 3.0 * regressor + noise.ravel()
+        found = Rows(known).solve(target, regressor[:, np.newaxis], 1)
+        assert found.linear[0] == pytest.approx(3.0, abs=0.05)
+        assert found.c[0] == pytest.approx(-0.6, abs=0.05)
+        np.testing.assert_allclose(found.errors, xi.ravel(), atol=0.3)
 
 
 class TestRefusal:
