@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.examples import tclab_twin
+from benchmarks.identify import tclab_twin
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """Identify a plant that no one here wrote, TCLab's digital twin, and control it.
 
-`python -m benchmarks.examples.tclab_twin`, after `pip install tclab`. The lab is a
+`python -m benchmarks.identify.tclab_twin`, after `pip install tclab`. The lab is a
 small heater with a sensor, for teaching; its package holds a simulation of it, with four
 temperatures inside, a sensor that counts in steps of 0.32 degC, and noise. Here heater 1, in
 percent, stands for the flow. The page
