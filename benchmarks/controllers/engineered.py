@@ -7,7 +7,7 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from agents import PIController, SelfTuningController, SmithPredictor
+from agents import DirectNNController, PIController, SelfTuningController, SmithPredictor
 from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.step_test import step_test
@@ -32,6 +32,16 @@ class Nothing:
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return actions of 0 t/h, shape (runs, 1)."""
         return np.full((len(observation), 1), self._action, np.float32)
+
+
+def direct_nn(
+    parameters: Parameters, num_envs: int, seed: int, u_min: float, u_max: float, **gains: float
+) -> DirectNNController:
+    """Return the paper's network, which is told the direction of the plant's response."""
+    direction = 1 if sum(parameters.b) / sum(parameters.a) > 0.0 else -1
+    return DirectNNController(
+        num_envs=num_envs, seed=seed, u_min=u_min, u_max=u_max, direction=direction, **gains
+    )
 
 
 def simc_pi(parameters: Parameters, u_min: float, u_max: float) -> PIController:

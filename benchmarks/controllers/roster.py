@@ -27,7 +27,7 @@ ROSTER: dict[str, Controller] = {
         Controller(
             "nn",
             "NN",
-            "agents:DirectNNController",
+            "benchmarks.controllers.engineered:direct_nn",
             in_service="benchmarks.controllers.commissioned:learning_network",
             account=Account(
                 "direction; gains searched on the paper's plant",
