@@ -8,6 +8,7 @@ import difflib
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Final, Generic, TypeVar
 
@@ -347,7 +348,7 @@ class Parameters(PlantNumbers[Number]):
         """Names of the plant numbers that are drawn at each reset."""
         return tuple(name for name in PLANT_NUMBERS if isinstance(getattr(self, name), tuple))
 
-    @property
+    @cached_property
     def is_stable(self) -> bool:
         """Whether all poles of 1 / A lie within the unit circle."""
         return bool(np.all(np.abs(np.roots(self.a)) < 1.0))
