@@ -87,11 +87,12 @@ class Dynamics:
         Parameters
         ----------
         numbers
-            The plant numbers, floats, or arrays for many plants.
+            The plant numbers, floats, or arrays or tensors for many plants.
         age
-            k, one number, or an array.
+            k, one number, or an array or tensor.
         """
-        share = np.minimum(age / self._samples, 1.0)
+        share = age / self._samples
+        share = share * (share < 1.0) + (share >= 1.0)  # at most 1, of arrays of any library
         gain, time_constant = numbers.gain_factor, numbers.time_constant_factor
         return (
             gain + gain * (numbers.gain_drift - 1.0) * share,

@@ -248,6 +248,10 @@ class Levels:
     ----------
     random : bool
         Whether they are drawn.
+    amplitude : float
+        Random ones are uniform within plus and minus that, degC.
+    shortest, longest : int
+        How many samples random ones are held for, both ends included.
     values : list of float
         Otherwise the levels, degC, to be repeated.
     lengths : list of int
@@ -257,9 +261,9 @@ class Levels:
     def __init__(self, parameters: Parameters) -> None:
         kind, period = parameters.setpoint, parameters.setpoint_period
         self.random = kind == "random"
-        self._amplitude = amplitude = parameters.setpoint_amplitude
-        self._shortest = max(1, math.ceil(period / 6))
-        self._longest = max(self._shortest, period // 2)
+        self.amplitude = amplitude = parameters.setpoint_amplitude
+        self.shortest = max(1, math.ceil(period / 6))
+        self.longest = max(self.shortest, period // 2)
         if isinstance(kind, str):  # "square"
             self.values = [amplitude, -amplitude]
             self.lengths = [(period + 1) // 2, period // 2]
@@ -269,8 +273,8 @@ class Levels:
 
     def draw(self, generator: np.random.Generator) -> tuple[float, int]:
         """Draw a level, degC, and how many samples it is held for."""
-        level = generator.uniform(-self._amplitude, self._amplitude)
-        return level, int(generator.integers(self._shortest, self._longest, endpoint=True))
+        level = generator.uniform(-self.amplitude, self.amplitude)
+        return level, int(generator.integers(self.shortest, self.longest, endpoint=True))
 
 
 class SetPoint:

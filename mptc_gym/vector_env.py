@@ -38,6 +38,24 @@ _NOISE_BYTES = 1 << 27  # of a block of noise, unless a single sample of all pla
 _STEPS_PER_SHIFT = 64  # steps until the window of the observations is moved back
 
 
+def checked_limit(max_episode_steps: int | None) -> int:
+    """Return the samples of an episode; `FOREVER` if there is no limit, None or -1."""
+    if max_episode_steps is None or max_episode_steps == -1:
+        return FOREVER
+    return min(FOREVER, positive_count("max_episode_steps", max_episode_steps))
+
+
+def checked_mode(autoreset_mode: str | AutoresetMode) -> AutoresetMode:
+    """Return an autoreset mode that is given by itself or by its value."""
+    try:
+        return AutoresetMode(autoreset_mode)
+    except ValueError:
+        allowed = ", ".join(repr(mode.value) for mode in AutoresetMode)
+        raise ValueError(
+            f"autoreset_mode must be one of {allowed}, got {autoreset_mode!r}"
+        ) from None
+
+
 class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
     """n plants that advance together: `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
 
@@ -72,8 +90,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     -----
     All plants share one clock, so that a step is array arithmetic alone. There is a Python loop
     over plants only where each draws from its own generators: at the start of an episode, once
-    in some 600 samples of noise, and when a random set point changes. A plant needs the same few
-    KiB however long an episode lasts.
+    in some 600 samples of noise, and when a random set point changes. A plant needs the same
+    few KiB however long an episode lasts.
 
     With an unstable `a`, or with actions beyond 1e154, y may leave the range of floats. NumPy
     then warns here, while `MiddlePointEnv` continues without a warning.
@@ -117,16 +135,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         rendering.check_mode(render_mode, self.metadata["render_modes"])
         single = MiddlePointEnv(**arguments)
         self.num_envs = num_envs = positive_count("num_envs", num_envs)
-        self._limit = FOREVER  # samples of an episode
-        if max_episode_steps is not None and max_episode_steps != -1:
-            self._limit = min(FOREVER, positive_count("max_episode_steps", max_episode_steps))
-        try:
-            self.autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
-            allowed = ", ".join(repr(mode.value) for mode in AutoresetMode)
-            raise ValueError(
-                f"autoreset_mode must be one of {allowed}, got {autoreset_mode!r}"
-            ) from None
+        self._limit = checked_limit(max_episode_steps)
+        self.autoreset_mode = checked_mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
         self._records: dict[int, Record] = {}  # of every plant, for pictures

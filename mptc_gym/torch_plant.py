@@ -1,0 +1,284 @@
+"""Plant and actuator in PyTorch, (28) and (29): many plants, a block of samples at a time.
+
+`Plants` in `mptc_gym.plant` is the same in NumPy, a sample at a time.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from mptc_gym.parameters import Parameters, PlantNumbers
+from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
+
+Number = float | Tensor  # the same for all plants, or one for each, shape (n,)
+
+
+def flow_command(actions: Tensor, middle: Tensor, half_range: Number) -> Tensor:
+    """Scale normalised actions to commands u, t/h: the last formula of Section 4.
+
+    Parameters
+    ----------
+    actions
+        Normalised, shape (n,).
+    middle, half_range
+        Of the limits, t/h: (U_min + U_max) / 2 and (U_max - U_min) / 2.
+    """
+    return _plus(middle, half_range, actions)
+
+
+def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:
+    """Return the flow u_a that the actuator applies, (29), t/h.
+
+    Its gradient with respect to the command is 1 up to the limits, straight through the dead
+    zone as if there were none, and 0 beyond the limits.
+
+    Parameters
+    ----------
+    command
+        u, t/h, shape (n,).
+    edge
+        The largest magnitude of a command without effect: see `largest_dead`.
+    u_min, u_max
+        The limits, t/h, both floats or both of shape (n,).
+    """
+    alike = not any(isinstance(each, Tensor) for each in (edge, u_min, u_max))
+    if alike and not command.requires_grad and u_min <= 0.0 <= u_max:
+        return functional.hardshrink(command, edge).clamp_(u_min, u_max)  # the same, at once
+    limited = torch.clamp(command, u_min, u_max)  # type: ignore[arg-type]
+    # 0 inside the dead zone and 1 outside, without conditions: they take a processor many times
+    # as long where it cannot foresee them.
+    passes = command.detach().abs().sub_(edge).sign_().clamp_(min=0.0)
+    if not limited.requires_grad:
+        return limited.mul_(passes)
+    return torch.addcmul(limited, limited.detach(), passes.sub_(1.0))
+
+
+def largest_dead(dead_zone: Number, like: Tensor) -> Number:
+    """Return the largest magnitude below a dead zone, as numbers of a type go."""
+    if isinstance(dead_zone, Tensor):
+        return dead_zone.nextafter(torch.full_like(dead_zone, -1.0))
+    kind = np.float32 if like.dtype == torch.float32 else np.float64
+    return float(np.nextafter(kind(dead_zone), kind(-1.0)))
+
+
+class TorchPlants:
+    """Many plants side by side, with gradients where the actions have them.
+
+    Because of the delay d, the outputs of the d + 1 samples after an action follow from the
+    actions so far, whatever comes next. So they are worked out in a block, d being the shortest
+    delay that can be drawn.
+
+    Parameters
+    ----------
+    parameters
+        Uses `a`, `b`, the delay, and what `Dynamics` does.
+    nothing
+        Zeros of the device and type to use, shape (n,).
+
+    Attributes
+    ----------
+    most_samples : int
+        How many samples can be worked out at once.
+    """
+
+    def __init__(self, parameters: Parameters, nothing: Tensor) -> None:
+        self._nothing = nothing
+        self._dynamics = Dynamics(parameters)
+        self._drifts, self._scales = parameters.drifts, parameters.changes_dynamics
+        self._beta = tuple(parameters.b)
+        shortest, self._longest = map(int, parameters.range_of("delay"))
+        self.most_samples = shortest + 1
+        self._rows = torch.arange(self.most_samples, device=nothing.device)[:, None]
+        self._order = len(parameters.a) - 1  # of A
+        self._all_at_once: Tensor | None = None
+        if not parameters.changes_dynamics:
+            alpha, _, _ = self._dynamics.coefficients(1.0, 1.0)
+            units = torch.eye(
+                self._order + self.most_samples, dtype=nothing.dtype, device=nothing.device
+            ).unbind()
+            past, forced = list(units[: self._order]), units[self._order :]
+            self._all_at_once = torch.stack(_follow(past, forced, alpha))
+
+    def rest(
+        self,
+        which: Tensor | None,
+        taken: int,
+        numbers: Mapping[str, Number],
+        starts: Tensor,
+        phases: Collection[int],
+    ) -> None:
+        """Bring plants to rest.
+
+        Parameters
+        ----------
+        which
+            Whether each is, shape (n,), bool; None for all.
+        taken
+            How many samples of the last block have passed.
+        numbers
+            The plant numbers of all plants from now on, by name.
+        starts
+            The clock at the beginning of each plant's episode, shape (n,).
+        phases
+            The remainders of `starts` when divided by `DRIFT_INTERVAL`.
+        """
+        self._numbers, self._starts, self._phases = numbers, starts, phases
+        self._factors: tuple[Number, Number] | None = None
+        if which is None:
+            # What the inputs so far add to B of the next ones, and B of the latest, z, oldest
+            # first, without the delay. Then y, also oldest first: what A needs from before the
+            # last block, and the block.
+            self._carried = [self._nothing] * (len(self._beta) - 1)
+            self._responses = deque([self._nothing] * (self._longest + 1), self._longest + 1)
+            self._history = [self._nothing] * self._order
+        else:
+            past = self._history[taken : taken + self._order]
+            self._history = [each.masked_fill(which, 0.0) for each in past]
+            self._carried = [each.masked_fill(which, 0.0) for each in self._carried]
+            responses = torch.stack([*self._responses]).masked_fill_(which, 0.0)
+            self._responses.extend(responses.unbind())
+        u_min, u_max = numbers["u_min"], numbers["u_max"]
+        self._middle = self._nothing.new_zeros(()) + (u_min + u_max) / 2.0
+        self._half_range = (u_max - u_min) / 2.0
+        self._edge = largest_dead(numbers["dead_zone"], self._nothing)
+        delay = numbers["delay"]
+        self._taken = None
+        if isinstance(delay, Tensor):
+            self._taken = self._rows + (self._longest - delay.to(torch.int64))
+
+    def apply(self, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Take a(k) of all plants, shape (n,), and return u(k) and u_a(k), t/h."""
+        command = flow_command(actions, self._middle, self._half_range)
+        numbers = self._numbers
+        applied = applied_flow(command, self._edge, numbers["u_min"], numbers["u_max"])
+        response = applied * self._beta[0]  # B of (28)
+        if self._carried:
+            response = response.add_(self._carried[0])
+            carried = [*self._carried[1:], None]
+            self._carried = [
+                applied * beta if more is None else torch.add(more, applied, alpha=beta)
+                for beta, more in zip(self._beta[1:], carried, strict=True)
+            ]
+        self._responses.append(response)
+        return command, applied
+
+    def outputs(
+        self,
+        taken: int,
+        clock: int,
+        samples: int,
+        noise: Tensor | None,
+        load: Tensor | None,
+    ) -> tuple[Tensor, list[tuple[Number, Number]]]:
+        """Work out the next samples, once the action before them has been applied.
+
+        Parameters
+        ----------
+        taken
+            How many samples of the last block have passed.
+        clock
+            Of the first of the next ones.
+        samples
+            How many, at most `most_samples`.
+        noise, load
+            n and w of these samples, degC, shape (samples, n), if there are any.
+
+        Returns
+        -------
+        Tensor, list of tuple
+            y, degC, shape (samples, n); and of each sample gain and time constant, as multiples
+            of those that A and B have.
+        """
+        past = self._history[taken : taken + self._order]
+        rows, told = past, []
+        response = self._response(samples)
+        for first, last in self._stretches(clock, samples):
+            factors = self._drifted(clock + first)
+            alpha, scale, load_gain = self._dynamics.coefficients(*factors)
+            forced = response[first:last]
+            if noise is not None:
+                forced = _plus(noise[first:last], scale, forced)
+            elif self._scales:
+                forced = forced * scale
+            if load is not None:
+                forced = _plus(forced, load_gain, load[first:last])
+            told += [factors] * (last - first)
+            if self._all_at_once is None or not _multiplies_exactly(forced):
+                rows = _follow(rows, forced.unbind(), alpha)
+        if len(rows) > self._order:
+            self._history = rows
+            return torch.stack(rows[self._order :]), told
+        size = self._order + samples
+        known = torch.cat((torch.stack(past), forced)) if past else forced
+        products = torch.mm(self._all_at_once[:size, :size], known)
+        self._history = [*products.unbind()]
+        return products[self._order :].clone(), told
+
+    def detach(self) -> None:
+        """Cut the graph that leads to earlier actions."""
+        self._history = [each.detach() for each in self._history]
+        self._carried = [each.detach() for each in self._carried]
+        self._responses.extend([each.detach() for each in self._responses])
+
+    def _response(self, samples: int) -> Tensor:
+        """Return the response to the inputs, B of (28), shape (samples, n)."""
+        if self._taken is None:
+            return torch.stack([*islice(self._responses, samples)])
+        rows = self._longest - self.most_samples + 1 + samples
+        return torch.stack([*islice(self._responses, rows)]).gather(0, self._taken[:samples])
+
+    def _stretches(self, clock: int, samples: int) -> list[tuple[int, int]]:
+        """Return from which to which sample the dynamics of no plant change."""
+        begins = [0]
+        if self._drifts:
+            begins += [
+                r for r in range(1, samples) if (clock + r) % DRIFT_INTERVAL in self._phases
+            ]
+        return list(zip(begins, [*begins[1:], samples], strict=True))
+
+    def _drifted(self, clock: int) -> tuple[Any, Any]:
+        """Return gain and time constant at a sample."""
+        if self._factors is None or (self._drifts and clock % DRIFT_INTERVAL in self._phases):
+            slow: Any = 0
+            if self._drifts:
+                ages = clock - self._starts
+                slow = (ages - ages % DRIFT_INTERVAL).to(self._nothing.dtype)
+            self._factors = self._dynamics.factors(PlantNumbers(**self._numbers), slow)
+        return self._factors
+
+
+def _follow(
+    past: Sequence[Tensor], forced: Iterable[Tensor], alpha: Sequence[Number]
+) -> list[Tensor]:
+    """Return past outputs and those that follow, by A of (28), oldest first."""
+    outputs = list(past)
+    for output in forced:
+        for lag, coefficient in enumerate(alpha, start=1):
+            output = _plus(output, coefficient, outputs[-lag])
+        outputs.append(output)
+    return outputs
+
+
+def _multiplies_exactly(tensor: Tensor) -> bool:
+    """Whether nobody has asked for quick products of matrices, with fewer digits."""
+    if tensor.dtype == torch.float64:
+        return True
+    kind = tensor.device.type
+    return kind == "cpu" and not (
+        torch.is_autocast_enabled(kind) or torch.get_float32_matmul_precision() != "highest"
+    )
+
+
+def _plus(first: Tensor, factor: Number, second: Tensor) -> Tensor:
+    """Return first + factor * second, in one operation."""
+    if isinstance(factor, Tensor):
+        return torch.addcmul(first, factor, second)
+    return torch.add(first, second, alpha=factor)

@@ -1,0 +1,750 @@
+"""The environment in PyTorch: equal to the one in NumPy, draws, gradients, no waiting."""
+
+import gc
+import inspect
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="it is what is tested")
+
+from gymnasium.error import ResetNeeded  # noqa: E402 (torch first)
+from gymnasium.vector import AutoresetMode  # noqa: E402
+from hypothesis import given, settings  # noqa: E402
+from hypothesis import strategies as st  # noqa: E402
+from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
+
+from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters  # noqa: E402
+from mptc_gym.torch_env import MiddlePointTorchEnv  # noqa: E402
+from tests.arguments import valid_arguments  # noqa: E402
+
+MODES = [mode.value for mode in AutoresetMode]
+
+
+class Recording:
+    """Runs the environment in NumPy, and keeps all that goes in and comes out.
+
+    What comes from outside is kept for each plant, episode by episode.
+    """
+
+    def __init__(self, envs):
+        self.envs, self.calls = envs, []
+        self.episodes = [[] for _ in range(envs.num_envs)]
+        self._reading = self._ended = np.zeros(envs.num_envs)
+        transmitters = envs._transmitter
+        following = transmitters.next
+
+        def spied():
+            self._reading = following()
+            return self._reading
+
+        transmitters.next = spied
+
+    def reset(self, **given):
+        returned = self.envs.reset(**given)
+        mask = (given.get("options") or {}).get("reset_mask")
+        self._begin(np.ones(self.envs.num_envs, bool) if mask is None else mask, returned[1])
+        self.calls.append(("reset", mask, returned))
+
+    def step(self, actions):
+        self._reading = np.zeros(self.envs.num_envs)
+        returned = self.envs.step(actions)
+        infos = returned[-1]
+        restarted = infos.get("_final_info", self._ended if self._next_step else None)
+        if restarted is None:
+            restarted = np.zeros(self.envs.num_envs, bool)
+        for i in range(self.envs.num_envs):
+            if "_final_info" in infos and infos["_final_info"][i]:
+                self._add(i, infos["final_info"])
+            elif not restarted[i]:
+                self._add(i, infos)
+        self._begin(restarted, infos)
+        self._ended = returned[3].copy()
+        self.calls.append(("step", actions.copy(), returned))
+
+    @property
+    def _next_step(self):
+        return self.envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+
+    def _add(self, i, infos):
+        episode = self.episodes[i][-1]
+        for name in ("noise", "setpoint", "disturbance"):
+            if name in infos:
+                episode[name].append(infos[name][i])
+        episode["measurement_noise"].append(self._reading[i])
+
+    def _begin(self, mask, infos):
+        for i in np.flatnonzero(mask):
+            names = ("noise", "setpoint", "disturbance")
+            episode = {name: [infos[name][i]] for name in names if name in infos}
+            ranges = {name: infos[name][i] for name in self.envs.parameters.ranges}
+            self.episodes[i].append({**episode, "measurement_noise": [0.0], **ranges})
+
+    def signals(self):
+        """Return what is to be handed in to meet the same."""
+        episodes = max(map(len, self.episodes))
+        samples = max(len(each["noise"]) for own in self.episodes for each in own) + 1
+        signals = {}
+        for name, first in self.episodes[0][0].items():
+            shape = (episodes, samples) if isinstance(first, list) else (episodes,)
+            signals[name] = np.zeros((*shape, self.envs.num_envs))
+            for i, own in enumerate(self.episodes):
+                for j, each in enumerate(own):
+                    if isinstance(first, list):
+                        signals[name][j, : len(each[name]), i] = each[name]
+                    else:
+                        signals[name][j:, i] = each[name]
+        return {name: torch.tensor(values) for name, values in signals.items()}
+
+
+def random_actions(rng, n):
+    actions = rng.normal(0, 1, (n, 1)).astype(np.float32)
+    actions[rng.random(n) < 0.1] *= 1e6
+    actions[rng.random(n) < 0.1] = rng.choice([0.5, -0.5])  # the edge of the dead zone
+    return actions
+
+
+def record(envs, *, steps, rng, partial_resets):
+    recording = Recording(envs)
+    recording.reset(seed=int(rng.integers(2**30)))
+    n = envs.num_envs
+    for _ in range(steps):
+        recording.step(random_actions(rng, n))
+        mask = rng.random(n) < partial_resets
+        if envs.metadata["autoreset_mode"] is AutoresetMode.DISABLED:
+            mask |= recording.calls[-1][2][3]
+        if mask.any():
+            recording.reset(options={"reset_mask": mask})
+            recording._ended = recording._ended.astype(bool) & ~mask
+    return recording
+
+
+def assert_close(ours, theirs, name, rtol, atol):
+    if isinstance(theirs, dict):
+        assert set(ours) == set(theirs)
+        for key in theirs:
+            assert_close(ours[key], theirs[key], key, rtol, atol)
+    elif name == "final_obs":
+        for own, other in zip(ours, theirs, strict=True):
+            assert_close(own, np.zeros(own.shape) if other is None else other, "", rtol, atol)
+    elif theirs.dtype == bool:
+        assert ours.dtype == torch.bool
+        np.testing.assert_array_equal(ours.numpy(), theirs, err_msg=name)
+    else:
+        if theirs.dtype == np.float32:  # half a unit in the last place
+            rtol = max(rtol, 6e-8)
+        ours = ours.detach().numpy()
+        assert ours.shape == theirs.shape
+        np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=atol, err_msg=name)
+
+
+def replay(recording, env, rtol=1e-9, atol=1e-9):
+    mode = env.autoreset_mode
+    assert mode is recording.envs.metadata["autoreset_mode"]
+    for call, given_, theirs in recording.calls:
+        if call == "step":
+            ours = env.step(torch.tensor(given_))
+        elif given_ is None:
+            ours = env.reset(options={"signals": recording.signals()})
+        else:
+            ours = env.reset(options={"reset_mask": torch.tensor(given_)})
+        names = "reset" if call == "reset" else "observation reward terminated truncated infos"
+        for own, other, name in zip(
+            ours, theirs, ("observation", "infos") if call == "reset" else names.split(),
+            strict=True,
+        ):  # fmt: skip
+            assert_close(own, other, name, rtol, atol)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    arguments=valid_arguments,
+    num_envs=st.integers(1, 5),
+    mode=st.sampled_from(MODES),
+    limit=st.none() | st.integers(1, 40),
+    partial_resets=st.sampled_from([0.0, 0.05, 0.3]),
+    differentiable=st.booleans(),
+    randomness=st.integers(0, 2**32),
+)
+def test_it_equals_the_environment_in_numpy(
+    arguments, num_envs, mode, limit, partial_resets, differentiable, randomness
+):
+    rng = np.random.default_rng(randomness)
+    made = {"max_episode_steps": limit, "autoreset_mode": mode, **arguments}
+    recording = record(
+        MiddlePointVectorEnv(num_envs, **made), steps=60, rng=rng, partial_resets=partial_resets
+    )
+    made |= {"dtype": torch.float64, "differentiable": differentiable}
+    replay(recording, MiddlePointTorchEnv(num_envs, **made))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_equals_it_over_long_episodes_in_both_types(mode, rng):
+    arguments = {
+        **PRESETS["hard"], "action_window": 20, "output_window": 2, "move_weight": 0.1,
+        "max_episode_steps": 600, "autoreset_mode": mode,
+    }  # fmt: skip
+    recording = record(
+        MiddlePointVectorEnv(3, **arguments), steps=1200, rng=rng, partial_resets=0.001
+    )
+    replay(recording, MiddlePointTorchEnv(3, dtype=torch.float64, **arguments))
+    # float32 has 24 bits. Errors of rounding grow with the slowest pole's time constant of
+    # some 20 samples, and temperatures are some 10 degC: 10 * 20 * 2^-24 = 1e-5.
+    replay(recording, MiddlePointTorchEnv(3, **arguments), rtol=1e-5, atol=1e-4)
+
+
+def make(num_envs=2, **arguments):
+    return MiddlePointTorchEnv(num_envs, **{"dtype": torch.float64, **arguments})
+
+
+def collected(env, steps, name):
+    """Return an info of all samples from k = 1 on, shape (steps, n), with no flow."""
+    actions = torch.zeros(env.num_envs, 1)
+    return torch.stack([env.step(actions)[-1][name].clone() for _ in range(steps)]).numpy()
+
+
+class TestDraws:
+    """Bounds of five standard errors: one test in two million fails by chance."""
+
+    def test_noise_has_its_variance_and_is_white_and_normal(self):
+        n, steps, variance = 400, 250, 0.5
+        env = make(n, noise_variance=variance, c=[1.0])
+        env.reset(seed=3)
+        xi = collected(env, steps, "noise") / variance**0.5
+        size = xi.size
+        for power, moment, spread in (
+            (1, 0.0, 1.0),
+            (2, 1.0, 2.0),
+            (3, 0.0, 15.0),
+            (4, 3.0, 96.0),
+        ):
+            # The variance of xi^p is E xi^2p - (E xi^p)^2: 1, 3 - 1, 15, 105 - 9.
+            assert abs((xi**power).mean() - moment) < 5 * (spread / size) ** 0.5
+        for shifted in (1, 2, 7, 19, 20):
+            assert abs((xi[shifted:] * xi[:-shifted]).mean()) < 5 / (size - shifted * n) ** 0.5
+            assert abs((xi[:, shifted:] * xi[:, :-shifted]).mean()) < 5 / (size * 0.9) ** 0.5
+        inside = (np.abs(xi) < 0.6745).mean()  # the quartiles of a normal distribution
+        assert abs(inside - 0.5) < 5 * (0.25 / size) ** 0.5
+
+    def test_noise_has_the_colour_of_c(self):
+        n, steps, variance = 400, 250, 0.5
+        env = make(n, noise_variance=variance)
+        env.reset(seed=4)
+        noise = collected(env, steps, "noise")[2:] / variance**0.5
+        c = np.array([1.0, -0.35740, -0.03392])
+        for lag in range(4):
+            product = noise[lag:] * noise[: len(noise) - lag]
+            expected = c[lag:] @ c[: len(c) - lag]  # 0 from lag 3 on
+            # Neighbours in time are hardly independent: the spread is that of the plants'
+            # means.
+            means = product.mean(0)
+            assert abs(means.mean() - expected) < 5 * means.std() / n**0.5
+
+    def test_the_first_noise_of_each_episode_knows_none_before(self):
+        n = 4000
+        env = make(n, noise_variance=1.0, c=[1.0, 3.0], max_episode_steps=10)
+        env.reset(seed=0)
+        noise = collected(env, 30, "noise")
+        for first in (0, 11, 22):  # a reset lies between two episodes
+            spread = (2.0 / n) ** 0.5
+            assert abs(noise[first].var() - 1.0) < 5 * spread
+            assert abs(noise[first + 1].var() - 10.0) < 5 * 10.0 * spread
+
+    def test_readings_are_off_by_white_noise(self):
+        n, steps = 200, 100
+        env = make(
+            n, measurement_noise_variance=0.3, output_window=1, setpoint=0.0,
+            setpoint_window=0, error_window=1,
+        )  # fmt: skip
+        env.reset(seed=0)
+        readings = []
+        for _ in range(steps):
+            observation, _, _, _, infos = env.step(torch.zeros(n, 1))
+            assert torch.equal(observation[:, 0], -observation[:, 1])
+            assert not infos["output"].any()
+            readings.append(observation[:, 1])
+        v = torch.stack(readings).numpy()
+        assert abs(v.var() - 0.3) < 5 * 0.3 * (2 / v.size) ** 0.5
+        assert abs((v[1:] * v[:-1]).mean()) < 5 * 0.3 / v.size**0.5
+
+    @pytest.mark.parametrize("period", [600, 7, 1])
+    def test_set_points_have_their_levels_and_lengths(self, period):
+        n, steps, amplitude = 300, 40 * max(period // 6, 3), 4.0
+        env = make(
+            n, setpoint="random", setpoint_period=period, setpoint_amplitude=amplitude,
+            max_episode_steps=None, delay=25,
+        )  # fmt: skip
+        _, infos = env.reset(seed=1)
+        levels = np.vstack([infos["setpoint"][None], collected(env, steps, "setpoint")])
+        assert np.abs(levels).max() <= amplitude
+        shortest, longest = max(1, -(-period // 6)), max(1, -(-period // 6), period // 2)
+        first = []
+        for column in levels.T:
+            changes = np.flatnonzero(np.diff(column)) + 1
+            lengths = np.diff(np.concatenate(([0], changes)))
+            assert set(lengths) <= set(range(shortest, longest + 1))
+            first.append(lengths[:5])
+        lengths = np.concatenate(first)  # as many of each plant, so that none is preferred
+        middle, count = (shortest + longest) / 2, longest - shortest + 1
+        spread = ((count**2 - 1) / 12 / lengths.size) ** 0.5
+        assert abs(lengths.mean() - middle) <= 5 * spread
+        if count > 1:
+            assert {lengths.min(), lengths.max()} == {shortest, longest} or count > 100
+        starts = levels[0]
+        assert abs(starts.mean()) < 5 * amplitude / (3 * n) ** 0.5
+        # The variance of x^2, x uniform in [-1, 1], is 1/5 - 1/9.
+        squares = (starts / amplitude) ** 2
+        assert abs(squares.mean() - 1 / 3) < 5 * ((1 / 5 - 1 / 9) / n) ** 0.5
+
+    def test_load_steps_have_their_times_and_levels(self):
+        n, steps, amplitude, interval = 300, 1000, 2.0, 50.0
+        env = make(n, disturbance_amplitude=amplitude, disturbance_interval=interval)
+        env.reset(seed=2)
+        load = np.vstack([np.zeros(n), collected(env, steps, "disturbance")])
+        changed = np.diff(load, axis=0) != 0.0  # from k to k + 1
+        assert not changed[np.arange(1, steps + 1) % 10 != 0].any()
+        chances = changed[9::10]
+        probability = 10 / interval
+        spread = (probability * (1 - probability) / chances.size) ** 0.5
+        assert abs(chances.mean() - probability) < 5 * spread
+        levels = load[1:][changed] / amplitude
+        assert np.abs(levels).max() <= 1.0
+        assert abs(levels.mean()) < 5 / (3 * levels.size) ** 0.5
+        assert abs((levels**2).mean() - 1 / 3) < 5 * ((1 / 5 - 1 / 9) / levels.size) ** 0.5
+
+    def test_below_ten_samples_every_change_is_a_step(self):
+        env = make(50, disturbance_amplitude=1.0, disturbance_interval=2.0)
+        env.reset(seed=2)
+        load = collected(env, 200, "disturbance")
+        levels = load[9::10]
+        assert (np.diff(levels, axis=0) != 0.0).all()
+        assert abs((levels**2).mean() - 1 / 3) < 5 * ((1 / 5 - 1 / 9) / levels.size) ** 0.5
+
+    def test_the_walk_gains_its_variance(self):
+        n, steps, variance = 2000, 400, 0.01
+        env = make(n, disturbance_walk_variance=variance)
+        env.reset(seed=5)
+        load = collected(env, steps, "disturbance")
+        ends = load[steps - 1]
+        assert abs(ends.var() / (variance * steps) - 1.0) < 5 * (2 / n) ** 0.5
+        moves = np.diff(load[9::10], axis=0)
+        assert abs((moves[1:] * moves[:-1]).mean()) < 5 * variance * 10 / moves.size**0.5
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_ranges_have_both_ends(self, dtype):
+        n = 20_000
+        env = make(n, delay=[12, 24], gain_factor=[0.75, 1.5], dead_zone=3.0, dtype=dtype)
+        infos = env.reset(seed=0)[1]
+        delays = infos["delay"].numpy()
+        counts = np.array([(delays == d).sum() for d in range(12, 25)])
+        assert counts.sum() == n
+        assert (np.abs(counts - n / 13) < 5 * (n / 13 * 12 / 13) ** 0.5).all()
+        gains = infos["gain_factor"].numpy()
+        assert gains.min() >= 0.75
+        assert gains.max() <= 1.5
+        # The ends are met to within 1 / n or so of the range: the chance of more than 20 / n at
+        # one end is e^-20.
+        assert gains.min() < 0.75 + 0.75 * 20 / n
+        assert gains.max() > 1.5 - 0.75 * 20 / n
+        assert abs(gains.mean() - 1.125) < 5 * 0.75 / (12 * n) ** 0.5
+        assert abs(np.corrcoef(delays, gains)[0, 1]) < 5 / n**0.5
+
+    def test_the_seed_is_all_that_differs(self):
+        def trajectory(seed):
+            env = make(5, **PRESETS["hard"], max_episode_steps=50)
+            env.reset(seed=seed)
+            return collected(env, 120, "output")
+
+        np.testing.assert_array_equal(trajectory(1), trajectory(1))
+        assert not np.array_equal(trajectory(1), trajectory(2))
+
+    def test_nothing_is_drawn_from_the_global_generator(self):
+        torch.manual_seed(0)
+        state = torch.get_rng_state()
+        env = make(5, **PRESETS["hard"], max_episode_steps=20)
+        env.reset(seed=0), collected(env, 60, "output")
+        assert torch.equal(torch.get_rng_state(), state)
+
+
+def total_cost(actions, env, weights):
+    """Return a smooth function of all that an episode returns."""
+    observation, _ = env.reset(seed=0)
+    total = (observation * weights[0]).sum()
+    for a in actions:
+        observation, reward, _, _, infos = env.step(a)
+        total = total + (reward * weights[1]).sum() + (observation * weights[2]).sum()
+        total = total + (infos["output"] ** 2).sum()
+    return total
+
+
+class TestGradients:
+    HARD = {  # noqa: RUF012 (of a test)
+        **PRESETS["hard"], "delay": 18, "dead_zone": 1.0, "action_window": 3,
+        "output_window": 2, "move_weight": 0.1, "u_min": [-12.0, -10.0], "differentiable": True,
+    }  # fmt: skip
+
+    @pytest.mark.parametrize("plant", [{"differentiable": True, "dead_zone": 1.0}, HARD])
+    def test_it_equals_finite_differences_away_from_the_kinks(self, plant):
+        env = make(2, **plant)
+        rng = torch.Generator().manual_seed(0)
+        # Well inside what the actuator passes, and far from the same action twice.
+        size = 0.3 + 0.5 * torch.rand(70, 2, 1, generator=rng, dtype=torch.float64)
+        actions = (size * torch.tensor([1.0, -1.0]).repeat(35)[:, None, None]).requires_grad_()
+        weights = torch.randn(3, 1, generator=rng, dtype=torch.float64)
+        total_cost(actions, env, weights).backward()
+        assert actions.grad[:51].abs().min() > 1e-6  # all but the last reach the output
+        for k, i in ((0, 0), (3, 1), (20, 0), (40, 1), (69, 0)):
+            around = []
+            for step in (1e-5, -1e-5):
+                moved = actions.detach().clone()
+                moved[k, i] += step
+                around.append(total_cost(moved, env, weights))
+            slope = (around[0] - around[1]) / 2e-5
+            assert actions.grad[k, i].item() == pytest.approx(slope.item(), rel=1e-5, abs=1e-6)
+
+    @pytest.mark.parametrize("differ", [{}, {"delay": [2, 4], "gain_factor": [0.5, 2.0]}])
+    def test_gradcheck(self, differ):
+        arguments = {"delay": 2, "dead_zone": 0.0, "output_window": 1, "action_window": 2}
+        env = make(2, differentiable=True, **{**arguments, **differ})
+
+        def returned(actions):
+            env.reset(seed=0)
+            steps = [env.step(a) for a in actions]
+            return torch.stack([step[1] for step in steps]), torch.stack([s[0] for s in steps])
+
+        actions = torch.linspace(-0.8, 0.7, 16, dtype=torch.float64).reshape(8, 2, 1)
+        assert torch.autograd.gradcheck(returned, actions.requires_grad_())
+
+    def test_it_goes_straight_through_the_dead_zone_and_ends_at_the_limits(self):
+        # The commands: inside the dead zone, outside it, at its edge, beyond either limit.
+        env = make(5, differentiable=True, delay=0)
+        env.reset()
+        actions = torch.tensor([[0.3], [0.7], [-0.5], [1.2], [-3.0]], requires_grad=True)
+        infos = env.step(actions)[-1]
+        assert infos["applied"].tolist() == pytest.approx([0.0, 7.0, -5.0, 10.0, -10.0])
+        infos["applied"].sum().backward(retain_graph=True)
+        assert actions.grad.ravel().tolist() == [10.0, 10.0, 10.0, 0.0, 0.0]
+        actions.grad = None
+        infos["output"].sum().backward()
+        ours = actions.grad.ravel().tolist()
+        assert ours == pytest.approx([-0.4560, -0.4560, -0.4560, 0.0, 0.0])
+
+    def test_the_same_with_a_dead_zone_of_each_plant(self):
+        env = make(3, differentiable=True, dead_zone=[4.0, 6.0], delay=0)
+        env.reset(seed=0, options={"signals": {"dead_zone": torch.tensor([4.0, 5.0, 6.0])}})
+        actions = torch.tensor([[0.5], [0.5], [0.5]], requires_grad=True)
+        infos = env.step(actions)[-1]
+        infos["applied"].sum().backward()
+        assert infos["applied"].tolist() == [5.0, 5.0, 0.0]
+        assert actions.grad.ravel().tolist() == [10.0, 10.0, 10.0]
+
+    def test_detach_cuts_what_was_before_and_nothing_else(self):
+        def gradients(cut):
+            env = make(
+                2, differentiable=True, action_window=3, move_weight=0.1, noise_variance=1.0
+            )
+            env.reset(seed=0)
+            actions = torch.full((60, 2, 1), 0.8, dtype=torch.float64)
+            actions[1::2] = 0.6
+            actions.requires_grad_()
+            total = 0.0
+            for k, a in enumerate(actions):
+                if k == 25 and cut:
+                    env.detach()
+                observation, reward, _, _, infos = env.step(a)
+                if k >= 25:
+                    total = total + reward.sum() + observation.sum() + infos["output"].sum()
+            total.backward()
+            return actions.grad, total.item()
+
+        (whole, value), (cut, same) = gradients(False), gradients(True)
+        assert value == same
+        assert whole[:25].abs().min() > 0
+        assert not cut[:25].any()
+        # The last move before the cut is one of an action after it, too.
+        torch.testing.assert_close(cut[25:], whole[25:])
+
+    def test_truncated_backpropagation_runs(self):
+        env = make(3, differentiable=True, noise_variance=0.5, max_episode_steps=60)
+        observation, _ = env.reset(seed=0)
+        policy = torch.nn.Linear(6, 1).double()
+        for k in range(100):
+            observation, reward, *_ = env.step(policy(observation))
+            if k % 25 == 24:  # longer than the delay
+                reward.sum().backward()
+                env.detach()
+                observation = observation.detach()
+        assert policy.weight.grad.abs().sum() > 0
+
+    def test_an_episode_knows_nothing_of_the_one_before(self):
+        env = make(2, differentiable=True, max_episode_steps=30, autoreset_mode="SameStep")
+        env.reset(seed=0)
+        actions = torch.full((60, 2, 1), 0.8, dtype=torch.float64, requires_grad=True)
+        rewards = [env.step(a)[1] for a in actions]
+        torch.stack(rewards[30:]).sum().backward()
+        assert not actions.grad[:30].any()
+        assert actions.grad[30:40].abs().min() > 0
+
+    def test_without_gradients_nothing_of_a_graph_is_kept(self):
+        env = make(2, action_window=3, output_window=1, move_weight=0.1, **PRESETS["hard"])
+        env.reset(seed=0)
+        weight = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
+        for _ in range(30):
+            observation, reward, *_, infos = env.step(torch.full((2, 1), 0.7) * weight)
+            assert not any(
+                each.requires_grad for each in (observation, reward, *infos.values())
+            )
+
+    @pytest.mark.parametrize("differentiable", [False, True])
+    def test_memory_does_not_grow(self, differentiable):
+        env = make(
+            3, differentiable=differentiable, max_episode_steps=None, action_window=5,
+            **PRESETS["hard"],
+        )  # fmt: skip
+        env.reset(seed=0)
+        weight = torch.ones(1, 1, dtype=torch.float64, requires_grad=differentiable)
+        counts = []
+        for _ in range(4):
+            for _ in range(100):
+                env.step(torch.full((3, 1), 0.7) * weight)
+                env.detach()
+            gc.collect()
+            counts.append(sum(type(each) is torch.Tensor for each in gc.get_objects()))
+        assert counts[-1] <= counts[1] + 40  # as many as there are in a block, more or less
+
+
+class Waiting(TorchDispatchMode):
+    """Refuses what a device would have to be waited for."""
+
+    REFUSED = ("_local_scalar_dense", "nonzero", "is_nonzero", "masked_select", "equal")
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func._schema.name.partition("::")[2]
+        assert name not in self.REFUSED, name
+        indices = args[1] if name.startswith(("index", "_index")) else ()
+        if isinstance(indices, list | tuple):
+            assert not any(each is not None and each.dtype == torch.bool for each in indices), (
+                f"{name} by a mask"
+            )
+        if name in ("_to_copy", "copy_", "lift_fresh"):
+            assert name != "lift_fresh", "a tensor of Python numbers is copied to the device"
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("differentiable", [False, True])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_a_step_never_waits_for_the_device(mode, differentiable):
+    arguments = {
+        **PRESETS["hard"], "action_window": 5, "move_weight": 0.1, "autoreset_mode": mode,
+        "max_episode_steps": 30, "u_max": [9.0, 10.0], "differentiable": differentiable,
+    }  # fmt: skip
+    for plant in (arguments, {"max_episode_steps": 30, "autoreset_mode": mode}):
+        env = make(3, **plant)
+        env._waits = False  # as on any device but the CPU
+        env.reset(seed=0)
+        env.step(torch.zeros(3, 1, dtype=torch.float64))
+        env.reset(options={"reset_mask": torch.tensor([True, False, False])})
+        with Waiting():
+            for _ in range(100):
+                env.step(torch.zeros(3, 1, dtype=torch.float64))
+
+
+def test_the_interface_is_that_of_the_one_in_numpy():
+    ours, theirs = make(3, output_window=2), MiddlePointVectorEnv(3, output_window=2)
+    for name in ("action_space", "observation_space"):
+        assert getattr(ours, name) == getattr(theirs, name)
+        assert getattr(ours, f"single_{name}") == getattr(theirs, f"single_{name}")
+    assert ours.autoreset_mode is ours.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert ours.num_envs == 3
+    assert ours.np_random_seed is None
+    ours.reset(seed=7)
+    assert ours.np_random_seed == 7
+
+
+def test_help_shows_every_argument():
+    names = set(inspect.signature(MiddlePointTorchEnv).parameters)
+    own = {
+        "num_envs",
+        "device",
+        "dtype",
+        "max_episode_steps",
+        "autoreset_mode",
+        "differentiable",
+    }
+    assert names == own | set(inspect.signature(Parameters).parameters)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("num_envs", 0), ("num_envs", 2.0), ("max_episode_steps", 0),
+        ("autoreset_mode", "Never"),
+        ("dead_zone", -1.0), ("delay", 1.5), ("dtype", torch.float16), ("dtype", "float32"),
+        ("device", "toaster"), ("differentiable", "yes"),
+    ],
+)  # fmt: skip
+def test_bad_argument_is_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        MiddlePointTorchEnv(**{"num_envs": 2, name: value})
+
+
+def test_unknown_argument_is_refused():
+    with pytest.raises(TypeError, match="deadzone"):
+        MiddlePointTorchEnv(2, deadzone=5.0)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, True, "12", [1, 2]])
+def test_bad_seed_is_refused(seed):
+    with pytest.raises(ValueError, match="seed"):
+        make().reset(seed=seed)
+
+
+@pytest.mark.parametrize(
+    "mask", [[True, False], torch.tensor([1, 0]), torch.tensor([True]), torch.zeros(2).bool()]
+)
+def test_bad_reset_mask_is_refused(mask):
+    env = make()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="reset_mask"):
+        env.reset(options={"reset_mask": mask})
+
+
+@pytest.mark.parametrize(
+    ("signals", "named"),
+    [
+        ({}, "signals"), ({"nois": torch.zeros(5, 2)}, "signals"), (3, "signals"),
+        ({"noise": torch.zeros(5, 3)}, "noise"), ({"noise": torch.zeros(2)}, "noise"),
+        ({"noise": torch.full((5, 2), torch.nan)}, "noise"),
+        ({"disturbance": torch.zeros(5, 2)}, "disturbance"),
+        ({"delay": torch.zeros(2)}, "delay"), ({"delay": torch.full((2,), 7.5)}, "delay"),
+        ({"dead_zone": torch.zeros(2)}, "dead_zone"),
+    ],
+)  # fmt: skip
+def test_bad_signals_are_named(signals, named):
+    env = make(delay=[5, 9])
+    with pytest.raises(ValueError, match=named):
+        env.reset(options={"signals": signals})
+
+
+def test_signals_end_with_an_error_and_with_a_reset_without():
+    env = make(noise_variance=0.5)
+    env.reset(seed=0, options={"signals": {"noise": torch.ones(4, 2)}})
+    with pytest.raises(ValueError, match="signals"):
+        env.reset(
+            options={"reset_mask": torch.tensor([True, False]), "signals": {"noise": 1.0}}
+        )
+    for _ in range(3):
+        assert env.step(torch.zeros(2, 1))[-1]["noise"].tolist() == [1.0, 1.0]
+    with pytest.raises(ValueError, match="end at sample 3"):
+        env.step(torch.zeros(2, 1))
+    env.reset()
+    assert env.step(torch.zeros(2, 1))[-1]["noise"].tolist() != [1.0, 1.0]
+
+
+BAD_ACTIONS = [
+    torch.zeros(2), torch.zeros(1, 1), torch.zeros(2, 2), torch.tensor([[torch.nan], [0.0]]),
+    torch.tensor([[0.0], [torch.inf]]), [["up"], ["down"]], None,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("differentiable", [False, True])
+@pytest.mark.parametrize("actions", BAD_ACTIONS)
+def test_bad_actions_leave_the_plants_untouched(actions, differentiable):
+    noisy = {"noise_variance": 0.5, "setpoint": "random", "differentiable": differentiable}
+    env, twin = make(**noisy), make(**noisy)
+    env.reset(seed=0), twin.reset(seed=0)
+    for _ in range(40):
+        with pytest.raises(ValueError, match="actions"):
+            env.step(actions)
+        ours, theirs = env.step(torch.ones(2, 1)), twin.step(torch.ones(2, 1))
+        assert torch.equal(ours[0], theirs[0])
+        assert torch.equal(ours[1], theirs[1])
+
+
+def test_huge_actions_are_taken():
+    env = make()
+    env.reset(seed=0)
+    actions = torch.tensor([[1e200], [-1e200]], dtype=torch.float64)
+    assert env.step(actions)[-1]["applied"].tolist() == [10.0, -10.0]
+
+
+def test_reset_is_asked_for():
+    env = make(max_episode_steps=2, autoreset_mode="Disabled")
+    actions = torch.zeros(2, 1)
+    with pytest.raises(ResetNeeded):
+        env.step(actions)
+    with pytest.raises(ResetNeeded):
+        env.reset(options={"reset_mask": torch.tensor([True, False])})
+    env.reset(seed=0)
+    env.step(actions)
+    env.step(actions)
+    env.reset(options={"reset_mask": torch.tensor([True, False])})
+    with pytest.raises(ResetNeeded, match=r"\[1\]"):
+        env.step(actions)
+    env.reset(options={"reset_mask": torch.tensor([False, True])})
+    env.step(actions)
+
+
+@pytest.mark.parametrize("plant", [{}, PRESETS["hard"]], ids=["calm", "hard"])
+def test_what_is_returned_can_be_overwritten(plant):
+    arguments = {"autoreset_mode": "SameStep", "move_weight": 0.1, "output_window": 1, **plant}
+    arguments |= {"max_episode_steps": 30}
+    for window in (0, 3):
+        env, twin = (make(4, action_window=window, **arguments) for _ in range(2))
+        returned, theirs = env.reset(seed=1), twin.reset(seed=1)
+        rng = torch.Generator().manual_seed(0)
+        for k in range(100):
+            for tensor in (*returned[:-1], *returned[-1].values()):
+                if isinstance(tensor, torch.Tensor):
+                    tensor.fill_(k % 2 if tensor.dtype == torch.bool else 77)
+            actions = torch.randn(4, 1, generator=rng, dtype=torch.float64)
+            kept = actions.clone()
+            returned, theirs = env.step(actions), twin.step(kept.clone())
+            assert torch.equal(actions, kept)
+            actions.fill_(9.0)
+            for own, other in zip(returned[:4], theirs[:4], strict=True):
+                assert torch.equal(own, other)
+            for name in ("output", "applied", "command", "noise", "setpoint", "error"):
+                assert torch.equal(returned[-1][name], theirs[-1][name])
+            if k % 10 == 0:
+                options = {"reset_mask": torch.tensor([True, False, False, True])}
+                returned, theirs = env.reset(options=options), twin.reset(options=options)
+                assert torch.equal(returned[0], theirs[0])
+                assert options["reset_mask"].tolist() == [True, False, False, True]
+
+
+@pytest.mark.parametrize("ask", ["medium", "autocast"])
+def test_quick_matrix_products_are_not_used(ask):
+    """Users who ask for them mean their networks."""
+
+    def outputs():
+        env = MiddlePointTorchEnv(3, noise_variance=0.5)
+        env.reset(seed=0)
+        return collected(env, 60, "output")
+
+    expected = outputs()
+    if ask == "autocast":
+        with torch.autocast("cpu", torch.bfloat16):
+            found = outputs()
+    else:
+        torch.set_float32_matmul_precision("medium")
+        try:
+            found = outputs()
+        finally:
+            torch.set_float32_matmul_precision("highest")
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_without_torch_the_import_says_what_to_install():
+    program = """
+import sys
+import mptc_gym
+assert "torch" not in sys.modules
+sys.modules["torch"] = None  # an import is an error from now on
+import mptc_gym.torch_env
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode
+    assert 'pip install "mptc_gym[torch]"' in done.stderr.splitlines()[-1]
