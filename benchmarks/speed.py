@@ -19,7 +19,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pandas as pd
+import torch
 from rich.console import Console
+from torch import nn
 from tqdm import tqdm
 
 from agents import DirectNNController
@@ -27,6 +29,7 @@ from benchmarks.lib import command_line
 from benchmarks.lib.tables import on_screen
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv
+from mptc_gym.torch_env import MiddlePointTorchEnv
 
 ROUNDS = 15
 SINGLE_STEPS = 20_000
@@ -38,6 +41,14 @@ MEMORY_PLANTS = 100
 LONG = 100_000  # steps, to see whether memory grows
 NOISE = {"noise_variance": 0.5}
 RANDOM = {**NOISE, "setpoint": "random"}
+IN_TORCH: dict[str, dict[str, Any]] = {
+    "in PyTorch": {},
+    "in PyTorch, R = 0.5": NOISE,
+    "in PyTorch, hard": PRESETS["hard"],
+}
+DEVICE_BATCHES = tuple(4**power for power in range(5, 12))  # 1,024 to 4,194,304 plants
+DEVICE_STEPS = 200
+GRADIENTS, BACKWARD = 1024, 300  # plants, and samples
 WITH_ENVPOOL = importlib.util.find_spec("envpool") is not None  # if it is installed
 REFERENCE = "CartPole-v1"
 SINGLE: dict[str, tuple[str, dict[str, Any]]] = {
@@ -72,16 +83,23 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rounds", type=command_line.number, default=ROUNDS, help="measurements of each"
     )
+    parser.add_argument(
+        "--device", help="measure the environment in PyTorch there (cuda), and nothing else"
+    )
 
 
-@command_line.command("speed", __doc__, _add_options, width=110, interrupted="nothing is kept.")
+@command_line.command("speed", __doc__, _add_options, width=130, interrupted="nothing is kept.")
 def main(options: argparse.Namespace, console: Console) -> str:
     """Measure and print."""
     rounds = options.rounds
+    torch.set_num_threads(1)  # one core, as for the others
 
     def show(title: str, table: pd.DataFrame) -> None:
         console.print(title, on_screen(table), sep="\n")
 
+    if options.device is not None:
+        show(f"Steps a second on {options.device}", on_device(options.device, rounds))
+        return f"Medians of {rounds} rounds."
     cases = [_single(name, *made) for name, made in SINGLE.items()]
     show("One environment, from gymnasium.make", compare(cases, rounds))
     cases = [_single(name, *made, bare=True) for name, made in SINGLE.items()]
@@ -93,6 +111,10 @@ def main(options: argparse.Namespace, console: Console) -> str:
     show(
         f"Plants with R = 0.5 and NNs that learn, one each: {EPISODE} samples together",
         compare([_alone(), *(_closed_loop(n) for n in LOOPS)], rounds),
+    )
+    show(
+        "Through the plant: a policy of two layers of 64, forward and backward",
+        compare([_through_the_plant(GRADIENTS)], rounds),
     )
     show("Memory of a plant, 20 past actions", memory())
 
@@ -227,6 +249,8 @@ def _vector(n: int) -> Iterable[Case]:
         envs.action_space.seed(0)
         actions = [envs.action_space.sample() for _ in range(20)]
         yield Case(name, _stepper(envs, actions, EPISODE + 1), n * (EPISODE + 1))
+    for name, arguments in IN_TORCH.items():
+        yield _in_torch(name, n, "cpu", EPISODE + 1, arguments)
     if WITH_ENVPOOL:
         import envpool
 
@@ -235,6 +259,60 @@ def _vector(n: int) -> Iterable[Case]:
         actions = list(np.random.default_rng(0).integers(0, 2, (20, n), dtype=np.int32))
         steps = 100  # fewer, as it takes longer
         yield Case(f"{REFERENCE} of envpool", _stepper(envs, actions, steps), n * steps)
+
+
+def _in_torch(name: str, n: int, device: str, steps: int, arguments: dict[str, Any]) -> Case:
+    """Return the environment in PyTorch; a call ends when the device is done."""
+    envs = MiddlePointTorchEnv(n, device=device, **arguments)
+    envs.reset(seed=0)
+    actions = [2.0 * torch.rand(n, 1, device=device) - 1.0 for _ in range(20)]
+    step = _stepper(envs, actions, steps)
+
+    def run() -> None:
+        step()
+        if device != "cpu":
+            torch.accelerator.synchronize()
+
+    return Case(name, run, n * steps)
+
+
+def on_device(device: str, rounds: int) -> pd.DataFrame:
+    """Measure the environment in PyTorch on a device, for more and more plants.
+
+    Returns
+    -------
+    DataFrame
+        A row a number of plants: environment steps a second of each case.
+    """
+    rows = []
+    for n in DEVICE_BATCHES:
+        row = {"n": f"{n:,}"}
+        for name, arguments in IN_TORCH.items():
+            case = _in_torch(name, n, device, DEVICE_STEPS, arguments)
+            case.run()  # what is done once, the first time
+            seconds = _alternately([case], rounds)[name]
+            row[name] = f"{np.median(case.steps / seconds):.3g}"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _through_the_plant(n: int) -> Case:
+    """Return forward and backward through plants and a policy."""
+    envs = MiddlePointTorchEnv(n, max_episode_steps=None, differentiable=True)
+    size = envs.parameters.observation_size
+    policy = nn.Sequential(
+        nn.Linear(size, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 1)
+    )
+
+    def train() -> None:
+        observations, _ = envs.reset(seed=0)
+        total = torch.zeros(())
+        for _ in range(BACKWARD):
+            observations, rewards, *_ = envs.step(policy(observations))
+            total = total + rewards.mean()
+        total.backward()
+
+    return Case(f"gradient through {n:,} plants and {BACKWARD} samples", train, n * BACKWARD)
 
 
 def _stepper(envs: Any, actions: list[Any], steps: int) -> Callable[[], None]:

@@ -50,10 +50,10 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
     """n plants that advance together, whose observations, actions and rewards are tensors.
 
     The plant, the spaces, the reward, the infos and the arguments are those of
-    `MiddlePointEnv`. A reset does what it does in `MiddlePointVectorEnv`. Given the same
-    signals and actions, `reset` and `step` return the same but for rounding.
+    `MiddlePointEnv`; resets are those of `MiddlePointVectorEnv`. Given the same signals and
+    actions, all that `reset` and `step` return is the same but for rounding.
 
-    Use it to train on a GPU, on thousands of noisy plants, or through the plant. With few
+    Use it to train on a GPU, on thousands of noisy plants, or through the plant. With fewer
     plants on a CPU, NumPy is quicker: `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
 
     Parameters
@@ -104,9 +104,9 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
     ValueError if a step needs a sample beyond the last.
 
     **Gradients.** The actuator is not smooth. The gradient goes straight through the dead zone,
-    as if it were not there, and is 0 beyond the limits, where nothing changes; the same holds
-    for readings beyond the transmitter's span. So a policy also learns from commands without
-    effect, which have no gradient in truth. `detach` cuts the graph for truncated
+    as if it were not there, and is 0 beyond the limits, as nothing changes there; the same
+    holds for readings beyond the transmitter's span. So a policy also learns from commands
+    without effect, which have no gradient in truth. `detach` cuts the graph for truncated
     backpropagation. An action shows after `delay` + 1 samples: shorter pieces have no gradient.
     Without `differentiable` nothing of a graph is kept.
 

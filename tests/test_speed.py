@@ -18,13 +18,22 @@ def test_ratios_compare_rounds_with_each_other(monkeypatch):
 def test_it_runs(monkeypatch, capsys):
     small = {
         "SINGLE_STEPS": 50, "FRAMES": 3, "EPISODE": 5, "LONG": 5, "BATCHES": (1, 3),
-        "LOOPS": (2,), "WITH_ENVPOOL": False,
+        "LOOPS": (2,), "WITH_ENVPOOL": False, "GRADIENTS": 2, "BACKWARD": 25,
     }  # fmt: skip
     for name, value in small.items():
         monkeypatch.setattr(speed, name, value)
     speed.main(["--rounds", "1"])
     shown = capsys.readouterr().out
-    for words in ("n = 3", "Pendulum-v1", "picture", "batch of 2", "KiB", "import mptc_gym"):
+    for words in (
+        "n = 3",
+        "Pendulum-v1",
+        "picture",
+        "batch of 2",
+        "KiB",
+        "PyTorch",
+        "gradient",
+        "import mptc_gym",
+    ):
         assert words in shown
 
 
@@ -33,3 +42,13 @@ def test_bad_rounds_are_named(rounds, capsys):
     with pytest.raises(SystemExit):
         speed.main(["--rounds", rounds])
     assert "--rounds" in capsys.readouterr().err
+
+
+def test_a_device_can_be_measured_alone(monkeypatch, capsys):
+    monkeypatch.setattr(speed, "DEVICE_BATCHES", (2, 3))
+    monkeypatch.setattr(speed, "DEVICE_STEPS", 5)
+    speed.main(["--rounds", "1", "--device", "cpu"])
+    shown = capsys.readouterr().out
+    assert "on cpu" in shown
+    assert "hard" in shown
+    assert "CartPole" not in shown

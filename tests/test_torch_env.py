@@ -1,9 +1,10 @@
-"""The environment in PyTorch: equal to the one in NumPy, draws, gradients, no waiting."""
+"""The environment in PyTorch: equal to that in NumPy, its draws, gradients, and no waiting."""
 
 import gc
 import inspect
 import subprocess
 import sys
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -206,7 +207,7 @@ def collected(env, steps, name):
 
 
 class TestDraws:
-    """Bounds of five standard errors: one test in two million fails by chance."""
+    """Within five standard errors, which chance exceeds once in two million times."""
 
     def test_noise_has_its_variance_and_is_white_and_normal(self):
         n, steps, variance = 400, 250, 0.5
@@ -380,7 +381,7 @@ def total_cost(actions, env, weights):
 
 
 class TestGradients:
-    HARD = {  # noqa: RUF012 (of a test)
+    HARD: ClassVar = {
         **PRESETS["hard"], "delay": 18, "dead_zone": 1.0, "action_window": 3,
         "output_window": 2, "move_weight": 0.1, "u_min": [-12.0, -10.0], "differentiable": True,
     }  # fmt: skip
@@ -580,8 +581,8 @@ def test_help_shows_every_argument():
     ("name", "value"),
     [
         ("num_envs", 0), ("num_envs", 2.0), ("max_episode_steps", 0),
-        ("autoreset_mode", "Never"),
-        ("dead_zone", -1.0), ("delay", 1.5), ("dtype", torch.float16), ("dtype", "float32"),
+        ("autoreset_mode", "Never"), ("dead_zone", -1.0), ("delay", 1.5),
+        ("dtype", torch.float16), ("dtype", "float32"),
         ("device", "toaster"), ("differentiable", "yes"),
     ],
 )  # fmt: skip

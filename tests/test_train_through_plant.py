@@ -11,8 +11,8 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from agents import PolicyNetwork  # noqa: E402
-from benchmarks.rollout import make_plants, rollout  # noqa: E402
 from benchmarks.designs import SPANS  # noqa: E402
+from benchmarks.rollout import make_plants, rollout  # noqa: E402
 from benchmarks.train import __main__ as command  # noqa: E402
 from benchmarks.train import through_plant  # noqa: E402
 from benchmarks.train.through_plant import (  # noqa: E402

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from mptc_gym.torch_env import MiddlePointTorchEnv
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -29,6 +28,7 @@ from benchmarks.designs import SPANS
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import commit, replacing, versions
 from mptc_gym import Parameters
+from mptc_gym.torch_env import MiddlePointTorchEnv
 
 NOMINAL = Parameters()
 GAIN = sum(NOMINAL.b) / sum(NOMINAL.a)  # steady-state, degC per t/h; limits are +-10 t/h
