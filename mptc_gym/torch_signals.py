@@ -112,7 +112,8 @@ class Held:
         self._shortest, self._following = shortest, following
         self._nothing = nothing
         self._rows = torch.arange(LONGEST, dtype=nothing.dtype, device=nothing.device)[:, None]
-        # What comes next: in how many samples the state changes, the state and next change then.
+        # What comes next: in how many samples the state changes, and the state and the next
+        # change then.
         # Counts are whole numbers of type float, with which a processor is quickest; or one
         # int if it is the same for all plants.
         self._ahead: list[tuple[Tensor | int, Tensor, Tensor | int]] = []
