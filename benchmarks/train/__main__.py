@@ -1,7 +1,8 @@
-"""Train the networks that learn by the gradient through the plant.
+"""Train the networks that control: by the gradient through the plant, or by PPO.
 
 `nn-dpc` is for the paper's plant, `nn-adaptive` for many plants. Several networks are trained,
-which differ in their seeds, and validation chooses one. What is finished is kept; the same
+which differ in their seeds, and validation chooses one. `ppo` trains the policies of
+Stable-Baselines3's PPO, all of which are compared. What is finished is kept; the same
 command goes on with what was interrupted, and ends in the same networks.
 """
 
@@ -20,10 +21,12 @@ from rich.console import Console
 
 from agents import PolicyNetwork
 from agents.policy_network import PRETRAINED
+from benchmarks.controllers import roster
 from benchmarks.lib import command_line, drawing
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import replacing
 from benchmarks.lib.tables import on_screen
+from benchmarks.train import ppo
 from benchmarks.train.through_plant import TRAININGS, Training, train, training_key
 
 NETWORKS = 5  # are trained, from seeds in sequence
@@ -39,14 +42,14 @@ def _price(text: str) -> float:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("network", choices=TRAININGS, help="what to train")
+    add("network", choices=[*TRAININGS, "ppo"], help="what to train")
     add("--networks", type=command_line.number, default=NETWORKS, help="how many")
     add("--steps", type=command_line.number, default=argparse.SUPPRESS,
-        help="of the optimiser (default: the network's own)")  # fmt: skip
+        help="of the optimiser, or samples of PPO (default: the network's own)")  # fmt: skip
     add("--prices", type=_price, nargs="+", metavar="PRICE", default=[],
         help="of valve travel: train with each, and draw what it buys")  # fmt: skip
     add("--retrain", action="store_true", help="train even what is finished")
-    add("--keep", action="store_true", help="put the chosen network into agents/pretrained")
+    add("--keep", action="store_true", help="put what is chosen into agents/pretrained")
     add("--out", type=Path, default=Path("results/networks"), help="folder to write to")
     command_line.add_fan_out(parser, "trainings")
 
@@ -56,6 +59,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, console: Console) -> str:
     """Train, say how the networks do in validation, and choose one."""
+    if options.network == "ppo":
+        return _train_ppo(options, console)
     training = TRAININGS[options.network]
     if "steps" in options:
         training = replace(training, steps=options.steps)
@@ -81,6 +86,37 @@ def main(options: argparse.Namespace, console: Console) -> str:
     target.parent.mkdir(parents=True, exist_ok=True)
     best.save(target)
     return f"Validation chooses seed {best.provenance['training']['seed']}: it is in {target}"
+
+
+def _train_ppo(options: argparse.Namespace, console: Console) -> str:
+    """Train PPO's policies, say how they do, and put them where they are kept."""
+    if options.prices:
+        raise command_line.UsageError("--prices: PPO's training has no price of valve travel")
+    out = command_line.out_folder(options.out)
+    asked = roster.Training(
+        command_line.fan_out(options),
+        out,
+        getattr(options, "steps", None),
+        options.networks,
+        options.retrain,
+    )
+    policies = ppo.members(asked, shipped=False)
+    rows = []
+    for policy in policies:
+        best = min(policy.curve, key=lambda point: point["validation_mae"])
+        rows.append(
+            {
+                "seed": policy.arguments.seed,
+                "best after": best["steps"],
+                "mean |e| in validation (°C)": best["validation_mae"],
+                "on the square wave (°C)": best["square_mae"],
+                "CPU (s)": policy.curve[-1]["seconds"],
+            }
+        )
+    console.print(on_screen(pd.DataFrame(rows).map("{:.4g}".format)))
+    target = PRETRAINED if options.keep else out
+    ppo.publish(policies, target)
+    return f"The policies are in {target}"
 
 
 def run(

@@ -36,8 +36,12 @@ class PPOArguments:
 
     seed: int = 10_000
     """Of the initial policy, the exploration, and what the plants meet in training."""
-    steps: int = 400_000
+    steps: int = 1_196_032
     """Samples of experience, all plants together."""
+    starts: int = 4
+    """How often to begin anew, with other initial weights and an equal share of the samples.
+    Validation chooses the best of all: many a training ends with an offset, and more samples do
+    not mend that."""
     max_move: float = 1.0
     """How far an action of 1 moves the flow, as a share of half its range."""
     undo_dead_zone: float = DEAD_ZONE
@@ -81,9 +85,6 @@ class PPOArguments:
     log_std: tuple[float, float] = (-1.0, -3.0)
     """Logarithm of the standard deviation of the action, at first and at last. Left to itself
     it stays high, and a mean that is right with the exploration is wrong without it."""
-    averaging: float = 0.9
-    """The policy that is validated and kept is a moving average of the weights: what an update
-    leaves of it. The policies of single updates err to one side and to the other."""
     hidden: tuple[int, ...] = (64, 64)
     """Nodes of the hidden layers, of policy and value function alike."""
 
@@ -190,7 +191,9 @@ def _load(file: Path) -> PolicyNetwork:
 _loaded = cache(_load)
 
 
-def members(training: Training, arguments: PPOArguments | None = None) -> list[Policy]:
+def members(
+    training: Training, arguments: PPOArguments | None = None, *, shipped: bool = True
+) -> list[Policy]:
     """Return policies that differ in their seeds, and train those that are missing.
 
     Policies that were trained here are taken first, then those that come with the project.
@@ -201,6 +204,8 @@ def members(training: Training, arguments: PPOArguments | None = None) -> list[P
         Where they are kept, how many there are, and what trains them.
     arguments
         How to train the first; the seeds of the others follow.
+    shipped
+        Whether those that come with the project will do.
     """
     arguments = arguments or PPOArguments()
     if training.steps is not None:
@@ -210,9 +215,9 @@ def members(training: Training, arguments: PPOArguments | None = None) -> list[P
     for each in (replace(arguments, seed=seed) for seed in seeds):
         # Absolute, as workers may have been started elsewhere.
         policy = Policy(each, (training.folder / policy_key(each) / POLICY).absolute())
-        shipped = Policy(each, pretrained(each))
-        if not (training.retrain or policy.file.exists()) and is_trained_as(shipped):
-            policy = shipped
+        if shipped and not (training.retrain or policy.file.exists()):
+            comes = Policy(each, pretrained(each))
+            policy = comes if is_trained_as(comes) else policy
         policies.append(policy)
     # A bar for each training; those of other machines do not come here.
     bars = training.fan_out.backend == "loky"

@@ -20,7 +20,6 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 from tqdm import tqdm
@@ -35,7 +34,7 @@ from benchmarks.train.sb3_vec_env import GymnasiumVecEnv
 from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
 
-CHECKPOINT_INTERVAL = 32_768  # samples of experience between checkpoints
+VALIDATION_INTERVAL = 32_768  # samples of experience
 VALIDATION_RUNS = 16
 VALIDATION_SEED = 2_000_000  # met neither in training nor by any comparison
 VALIDATION_DEAD_ZONE = 6.5  # t/h, one that no comparison has
@@ -47,7 +46,6 @@ PROBE_SEED = 1_000_000  # met by no comparison
 TRAINING_SEEDS = (
     1 << 32
 )  # and above: of what the plants meet in training, and nothing else does
-_MOMENTS = "step", "exp_avg", "exp_avg_sq"  # what Adam remembers of a parameter
 
 
 def train(
@@ -60,8 +58,8 @@ def train(
     arguments
         How to train.
     checkpoint
-        Where the training is kept as it goes. If the file is there, the training goes on from
-        it, and ends in the same policy, to the bit, as one that was not interrupted.
+        Where the training is kept after each start. If the file is there, the training goes on
+        from it, and ends in the same policy, to the bit, as one that was not interrupted.
     progress
         Whether to show a progress bar.
 
@@ -76,23 +74,26 @@ def train(
     ValueError
         If the checkpoint is damaged; the message names it.
     """
-    model = begin(arguments)
     kept = Progress()
     if checkpoint is not None and checkpoint.exists():
-        kept = _resume(model, arguments, checkpoint)
+        kept = _resume(arguments, checkpoint)
+    share = arguments.steps // arguments.starts
     bar = tqdm(
         desc=f"training PPO, seed {arguments.seed}",
-        total=arguments.steps,
-        initial=model.num_timesteps,
+        total=share * arguments.starts,
+        initial=share * kept.starts,
         unit=" samples",
         unit_scale=True,
         disable=not progress,
     )
     with bar:
-        keeper = Keeper(arguments, kept, bar, checkpoint)
-        left = arguments.steps - model.num_timesteps
-        model.learn(left, callback=keeper, reset_num_timesteps=False)
-        keeper.finish()
+        while kept.starts < arguments.starts:
+            keeper = Keeper(arguments, kept, bar)
+            begin(arguments, start=kept.starts).learn(share, callback=keeper)
+            keeper.record()
+            kept.starts += 1
+            if checkpoint is not None:
+                _save(arguments, kept, checkpoint)
     provenance = {
         "algorithm": "PPO of Stable-Baselines3",
         "arguments": asdict(arguments),
@@ -174,7 +175,7 @@ class OddPolicy(ActorCriticPolicy):
                 layer.bias.requires_grad_(False)
 
 
-def begin(arguments: PPOArguments, plants: VecEnv | None = None) -> PPO:
+def begin(arguments: PPOArguments, plants: VecEnv | None = None, *, start: int = 0) -> PPO:
     """Make a model that has learnt nothing yet.
 
     Parameters
@@ -184,6 +185,8 @@ def begin(arguments: PPOArguments, plants: VecEnv | None = None) -> PPO:
     plants
         What to train on, if not a batch of plants that are stepped at once. Its action is one
         of `IncrementalAction`.
+    start
+        The number of the start; what is random depends on it, too.
 
     Returns
     -------
@@ -204,7 +207,9 @@ def begin(arguments: PPOArguments, plants: VecEnv | None = None) -> PPO:
             )
         )
     matrix = features(Parameters(**arguments.training))
-    return PPO(
+    seeds = np.random.SeedSequence([arguments.seed, start]).generate_state(2)
+    model_seed, plants_seed = (int(seed) for seed in seeds)
+    model = PPO(
         OddPolicy,
         plants,
         # The last update comes when no progress remains; it is not to be in vain.
@@ -220,9 +225,11 @@ def begin(arguments: PPOArguments, plants: VecEnv | None = None) -> PPO:
             "features_extractor_kwargs": {"matrix": matrix.tolist()},
             "net_arch": list(arguments.hidden),
         },
-        seed=arguments.seed,
+        seed=model_seed,
         device="cpu",
     )
+    plants.seed(TRAINING_SEEDS + plants_seed)
+    return model
 
 
 def _incremental(plants: VectorEnv[Any, Any, Any], arguments: PPOArguments) -> VectorEnv:
@@ -270,29 +277,25 @@ State = dict[str, torch.Tensor]
 
 @dataclass
 class Progress:
-    """How far a training got, apart from its model.
+    """How far a training got.
 
     Attributes
     ----------
+    starts
+        How many starts are finished.
     curve
         The learning curve, a row a point.
-    average
-        The moving average of the policy's parameters.
     best
-        What that was when it did best in validation.
+        The parameters of the policy that did best in validation.
     """
 
+    starts: int = 0
     curve: list[dict[str, float]] = field(default_factory=list)
-    average: State = field(default_factory=dict)
     best: State = field(default_factory=dict)
 
 
 class Keeper(BaseCallback):
-    """Makes a training one of stretches, and between two of them records how far it got.
-
-    Each stretch begins with plants at rest and with random numbers of its own. So a training
-    that goes on after one is the same, to the bit, as one that was not interrupted, and all
-    that has to be kept is what was learnt.
+    """Lets the exploration fall, and records how far a training gets.
 
     Parameters
     ----------
@@ -302,23 +305,17 @@ class Keeper(BaseCallback):
         How far the training got; it is carried on.
     bar
         Shows it.
-    checkpoint
-        Where to keep the training after each stretch, if anywhere.
     """
 
-    def __init__(
-        self,
-        arguments: PPOArguments,
-        progress: Progress,
-        bar: tqdm[Any],
-        checkpoint: Path | None,
-    ) -> None:
+    def __init__(self, arguments: PPOArguments, progress: Progress, bar: tqdm[Any]) -> None:
         super().__init__()
         self.progress = progress
         self._bar = bar
-        self.arguments = arguments
-        self._checkpoint = checkpoint
+        self._arguments = arguments
         self._errors: list[float] = []
+        self._share = arguments.steps // arguments.starts
+        self._before = progress.starts * self._share
+        self._recorded = 0  # when, in samples of this start
         spent = progress.curve[-1]["seconds"] if progress.curve else 0.0
         self._began = time.process_time() - spent
 
@@ -333,47 +330,18 @@ class Keeper(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
-        self._average()
-        done = self.num_timesteps / self.arguments.steps
         with torch.no_grad():
-            log_std = np.interp(done, (0.0, 1.0), self.arguments.log_std)
+            done = self.num_timesteps / self._share
+            log_std = np.interp(done, (0.0, 1.0), self._arguments.log_std)
             cast("torch.Tensor", self.model.policy.log_std).fill_(float(log_std))
-        curve = self.progress.curve
-        before = curve[-1]["steps"] if curve else 0
-        if self.num_timesteps - before >= CHECKPOINT_INTERVAL:
+        if self.num_timesteps - self._recorded >= VALIDATION_INTERVAL:
             self.record()
-            if self._checkpoint is not None:
-                _save(self, self._checkpoint)
-            self._begin_stretch()
-        elif not self._errors:
-            self._begin_stretch()
-
-    def _average(self) -> None:
-        """Take an update into the moving average."""
-        keeps, state = self.arguments.averaging, self.model.policy.state_dict()
-        average = self.progress.average or copy.deepcopy(state)
-        self.progress.average = {
-            name: value.lerp(state[name], 1.0 - keeps) for name, value in average.items()
-        }
-
-    def _begin_stretch(self) -> None:
-        """Bring the plants to rest, and start all random numbers anew."""
-        seeds = np.random.SeedSequence([self.arguments.seed, len(self.progress.curve)])
-        plants, numbers = seeds.generate_state(2).tolist()
-        set_random_seed(numbers)
-        self._plants.seed(TRAINING_SEEDS + plants)
-        self.model._last_obs = self._plants.reset()
-        self.model._last_episode_starts = np.ones(self._plants.num_envs, np.bool_)
-
-    def finish(self) -> None:
-        """Take in and record what the last update brought."""
-        self._average()
-        self.record()
 
     def record(self) -> None:
         """Add a point to the learning curve, and keep the policy if it is the best so far."""
-        held = {**self.arguments.observation, "setpoint": HELD}
-        noisy = {**self.arguments.training, "setpoint": HELD}
+        self._recorded = self.num_timesteps
+        held = {**self._arguments.observation, "setpoint": HELD}
+        noisy = {**self._arguments.training, "setpoint": HELD}
         validation = np.mean(
             [
                 self._mae(noisy, VALIDATION_RUNS, len(HELD), VALIDATION_SEED),
@@ -383,11 +351,11 @@ class Keeper(BaseCallback):
         )
         curve = self.progress.curve
         if not curve or validation < min(point["validation_mae"] for point in curve):
-            self.progress.best = self.progress.average
-        square = {**self.arguments.observation, **PROBE.arguments}
+            self.progress.best = copy.deepcopy(self.model.policy.state_dict())
+        square = {**self._arguments.observation, **PROBE.arguments}
         curve.append(
             {
-                "steps": self.num_timesteps,
+                "steps": self._before + self.num_timesteps,
                 "seconds": time.process_time() - self._began,  # of the processor
                 "training_mae": float(np.mean(self._errors)) if self._errors else math.nan,
                 "validation_mae": float(validation),
@@ -399,61 +367,36 @@ class Keeper(BaseCallback):
 
     def _mae(self, arguments: dict[str, Any], runs: int, samples: int, seed: int) -> float:
         plants = make_plants(runs, samples, **arguments)
-        agent = exported(self.progress.average, self.arguments)
+        agent = exported(self.model.policy.state_dict(), self._arguments)
         return float(mean_error(rollout(plants, agent, samples, seed)).mean())
 
 
-def _save(keeper: Keeper, path: Path) -> None:
-    """Write all that a training needs to go on after a stretch."""
-    arrays: dict[str, NDArray[Any]] = {}
-    progress = keeper.progress
-    states = {
-        "policy": keeper.model.policy.state_dict(),
-        "average": progress.average,
-        "best": progress.best,
-    }
-    for kind, state in states.items():
-        arrays |= {f"{kind} {name}": value.numpy() for name, value in state.items()}
-    moments = keeper.model.policy.optimizer.state_dict()["state"]
-    for i, moment in moments.items():
-        arrays |= {f"moment {i} {name}": moment[name].numpy() for name in _MOMENTS}
+def _save(arguments: PPOArguments, progress: Progress, path: Path) -> None:
+    """Write all that a training needs to go on after a start."""
+    best = {f"best {name}": value.numpy() for name, value in progress.best.items()}
     about = {
-        "arguments": asdict(keeper.arguments),
-        "steps": keeper.num_timesteps,
-        "moments": sorted(moments),
+        "arguments": asdict(arguments),
+        "starts": progress.starts,
         "curve": progress.curve,
     }
     with replacing(path) as file:
-        np.savez(file, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
+        np.savez(file, about=np.array(json.dumps(about)), **best)  # type: ignore[arg-type]
 
 
-def _resume(model: PPO, arguments: PPOArguments, path: Path) -> Progress:
-    """Bring a new model to where a checkpoint was kept."""
+def _resume(arguments: PPOArguments, path: Path) -> Progress:
+    """Return how far a training got. Reading the file runs nothing that it holds."""
     try:
         # All of it is read, as that is when the checksums are looked at.
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            arrays = {
-                name: torch.from_numpy(file[name]) for name in file.files if name != "about"
-            }
             about = json.loads(str(file["about"]))
-        if about["arguments"] != json.loads(json.dumps(asdict(arguments))):
-            raise ValueError("it is of another training")
-        policy, average, best = (
-            {name: arrays[f"{kind} {name}"] for name in model.policy.state_dict()}
-            for kind in ("policy", "average", "best")
-        )
-        moments = {
-            i: {name: arrays[f"moment {i} {name}"] for name in _MOMENTS}
-            for i in about["moments"]
-        }
-        groups = model.policy.optimizer.state_dict()["param_groups"]
-        model.policy.load_state_dict(policy)
-        model.policy.optimizer.load_state_dict({"state": moments, "param_groups": groups})
-        model.num_timesteps = int(about["steps"])
-        progress = Progress([dict(point) for point in about["curve"]], average, best)
+            if about["arguments"] != json.loads(json.dumps(asdict(arguments))):
+                raise ValueError("it is of another training")
+            names = begin(arguments).policy.state_dict()
+            best = {name: torch.from_numpy(file[f"best {name}"]) for name in names}
+            curve = [dict(point) for point in about["curve"]]
+            return Progress(int(about["starts"]), curve, best)
     except Exception as error:  # damage shows in zip, zlib, NumPy, JSON or the shapes
         raise ValueError(
             f"{path} is no checkpoint of this training, or is damaged: {error}: "
             "remove it, or --retrain"
         ) from error
-    return progress
