@@ -1,0 +1,1 @@
+"""Offline data sets with a known optimum: `python -m benchmarks.datasets`."""

@@ -1,0 +1,180 @@
+"""Offline data sets: what was logged can be replayed, and scored on an absolute scale."""
+
+import builtins
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from agents import PIController
+from benchmarks.datasets import __main__ as datasets
+from benchmarks.datasets import history
+from mptc_gym import PRESETS
+from mptc_gym.plant import action_from_command
+
+ROOT = Path(__file__).parent.parent
+SMALL = history.Scale(least=0.5, idle=2.5, kind="news", seeds=range(7, 9))
+
+
+@pytest.fixture
+def minari(monkeypatch, tmp_path):
+    """Minari, with a folder of its own and a scale that takes no time."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.setattr(datasets, "scale", lambda plant: SMALL)
+    return pytest.importorskip("minari", reason="Minari needs Python 3.11")
+
+
+@pytest.mark.parametrize("name", ["middlepoint/paper/pi-v0", "middlepoint/fouling/mixed-v0"])
+def test_the_recorded_actions_give_the_recorded_observations(name, minari, tmp_path, capsys):
+    assert datasets.main([name, "--episodes", "5"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["middlepoint"]  # nothing is left over
+    assert name in capsys.readouterr().out
+    dataset = minari.load_dataset(name)
+    assert (dataset.total_episodes, dataset.total_steps) == (5, 6000)
+    env = dataset.recover_environment()
+    metadata = list(dataset.storage.get_episode_metadata(range(5)))
+    assert len({each["seed"] for each in metadata}) == 5
+    for episode, about in zip(dataset, metadata, strict=True):
+        observation, _ = env.reset(seed=about["seed"])
+        assert np.array_equal(observation, episode.observations[0])
+        for k, action in enumerate(episode.actions):
+            assert env.action_space.contains(action)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            assert np.array_equal(observation, episode.observations[k + 1])
+            assert reward == episode.rewards[k]
+            assert (terminated, truncated) == (
+                episode.terminations[k],
+                episode.truncations[k],
+            )
+        assert truncated
+
+
+def test_the_pi_of_the_set_is_the_paper_s():
+    logged = history.record("paper", "pi", episodes=2, seed=3)
+    env = gymnasium.make("MiddlePoint-v0", setpoint="random")
+    controller = PIController()
+    observation, info = env.reset(seed=4)
+    errors = []
+    for k in range(1200):
+        action = controller.act(observation)
+        assert logged.actions[1, k] == np.clip(action, -1.0, 1.0)
+        observation, _, _, _, info = env.step(action)
+        assert logged.observations[1, k + 1, 3] == observation[3]
+        errors.append(abs(info["error"]))
+    assert -logged.rewards[1].mean() == pytest.approx(np.mean(errors), rel=1e-12)
+
+
+def test_a_mixed_set_has_all_controllers_and_no_seed_twice():
+    logged = history.record("disturbed", "mixed", episodes=6, seed=50)
+    assert logged.controllers == ["pi", "pi-simc", "smith", "nn", "pi", "pi-simc"]
+    assert logged.seeds == list(range(50, 56))
+    assert len(np.unique(logged.actions, axis=0)) == 6
+    again = history.record("disturbed", "pi", episodes=6, seed=50)
+    assert np.array_equal(again.observations[[0, 4]], logged.observations[[0, 4]])
+
+
+def test_the_hash_is_of_the_content_and_the_same_in_every_process():
+    program = (
+        "from benchmarks.datasets.history import record; "
+        "print(record('fouling', 'mixed', 4).sha256)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    found = done.stdout.strip()
+    here = history.record("fouling", "mixed", 4)
+    assert found == here.sha256
+    here.actions[2, 700, 0] += 1e-6
+    assert here.sha256 != found
+
+
+def test_the_scale_is_of_the_episodes_it_names():
+    judged_by = history.scale("paper", episodes=2)
+    arguments = history.arguments_of("paper")
+    assert arguments.items() >= PRESETS["paper"].items()
+    # By hand, one plant after the other, with the valve left alone and with a good controller.
+    idle, smith = [], history.record("paper", "smith", 2, judged_by.seeds[0])
+    for seed in judged_by.seeds:
+        env = gymnasium.make("MiddlePoint-v0", **arguments)
+        env.reset(seed=seed)
+        rest = np.array([action_from_command(0.0, -10.0, 10.0)])
+        idle += [-env.step(rest)[1] for _ in range(1200)]
+    assert judged_by.idle == pytest.approx(np.mean(idle))
+    assert 0.0 < judged_by.least < smith.error < judged_by.idle
+    assert judged_by.score(judged_by.least) == 1.0
+    assert judged_by.score(judged_by.idle) == 0.0
+    assert not set(judged_by.seeds) & set(range(history.SEED, history.SEED + 10_000))
+
+
+def test_the_metadata_scores_a_learner(minari):
+    name = "middlepoint/paper/smith-v0"
+    datasets.main([name, "--episodes", "2"])
+    dataset = minari.load_dataset(name)
+    about = dataset.storage.metadata
+    assert about["least_possible_error"] == 0.5
+    assert about["idle_error"] == 2.5
+    assert about["evaluation_seeds"] == [7, 8]
+    assert about["sha256"] == history.record("paper", "smith", 2).sha256
+    assert about["behaviour_error"] == -np.mean([episode.rewards for episode in dataset])
+    # A mean |e| of 1 degC over 1200 steps lies three quarters of the way from 2.5 to 0.5.
+    assert minari.get_normalized_score(dataset, np.array([-1200.0])) == pytest.approx(0.75)
+    assert dataset.recover_environment(eval_env=True).spec == dataset.env_spec
+
+
+def test_writing_again_replaces_and_a_failure_changes_nothing(minari, monkeypatch, tmp_path):
+    name = "middlepoint/paper/pi-v0"
+    for episodes in ("2", "3"):
+        assert datasets.main([name, "--episodes", episodes]) == 0
+    assert minari.load_dataset(name).total_episodes == 3
+
+    def fail(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(minari, "create_dataset_from_buffers", fail)
+    assert datasets.main([name, "--episodes", "2"]) == 130
+    assert minari.load_dataset(name).total_episodes == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["middlepoint"]
+
+
+def test_without_minari_it_says_what_to_install(monkeypatch, capsys):
+    real = builtins.__import__
+
+    def without(name, *rest, **named):
+        if name.partition(".")[0] == "minari":
+            raise ImportError("No module named 'minari'")
+        return real(name, *rest, **named)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(SystemExit):
+        datasets.main(["middlepoint/paper/pi-v0"])
+    assert 'pip install -e ".[data]"' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["middlepoint/paper/ppo-v0"], "no 'middlepoint/paper/ppo-v0'"),
+        (["middlepoint/paper/mixed-v0", "--episodes", "3"], "episodes must be at least 4"),
+    ],
+)
+def test_bad_options_are_named(arguments, named, minari, capsys):
+    with pytest.raises(SystemExit):
+        datasets.main(arguments)
+    assert named in capsys.readouterr().err
+
+
+def test_bad_names_are_named():
+    with pytest.raises(ValueError, match="plant must be one of paper"):
+        history.record("hard", "pi")
+    with pytest.raises(ValueError, match="behaviour must be one of pi"):
+        history.record("paper", "expert")
+
+
+def test_the_arguments_are_json():
+    for plant in history.PLANTS:
+        arguments = history.arguments_of(plant)
+        assert json.loads(json.dumps(arguments)) == arguments
