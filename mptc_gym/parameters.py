@@ -282,7 +282,10 @@ class Parameters(PlantNumbers[Number]):
             if name not in ARGUMENTS:
                 close = difflib.get_close_matches(name, [*ARGUMENTS, "render_mode"], n=1)
                 hint = f": did you mean {close[0]!r}?" if close else ""
-                raise TypeError(f"MiddlePoint-v0 has no argument {name!r}{hint}")
+                # In Python's own words, by which callers know that they may leave it out.
+                raise TypeError(
+                    f"MiddlePoint-v0 got an unexpected keyword argument {name!r}{hint}"
+                )
         return cls(**arguments)
 
     def _check_actuator(self) -> None:
