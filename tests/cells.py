@@ -39,7 +39,7 @@ def die_once(seed: int, flag: Path, calls: Path | None = None) -> Rows:
     """Kill the own process, but not a second time."""
     if not flag.exists():
         flag.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
+        os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # as Windows has it
     return draw(seed, calls)
 
 

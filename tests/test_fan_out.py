@@ -240,6 +240,7 @@ def free_port():
         return server.getsockname()[1]
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Ray's clusters are Linux's")
 @pytest.mark.skipif(
     importlib.util.find_spec("ray") is None,
     reason="Ray is not installed: it is an extra, and there are not wheels for every Python",
