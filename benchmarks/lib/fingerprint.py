@@ -55,8 +55,8 @@ def behaviour() -> str:
     """Return a hash of what the environment does: of a trajectory of each preset."""
     digest = hashlib.sha256()
     for name, arguments in sorted(mptc_gym.PRESETS.items()):
-        windows = {"output_window": 2, "action_window": 3}
-        plants = gymnasium.make_vec("MiddlePoint-v0", 2, **arguments, **windows)
+        windowed: dict[str, Any] = {**arguments, "output_window": 2, "action_window": 3}
+        plants = gymnasium.make_vec("MiddlePoint-v0", 2, **windowed)
         actions = np.random.default_rng(0).uniform(-1.2, 1.2, (SAMPLES, 2, 1))
         digest.update(name.encode())
         observation, _ = plants.reset(seed=0)

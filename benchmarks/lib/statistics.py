@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -67,7 +67,8 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
     if ordered.ndim != 1 or not len(ordered) or np.isnan(ordered).any():
         raise ValueError(f"values must be numbers, one for each run, got {values!r}")
     # Of an infinite value nothing can be interpolated: the next higher of the values then.
-    method = "linear" if np.isfinite(ordered).all() else "higher"
+    finite = bool(np.isfinite(ordered).all())
+    method: Literal["linear", "higher"] = "linear" if finite else "higher"
     interval = stats.quantile_test(ordered, p=probability).confidence_interval(CONFIDENCE)
     low = -np.inf if np.isnan(interval.low) else interval.low
     high = np.inf if np.isnan(interval.high) else interval.high

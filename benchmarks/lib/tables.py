@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,9 @@ _NAMES = ("scenario", "agent", "controller", "case")
 _TEXTS = (*_NAMES, "claim", "verdict", "question", "command", "page")
 
 
-def percentiles(values: NDArray[np.float64], method: str = "linear") -> dict[str, Any]:
+def percentiles(
+    values: NDArray[np.float64], method: Literal["linear", "nearest", "higher"] = "linear"
+) -> dict[str, Any]:
     """Return median, 10th and 90th percentile along the last axis.
 
     Nothing can be interpolated where a value is infinite ("not settled"). The next higher value
@@ -23,9 +26,15 @@ def percentiles(values: NDArray[np.float64], method: str = "linear") -> dict[str
     """
     method = method if np.isfinite(values).all() else "higher"
     return {
-        name: np.percentile(values, percentile, axis=-1, method=method)  # type: ignore[call-overload]
+        name: np.percentile(values, percentile, axis=-1, method=method)
         for name, percentile in PERCENTILES.items()
     }
+
+
+def groups(table: pd.DataFrame, column: str) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield each name in a column and its rows, in the order in which the names appear."""
+    for name, rows in table.groupby(column, sort=False):
+        yield str(name), rows
 
 
 def on_screen(table: pd.DataFrame) -> Table:
