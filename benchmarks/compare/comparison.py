@@ -23,7 +23,7 @@ from benchmarks.compare.estimates import (
     travel_frontier,
     verdict,
 )
-from benchmarks.controllers.factories import Factory, build, observation
+from benchmarks.controllers.factories import Factory, build, curve, observation, provenances
 from benchmarks.controllers.records import Account, Controller, Training
 from benchmarks.controllers.roster import label
 from benchmarks.lib.report import Section, provenance_line, write_report
@@ -196,10 +196,10 @@ class Comparison:
     def _curves(self) -> pd.DataFrame:
         """Return the learning curves of all members that have one."""
         curves = [
-            pd.DataFrame(member.curve).assign(agent=name, policy=number)
+            pd.DataFrame(learnt).assign(agent=name, policy=number)
             for name, members in self._members.items()
             for number, member in enumerate(members)
-            if hasattr(member, "curve")
+            if (learnt := curve(member)) is not None
         ]
         return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
 
@@ -264,8 +264,8 @@ class Comparison:
             name, members = controller.name, self._members[controller.name]
             account: Account = getattr(members[0], "account", controller.account)
             cases = self.runs[(self.runs["agent"] == name) & (self.runs["scenario"] == TWICE)]
-            curves = [member.curve for member in members if hasattr(member, "curve")]
-            seconds = pd.Series([curve[-1]["seconds"] for curve in curves if curve]).median()
+            curves = [learnt for member in members if (learnt := curve(member))]
+            seconds = pd.Series([learnt[-1]["seconds"] for learnt in curves]).median()
             first, second = cases["mae"].mean(), self._again.get(name, float("nan"))
             rows.append(
                 {
@@ -300,11 +300,7 @@ class Comparison:
             "complete": complete,
             "seconds": round(time.perf_counter() - self._clock, 1),
             **self._origin,
-            "policies": {
-                name: [member.provenance for member in members]
-                for name, members in self._members.items()
-                if hasattr(members[0], "provenance")
-            },
+            "policies": provenances(self._members),
             "files": self._files,
         }
         write_json(self._path("provenance.json"), provenance)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Mapping
-from typing import Any, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 
@@ -15,6 +15,24 @@ from mptc_gym import Parameters
 Factory = Callable[..., Agent]
 
 WINDOWS = ("setpoint_window", "error_window", "output_window", "action_window")
+
+
+@runtime_checkable
+class HasProvenance(Protocol):
+    """A factory of a trained policy, which can say where the policy comes from."""
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """In a form for JSON."""
+
+
+@runtime_checkable
+class HasCurve(Protocol):
+    """A factory of a trained policy with its learning curve."""
+
+    @property
+    def curve(self) -> list[dict[str, float]]:
+        """A row an evaluation."""
 
 
 def try_out(factory: Factory) -> None:
@@ -111,6 +129,20 @@ def build(factory: Factory, parameters: Parameters, num_envs: int, seed: int) ->
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in accepted.values()):
         return factory(**offered)
     return factory(**{name: value for name, value in offered.items() if name in accepted})
+
+
+def provenances(members: Mapping[str, Sequence[object]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the provenance of every trained policy, by the name of its controller."""
+    found = {
+        name: [each.provenance for each in factories if isinstance(each, HasProvenance)]
+        for name, factories in members.items()
+    }
+    return {name: each for name, each in found.items() if each}
+
+
+def curve(factory: object) -> list[dict[str, float]] | None:
+    """Return the learning curve of a factory's policy; None if it has none."""
+    return factory.curve if isinstance(factory, HasCurve) else None
 
 
 def observation(factory: Factory) -> dict[str, Any]:

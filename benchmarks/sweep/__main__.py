@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks import plants as plant_options
-from benchmarks.controllers.factories import Factory
+from benchmarks.controllers.factories import Factory, provenances
 from benchmarks.controllers.records import POLICIES, Controller, Training
 from benchmarks.controllers.roster import ROSTER, chosen
 from benchmarks.designs import Plant, grid, random_design
@@ -130,11 +130,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
         "started": started,
         "seconds": round(seconds, 1),
         "options": {name: str(value) for name, value in vars(options).items()},
-        "policies": {
-            name: [member.provenance for member in each]
-            for name, each in members.items()
-            if hasattr(each[0], "provenance")
-        },
+        "policies": provenances(members),
         "versions": versions(),
         "commit": commit(),
     }
@@ -186,11 +182,7 @@ def _key(
         plants=plants,
         nominal=nominal,
         controllers=locations,
-        policies={
-            name: [member.provenance for member in each]
-            for name, each in members.items()
-            if hasattr(each[0], "provenance")
-        },
+        policies=provenances(members),
     )
 
 
