@@ -6,6 +6,7 @@ import argparse
 import hashlib
 import sys
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -25,7 +26,7 @@ LONGEST = 60  # characters of a folder's name
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    names = {"nargs": "*", "metavar": "NAME"}
+    names: dict[str, Any] = {"nargs": "*", "metavar": "NAME"}
     add("--agents", default=COMPARED, help="controllers of this repository", **names)
     add(
         "--agent",
@@ -111,7 +112,8 @@ def main(options: argparse.Namespace, console: Console) -> str:
 
     for section in report[:2]:
         console.print(section.title, *section.text, sep="\n")
-        console.print(on_screen(section.table))
+        if section.table is not None:
+            console.print(on_screen(section.table))
     return f"The report, tables, data and plots are in {out}/"
 
 

@@ -20,6 +20,7 @@ from benchmarks.lib.statistics import (
     interquartile_mean,
     stratified,
 )
+from benchmarks.lib.tables import groups
 from benchmarks.limits import LeastPossible, frontier, least_possible
 from benchmarks.scenarios import Scenario
 
@@ -111,19 +112,19 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) ->
         one.
     """
     rows = []
-    for scenario, cases in runs.groupby("scenario", sort=False):
+    for scenario, cases in groups(runs, "scenario"):
         scale = scales[scenario]
         limit = scale.least.value
         errors = {
             agent: group.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
-            for agent, group in cases.groupby("agent", sort=False)
+            for agent, group in groups(cases, "agent")
         }
         base = errors[reference].mean(axis=0) if reference in errors else None
         for agent, values in errors.items():
             mean = bootstrap(values, SEED)
             if scale.drawn and values.size == 1:
                 mean = replace(mean, low=-math.inf, high=math.inf)
-            row = {
+            row: dict[str, Any] = {
                 "scenario": scenario,
                 "agent": agent,
                 "limit": limit,
@@ -155,9 +156,9 @@ def scores(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
         each scenario.
     """
     rows = []
-    for agent, cases in runs.groupby("agent", sort=False):
+    for agent, cases in groups(runs, "agent"):
         tables, means = [], {}
-        for scenario, group in cases.groupby("scenario", sort=False):
+        for scenario, group in groups(cases, "scenario"):
             errors = group.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
             tables.append(scales[scenario].least.score(errors))
             means[scenario] = float(tables[-1].mean())

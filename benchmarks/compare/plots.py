@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib.ticker import LogLocator
 
 from benchmarks.controllers.roster import label
 from benchmarks.lib.drawing import COLOURS, STYLE, colours, save
+from benchmarks.lib.tables import groups
 from benchmarks.metrics import METRICS
 from benchmarks.scenarios import Scenario
 
@@ -36,7 +38,7 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9, 6))
         above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
-        for agent, rows in responses.groupby("agent", sort=False):
+        for agent, rows in groups(responses, "agent"):
             _band(above, rows, "output", palette[agent], label(agent))
             _band(below, rows, "applied", palette[agent], label(agent))
         minutes = rows["time_s"] / 60
@@ -64,7 +66,7 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
 
 def _band(axes: Axes, rows: pd.DataFrame, signal: str, colour: str, name: str) -> None:
     minutes = rows["time_s"] / 60
-    step = "post" if signal == "applied" else None
+    step: Literal["post"] | None = "post" if signal == "applied" else None
     axes.fill_between(
         minutes, rows[f"{signal}_p10"], rows[f"{signal}_p90"], step=step,
         color=colour, alpha=0.2, linewidth=0,
@@ -81,8 +83,7 @@ def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
     with mpl.rc_context(STYLE):
         figure, panels = _scenario_panels(estimates)
         shades = colours(list(estimates["agent"].unique()))
-        by_scenario = estimates.groupby("scenario", sort=False)
-        for axes, (_, rows) in zip(panels, by_scenario, strict=True):
+        for axes, (_, rows) in zip(panels, groups(estimates, "scenario"), strict=True):
             for place, (_, row) in enumerate(rows.iterrows()):
                 ends = [[row["mean"] - row["mean_low"]], [row["mean_high"] - row["mean"]]]
                 colour = shades[row["agent"]]
@@ -107,7 +108,7 @@ def plot_runs(runs: pd.DataFrame, path: Path) -> None:
     with mpl.rc_context(STYLE):
         figure, panels = _scenario_panels(runs)
         shades = colours(list(runs["agent"].unique()))
-        for axes, (_, cases) in zip(panels, runs.groupby("scenario", sort=False), strict=True):
+        for axes, (_, cases) in zip(panels, groups(runs, "scenario"), strict=True):
             agents = list(cases["agent"].unique())
             for place, agent in enumerate(agents):
                 errors = cases.loc[cases["agent"] == agent, "mae"]
@@ -161,9 +162,7 @@ def plot_travel(
     with mpl.rc_context(STYLE):
         figure, panels = _scenario_panels(medians, 3.0)
         shades = colours(list(medians["agent"].unique()))
-        for axes, (name, rows) in zip(
-            panels, medians.groupby("scenario", sort=False), strict=True
-        ):
+        for axes, (name, rows) in zip(panels, groups(medians, "scenario"), strict=True):
             # A valve that never moves has no place on this axis.
             moving = rows[rows["total_variation"] > 0.0]
             for _, row in moving.iterrows():

@@ -136,12 +136,12 @@ def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> p
         "scenario", key=lambda names: names.map(list(scenarios).index), kind="stable"
     )
     for (scenario, agent), group in others.groupby(["scenario", "agent"], sort=False):
-        noisy = scenarios[scenario].parameters.range_of("noise_variance")[1] > 0.0
+        noisy = scenarios[str(scenario)].parameters.range_of("noise_variance")[1] > 0.0
         cells = {
             METRICS[row["metric"]]: (
                 "" if noisy and row["metric"] in STEP_METRICS else format_cell(row)
             )
             for _, row in group.iterrows()
         }
-        rows.append({"scenario": scenario, "agent": label(agent)} | cells)
+        rows.append({"scenario": scenario, "agent": label(str(agent))} | cells)
     return pd.DataFrame(rows)
