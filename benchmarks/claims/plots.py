@@ -20,7 +20,7 @@ def plot_convergence(times: pd.DataFrame, path: Path) -> None:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9, 4))
         axes = figure.subplots()
-        for name, colour in colours(list(times)).items():
+        for name, colour in colours(list(times.columns)).items():
             finite = times[name].replace(math.inf, np.nan).dropna().sort_values()
             done = 100 * np.arange(1, len(finite) + 1) / len(times)
             axes.step(finite, done, where="post", color=colour, label=name)

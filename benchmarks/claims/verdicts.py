@@ -114,9 +114,9 @@ class Entry:
 
 def table(entries: Sequence[Entry]) -> pd.DataFrame:
     """Return one row for each finding, and one for a claim without any."""
-    rows = []
+    rows: list[dict[str, object]] = []
     for entry in entries:
-        about = {
+        about: dict[str, object] = {
             "claim": entry.name,
             "section": entry.section,
             "statement": entry.statement,
