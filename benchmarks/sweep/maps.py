@@ -19,7 +19,7 @@ from benchmarks.lib.drawing import STYLE, save
 from mptc_gym import Parameters
 
 _COLUMNS = 4
-_COLOURS = {"cmap": "cividis_r", "norm": LogNorm(1.0, 4.0)}
+_COLOURS: dict[str, Any] = {"cmap": "cividis_r", "norm": LogNorm(1.0, 4.0)}
 _OFTEN = 0.5  # of the runs on a plant, from which on it is marked
 _MARKS = {
     name: Line2D(
@@ -52,6 +52,7 @@ def plot_grid(runs: pd.DataFrame, path: Path) -> None:
     cells = _by_plant(runs, ["delay", "gain_factor"])
     nominal = Parameters()
     gain = abs(sum(nominal.b) / sum(nominal.a))
+    dead_zone, _ = nominal.range_of("dead_zone")
     with mpl.rc_context(STYLE | {"axes.grid": False}):
         figure, panels = _panels(cells)
         for axes, (_, rows) in zip(panels, cells.groupby("agent", sort=False), strict=False):
@@ -64,7 +65,7 @@ def plot_grid(runs: pd.DataFrame, path: Path) -> None:
                 _scatter(axes, mark, marked["delay"], marked["gain_factor"])
             axes.plot(18, 1.0, "+", color="black", markersize=12, markeredgewidth=2)
             # From here on, the flow that 5 degC needs lies in the dead zone.
-            axes.axhline(5.0 / (gain * nominal.dead_zone), color="black", linestyle=":")
+            axes.axhline(5.0 / (gain * dead_zone), color="black", linestyle=":")
             axes.set_xlabel("delay (samples)")
             axes.set_ylabel("gain (of the paper's)")
         plant = Line2D([], [], marker="+", linestyle="", color="black", markersize=10,

@@ -14,6 +14,7 @@ from benchmarks.controllers.roster import label
 from benchmarks.designs import Plant
 from benchmarks.lib.report import Section
 from benchmarks.lib.statistics import Estimate, bootstrap, improvement
+from benchmarks.lib.tables import groups
 from benchmarks.sweep import maps
 
 SEED = 0  # of the bootstraps
@@ -145,7 +146,7 @@ def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
 
 def _overview(runs: pd.DataFrame) -> pd.DataFrame:
     rows = []
-    for agent, group in runs.groupby("agent", sort=False):
+    for agent, group in groups(runs, "agent"):
         ratio = group.groupby("plant")["ratio"].median().dropna()
         rows.append(
             {
