@@ -81,9 +81,9 @@ def _draw_signal(axes: Axes, panel: Panel, signal: str) -> None:
             minutes, curves["setpoint"], "k--", linewidth=1, where="post", label="set point"
         )
     if signal == "command":
-        zone = parameters.dead_zone
+        zone, _ = parameters.range_of("dead_zone")
         axes.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0, label="dead zone")
-        for limit in (parameters.u_min, parameters.u_max):
+        for limit in (parameters.range_of("u_min")[0], parameters.range_of("u_max")[1]):
             axes.axhline(limit, color="0.4", linestyle=":", linewidth=1)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
