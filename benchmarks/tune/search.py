@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import optuna
 import pandas as pd
-from optuna.distributions import FloatDistribution
+from optuna.distributions import BaseDistribution, FloatDistribution
 from tqdm import tqdm
 
 from benchmarks.controllers.factories import load, load_factory
@@ -94,7 +94,9 @@ class Search:
         self._fan_out = fan_out
         self._tuning = tuning_of(controller)
         space = self._tuning.space
-        self._space = {name: FloatDistribution(*ends, log=True) for name, ends in space.items()}
+        self._space: dict[str, BaseDistribution] = {
+            name: FloatDistribution(*ends, log=True) for name, ends in space.items()
+        }
         self._study = optuna.create_study()
         self._rows: list[dict[str, float]] = []
         # In the form in which JSON gives it back.
@@ -213,7 +215,9 @@ class Search:
         answers = fan_out.run(cells, title="new runs for the best", progress=final)
         scores = pd.DataFrame(list(answers.values()))
         groups = [scores.iloc[i : i + members] for i in range(0, len(scores), members)]
-        return [{name: float(np.mean(group[name])) for name in group} for group in groups]
+        return [
+            {name: float(np.mean(group[name])) for name in scores.columns} for group in groups
+        ]
 
     def report(self, trials: int) -> pd.DataFrame:
         """Judge the best gains again, rounded and on new runs, and write them, best first.
