@@ -14,7 +14,10 @@ Values = NDArray[np.float64] | np.float64  # one value a loop: shape (), or (bat
 
 
 def action_from_command(
-    command: Values, u_min: float, u_max: float, dead_zone: float = 0.0
+    command: Values,
+    u_min: Values | float,
+    u_max: Values | float,
+    dead_zone: Values | float = 0.0,
 ) -> NDArray[np.float32]:
     """Scale commands to normalised actions, -1 at `u_min` and 1 at `u_max`.
 
