@@ -51,7 +51,7 @@ def simc_pi(parameters: Parameters, u_min: float, u_max: float) -> PIController:
 
 def searched_pi(u_min: float, u_max: float) -> PIController:
     """Return the paper's PI controller with the gains of `python -m benchmarks.tune pi`."""
-    return PIController(**SEARCHED_GAINS, u_min=u_min, u_max=u_max)
+    return PIController(SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"], u_min=u_min, u_max=u_max)
 
 
 def smith(parameters: Parameters, u_min: float, u_max: float) -> SmithPredictor:
