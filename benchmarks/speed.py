@@ -14,6 +14,7 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -39,7 +40,7 @@ BATCHES = (1, 8, 64, 1024, 16384)
 LOOPS = (64, 1000)
 MEMORY_PLANTS = 100
 LONG = 100_000  # steps, to see whether memory grows
-NOISE = {"noise_variance": 0.5}
+NOISE: dict[str, Any] = {"noise_variance": 0.5}
 RANDOM = {**NOISE, "setpoint": "random"}
 IN_TORCH: dict[str, dict[str, Any]] = {
     "in PyTorch": {},
@@ -119,8 +120,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     show("Memory of a plant, 20 past actions", memory())
 
     imports = [
-        Case(module, lambda module=module: _import(module), 1)
-        for module in ("gymnasium", "mptc_gym")
+        Case(module, partial(_import, module), 1) for module in ("gymnasium", "mptc_gym")
     ]
     taken = 1000 * pd.DataFrame(_alternately(imports, rounds))
     more = taken["mptc_gym"] - taken["gymnasium"]
@@ -163,7 +163,8 @@ def compare(cases: list[Case], rounds: int) -> pd.DataFrame:
 def memory() -> pd.DataFrame:
     """Measure the memory of a plant, in a batch and alone, and whether it grows."""
     rows = []
-    for name, arguments in (("R = 0", {}), ("R = 0.5, random set point", RANDOM)):
+    cases: dict[str, dict[str, Any]] = {"R = 0": {}, "R = 0.5, random set point": RANDOM}
+    for name, arguments in cases.items():
         batch = MiddlePointVectorEnv(
             MEMORY_PLANTS, max_episode_steps=EPISODE, action_window=20, **arguments
         )
@@ -235,7 +236,7 @@ def _drawn(name: str) -> Case:
 
 def _vector(n: int) -> Iterable[Case]:
     """Yield vector environments; a call is one of our episodes, with its reset."""
-    made = {
+    made: dict[str, tuple[str, dict[str, Any]]] = {
         REFERENCE: (REFERENCE, {}),
         "MiddlePoint-v0": ("MiddlePoint-v0", {}),
         "MiddlePoint-v0, R = 0.5": ("MiddlePoint-v0", NOISE),
