@@ -6,13 +6,15 @@ import argparse
 import math
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import gymnasium
 import pygame
+from gymnasium.vector import SyncVectorEnv
 from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
 from PIL import Image
 from rich.console import Console
@@ -130,8 +132,11 @@ def in_window(factory: Factory, scenario: Scenario, seed: int, speed: int) -> Tr
         If the window is closed before the end.
     """
     arguments = {**scenario.arguments, **observation(factory)}
-    plants = gymnasium.make_vec(
-        "MiddlePoint-v0", 1, vectorization_mode="sync", render_mode="human", **arguments
+    plants = cast(
+        "SyncVectorEnv",
+        gymnasium.make_vec(
+            "MiddlePoint-v0", 1, vectorization_mode="sync", render_mode="human", **arguments
+        ),
     )
     plant = plants.envs[0].unwrapped
     plant.metadata = {**plant.metadata, "render_fps": speed}
@@ -164,7 +169,7 @@ def in_film(
 
         def draw(k: int) -> None:
             if k % every == 0:
-                put(plants.render()[0])
+                put(cast("Sequence[Frame]", plants.render())[0])
 
         trajectory = rollout(plants, controller, scenario.samples, seed, draw)
     plants.close()
@@ -185,7 +190,7 @@ def _gif(path: Path, fps: float) -> Iterator[Put]:
     kept: list[bytes] = []  # compressed: in memory a minute of them takes a gigabyte
 
     def put(frame: Frame) -> None:
-        kept.append(zlib.compress(frame, 1))
+        kept.append(zlib.compress(frame.data, 1))
 
     yield put
     pictures = (Image.frombytes("RGB", SIZE, zlib.decompress(data)) for data in kept)
