@@ -10,7 +10,7 @@ import argparse
 import sys
 import time
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -21,7 +21,6 @@ from torch.distributions import Normal
 
 from benchmarks.metrics import mean_error
 from benchmarks.rollout import make_plants, rollout
-from mptc_gym import Parameters
 
 
 @dataclass(frozen=True)
@@ -61,9 +60,14 @@ class Arguments:
 
 
 # With delay + 2 past actions the problem is Markov while the set point holds.
-OBSERVATION = {"action_window": Parameters().delay + 2, "output_window": 2}
+OBSERVATION: dict[str, Any] = {"action_window": 20, "output_window": 2}
 # Returns of about 1 in size: the gradient of larger ones would crowd out that of the policy.
-TRAINING = {"setpoint": "random", "reward": "absolute", "error_scale": 50.0, **OBSERVATION}
+TRAINING: dict[str, Any] = {
+    "setpoint": "random",
+    "reward": "absolute",
+    "error_scale": 50.0,
+    **OBSERVATION,
+}
 DEGREES = 5.0  # what temperatures are divided by before they enter a network
 
 
@@ -91,16 +95,18 @@ class Agent(nn.Module):
     @torch.no_grad()
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return actions without exploration, as a controller does."""
-        return self(torch.as_tensor(observation))[0].numpy()
+        actions: Tensor = self(torch.as_tensor(observation))[0]
+        return cast("NDArray[np.float32]", actions.numpy())
 
 
 def network(size: int, last_gain: float) -> nn.Sequential:
     """Return two hidden layers and one output; a small gain makes the first outputs small."""
-    layers = [nn.Linear(size, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 1)]
-    for layer, gain in zip(layers[::2], (2**0.5, 2**0.5, last_gain), strict=True):
+    layers = nn.Linear(size, 64), nn.Linear(64, 64), nn.Linear(64, 1)
+    for layer, gain in zip(layers, (2**0.5, 2**0.5, last_gain), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
         nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
+    first, second, last = layers
+    return nn.Sequential(first, nn.Tanh(), second, nn.Tanh(), last)
 
 
 def estimate(
@@ -125,7 +131,7 @@ def train(arguments: Arguments) -> Agent:
     plants = gymnasium.make_vec(
         "MiddlePoint-v0", arguments.num_envs, autoreset_mode="SameStep", **TRAINING
     )
-    agent = Agent(plants.single_observation_space)
+    agent = Agent(cast("gymnasium.spaces.Box", plants.single_observation_space))
     optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5)
     shape = arguments.num_steps, arguments.num_envs
     observations = torch.zeros(*shape, len(agent.scale))

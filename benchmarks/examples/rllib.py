@@ -19,7 +19,8 @@ from ray.rllib.algorithms.ppo import PPOConfig
 
 import mptc_gym  # noqa: F401 (registers the environment)
 
-OBSERVATION = {"action_window": 20}  # with delay + 2 past actions the problem is Markov
+# With delay + 2 past actions the problem is Markov while the set point holds.
+OBSERVATION: dict[str, Any] = {"action_window": 20}
 
 
 @torch.no_grad()
