@@ -125,4 +125,4 @@ def main(options: argparse.Namespace, console: Console) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(None))

@@ -332,5 +332,5 @@ def _held(flow: Array) -> Array:
     """Return the flow with its gaps closed where it is the same on both sides."""
     series = pd.Series(flow)
     before, after = series.ffill(), series.bfill()
-    filled: Array = series.where(series.notna() | (before != after), before).to_numpy()
-    return filled
+    filled = series.where(series.notna() | (before != after), before)
+    return np.asarray(filled, np.float64)

@@ -209,4 +209,4 @@ def _row(plant: Plant, found: dict[str, Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(None))
