@@ -67,8 +67,9 @@ def minimum_variance(parameters: Parameters) -> float:
     the first d + 1 coefficients of C/A. All that came before could be undone (K. J. Astrom,
     "Introduction to Stochastic Control Theory", 1970, chapter 6).
     """
-    f = noise_response(parameters, parameters.delay + 1)
-    return parameters.noise_variance * float(f @ f)
+    numbers = Ranges(parameters).given
+    f = noise_response(parameters, int(numbers.delay) + 1)
+    return numbers.noise_variance * float(f @ f)
 
 
 def held(setpoint: Array) -> list[tuple[int, int]]:
@@ -157,7 +158,7 @@ def _limit(scenario: Scenario) -> Limit:
     plants = make_plants(1, scenario.samples, **scenario.arguments)
     setpoint = rollout(plants, PIController(0.0, 0.0), scenario.samples, seed=0).setpoint[:, 0]
     numbers = Ranges(parameters).given
-    longer = course(parameters, numbers, scenario.samples + parameters.delay + 1 + TAIL)
+    longer = course(parameters, numbers, scenario.samples + int(numbers.delay) + 1 + TAIL)
     mae = reference(longer, unknown(longer), setpoint).error.mean()
     square = noise_variance(longer)[: scenario.samples].sum()
     before = 0.0
@@ -190,15 +191,16 @@ def least_square(parameters: Parameters, before: float, after: float, samples: i
     ValueError
         If the limits do not let the plant stay at `before`.
     """
+    numbers = Ranges(parameters).given
     gain = sum(parameters.b) / sum(parameters.a)
     steady = before / gain
-    if not parameters.u_min <= steady <= parameters.u_max:
+    if not numbers.u_min <= steady <= numbers.u_max:
         raise ValueError(f"before must be within the reach of the flow, got {before!r}")
     # Deviations from the steady state: y = G u, and e = change - y.
     impulse = signal.lfilter(
-        [*[0.0] * (parameters.delay + 1), *parameters.b], parameters.a, np.eye(1, samples)[0]
+        [*[0.0] * (int(numbers.delay) + 1), *parameters.b], parameters.a, np.eye(1, samples)[0]
     )
-    low, high = parameters.u_min - steady, parameters.u_max - steady
+    low, high = numbers.u_min - steady, numbers.u_max - steady
     return _least_square(impulse, after - before, low, high)
 
 
