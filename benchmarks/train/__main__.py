@@ -163,8 +163,8 @@ def draw_prices(table: pd.DataFrame, path: Path) -> None:
         figure, axes = plt.subplots(figsize=(6.0, 4.0))
         axes.plot(table[travel], table[error], ".", color="0.6")
         axes.plot(medians[travel], medians[error], "o-", color=drawing.COLOURS[0])
-        for price, point in zip(medians.index, medians.to_numpy(), strict=True):
-            axes.annotate(f"{price:g}", point, (4, 4), textcoords="offset points")
+        for price, (x, y) in zip(medians.index, medians.to_numpy(), strict=True):
+            axes.annotate(f"{price:g}", (x, y), (4, 4), textcoords="offset points")
         axes.set(xlabel=travel, ylabel=error, title="What a price of valve travel buys")
         drawing.save(figure, path)
         plt.close(figure)

@@ -252,4 +252,4 @@ def main(options: argparse.Namespace, _console: Console) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(None))

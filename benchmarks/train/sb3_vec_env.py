@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -65,7 +65,8 @@ class GymnasiumVecEnv(VecEnv):
             raise ValueError(f"options must be empty, got {self._options!r}")
         observations, infos = zip(
             *(
-                batch.reset(seed=list(self._seeds[part]))
+                # It takes a seed for each environment, whatever its annotation says.
+                batch.reset(seed=cast("int", list(self._seeds[part])))
                 for batch, part in zip(self.batches, self._parts, strict=True)
             ),
             strict=True,
@@ -100,7 +101,8 @@ class GymnasiumVecEnv(VecEnv):
 
     def get_images(self) -> list[NDArray[np.uint8]]:
         """Return a picture of each environment, if the batch has the mode "rgb_array"."""
-        return [picture for batch in self.batches for picture in batch.render() or []]
+        pictures = itertools.chain.from_iterable(batch.render() or () for batch in self.batches)
+        return cast("list[NDArray[np.uint8]]", list(pictures))
 
     def close(self) -> None:
         """Close the batches."""

@@ -15,7 +15,7 @@ import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -120,8 +120,9 @@ class Network(nn.Module):
         self.layers = nn.ModuleList(
             nn.Linear(before, after, bias=False) for before, after in itertools.pairwise(sizes)
         )
+        last = cast("nn.Linear", self.layers[-1])
         with torch.no_grad():
-            self.layers[-1].weight.mul_(0.1)  # begins close to the action that holds
+            last.weight.mul_(0.1)  # begins close to the action that holds
 
     def weights(self) -> list[Tensor]:
         """Return the weights of each layer, the first for observations."""
