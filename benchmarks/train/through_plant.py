@@ -326,7 +326,7 @@ class Trainer:
         errors, applied = run(self._plants, self._network, draw.signals(), training.samples)
         loss = loss_of(errors, applied, training)
         self._optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         norm = nn.utils.clip_grad_norm_(self._network.parameters(), 1.0)
         if math.isfinite(norm):
             self._optimiser.step()
