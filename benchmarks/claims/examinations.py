@@ -325,7 +325,7 @@ def against_the_paper(networks: Sequence[Network]) -> Callable[[Batch], Results]
 
 
 def node_failure(batch: Batch) -> Results:
-    """Find how networks of several sizes get over the failure of a hidden node."""
+    """Find how networks of several sizes recover from the failure of a hidden node."""
     results = Results()
     for slower, stuck_at in itertools.product((False, True), (0, 1)):
         error = {}
@@ -447,5 +447,5 @@ def other_plants(batch: Batch) -> Results:
 
 
 def nothing(_: Batch) -> Results:
-    """Stand for what the text does not let us test."""
+    """Return no findings: the paper does not say enough for a test."""
     return Results()

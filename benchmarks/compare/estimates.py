@@ -1,4 +1,4 @@
-"""From runs to estimates: how near the limits, how much better than another, how sure."""
+"""Estimates from runs: the distance to the least possible error, and paired differences."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from benchmarks.limits import LeastPossible, frontier, least_possible
 from benchmarks.scenarios import Scenario
 
 SEED = 0  # of the first run, and of the bootstraps
-EPISODES = 100  # at most, that a bound of drawn plants is the mean over
-SAME = 1e-4  # degC; of two bounds that differ by less, that of every controller is shown
-TOLERANCE = 1e-4  # share of a bound that it may be off by
+EPISODES = 100  # at most, over which a bound of drawn plants is averaged
+SAME = 1e-4  # degC; where two bounds differ by less, that of every controller is shown
+TOLERANCE = 1e-4  # relative error that a bound may have
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def beaten(estimates: pd.DataFrame, bound: str = "limit") -> pd.DataFrame:
 
 
 def verdict(estimates: pd.DataFrame) -> str:
-    """Say in a sentence whether anyone came below a bound, and what that means."""
+    """Say in a sentence whether a controller came below a bound, and what that means."""
     below, impossible = beaten(estimates), beaten(estimates, "preview")
 
     def cases(rows: pd.DataFrame) -> str:

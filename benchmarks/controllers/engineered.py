@@ -55,10 +55,10 @@ def searched_pi(u_min: float, u_max: float) -> PIController:
 
 
 def smith(parameters: Parameters, u_min: float, u_max: float) -> SmithPredictor:
-    """Return a Smith predictor of what a step test shows, with half the time constant.
+    """Return a Smith predictor whose model comes from a step test of the plant.
 
-    Of the actuator it knows what stands in a data sheet: the dead zone, in the middle if it is
-    a range, and the limits.
+    Its closed loop has half the plant's time constant. It knows what the actuator's data sheet
+    says: the limits and the dead zone, the middle of it if it is a range.
     """
     tested = step_test(parameters)
     return SmithPredictor(
@@ -81,5 +81,5 @@ def self_tuning(parameters: Parameters, u_min: float, u_max: float) -> SelfTunin
 
 
 def mpc(parameters: Parameters, num_envs: int, seed: int = 0) -> PredictiveController:
-    """Return the predictive controller that knows all but the future."""
+    """Return the predictive controller, which knows everything except the future."""
     return PredictiveController(parameters, num_envs, seed)

@@ -41,7 +41,7 @@ def try_out(factory: Factory) -> None:
     Raises
     ------
     ValueError
-        If it is no controller of a batch; the message says what is expected.
+        If it is not a controller of a batch; the message says what is expected.
     """
     windows = observation(factory)
     parameters = Parameters(**windows)
@@ -109,7 +109,7 @@ def load_factory(location: str) -> Factory:
     Raises
     ------
     ValueError
-        If there is no such module or factory in it, or if its observation is none.
+        If there is no such module or factory, or if its `observation` is not valid.
     """
     factory = cast("Factory", load(location))
     observation(factory)
@@ -117,7 +117,7 @@ def load_factory(location: str) -> Factory:
 
 
 def build(factory: Factory, parameters: Parameters, num_envs: int, seed: int) -> Agent:
-    """Call a factory with those of the arguments it can be offered that it has."""
+    """Call a factory with the arguments that it accepts; see `load_factory`."""
     offered: dict[str, Any] = {
         "num_envs": num_envs,
         "seed": seed,
@@ -151,7 +151,7 @@ def observation(factory: Factory) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If it is no dict, or holds other arguments: everyone is to control the same plant.
+        If it is not a dict, or holds other arguments: all controllers have the same plant.
     """
     arguments = getattr(factory, "observation", {})
     if not isinstance(arguments, Mapping):

@@ -25,7 +25,7 @@ class Estimate:
     low, high
         Ends of the interval.
     runs
-        How many runs it rests on.
+        Number of runs.
     """
 
     value: float
@@ -35,16 +35,16 @@ class Estimate:
 
 
 def exact(value: float) -> Estimate:
-    """Return what nothing random has a part in: a single run, an interval without width."""
+    """Return the estimate of a value that is not random: one run, an interval of no width."""
     return Estimate(float(value), float(value), float(value), 1)
 
 
 def quantile(values: ArrayLike, probability: float) -> Estimate:
     """Estimate a quantile over runs.
 
-    The interval is that between two of the ordered values (Conover, "Practical Nonparametric
-    Statistics", 3rd edition, 1999, section 3.2, as `scipy.stats.quantile_test` has it). It
-    supposes nothing of the distribution, and takes infinite values ("never").
+    The interval lies between two of the ordered values (Conover, "Practical Nonparametric
+    Statistics", 3rd edition, 1999, section 3.2; see `scipy.stats.quantile_test`). It assumes
+    nothing about the distribution and accepts infinite values ("never").
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     if ordered.ndim != 1 or not len(ordered) or np.isnan(ordered).any():
         raise ValueError(f"values must be numbers, one for each run, got {values!r}")
-    # Of an infinite value nothing can be interpolated: the next higher of the values then.
+    # Infinite values cannot be interpolated; the next higher value is taken instead.
     finite = bool(np.isfinite(ordered).all())
     method: Literal["linear", "higher"] = "linear" if finite else "higher"
     interval = stats.quantile_test(ordered, p=probability).confidence_interval(CONFIDENCE)
@@ -108,7 +108,7 @@ def share(flags: ArrayLike) -> Estimate:
 
 
 def interquartile_mean(values: ArrayLike, axis: int | None = None) -> Any:
-    """Return the mean of the middle half: neither blind to outliers nor led by them."""
+    """Return the mean of the middle half, which outliers move less than the mean of all."""
     return stats.trim_mean(values, 0.25, axis=axis)
 
 
@@ -123,12 +123,12 @@ def bootstrap(
     ----------
     values
         Shape (runs,); or (members, runs) for several trained controllers in the same runs. Then
-        members and runs are drawn, both once, and what is drawn are all the cells where they
-        cross: the members of a run meet the same noise, so they do not count as runs of their
-        own, and the interval also tells how other trainings would do (A. B. Owen, "The
-        pigeonhole bootstrap", Annals of Applied Statistics 1, 2007, 386-411). Of five members
-        that differ by far more than runs do, it holds the truth in 82 % of the cases: five are
-        few to draw from.
+        members and runs are drawn independently, and a sample holds every cell where they
+        cross. Members of the same run meet the same noise, so they do not count as runs of
+        their own. The interval also covers other trainings (A. B. Owen, "The pigeonhole
+        bootstrap", Annals of Applied Statistics 1, 2007, 386-411). With five members that
+        differ far more than runs do, it holds the true value in 82 % of the cases: five are few
+        to draw from.
     seed
         Of the draws.
     statistic
@@ -149,7 +149,7 @@ def bootstrap(
         raise ValueError(f"values must be finite, one for each run, got {values!r}")
     members, runs = table.shape
     value = float(statistic(table.reshape(1, -1), axis=-1)[0])
-    if np.all(table == table.flat[0]):  # nothing random had a part in it
+    if np.all(table == table.flat[0]):  # nothing was random
         return Estimate(value, value, value, table.size)
     generator = np.random.default_rng(seed)
     member = generator.integers(members, size=(RESAMPLES, members, 1))
@@ -192,8 +192,8 @@ def stratified(
     Parameters
     ----------
     tables
-        One a task, all of one shape: (runs,), or (members, runs) as in `bootstrap`. Runs and
-        members are drawn within each task; the tasks are those that there are.
+        One for each task, all of the same shape: (runs,), or (members, runs) as in `bootstrap`.
+        Runs and members are drawn within each task; the tasks themselves are not drawn.
     seed
         Of the draws.
     statistic

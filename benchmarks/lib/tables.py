@@ -21,8 +21,8 @@ def percentiles(
 ) -> dict[str, Any]:
     """Return median, 10th and 90th percentile along the last axis.
 
-    Nothing can be interpolated where a value is infinite ("not settled"). The next higher value
-    is taken there.
+    Infinite values ("not settled") cannot be interpolated. Where there is one, the next higher
+    value is taken.
     """
     method = method if np.isfinite(values).all() else "higher"
     return {

@@ -20,7 +20,7 @@ from mptc_gym import Parameters
 
 _COLUMNS = 4
 _COLOURS: dict[str, Any] = {"cmap": "cividis_r", "norm": LogNorm(1.0, 4.0)}
-_OFTEN = 0.5  # of the runs on a plant, from which on it is marked
+_OFTEN = 0.5  # a plant is marked from this share of its runs on
 _MARKS = {
     name: Line2D(
         [],
@@ -45,7 +45,7 @@ def plot_grid(runs: pd.DataFrame, path: Path) -> None:
     Parameters
     ----------
     runs
-        One row a run, of a sweep over a grid.
+        One row for each run of a sweep over a grid.
     path
         The PNG file to write.
     """
@@ -82,7 +82,7 @@ def plot_plants(runs: pd.DataFrame, path: Path) -> None:
     Parameters
     ----------
     runs
-        One row a run, of a sweep over a random design.
+        One row for each run of a sweep over a random design.
     path
         The PNG file to write.
     """
@@ -110,12 +110,12 @@ def plot_plants(runs: pd.DataFrame, path: Path) -> None:
 
 
 def plot_drift(runs: pd.DataFrame, pair: tuple[str, str], path: Path) -> None:
-    """Draw by how much one controller does better than another, over the drift of the gain.
+    """Draw how much smaller the error of one controller is, over the drift of the gain.
 
     Parameters
     ----------
     runs
-        One row a run, of a sweep over a random design.
+        One row for each run of a sweep over a random design.
     pair
         Names of the two.
     path

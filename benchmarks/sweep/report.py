@@ -1,4 +1,4 @@
-"""What a sweep found: one row a run, and what there is to say of it."""
+"""The results of a sweep: one row for each run, and the sections of the report."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from benchmarks.lib.tables import groups
 from benchmarks.sweep import maps
 
 SEED = 0  # of the bootstraps
-OSCILLATES = 1.0  # degC that the swing on steady stretches exceeds that without control by
-GROUPS = (  # of the plants that drift, by which the answer is split: half-open intervals
+OSCILLATES = 1.0  # degC by which the swing on steady stretches exceeds that without control
+GROUPS = (  # of the plants that drift, with half-open intervals; each has a row of its own
     ("gain falls to less than 0.8 times", "gain_drift", 0.0, 0.8),
     ("gain stays within 0.8 to 1.25 times", "gain_drift", 0.8, 1.25),
     ("gain rises to more than 1.25 times", "gain_drift", 1.25, np.inf),
@@ -40,7 +40,7 @@ ADAPTING = (
 def table(
     plants: Sequence[Plant], agents: Sequence[str], results: dict[str, Any]
 ) -> pd.DataFrame:
-    """Return one row a run: the plant, what came of it, and how that compares.
+    """Return one row for each run: the plant, the measures, and how they compare.
 
     Parameters
     ----------
@@ -95,12 +95,12 @@ DIFFERENCES_TEXT = (
 
 
 def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
-    """Draw the maps, and return what there is to say.
+    """Draw the maps and return the sections of the report.
 
     Parameters
     ----------
     runs
-        One row a run.
+        One row for each run.
     out
         Where to write the maps.
     design

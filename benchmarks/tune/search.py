@@ -65,18 +65,18 @@ class Search:
     runs
         Of each scenario in a trial.
     folder
-        Where it is kept, as `<controller>.json`; what is there is continued. The trials are in
-        `<controller>.csv` too, for readers.
+        Where the search is kept, as `<controller>.json`. A search that is there already is
+        continued. `<controller>.csv` holds the trials, too, for readers.
     fan_out
-        Runs what does not depend on each other: the members of a trial, and the finalists.
+        Runs the members of a trial, or the finalists, side by side.
     plant
         Arguments of the environment, if it is not the paper's plant.
 
     Raises
     ------
     ValueError
-        If what is there was another search, or one that other code judged, or is damaged; the
-        message says what to do.
+        If the file is of another search, was made by other code, or is damaged; the message
+        says what to do.
     """
 
     def __init__(
@@ -222,7 +222,7 @@ class Search:
     def report(self, trials: int) -> pd.DataFrame:
         """Judge the best gains again, rounded and on new runs, and write them, best first.
 
-        The gains that did best in a search did so by luck too; new runs tell.
+        The best gains of a search owe some of their result to luck; new runs show how much.
 
         Parameters
         ----------
