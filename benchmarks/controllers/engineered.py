@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ class Nothing:
 
 
 def direct_nn(
-    parameters: Parameters, num_envs: int, seed: int, u_min: float, u_max: float, **gains: float
+    parameters: Parameters, num_envs: int, seed: int, u_min: float, u_max: float, **gains: Any
 ) -> DirectNNController:
     """Return the paper's network, which is told the direction of the plant's response."""
     direction = 1 if sum(parameters.b) / sum(parameters.a) > 0.0 else -1
