@@ -1,4 +1,4 @@
-"""What gains are judged by: scenarios that no comparison uses, and one number."""
+"""The objective of a search of gains: scenarios that no comparison uses, and one number."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def score(
     Parameters
     ----------
     factory
-        Makes the controller, as `roster.build` calls it.
+        Makes the controller; called by `benchmarks.controllers.factories.build`.
     runs
         Of each scenario.
     first_run
