@@ -99,9 +99,9 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
     **Signals from outside.** `reset(options={"signals": signals})` takes a dict of tensors:
     "noise" (n), "setpoint" (y_d), "disturbance" (w) and "measurement_noise", degC, each of
     shape (samples, num_envs), where row k is that of sample k; and numbers that are ranges by
-    their names, shape (num_envs,). With one dimension more before, the j-th episode of a plant gets
-    the j-th, and after the last one the first again. What is not in the dict is drawn. It is a
-    ValueError if a step needs a sample beyond the last.
+    their names, shape (num_envs,). With one dimension more before, the j-th episode of a plant
+    gets the j-th, and after the last one the first again. What is not in the dict is drawn. It
+    is a ValueError if a step needs a sample beyond the last.
 
     **Gradients.** The actuator is not smooth. The gradient goes straight through the dead zone,
     as if it were not there, and is 0 beyond the limits, as nothing changes there; the same
