@@ -31,7 +31,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) -> pd.DataFrame:
-    """Return the set point and the percentiles of y and u_a over the runs, a row for each sample.
+    """Return the set point and the percentiles of y and u_a over the runs, row by sample.
 
     Where every run has a set point of its own, the first run stands for all.
     """

@@ -142,7 +142,7 @@ def _draw(figures: Sequence[Figure], curves: dict[str, pd.DataFrame], path: Path
 
 
 def summarise(trajectory: Trajectory) -> pd.DataFrame:
-    """Return the set point, and each signal in a typical run and over all, a row for each sample.
+    """Return the set point, and each signal in a typical run and over all, row by sample.
 
     Parameters
     ----------
