@@ -10,7 +10,7 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
-from benchmarks.examples import cleanrl_style, sb3
+from benchmarks.examples import cleanrl_style, ppo_torch, sb3
 from benchmarks.train import defaults
 
 ROOT = Path(__file__).parent.parent
@@ -108,6 +108,51 @@ class TestOnOnePage:
             assert torch.equal(next_values[:-1][went_on], values[1:][went_on])
             assert not torch.equal(next_values[:-1][~went_on], values[1:][~went_on])
         assert torch.stack([ends for *_, ends in kept]).mean() == pytest.approx(0.2, abs=0.02)
+
+
+class TestInPyTorch:
+    SMALL = ppo_torch.Arguments(
+        steps=1024, num_envs=8, num_steps=16, epochs=2, minibatches=2, seed=1
+    )
+
+    def test_times_of_both_are_shown(self, monkeypatch, capsys):
+        monkeypatch.setattr(ppo_torch, "SIZES", (4, 8))
+        ppo_torch.main(["--times", "--num-steps", "8", "--epochs", "1"])
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.split()[0] for line in lines] == ["4", "4", "8", "8"]
+        assert [line.split()[3].rstrip(":") for line in lines] == ["PyTorch", "NumPy"] * 2
+
+    def test_the_seed_is_all_that_differs(self):
+        first, again, other = (
+            weights(ppo_torch.train(replace(self.SMALL, seed=seed))[0]) for seed in (1, 1, 2)
+        )
+        assert torch.equal(first, again)
+        assert not torch.equal(first, other)
+
+    def test_values_at_an_end_are_those_of_the_last_observation(self, monkeypatch):
+        # What the value function is asked for at an end is the error that the step led to,
+        # which the reward tells, and not the first one of the next episode.
+        asked = []
+        forward, step = ppo_torch.Agent.forward, ppo_torch.MiddlePointTorchEnv.step
+
+        def spy_forward(agent, observations):
+            asked.append(observations[:, 3].clone())
+            return forward(agent, observations)
+
+        told = []
+
+        def spy_step(plants, actions):
+            returned = step(plants, actions)
+            told.append((returned[1].clone(), returned[3].clone(), len(asked)))
+            return returned
+
+        monkeypatch.setattr(ppo_torch.Agent, "forward", spy_forward)
+        monkeypatch.setattr(ppo_torch.MiddlePointTorchEnv, "step", spy_step)
+        monkeypatch.setitem(ppo_torch.TRAINING, "max_episode_steps", 5)
+        ppo_torch.train(self.SMALL)
+        assert torch.stack([ends for _, ends, _ in told]).any()
+        for rewards, _, following in told:
+            torch.testing.assert_close(asked[following].abs(), -50.0 * rewards)
 
 
 def test_controllers_need_neither_torch_nor_sb3():
