@@ -136,17 +136,16 @@ class TestSweep:
                 self.provenance = provenance
 
         common = {
-            "plants": [{"delay": 18}], "nominal": {}, "members": {"pi": [Member("a")]},
-            "options": argparse.Namespace(runs=2, samples=700),
-            "controllers": {"pi": ROSTER["pi"]},
+            "plants": [{"delay": 18}], "nominal": {}, "factories": [Member("a")],
+            "options": argparse.Namespace(runs=2, samples=700), "controller": ROSTER["pi"],
         }  # fmt: skip
         changes = [
             {}, {"plants": [{"delay": 19}]}, {"nominal": {"dead_zone": 7.0}},
-            {"members": {"pi": [Member("b")]}}, {"controllers": {"nn": ROSTER["nn"]}},
+            {"factories": [Member("b")]}, {"controller": ROSTER["nn"]},
             {"options": argparse.Namespace(runs=3, samples=700)},
             {"options": argparse.Namespace(runs=2, samples=650)},
         ]  # fmt: skip
-        keys = {sweep._key(**{**common, **change}) for change in changes}
+        keys = {sweep._agent_key(**{**common, **change}) for change in changes}
         assert len(keys) == len(changes)
 
     def test_grid(self, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
@@ -103,9 +103,9 @@ def main(options: argparse.Namespace, console: Console) -> str:
         getattr(options, "training_steps", None),
         getattr(options, "policies", None),
     )
+    known = {NOTHING: ROSTER[NOTHING], **controllers}
     members = {
-        name: controller.members_in_service(training)
-        for name, controller in {NOTHING: ROSTER[NOTHING], **controllers}.items()
+        name: controller.members_in_service(training) for name, controller in known.items()
     }
     differing = (
         grid()
@@ -113,13 +113,19 @@ def main(options: argparse.Namespace, console: Console) -> str:
         else random_design(options.plants, options.design_seed, options.samples)
     )
     plants = [{**nominal, **plant} for plant in differing]
-    cells = _cells(plants, nominal, options, members)
     began = time.perf_counter()
     results = fan_out.run(
-        cells,
-        out / "cells" / _key(plants, nominal, options, controllers, members),
-        title="sweep",
+        _limit_cells(plants, options),
+        out / "cells" / _limit_key(plants, options),
+        title="limit",
     )
+    for name, factories in members.items():
+        results |= fan_out.run(
+            _agent_cells(name, factories, plants, nominal, options),
+            # A folder for each, so that one more controller leaves the others' cells valid.
+            out / "cells" / _agent_key(known[name], factories, plants, nominal, options),
+            title=name,
+        )
     seconds = time.perf_counter() - began
 
     runs = table(plants, list(controllers), results)
@@ -141,48 +147,58 @@ def main(options: argparse.Namespace, console: Console) -> str:
         console.print(section.title, *section.text, sep="\n")
         if section.table is not None:
             console.print(on_screen(section.table))
-    return f"{len(cells)} cells in {seconds:.0f} s. The report, data and maps are in {out}/"
+    return f"{len(results)} cells in {seconds:.0f} s. The report, data and maps are in {out}/"
 
 
-def _cells(
-    plants: list[Plant],
-    nominal: Plant,
-    options: argparse.Namespace,
-    members: Mapping[str, list[Factory]],
+def _limit_cells(
+    plants: list[Plant], options: argparse.Namespace
 ) -> dict[str, Callable[[], Any]]:
-    """Return what is to be run: every controller on every plant, and the limits."""
-    cells: dict[str, Callable[[], Any]] = {}
-    common = {"samples": options.samples, "runs": options.runs, "seed": SEED}
-    for i, plant in enumerate(plants):
-        cells[f"limit {i}"] = partial(limit_cell, plant, options.samples)
-        for name, factories in members.items():
-            # Every plant has its own member, in turn: how much they differ shows in the maps.
-            factory = factories[i % len(factories)]
-            cells[f"{name} {i}"] = partial(agent_cell, factory, nominal, plant, **common)
-    return cells
+    return {
+        f"limit {i}": partial(limit_cell, plant, options.samples)
+        for i, plant in enumerate(plants)
+    }
 
 
-def _key(
+def _limit_key(plants: list[Plant], options: argparse.Namespace) -> str:
+    return fingerprint(limit_cell.__module__, plants=plants, samples=options.samples)
+
+
+def _agent_cells(
+    name: str,
+    factories: Sequence[Factory],
     plants: list[Plant],
     nominal: Plant,
     options: argparse.Namespace,
-    controllers: Mapping[str, Controller],
-    members: Mapping[str, list[Factory]],
-) -> str:
-    """Return a name made of everything that shapes the cells' results."""
-    locations = {
-        name: controller.in_service or controller.factory
-        for name, controller in controllers.items()
+) -> dict[str, Callable[[], Any]]:
+    """Return a controller on every plant, by name."""
+    common = {"samples": options.samples, "runs": options.runs, "seed": SEED}
+    return {
+        # Every plant has its own member, in turn: how much they differ shows in the maps.
+        f"{name} {i}": partial(
+            agent_cell, factories[i % len(factories)], nominal, plant, **common
+        )
+        for i, plant in enumerate(plants)
     }
-    modules = {location.partition(":")[0] for location in locations.values() if location}
+
+
+def _agent_key(
+    controller: Controller,
+    factories: Sequence[Factory],
+    plants: list[Plant],
+    nominal: Plant,
+    options: argparse.Namespace,
+) -> str:
+    """Return a name made of everything that shapes the results of a controller."""
+    location = controller.in_service or controller.factory
+    modules = [location.partition(":")[0]] if location else []
     return fingerprint(
         agent_cell.__module__,
-        *sorted(modules),
+        *modules,
         options=[options.runs, options.samples],
         plants=plants,
         nominal=nominal,
-        controllers=locations,
-        policies=provenances(members),
+        controller=location,
+        policies=provenances({controller.name: factories}),
     )
 
 
