@@ -342,6 +342,17 @@ class TestDamage:
 
 
 class TestMembers:
+    def test_a_controller_is_told_the_dead_zone_of_its_plant(self, tmp_path):
+        train(tmp_path)
+        policy = ppo.Policy(SMALL, tmp_path / "policy.npz")
+        observation = np.random.default_rng(0).normal(size=policy.network.n_obs)
+        for given, edge in ((7.0, 0.7), (5.0, 0.5), ([3.0, 7.0], 0.5)):
+            controller = policy(Parameters(dead_zone=given))
+            # At its first move the policy is just beyond the edge of the dead zone.
+            position = (abs(controller.act(observation)[0]) - edge) / (1.0 - edge)
+            assert 0.0 < position < 0.2
+        assert policy.network.increments.dead_zone == 5.0  # is not changed by it
+
     def members(self, folder, jobs, *, retrain=False):
         return ppo.members(Training(FanOut(jobs), folder, members=2, retrain=retrain), SMALL)
 

@@ -17,12 +17,13 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
-from agents import PolicyNetwork
+from agents import Increments, PolicyNetwork
 from agents.policy_network import PRETRAINED
 from benchmarks.controllers.records import Account, Training
 from benchmarks.designs import SPANS
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import replacing
+from mptc_gym import Parameters
 
 POLICIES = 5  # are trained and compared, from seeds in sequence
 TUNING_SEED, FINAL_SEED = 1000, 2000  # of policies in a search, others than a comparison uses
@@ -45,8 +46,8 @@ class PPOArguments:
     max_move: float = 1.0
     """How far an action of 1 moves the flow, as a share of half its range."""
     undo_dead_zone: float = DEAD_ZONE
-    """The dead zone that is undone on the way from the policy to the plant, t/h. It is the
-    nominal one, whichever the plant has."""
+    """The dead zone that is undone on the way from the policy to the plant, t/h. A comparison
+    takes that of the plant that is run."""
     noise_variance: float = 0.5
     """R of the plants trained on, degC^2. A policy trained with noise steers less nervously,
     and does better with another dead zone than one trained on that plant."""
@@ -176,9 +177,12 @@ class Policy:
         kept = self.network.provenance
         return {"file": self.file.name, **{k: v for k, v in kept.items() if k != "curve"}}
 
-    def __call__(self) -> PolicyNetwork:
-        """Return a controller."""
-        return copy.deepcopy(self.network)
+    def __call__(self, parameters: Parameters | None = None) -> PolicyNetwork:
+        """Return a controller; it is told the plant's dead zone, if that is a number."""
+        network = copy.deepcopy(self.network)
+        if parameters is not None and not isinstance(parameters.dead_zone, Sequence):
+            network.increments = Increments(self.arguments.max_move, parameters.dead_zone)
+        return network
 
 
 def _load(file: Path) -> PolicyNetwork:
