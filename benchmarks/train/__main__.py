@@ -74,7 +74,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     out = command_line.out_folder(options.out)
     networks = run(trainings, out, fan_out, retrain=options.retrain)
     table = summary(networks)
-    console.print(on_screen(table.map("{:.4g}".format)))
+    console.print(on_screen(table.map("{:.6g}".format)))
     if options.prices:
         files = [out / f"{options.network}-prices.{suffix}" for suffix in ("csv", "png")]
         with replacing(files[0]) as file:
