@@ -120,12 +120,28 @@ def draw(record: Record) -> pygame.Surface:
     surface.fill(_PAGE)
     _header(surface, record)
     top = Panel(86, 304, record, record.temperatures)
-    bottom = Panel(346, 496, record, record.flows)
+    bottom = _flow_panel(record)
     _temperatures(surface, top)
     _flows(surface, bottom)
     _time_axis(surface, bottom)
     _legend(surface, record.plant.dead_zone > 0.0)
     return surface
+
+
+def flow_at(record: Record, point: tuple[int, int]) -> float | None:
+    """Return the flow that a point of a record's picture stands for, t/h.
+
+    It is None for a point outside the panel of flows.
+    """
+    panel = _flow_panel(record)
+    if not panel.rect.collidepoint(point):
+        return None
+    share = (panel.bottom - point[1]) / (panel.bottom - panel.top)
+    return panel.axis.low + share * (panel.axis.high - panel.axis.low)
+
+
+def _flow_panel(record: Record) -> Panel:
+    return Panel(346, 496, record, record.flows)
 
 
 @cache

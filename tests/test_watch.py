@@ -1,17 +1,21 @@
 """Watching a controller: films and windows show the run that is asked for."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 import pygame
 import pytest
 from moviepy import VideoFileClip
 from PIL import Image
+from scipy import signal
 
 from agents import PIController
-from benchmarks import watch
 from benchmarks.train import ppo
-from mptc_gym import MiddlePointEnv, drawing
+from benchmarks.watch import __main__ as watch
+from benchmarks.watch import rivals
+from mptc_gym import PRESETS, MiddlePointEnv, drawing
 from tests.conftest import run
 from tests.small_training import SMALL
 
@@ -162,3 +166,184 @@ def test_bad_options_are_named(option, value, named, capsys):
     shown = capsys.readouterr().err
     assert option in shown
     assert named in shown
+
+
+def post(kind, **about):
+    pygame.event.post(pygame.event.Event(kind, **about))
+
+
+def press(key, unicode=""):
+    post(pygame.KEYDOWN, key=key, unicode=unicode, mod=0)
+
+
+@pytest.fixture
+def hands_on(screen, monkeypatch):
+    """Do something at samples, given as {k: function}; k counts the pictures drawn."""
+    show = drawing.show
+
+    def install(moves):
+        def shown(record, fps):
+            show(record, fps)
+            moves.get(len(screen) - 1, lambda: None)()
+
+        monkeypatch.setattr(drawing, "show", shown)
+        return screen
+
+    return install
+
+
+# A bound takes seconds, and is tested where it is made.
+@pytest.fixture
+def quick_bound(monkeypatch):
+    asked = []
+
+    def bound(**arguments):
+        asked.append(arguments)
+        return SimpleNamespace(value=0.123)
+
+    monkeypatch.setattr(rivals, "least_possible", bound)
+    return asked
+
+
+def window_point(flow):
+    # The lower chart: 12 t/h is 1 at its top, pixel 346, and -12.4 t/h at its bottom, 496.
+    return 400, round(421 - flow * 75 / 12.4)
+
+
+def test_your_hands_are_on_the_valve(hands_on, quick_bound, capsys):
+    screen = hands_on(
+        {
+            3: lambda: [press(pygame.K_UP) for _ in range(12)],
+            10: lambda: post(pygame.MOUSEBUTTONDOWN, button=1, pos=window_point(-8.0)),
+            15: lambda: post(
+                pygame.MOUSEMOTION, buttons=(1, 0, 0), pos=window_point(9.0), rel=(0, 0)
+            ),
+            20: lambda: post(pygame.MOUSEBUTTONDOWN, button=1, pos=(400, 100)),  # no flow
+            25: lambda: press(pygame.K_HOME),
+            30: lambda: press(pygame.K_DOWN),
+        }
+    )
+    assert watch.main(["--agent", "you", "--speed", "1000"]) == 0
+    commands = [sample[2] for sample, _ in screen[1:]]
+    assert commands[:3] == [0.0] * 3
+    assert commands[3:10] == pytest.approx([6.0] * 7, abs=1e-6)
+    assert commands[10:15] == pytest.approx([-8.0] * 5, abs=0.1)  # a pixel is 0.17 t/h
+    assert commands[15:25] == pytest.approx([9.0] * 10, abs=0.1)
+    assert commands[25:30] == [0.0] * 5
+    assert commands[30:] == pytest.approx([-0.5] * 10, abs=1e-6)
+
+    shown = capsys.readouterr().out
+    errors = [abs(sample[0] - sample[1]) for sample, _ in screen[:-1]]
+    applied = [sample[3] for sample, _ in screen]
+    mine = next(line for line in shown.splitlines() if line.split()[:1] == ["you"])
+    assert mine.split()[1:] == [
+        f"{np.mean(errors):.3f}",
+        f"{np.abs(np.diff(applied)).sum():.0f}",
+    ]
+    # Beside the controllers, on the same plant, and the bound.
+    controller = PIController()
+    observation, info = (plant := MiddlePointEnv()).reset(seed=0)
+    errors = []
+    for _ in range(SAMPLES):
+        errors.append(abs(info["error"]))
+        observation, _, _, _, info = plant.step(controller.act(observation))
+    pi = next(line for line in shown.splitlines() if line.split()[:1] == ["PI"])
+    assert pi.split()[1] == f"{np.mean(errors):.3f}"
+    assert "0.123" in shown
+    assert "you on square wave" in shown
+    assert "setpoint" not in quick_bound[0]
+
+
+def test_keys_move_set_point_and_load_under_any_controller(hands_on, quick_bound, capsys):
+    screen = hands_on(
+        {
+            5: lambda: [press(pygame.K_PAGEUP), press(pygame.K_PAGEUP)],
+            12: lambda: press(pygame.K_PAGEDOWN),
+        }
+    )
+    assert watch.main(["--agent", "pi", "--scenario", "constant", "--speed", "1000"]) == 0
+    setpoints = [sample[0] for sample, _ in screen]
+    assert setpoints == [5.0] * 6 + [7.0] * 7 + [6.0] * (SAMPLES - 12)
+    # The controller saw it: it does what it does on a plant with these set points.
+    own = run_closed(MiddlePointEnv(setpoint=setpoints), PIController())
+    assert [sample[1] for sample, _ in screen] == pytest.approx(own, abs=1e-5)
+    assert quick_bound[0]["setpoint"] == setpoints[:-1]
+    assert "Smith" in capsys.readouterr().out
+
+
+def run_closed(env, controller):
+    observation, info = env.reset(seed=0)
+    outputs = [info["output"]]
+    for _ in range(SAMPLES):
+        observation, _, _, _, info = env.step(controller.act(observation))
+        outputs.append(info["output"])
+    return outputs
+
+
+def test_a_load_step_shows_as_in_the_plant_s_equation(hands_on, quick_bound, capsys):
+    screen = hands_on({4: lambda: [press(pygame.K_l), press(pygame.K_l), press(pygame.K_k)]})
+    arguments = ["--agent", "nothing", "--scenario", "constant-noise"]
+    assert watch.main([*arguments, "--speed", "1000"]) == 0
+    untouched = run(MiddlePointEnv(noise_variance=0.5), np.zeros(SAMPLES))["output"]
+    added = np.array([sample[1] for sample, _ in screen]) - untouched
+    a = [1.0, -0.45181, -0.47546]  # (28): w adds A(1) w to the right-hand side
+    load = np.r_[np.zeros(5), np.ones(SAMPLES - 4)]
+    assert added == pytest.approx(signal.lfilter([sum(a)], a, load), abs=1e-9)
+    assert quick_bound == []  # there is no bound for a load by hand
+    assert "least possible" not in capsys.readouterr().out
+
+
+def test_speed_pause_and_escape(hands_on, monkeypatch):
+    screen = hands_on(
+        {
+            2: lambda: press(pygame.K_PLUS, "+"),
+            4: lambda: press(pygame.K_MINUS, "-"),
+            6: lambda: press(pygame.K_SPACE),
+            9: lambda: press(pygame.K_ESCAPE),
+        }
+    )
+    waited = []
+
+    def wait(milliseconds):
+        waited.append(milliseconds)
+        if len(waited) == 5:
+            press(pygame.K_SPACE)
+
+    monkeypatch.setattr(pygame.time, "wait", wait)
+    assert watch.main(["--agent", "you", "--speed", "400"]) == 0
+    assert [fps for _, fps in screen[3:7]] == [800.0, 800.0, 400.0, 400.0]
+    assert len(waited) == 5  # it stood still, and went on
+    assert len(screen) == 10
+
+
+@pytest.mark.parametrize("preset", ["disturbed", "hard"])
+def test_a_plant_that_is_not_touched_is_the_environment_s(preset):
+    arguments = {**PRESETS[preset], "output_window": 2, "action_window": 3}
+    rng = np.random.default_rng(1)
+    plants = rivals.touched_plants(50, arguments)
+    plain = gymnasium.make("MiddlePoint-v0", **arguments)
+    assert np.array_equal(plants.reset(seed=3)[0][0], plain.reset(seed=3)[0])
+    for action in rng.uniform(-1, 1, (40, 1)).astype(np.float32):
+        ours, theirs = plants.step(action[None]), plain.step(action)
+        assert np.array_equal(ours[0][0], theirs[0])
+        assert ours[4]["output"][0] == theirs[4]["output"]
+
+
+def test_the_observation_is_that_of_the_touched_plant():
+    # All windows, against an environment whose own set point changes.
+    windows = {"setpoint_window": 2, "error_window": 4, "output_window": 3, "action_window": 1}
+    touched = rivals.touched_plants(50, {"setpoint": 1.0, **windows})
+    other = gymnasium.make("MiddlePoint-v0", setpoint=[1.0] * 6 + [3.0], **windows)
+    touched.reset(seed=0), other.reset(seed=0)
+    for k in range(40):
+        if k == 5:
+            touched.envs[0].setpoint = 2.0
+        ours, theirs = touched.step(np.array([[0.9]])), other.step(np.array([0.9]))
+        assert ours[0][0] == pytest.approx(theirs[0], abs=1e-5)
+
+
+def test_your_hands_need_a_window(capsys):
+    for more in ([], ["--video", "film.gif"]):
+        with pytest.raises(SystemExit):
+            watch.main(["--agent", "you", *more])
+        assert "--agent you: needs a screen" in capsys.readouterr().err

@@ -21,6 +21,8 @@ from torch.nn import functional
 
 import mptc_gym  # noqa: F401 (registers the environment)
 
+LAST_ACTION = 6  # its place in an observation: after three set points and three errors
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -90,7 +92,16 @@ class Network(nn.Module):
         return result
 
 
-def learn(data: Transitions, high: np.ndarray, arguments: Arguments, seed: int) -> Network:
+class Actor(Network):
+    """A policy that changes the last action, as a valve's position is changed."""
+
+    def act(self, observations: Tensor) -> Tensor:
+        """Return actions within [-1, 1], shape (n, 1)."""
+        last = observations[:, LAST_ACTION, None]
+        return (last + self(observations)).clamp(-1.0, 1.0)
+
+
+def learn(data: Transitions, high: np.ndarray, arguments: Arguments, seed: int) -> Actor:
     """Return an actor: TD3+BC (Fujimoto & Gu 2021), or behaviour cloning if alpha is 0.
 
     Parameters
@@ -105,10 +116,12 @@ def learn(data: Transitions, high: np.ndarray, arguments: Arguments, seed: int) 
         Of the weights, the batches and the noise.
     """
     torch.manual_seed(seed)
-    actor = Network(high, arguments.width)
+    actor = Actor(high, arguments.width)
     with_action = np.append(high, np.float32(1.0))
     critics = nn.ModuleList(Network(with_action, arguments.width) for _ in range(2))
-    targets = copy.deepcopy(nn.ModuleList([actor, *critics])).requires_grad_(False)
+    target_actor, target_critics = (
+        copy.deepcopy(module).requires_grad_(False) for module in (actor, critics)
+    )
     optimizers = [
         torch.optim.Adam(module.parameters(), arguments.learning_rate)
         for module in (actor, critics)
@@ -125,23 +138,24 @@ def learn(data: Transitions, high: np.ndarray, arguments: Arguments, seed: int) 
             noise = (torch.randn_like(taken) * arguments.smoothing).clamp(
                 -arguments.clip, arguments.clip
             )
-            next_action = (targets[0](following).tanh() + noise).clamp(-1.0, 1.0)
+            next_action = (target_actor.act(following) + noise).clamp(-1.0, 1.0)
             ahead = torch.hstack((following, next_action))
-            worth = torch.min(targets[1](ahead), targets[2](ahead))
+            worth = torch.min(*(critic(ahead) for critic in target_critics))
             goal = data.rewards[rows, None] + arguments.gamma * worth
-            pairs = torch.hstack((seen, taken))
-            _descend(optimizers[1], sum(functional.mse_loss(c(pairs), goal) for c in critics))
+            now = torch.hstack((seen, taken))
+            _descend(optimizers[1], sum(functional.mse_loss(c(now), goal) for c in critics))
         if step % arguments.delay == 0 or arguments.alpha == 0.0:
-            action = actor(seen).tanh()
+            action = actor.act(seen)
             loss = functional.mse_loss(action, taken)
             if arguments.alpha > 0.0:
                 value = critics[0](torch.hstack((seen, action)))
                 loss = loss - arguments.alpha * value.mean() / value.abs().mean().detach()
             _descend(optimizers[0], loss)
         with torch.no_grad():
-            sources = (*actor.parameters(), *critics.parameters())
-            for target, source in zip(targets.parameters(), sources, strict=True):
-                target.lerp_(source, arguments.tau)
+            for followers, leaders in ((target_actor, actor), (target_critics, critics)):
+                pairs = zip(followers.parameters(), leaders.parameters(), strict=True)
+                for follower, leader in pairs:
+                    follower.lerp_(leader, arguments.tau)
     return actor
 
 
@@ -152,7 +166,7 @@ def _descend(optimizer: torch.optim.Optimizer, loss: Any) -> None:
 
 
 @torch.no_grad()
-def mean_error(actor: Network, spec: Any, seeds: list[int]) -> float:
+def mean_error(actor: Actor, spec: Any, seeds: list[int]) -> float:
     """Return the mean |e| of an actor over k = 1 to the end of each episode, degC.
 
     Parameters
@@ -170,7 +184,7 @@ def mean_error(actor: Network, spec: Any, seeds: list[int]) -> float:
     observations, _ = plants.reset(seed=seeds)
     errors = 0.0
     for _ in range(spec.max_episode_steps):
-        actions = actor(torch.as_tensor(observations)).tanh().numpy()
+        actions = actor.act(torch.as_tensor(observations)).numpy()
         observations, _, _, _, infos = plants.step(actions)
         errors += float(np.abs(infos["error"]).mean())
     return errors / spec.max_episode_steps

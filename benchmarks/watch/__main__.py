@@ -1,4 +1,4 @@
-"""Watch a controller at work, in a window or in a film: `python -m benchmarks.watch --help`."""
+"""Watch a controller at work, in a window or in a film, or take its place: `--agent you`."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-import gymnasium
 import pygame
-from gymnasium.vector import SyncVectorEnv
 from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
 from PIL import Image
 from rich.console import Console
@@ -25,16 +23,21 @@ from benchmarks.controllers.records import Controller, Training
 from benchmarks.controllers.roster import ROSTER, own_controller
 from benchmarks.lib import command_line
 from benchmarks.lib.storage import replacing
+from benchmarks.lib.tables import on_screen
 from benchmarks.metrics import mean_error
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import SCENARIOS, SETPOINTS, Scenario, scenarios_of
-from mptc_gym import MiddlePointEnv, Parameters
+from benchmarks.watch import rivals
+from benchmarks.watch.hands import HELP, Closed, Hands
+from mptc_gym import MiddlePointEnv, Parameters, drawing
 from mptc_gym.drawing import SIZE
+from mptc_gym.record import Record
 from mptc_gym.rendering import Frame
 
 SPEED = MiddlePointEnv.metadata["render_fps"]  # samples a second
 COLOURS = 48  # of a GIF: the lines', the areas' and what lies between them
 OUT = Path("results/watch")
+YOU = "you"  # the agent that is no controller
 Put = Callable[[Frame], object]  # takes the pictures of a film, one after the other
 
 
@@ -54,14 +57,10 @@ class Film:
     fps: int
 
 
-class Closed(Exception):  # noqa: N818 (no error)
-    """The window has been closed."""
-
-
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     names = ", ".join(ROSTER)
-    add("--agent", default="nn", help=f"{names}, or MODULE:FACTORY for one of your own")
+    add("--agent", default="nn", help=f"{names}, you, or MODULE:FACTORY for one of your own")
     own = ", ".join(name for name, *_ in SETPOINTS)
     add(
         "--scenario",
@@ -81,7 +80,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     film: Path | None = options.video
     if film and film.suffix not in FILMS:
         raise command_line.UsageError(f"--video: must end in {' or '.join(FILMS)}, got {film}")
-    controller = _controller(options.agent)
+    controller = None if options.agent == YOU else _controller(options.agent)
     plant = plants.chosen(options)
     scenarios = scenarios_of(plant.name, plant.arguments) if plant.arguments else SCENARIOS
     if options.scenario not in scenarios:
@@ -90,66 +89,92 @@ def main(options: argparse.Namespace, console: Console) -> str:
             f"--scenario: no {options.scenario!r} on this plant; there are {known}"
         )
     scenario = scenarios[options.scenario]
-    factory = controller.members(Training(members=1))[0]
+    if controller is None and (film is not None or not _has_screen()):
+        raise command_line.UsageError(
+            f"--agent {YOU}: needs a screen to open a window on, and no --video"
+        )
+    factory = controller.members(Training(members=1))[0] if controller else None
 
     if film is None and not _has_screen():
         film = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.mp4"
         console.print(f"There is no screen to open a window on: writing a film, {film}")
+    label = controller.label if controller else YOU
+    if film is not None:
+        assert factory is not None
+        trajectory = in_film(factory, scenario, options.seed, options.speed, film)
+        return f"{_closing(label, scenario, trajectory)}\nThe film is {film}"
+    console.print(HELP)
     try:
-        if film is None:
-            trajectory = in_window(factory, scenario, options.seed, options.speed)
-        else:
-            trajectory = in_film(factory, scenario, options.seed, options.speed, film)
+        trajectory, moves = in_window(factory, scenario, options.seed, options.speed)
     except Closed:
         return "The window was closed."
+    if controller is None or moves:
+        console.print("The same for the controllers ...")
+        table = rivals.table(label, trajectory, moves, scenario, options.seed)
+        console.print(on_screen(table))
+    return _closing(label, scenario, trajectory)
+
+
+def _closing(label: str, scenario: Scenario, trajectory: Trajectory) -> str:
     error = mean_error(trajectory)[0]
-    closing = f"{controller.label} on {scenario.title}: mean absolute error {error:.3f} °C"
-    return closing if film is None else f"{closing}\nThe film is {film}"
+    return f"{label} on {scenario.title}: mean absolute error {error:.3f} °C"
 
 
-def in_window(factory: Factory, scenario: Scenario, seed: int, speed: int) -> Trajectory:
-    """Run a controller and show it in a window.
+def in_window(
+    factory: Factory | None, scenario: Scenario, seed: int, speed: int
+) -> tuple[Trajectory, rivals.Moves]:
+    """Run a controller, or the one who watches, and show it in a window.
 
     Parameters
     ----------
     factory
-        Makes the controller.
+        Makes the controller; None for the one who watches.
     scenario
         What it runs on.
     seed
         Of the plant and of the controller.
     speed
-        Samples a second, if so many can be drawn.
+        Samples a second at the start, if so many can be drawn.
 
     Returns
     -------
     Trajectory
         Of the one run.
+    Moves
+        What was done to set point and load.
 
     Raises
     ------
     Closed
         If the window is closed before the end.
     """
-    arguments = {**scenario.arguments, **observation(factory)}
-    plants = cast(
-        "SyncVectorEnv",
-        gymnasium.make_vec(
-            "MiddlePoint-v0", 1, vectorization_mode="sync", render_mode="human", **arguments
-        ),
-    )
-    plant = plants.envs[0].unwrapped
-    plant.metadata = {**plant.metadata, "render_fps": speed}
+    arguments = {**scenario.arguments, **(observation(factory) if factory else {})}
+    parameters = Parameters(**arguments)
+    hands = Hands(parameters.range_of("u_min")[0], parameters.range_of("u_max")[1], speed)
 
-    def stop_if_closed(_: int) -> None:
-        if pygame.event.get(pygame.QUIT):
-            raise Closed
+    def show(record: Record) -> None:
+        drawing.show(record, hands.speed)
 
-    controller = build(factory, Parameters(**arguments), 1, seed)
+    plants = rivals.touched_plants(scenario.samples, arguments, show)
+    touched = plants.envs[0]
+    moves: rivals.Moves = {}
+
+    def attend(k: int) -> None:
+        hands.take(pygame.event.get(), touched.record)
+        while hands.paused:
+            pygame.time.wait(20)
+            hands.take(pygame.event.get(), touched.record)
+        if (hands.setpoint, hands.load) != (touched.setpoint, touched.load):
+            moves[k] = touched.setpoint, touched.load = hands.setpoint, hands.load
+
+    controller = build(factory, parameters, 1, seed) if factory else hands
+    pygame.display.init()
+    pygame.key.set_repeat(300, 60)  # ms
     try:
-        return rollout(plants, controller, scenario.samples, seed, stop_if_closed)
+        return rollout(plants, controller, scenario.samples, seed, attend), moves
     finally:
         plants.close()
+        drawing.close_window()
 
 
 def in_film(
@@ -211,8 +236,8 @@ def _controller(agent: str) -> Controller:
         return own_controller(agent, agent)
     if agent not in ROSTER:
         raise command_line.UsageError(
-            f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, and MODULE:FACTORY of your "
-            "own"
+            f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, {YOU}, and MODULE:FACTORY "
+            "of your own"
         )
     return ROSTER[agent]
 

@@ -1,0 +1,1 @@
+"""Watch a controller at work, or take its place: `python -m benchmarks.watch`."""

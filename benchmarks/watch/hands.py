@@ -1,0 +1,112 @@
+"""What the one who watches does: keys and mouse, and the flow that they ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pygame
+from numpy.typing import NDArray
+
+from mptc_gym.drawing import flow_at
+from mptc_gym.plant import action_from_command
+from mptc_gym.record import Record
+
+HELP = (
+    "keys: ↑ ↓ or the mouse in the lower chart move the flow (with --agent you), Home sets it "
+    "to 0; Page Up and Page Down move the set point, L and K the load, by 1 °C; + and - change "
+    "the speed; space pauses, Esc ends"
+)
+FLOW_STEP = 0.5  # t/h
+STEP = 1.0  # of set point and load, degC
+FASTEST = 1920  # samples a second
+
+_FLOWS = {pygame.K_UP: FLOW_STEP, pygame.K_DOWN: -FLOW_STEP}
+_SETPOINTS = {pygame.K_PAGEUP: STEP, pygame.K_PAGEDOWN: -STEP}
+_LOADS = {pygame.K_l: STEP, pygame.K_k: -STEP}
+_SPEEDS = {"+": 2.0, "=": 2.0, "-": 0.5}  # by character, as keyboards differ
+
+
+class Closed(Exception):  # noqa: N818 (no error)
+    """The window has been closed."""
+
+
+class Hands:
+    """A controller whose flow comes from keys and mouse.
+
+    Parameters
+    ----------
+    u_min, u_max
+        The actuator's limits, t/h.
+    speed
+        Samples a second at the start.
+
+    Attributes
+    ----------
+    flow : float
+        The command, t/h.
+    setpoint, load : float
+        What has been added to both by hand, degC.
+    speed : float
+        Samples a second.
+    paused : bool
+        Whether the plant is to stand still.
+    """
+
+    def __init__(self, u_min: float, u_max: float, speed: float) -> None:
+        self.u_min, self.u_max, self.speed = u_min, u_max, speed
+        self.flow = self.setpoint = self.load = 0.0
+        self.paused = False
+
+    def reset(self) -> None:
+        """Let go of the flow."""
+        self.flow = 0.0
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the action of the present flow, shape (runs, 1)."""
+        action = action_from_command(self.flow, self.u_min, self.u_max)
+        return np.full((len(observation), 1), action, np.float32)
+
+    def take(self, events: Iterable[Any], record: Record) -> None:
+        """Do what events of pygame ask for.
+
+        Parameters
+        ----------
+        events
+            In their order.
+        record
+            What the window shows.
+
+        Raises
+        ------
+        Closed
+            If the window has been closed, or Esc pressed.
+        """
+        for event in events:
+            if event.type == pygame.QUIT:
+                raise Closed
+            if event.type == pygame.KEYDOWN:
+                self._press(event.key, getattr(event, "unicode", ""))
+            held = event.type == pygame.MOUSEBUTTONDOWN and event.button == 1
+            dragged = event.type == pygame.MOUSEMOTION and event.buttons[0]
+            if held or dragged:
+                flow = flow_at(record, event.pos)
+                if flow is not None:
+                    self._move(flow)
+
+    def _press(self, key: int, character: str) -> None:
+        if key == pygame.K_ESCAPE:
+            raise Closed
+        if key == pygame.K_SPACE:
+            self.paused = not self.paused
+        elif key == pygame.K_HOME:
+            self._move(0.0)
+        elif character in _SPEEDS:
+            self.speed = min(max(self.speed * _SPEEDS[character], 1.0), float(FASTEST))
+        self._move(self.flow + _FLOWS.get(key, 0.0))
+        self.setpoint += _SETPOINTS.get(key, 0.0)
+        self.load += _LOADS.get(key, 0.0)
+
+    def _move(self, flow: float) -> None:
+        self.flow = min(max(flow, self.u_min), self.u_max)

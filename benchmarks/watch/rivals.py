@@ -1,0 +1,102 @@
+"""What the controllers do on the plant that someone has had in hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium
+import pandas as pd
+
+from benchmarks.controllers.factories import build, observation
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.limits import least_possible
+from benchmarks.metrics import mean_error, measure
+from benchmarks.rollout import Trajectory, rollout
+from benchmarks.scenarios import Scenario
+from benchmarks.watch.touched import Touched
+from mptc_gym import Parameters
+from mptc_gym.record import Record
+
+Moves = dict[int, tuple[float, float]]  # k: what is added to set point and load from k + 1 on
+EPISODES = 20  # of the bound, where a plant is drawn
+
+
+def touched_plants(
+    samples: int, arguments: Mapping[str, Any], show: Callable[[Record], None] | None = None
+) -> gymnasium.vector.SyncVectorEnv:
+    """Return a batch of one plant that can be touched, `plants.envs[0]`."""
+    plants = gymnasium.make_vec(
+        "MiddlePoint-v0",
+        1,
+        vectorization_mode="sync",
+        wrappers=(lambda env: Touched(env, show),),
+        max_episode_steps=samples,
+        **arguments,
+    )
+    assert isinstance(plants, gymnasium.vector.SyncVectorEnv)
+    return plants
+
+
+def replay(name: str, moves: Moves, scenario: Scenario, seed: int) -> Trajectory:
+    """Run a controller of the roster, with the noise and the moves of another's run."""
+    factory = ROSTER[name].members()[0]
+    arguments = {**scenario.arguments, **observation(factory)}
+    plants = touched_plants(scenario.samples, arguments)
+    touched = plants.envs[0]
+
+    def move(k: int) -> None:
+        if k in moves:
+            touched.setpoint, touched.load = moves[k]
+
+    try:
+        controller = build(factory, Parameters(**arguments), 1, seed)
+        return rollout(plants, controller, scenario.samples, seed, move)
+    finally:
+        plants.close()
+
+
+def table(
+    label: str, trajectory: Trajectory, moves: Moves, scenario: Scenario, seed: int
+) -> pd.DataFrame:
+    """Return mean error and valve travel of a run, of the controllers', and the bound.
+
+    The bound is none where the load was moved by hand.
+
+    Parameters
+    ----------
+    label
+        Of the run.
+    trajectory
+        The run.
+    moves
+        What was done to set point and load in it.
+    scenario, seed
+        What it ran on.
+    """
+    runs = {label: trajectory} | {
+        controller.label: replay(name, moves, scenario, seed)
+        for name, controller in ROSTER.items()
+        if controller.compared and not controller.trained and controller.label != label
+    }
+    rows = [
+        (name, float(mean_error(run)[0]), _travel(run, scenario)) for name, run in runs.items()
+    ]
+    rows.sort(key=lambda row: row[1])
+    if not any(load for _, load in moves.values()):
+        arguments = dict(scenario.arguments)
+        if moves:
+            arguments["setpoint"] = trajectory.setpoint[:, 0].tolist()
+        bound = least_possible(samples=scenario.samples, episodes=EPISODES, **arguments)
+        rows.insert(0, ("least possible, on average", bound.value, float("nan")))
+    return pd.DataFrame(
+        [
+            (name, f"{error:.3f}", "" if travel != travel else f"{travel:.0f}")
+            for name, error, travel in rows
+        ],
+        columns=["", "mean |e| (°C)", "valve travel (t/h)"],
+    )
+
+
+def _travel(run: Trajectory, scenario: Scenario) -> float:
+    return float(measure(run, scenario.parameters)["total_variation"][0])

@@ -1,0 +1,106 @@
+"""A plant whose set point and load can be changed by hand while it runs."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from mptc_gym import MiddlePointEnv
+from mptc_gym.plant import Dynamics
+from mptc_gym.ranges import Ranges
+from mptc_gym.record import Record
+
+Step = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]
+
+
+class Touched(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Adds to a plant's set point, and to its load, what a hand does.
+
+    The set point does not act on the plant, and (28) is linear in the load: with A(1) w(k)
+    added to it, y is what it is without, plus d(k) = alpha_1 d(k-1) + ... + A(1) w(k), where
+    the alpha are the coefficients of A with their signs changed. So both can be added outside
+    of the environment. Observation and info are those of the plant that is touched. The reward,
+    which nothing here uses, is that of the plant that is not, and so is the limit of the
+    transmitter.
+
+    Parameters
+    ----------
+    env
+        A `MiddlePointEnv`, wrapped or not.
+    show
+        Called with a record of the last samples at each reset and step; None for no record.
+
+    Attributes
+    ----------
+    setpoint, load : float
+        What is added from the next sample on, degC.
+    """
+
+    def __init__(
+        self, env: gymnasium.Env[Any, Any], show: Callable[[Record], None] | None = None
+    ) -> None:
+        super().__init__(env)
+        plant = cast("MiddlePointEnv", env.unwrapped)
+        self.parameters = plant.parameters
+        self._dynamics = Dynamics(self.parameters)
+        self._show = show
+        self.setpoint = self.load = 0.0
+
+    def reset(self, **arguments: Any) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Reset the plant; nothing is added at k = 0."""
+        observation, info = self.env.reset(**arguments)
+        parameters = self.parameters
+        drawn = {name: info[name] for name in parameters.ranges}
+        numbers = replace(Ranges(parameters).given, **drawn)
+        self._factors = numbers.gain_factor, numbers.time_constant_factor
+        self._order = len(self._dynamics.coefficients(*self._factors)[0])
+        length = max(*parameters.windows, self._order)
+        # What is added to y_d and to y, newest first.
+        self._setpoints = deque([0.0] * length, length)
+        self._outputs = deque([0.0] * length, length)
+        if self._show is not None:
+            self.record = Record(numbers, parameters.sampling_interval, info["setpoint"])
+            self._show(self.record)
+        return observation, info
+
+    def step(self, action: Any) -> Step:
+        """Step the plant, and add what the hand does."""
+        alpha, _, rest = self._dynamics.coefficients(*self._factors)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if self.parameters.drifts:
+            self._factors = info["gain_factor"], info["time_constant_factor"]
+        added = sum(a * d for a, d in zip(alpha, self._outputs, strict=False))
+        self._outputs.appendleft(added + rest * self.load)
+        self._setpoints.appendleft(self.setpoint)
+        output, setpoint = self._outputs[0], self._setpoints[0]
+        info |= {
+            "output": info["output"] + output,
+            "setpoint": info["setpoint"] + setpoint,
+            "error": info["error"] + setpoint - output,
+        }
+        if self._show is not None:
+            self.record.add(*(info[x] for x in ("setpoint", "output", "command", "applied")))
+            self._show(self.record)
+        shift = self._shift()
+        shifted = observation + shift if shift.any() else observation
+        return shifted, float(reward), terminated, truncated, info
+
+    def _shift(self) -> NDArray[np.float32]:
+        """Return what is added to the observation."""
+        setpoints, errors, outputs, actions = self.parameters.windows
+        return np.array(
+            [
+                *islice(self._setpoints, setpoints),
+                *(s - d for s, d in islice(zip(self._setpoints, self._outputs), errors)),  # noqa: B905 (of one length)
+                *islice(self._outputs, outputs),
+                *[0.0] * actions,
+            ],
+            np.float32,
+        )
