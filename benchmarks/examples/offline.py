@@ -11,7 +11,7 @@ import argparse
 import copy
 import sys
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -181,13 +181,14 @@ def mean_error(actor: Actor, spec: Any, seeds: list[int]) -> float:
     plants = gymnasium.make_vec(
         spec.id, len(seeds), max_episode_steps=spec.max_episode_steps, **spec.kwargs
     )
-    observations, _ = plants.reset(seed=seeds)
+    # It takes a seed for each environment, whatever its annotation says.
+    observations, _ = plants.reset(seed=cast("int", seeds))
     errors = 0.0
     for _ in range(spec.max_episode_steps):
         actions = actor.act(torch.as_tensor(observations)).numpy()
         observations, _, _, _, infos = plants.step(actions)
         errors += float(np.abs(infos["error"]).mean())
-    return errors / spec.max_episode_steps
+    return float(errors / spec.max_episode_steps)
 
 
 def main(arguments: list[str] | None = None) -> int:

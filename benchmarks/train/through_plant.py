@@ -167,20 +167,20 @@ def windows(window: int) -> dict[str, int]:
 
 def make_plants(training: Training, count: int, samples: int) -> MiddlePointTorchEnv:
     """Return plants that take all that differs between them as signals at each reset."""
-    ranges: dict[str, Any] = {"dead_zone": (0.0, 8.0)}
+    arguments: dict[str, Any] = {"dead_zone": (0.0, 8.0)}
     if training.plants == "many":
-        ranges |= SPANS
+        arguments |= SPANS
         for name in ("gain", "time_constant"):
             low, high = SPANS[f"{name}_factor"]
-            ranges[f"{name}_drift"] = (low / high, high / low)
-        ranges["drift_samples"] = DRIFT_SAMPLES
-    ranges["noise_variance"] = 0.0  # handed in, too
+            arguments[f"{name}_drift"] = (low / high, high / low)
+        arguments["drift_samples"] = DRIFT_SAMPLES
+    arguments["noise_variance"] = 0.0  # handed in, too
+    arguments |= windows(training.window)
     return MiddlePointTorchEnv(
         count,
         max_episode_steps=samples,
         differentiable=True,
-        **ranges,
-        **windows(training.window),
+        **arguments,
     )
 
 
