@@ -328,7 +328,8 @@ def test_misspelt_argument_is_refused_and_the_right_one_named(made):
     message = r"unexpected keyword argument 'dead_zon': did you mean 'dead_zone'\?"
     with pytest.raises(TypeError, match=message):
         made("MiddlePoint-v0", dead_zon=5.0)
-    with pytest.raises(TypeError, match="MiddlePoint-v0 got an unexpected keyword argument 'xyz'"):
+    message = "MiddlePoint-v0 got an unexpected keyword argument 'xyz'"
+    with pytest.raises(TypeError, match=message):
         made("MiddlePoint-v0", xyz=5.0)
 
 
