@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
@@ -40,6 +40,8 @@ from mptc_gym.torch_signals import (
 from mptc_gym.vector_env import checked_limit, checked_mode
 
 Infos = dict[str, Any]
+# Observations without past actions, rewards, terminations, truncations, and what infos tell.
+_Step = tuple[Tensor | None, Tensor, Tensor, Tensor, tuple[Tensor, ...]]
 
 SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
 _IN_CACHE = 1 << 17  # numbers that are worked on at once
@@ -176,7 +178,14 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self.action_space = batch_space(single.action_space, num_envs)
         self.observation_space = batch_space(single.observation_space, num_envs)
 
-        self._names = ("command", "applied", "output", "setpoint", "error", "noise")
+        self._names: tuple[str, ...] = (
+            "command",
+            "applied",
+            "output",
+            "setpoint",
+            "error",
+            "noise",
+        )
         self._names += ("disturbance",) if parameters.is_disturbed else ()
         self._names += ("gain_factor", "time_constant_factor") if parameters.drifts else ()
 
@@ -226,7 +235,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         in_cache = max(1, _IN_CACHE // num_envs) if self.device.type == "cpu" else LONGEST
         self._block = min(self._plants.most_samples, LONGEST, in_cache)
         self._offsets = torch.arange(LONGEST, device=self.device)[:, None]
-        self._ahead: list[tuple[Tensor, ...]] = []  # what the steps ahead return, worked out
+        self._ahead: list[_Step] = []  # what the steps ahead return, worked out
         self._samples = self._taken = 0  # of those in the block, and of those returned
         # What the observation shows of set point, error and output, oldest first, and then what
         # it will show in the samples of the block.
@@ -318,9 +327,9 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         """
         a = self._checked_actions(actions)
         if self._ended is not None and self._ended.all():
-            observations, infos = self._reset(None)
+            first, begun = self._reset(None)
             none = torch.zeros_like(self._starts, dtype=torch.bool)
-            return observations, self._nothing.clone(), none, none.clone(), infos
+            return first, self._nothing.clone(), none, none.clone(), begun
         self._clock += 1
         command, applied = self._plants.apply(a)
         if self._taken == self._samples:
@@ -350,10 +359,12 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self._ahead = [
             (
                 None if front is None else front.detach(),
-                *(each.detach() for each in rest),
+                rewards.detach(),
+                terminations.detach(),
+                truncations.detach(),
                 tuple(each.detach() for each in told),
             )
-            for front, *rest, told in self._ahead
+            for front, rewards, terminations, truncations, told in self._ahead
         ]
         self._seen = [[row.detach() for row in seen] for seen in self._seen]
         if self._past_actions is not None:
@@ -457,6 +468,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         """Return the observations once a(k) has been added to them."""
         window, newest = self._windows[3], a.clamp(-1.0, 1.0)
         if self.differentiable:
+            assert self._past_actions is not None  # as the window is not empty
             self._past_actions = torch.cat((newest[None], self._past_actions[:-1]))
         else:
             if self._place == 0:
@@ -478,7 +490,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         chosen = np.ones(self.num_envs, np.bool_) if which is None else which.cpu().numpy()
         mask = torch.ones_like(self._starts, dtype=torch.bool) if which is None else which
         begun = self._begin(which, chosen)
-        if self._ended is not None:
+        if self._ended is not None and self._ended_mask is not None:
             left = self._ended & ~chosen
             self._ended_mask = self._ended_mask & ~mask if left.any() else None
             self._ended = left if left.any() else None
@@ -506,7 +518,9 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
                 "_final_info": ended.clone(),
             }
             return self._window(), rewards, terminations, ended, infos
-        if self._ended is not None:  # at the step before this one
+        if (
+            self._ended is not None and self._ended_mask is not None
+        ):  # at the step before this one
             rewards = torch.where(self._ended_mask, 0.0, rewards)
             self._restart(self._ended_mask, self._ended, infos)
             observations = self._window()
@@ -551,7 +565,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
                 begun[name] = self._draws.within(
                     *self.parameters.range_of(name), whole=name == "delay"
                 )
-            self._numbers[name] = chosen_of(begun[name], self._numbers[name])
+            self._numbers[name] = chosen_of(begun[name], cast("Tensor", self._numbers[name]))
 
         self._starts = chosen_of(self._clock, self._starts)
         self._host_starts[chosen] = self._clock
@@ -677,7 +691,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         if given.requires_grad and not self.differentiable:
             given = given.detach()
         a = given.reshape(-1)
-        if self._ended is not None:
+        if self._ended is not None and self._ended_mask is not None:
             if self.autoreset_mode is AutoresetMode.DISABLED:
                 ended = np.flatnonzero(self._ended)
                 raise ResetNeeded(f"episodes of environments {ended} have ended: reset them")

@@ -49,8 +49,11 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     u_min, u_max
         The limits, t/h, both floats or both of shape (n,).
     """
-    alike = not any(isinstance(each, Tensor) for each in (edge, u_min, u_max))
-    if alike and not command.requires_grad and u_min <= 0.0 <= u_max:
+    if (
+        not (isinstance(edge, Tensor) or isinstance(u_min, Tensor) or isinstance(u_max, Tensor))
+        and not command.requires_grad
+        and u_min <= 0.0 <= u_max
+    ):
         return functional.hardshrink(command, edge).clamp_(u_min, u_max)  # the same, at once
     limited = torch.clamp(command, u_min, u_max)  # type: ignore[arg-type]
     # 0 inside the dead zone and 1 outside, without conditions: they take a processor many times
@@ -218,6 +221,7 @@ class TorchPlants:
             return torch.stack(rows[self._order :]), told
         size = self._order + samples
         known = torch.cat((torch.stack(past), forced)) if past else forced
+        assert self._all_at_once is not None  # otherwise each sample has been worked out above
         products = torch.mm(self._all_at_once[:size, :size], known)
         self._history = [*products.unbind()]
         return products[self._order :].clone(), told

@@ -6,7 +6,7 @@ All of it is made for a block of samples at a time, without a loop over plants.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -117,6 +117,8 @@ class Held:
         # Counts are whole numbers of type float, with which a processor is quickest; or one
         # int if it is the same for all plants.
         self._ahead: list[tuple[Tensor | int, Tensor, Tensor | int]] = []
+        self._state: Tensor
+        self._left: Tensor | int
         self._horizon = self._passed = 0  # samples that it is known for, and that are over
 
     def rest(self, which: Tensor | None, taken: int, state: Tensor, hold: Tensor | int) -> None:
@@ -146,9 +148,9 @@ class Held:
                 rows[after:] = [state.sum(0)] * len(rows[after:])
             return torch.stack(rows)
         # Known are the samples that the next change is away from that before the first one.
-        rows = self._rows[:samples] + (first + 2)
+        places = self._rows[:samples] + (first + 2)
         for change, state, _ in self._ahead:
-            level = torch.lerp(level, state.sum(0), (rows - change).clamp_(0.0, 1.0))
+            level = torch.lerp(level, state.sum(0), (places - change).clamp_(0.0, 1.0))
         return level
 
     def _foresee(self, samples: int) -> None:
@@ -170,7 +172,8 @@ class Held:
             else:
                 over = (passed + 1 - change).clamp_(0.0, 1.0)
                 self._state = torch.lerp(self._state, state, over)
-                self._left = torch.lerp(self._left, next_change, over)
+                left = cast("Tensor", self._left)
+                self._left = torch.lerp(left, cast("Tensor", next_change), over)
         if self._ahead:
             self._left = self._left - passed
         self._ahead, self._horizon, self._passed = [], 0, 0
