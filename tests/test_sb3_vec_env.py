@@ -10,7 +10,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks.train.sb3_vec_env import GymnasiumVecEnv
-from tests.test_ppo import weights
+from tests.test_ppo import parameters_of
 
 N = 4
 ARGUMENTS = {
@@ -88,9 +88,9 @@ def test_training_ends_in_the_same_weights():
         .learn(1024)
         for envs in make_both()
     ]  # fmt: skip
-    assert torch.equal(*map(weights, trained))
+    assert torch.equal(*map(parameters_of, trained))
     untrained = PPO("MlpPolicy", make_both()[0], seed=3, device="cpu")
-    assert not torch.equal(weights(trained[0]), weights(untrained))
+    assert not torch.equal(parameters_of(trained[0]), parameters_of(untrained))
 
 
 def test_infos_of_the_batch_are_at_hand():
