@@ -112,11 +112,12 @@ class Agent(nn.Module):
 
 def network(size: int, last_gain: float) -> nn.Sequential:
     """Return two hidden layers and one output; a small gain makes the first outputs small."""
-    layers = [nn.Linear(size, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 1)]
-    for layer, gain in zip(layers[::2], (2**0.5, 2**0.5, last_gain), strict=True):
+    layers = nn.Linear(size, 64), nn.Linear(64, 64), nn.Linear(64, 1)
+    for layer, gain in zip(layers, (2**0.5, 2**0.5, last_gain), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
         nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
+    first, second, last = layers
+    return nn.Sequential(first, nn.Tanh(), second, nn.Tanh(), last)
 
 
 def train(arguments: Arguments, *, numpy: bool = False) -> tuple[Agent, float, float]:
