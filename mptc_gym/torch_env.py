@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
@@ -40,8 +40,6 @@ from mptc_gym.torch_signals import (
 from mptc_gym.vector_env import checked_limit, checked_mode
 
 Infos = dict[str, Any]
-# Observations without past actions, rewards, terminations, truncations, and what infos tell.
-_Step = tuple[Tensor | None, Tensor, Tensor, Tensor, tuple[Tensor, ...]]
 
 SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
 _IN_CACHE = 1 << 17  # numbers that are worked on at once
@@ -178,17 +176,10 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self.action_space = batch_space(single.action_space, num_envs)
         self.observation_space = batch_space(single.observation_space, num_envs)
 
-        self._names: tuple[str, ...] = (
-            "command",
-            "applied",
-            "output",
-            "setpoint",
-            "error",
-            "noise",
-        )
-        self._names += ("disturbance",) if parameters.is_disturbed else ()
-        self._names += ("gain_factor", "time_constant_factor") if parameters.drifts else ()
-
+        load = ("disturbance",) if parameters.is_disturbed else ()
+        factors = ("gain_factor", "time_constant_factor") if parameters.drifts else ()
+        first = "command", "applied", "output", "setpoint", "error", "noise"
+        self._names = (*first, *load, *factors)  # of what infos hold
         self._keys = (*self._names, *(f"_{name}" for name in self._names))
 
         self._seed: int | None = None  # None until the first reset
@@ -225,7 +216,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self._aligned = True
         self._first_end = 0
         self._ended: NDArray[np.bool_] | None = None  # those still to be reset, if any
-        self._ended_mask: Tensor | None = None
+        self._ended_mask = torch.zeros_like(self._starts, dtype=torch.bool)  # and on the device
         self._waits = self.device.type == "cpu"  # it costs no time to look at a value
 
         self._zero = nothing.new_zeros(())
@@ -235,13 +226,13 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         in_cache = max(1, _IN_CACHE // num_envs) if self.device.type == "cpu" else LONGEST
         self._block = min(self._plants.most_samples, LONGEST, in_cache)
         self._offsets = torch.arange(LONGEST, device=self.device)[:, None]
-        self._ahead: list[_Step] = []  # what the steps ahead return, worked out
+        self._ahead: list[tuple[Any, ...]] = []  # what the steps ahead return, worked out
         self._samples = self._taken = 0  # of those in the block, and of those returned
         # What the observation shows of set point, error and output, oldest first, and then what
         # it will show in the samples of the block.
         self._windows = parameters.windows
         self._seen = [[nothing] * window for window in self._windows[:3]]
-        self._past_actions: Tensor | None = None
+        self._past_actions: Any = None  # a tensor where observations show any
         self._row = nothing.new_zeros(parameters.action_window + _ROOM, num_envs)
         self._place = _ROOM
 
@@ -327,9 +318,9 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         """
         a = self._checked_actions(actions)
         if self._ended is not None and self._ended.all():
-            first, begun = self._reset(None)
+            observations, infos = self._reset(None)
             none = torch.zeros_like(self._starts, dtype=torch.bool)
-            return first, self._nothing.clone(), none, none.clone(), begun
+            return observations, self._nothing.clone(), none, none.clone(), infos
         self._clock += 1
         command, applied = self._plants.apply(a)
         if self._taken == self._samples:
@@ -344,7 +335,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             observations = self._front()
         if self._windows[3]:
             observations = self._with_actions(observations, a)
-        infos: Infos = dict(zip(self._keys, (command, applied, *told), strict=True))
+        infos = dict(zip(self._keys, (command, applied, *told), strict=True))
         if self._clock >= self._first_end:
             return self._end_episodes(observations, rewards, terminations, infos)
         return observations, rewards, terminations, truncations, infos
@@ -359,12 +350,10 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self._ahead = [
             (
                 None if front is None else front.detach(),
-                rewards.detach(),
-                terminations.detach(),
-                truncations.detach(),
+                *(each.detach() for each in rest),
                 tuple(each.detach() for each in told),
             )
-            for front, rewards, terminations, truncations, told in self._ahead
+            for front, *rest, told in self._ahead
         ]
         self._seen = [[row.detach() for row in seen] for seen in self._seen]
         if self._past_actions is not None:
@@ -468,7 +457,6 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         """Return the observations once a(k) has been added to them."""
         window, newest = self._windows[3], a.clamp(-1.0, 1.0)
         if self.differentiable:
-            assert self._past_actions is not None  # as the window is not empty
             self._past_actions = torch.cat((newest[None], self._past_actions[:-1]))
         else:
             if self._place == 0:
@@ -490,9 +478,9 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         chosen = np.ones(self.num_envs, np.bool_) if which is None else which.cpu().numpy()
         mask = torch.ones_like(self._starts, dtype=torch.bool) if which is None else which
         begun = self._begin(which, chosen)
-        if self._ended is not None and self._ended_mask is not None:
+        if self._ended is not None:
             left = self._ended & ~chosen
-            self._ended_mask = self._ended_mask & ~mask if left.any() else None
+            self._ended_mask = self._ended_mask & ~mask
             self._ended = left if left.any() else None
         infos: Infos = {}
         for name in {*self._names, *begun}:
@@ -518,15 +506,13 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
                 "_final_info": ended.clone(),
             }
             return self._window(), rewards, terminations, ended, infos
-        if (
-            self._ended is not None and self._ended_mask is not None
-        ):  # at the step before this one
+        if self._ended is not None:  # at the step before this one
             rewards = torch.where(self._ended_mask, 0.0, rewards)
             self._restart(self._ended_mask, self._ended, infos)
             observations = self._window()
             ended = self._clock - self._starts >= self._limit
             host = self._clock - self._host_starts >= self._limit
-        self._ended, self._ended_mask = (host, ended.clone()) if host.any() else (None, None)
+        self._ended, self._ended_mask = host if host.any() else None, ended.clone()
         return observations, rewards, terminations, ended, infos
 
     def _restart(self, which: Tensor, chosen: NDArray[np.bool_], infos: Infos) -> None:
@@ -548,7 +534,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             The same on the host.
         """
 
-        def chosen_of(new: Any, old: Tensor) -> Tensor:
+        def chosen_of(new: Any, old: Any) -> Tensor:
             """Return the new values of those plants, and the old ones of the others."""
             if which is None:
                 return new if isinstance(new, Tensor) else torch.full_like(old, new)
@@ -565,7 +551,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
                 begun[name] = self._draws.within(
                     *self.parameters.range_of(name), whole=name == "delay"
                 )
-            self._numbers[name] = chosen_of(begun[name], cast("Tensor", self._numbers[name]))
+            self._numbers[name] = chosen_of(begun[name], self._numbers[name])
 
         self._starts = chosen_of(self._clock, self._starts)
         self._host_starts[chosen] = self._clock
@@ -691,7 +677,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         if given.requires_grad and not self.differentiable:
             given = given.detach()
         a = given.reshape(-1)
-        if self._ended is not None and self._ended_mask is not None:
+        if self._ended is not None:
             if self.autoreset_mode is AutoresetMode.DISABLED:
                 ended = np.flatnonzero(self._ended)
                 raise ResetNeeded(f"episodes of environments {ended} have ended: reset them")

@@ -49,12 +49,10 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     u_min, u_max
         The limits, t/h, both floats or both of shape (n,).
     """
-    if (
-        not (isinstance(edge, Tensor) or isinstance(u_min, Tensor) or isinstance(u_max, Tensor))
-        and not command.requires_grad
-        and u_min <= 0.0 <= u_max
-    ):
-        return functional.hardshrink(command, edge).clamp_(u_min, u_max)  # the same, at once
+    alike = isinstance(edge, float) and isinstance(u_min, float) and isinstance(u_max, float)
+    if alike and not command.requires_grad and u_min <= 0.0 <= u_max:
+        shrunk = functional.hardshrink(command, edge)  # type: ignore[arg-type]  # it is a float
+        return shrunk.clamp_(u_min, u_max)  # type: ignore[arg-type]  # the same, at once
     limited = torch.clamp(command, u_min, u_max)  # type: ignore[arg-type]
     # 0 inside the dead zone and 1 outside, without conditions: they take a processor many times
     # as long where it cannot foresee them.
@@ -101,7 +99,7 @@ class TorchPlants:
         self.most_samples = shortest + 1
         self._rows = torch.arange(self.most_samples, device=nothing.device)[:, None]
         self._order = len(parameters.a) - 1  # of A
-        self._all_at_once: Tensor | None = None
+        self._all_at_once: Any = None  # outputs in terms of what is before and what is added
         if not parameters.changes_dynamics:
             alpha, _, _ = self._dynamics.coefficients(1.0, 1.0)
             units = torch.eye(
@@ -221,7 +219,6 @@ class TorchPlants:
             return torch.stack(rows[self._order :]), told
         size = self._order + samples
         known = torch.cat((torch.stack(past), forced)) if past else forced
-        assert self._all_at_once is not None  # otherwise each sample has been worked out above
         products = torch.mm(self._all_at_once[:size, :size], known)
         self._history = [*products.unbind()]
         return products[self._order :].clone(), told

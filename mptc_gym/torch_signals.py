@@ -6,7 +6,7 @@ All of it is made for a block of samples at a time, without a loop over plants.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -116,9 +116,9 @@ class Held:
         # change then.
         # Counts are whole numbers of type float, with which a processor is quickest; or one
         # int if it is the same for all plants.
-        self._ahead: list[tuple[Tensor | int, Tensor, Tensor | int]] = []
-        self._state: Tensor
-        self._left: Tensor | int
+        self._ahead: list[tuple[Any, Tensor, Any]] = []
+        self._state = nothing[None]
+        self._left: Any = 0
         self._horizon = self._passed = 0  # samples that it is known for, and that are over
 
     def rest(self, which: Tensor | None, taken: int, state: Tensor, hold: Tensor | int) -> None:
@@ -142,15 +142,15 @@ class Held:
             self._passed += taken
         level, first = self._state.sum(0), self._passed
         if all(isinstance(change, int) for change, _, _ in self._ahead):
-            rows = [level] * samples
+            levels = [level] * samples
             for change, state, _ in self._ahead:
                 after = max(change - 1 - first, 0)
-                rows[after:] = [state.sum(0)] * len(rows[after:])
-            return torch.stack(rows)
+                levels[after:] = [state.sum(0)] * len(levels[after:])
+            return torch.stack(levels)
         # Known are the samples that the next change is away from that before the first one.
-        places = self._rows[:samples] + (first + 2)
+        rows = self._rows[:samples] + (first + 2)
         for change, state, _ in self._ahead:
-            level = torch.lerp(level, state.sum(0), (places - change).clamp_(0.0, 1.0))
+            level = torch.lerp(level, state.sum(0), (rows - change).clamp_(0.0, 1.0))
         return level
 
     def _foresee(self, samples: int) -> None:
@@ -172,8 +172,7 @@ class Held:
             else:
                 over = (passed + 1 - change).clamp_(0.0, 1.0)
                 self._state = torch.lerp(self._state, state, over)
-                left = cast("Tensor", self._left)
-                self._left = torch.lerp(left, cast("Tensor", next_change), over)
+                self._left = torch.lerp(self._left, next_change, over)
         if self._ahead:
             self._left = self._left - passed
         self._ahead, self._horizon, self._passed = [], 0, 0
