@@ -36,7 +36,7 @@ class Arguments:
     """Nodes of each of two hidden layers."""
     learning_rate: float = 1e-3
     """At the start; it falls linearly to a tenth."""
-    gamma: float = 0.97
+    gamma: float = 0.99
     """Discount a sample."""
     tau: float = 0.01
     """Share by which target networks follow in a step."""

@@ -89,13 +89,14 @@ def main(options: argparse.Namespace, console: Console) -> str:
             f"--scenario: no {options.scenario!r} on this plant; there are {known}"
         )
     scenario = scenarios[options.scenario]
-    if controller is None and (film is not None or not _has_screen()):
+    has_screen = film is None and _has_screen()
+    if controller is None and not has_screen:
         raise command_line.UsageError(
             f"--agent {YOU}: needs a screen to open a window on, and no --video"
         )
     factory = controller.members(Training(members=1))[0] if controller else None
 
-    if film is None and not _has_screen():
+    if film is None and not has_screen:
         film = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.mp4"
         console.print(f"There is no screen to open a window on: writing a film, {film}")
     label = controller.label if controller else YOU
