@@ -13,7 +13,7 @@ from agents import PolicyNetwork
 from benchmarks.controllers.records import Training
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.rollout import make_plants, rollout
-from benchmarks.train import ppo, ppo_training
+from benchmarks.train import ppo, ppo_arguments, ppo_training
 from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
 from tests.small_training import SMALL
@@ -132,7 +132,7 @@ class TestPPO:
         assert parameters.setpoint == "random"
         assert parameters.action_window == parameters.delay + 3
         assert parameters.noise_variance == SMALL.noise_variance
-        assert (Parameters().delay, Parameters().dead_zone) == (ppo.DELAY, ppo.DEAD_ZONE)
+        assert (Parameters().delay, Parameters().dead_zone) == (ppo_arguments.DELAY, ppo_arguments.DEAD_ZONE)
 
     def test_some_of_the_plants_are_calm(self):
         arguments = replace(SMALL, n_envs=8, calm=0.75)
