@@ -184,6 +184,12 @@ def test_examples_of_the_readme_run(example, monkeypatch, tmp_path):
     if "stable_baselines3" in example:
         pytest.importorskip("stable_baselines3", reason="it is what the example shows")
     monkeypatch.chdir(tmp_path)
+    if "minari" in example:
+        pytest.importorskip("minari", reason="it is what the example shows")
+        from benchmarks.datasets.__main__ import main  # as it needs Minari
+
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+        assert main([*re.findall(r"middlepoint/[\w/-]+", example), "--episodes", "2"]) == 0
     # A short time will do to see that it runs.
     exec(example.replace("300_000", "2_000"), {})
 

@@ -365,7 +365,7 @@ class TestMembers:
         assert np.array_equal(second, fourth)
         assert not np.array_equal(first, second)
         assert [policy.provenance["arguments"]["seed"] for policy in ones] == [0, 1]
-        assert [len(policy.curve) for policy in ones] == [1, 1]
+        assert [policy.curve[-1]["steps"] for policy in ones] == [1024, 1024]
         assert "0.001024 M a policy" in ones[0].account.samples
 
     def test_only_what_is_missing_is_trained(self, tmp_path):
