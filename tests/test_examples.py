@@ -4,13 +4,16 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from stable_baselines3 import PPO
 
-from benchmarks.examples import cleanrl_style, ppo_torch, sb3
+from benchmarks.datasets.history import arguments_of, record
+from benchmarks.examples import cleanrl_style, offline, ppo_torch, sb3
 from benchmarks.train import defaults
 
 ROOT = Path(__file__).parent.parent
@@ -178,3 +181,43 @@ def test_rllib_trains_on_it():
     assert done.returncode == 0, done.stderr
     shown = [line for line in done.stdout.splitlines() if "mean |e|" in line]
     assert [line.split()[0] for line in shown] == ["250", "500"]
+
+
+class TestOffline:
+    SMALL = offline.Arguments(steps=4, batch=8, width=8)
+
+    def transitions(self):
+        logged = record("paper", "smith", 2)
+        return offline.Transitions.of(
+            SimpleNamespace(observations=o, actions=a, rewards=r)
+            for o, a, r in zip(logged.observations, logged.actions, logged.rewards, strict=True)
+        )
+
+    def test_transitions_follow_one_another_within_an_episode(self):
+        data = self.transitions()
+        assert data.observations.shape == data.following.shape == (2400, 26)
+        assert torch.equal(data.following[:1199], data.observations[1:1200])
+        assert not torch.equal(data.following[1199], data.observations[1200])
+        # The reward is minus the error that the step leads to, and the action is seen after it.
+        torch.testing.assert_close(data.rewards, -data.following[:, 3].abs())
+        assert torch.equal(data.following[:, offline.LAST_ACTION], data.actions[:, 0])
+
+    @pytest.mark.parametrize("alpha", [0.0, 2.5])
+    def test_the_seed_is_all_that_differs(self, alpha):
+        data, high = self.transitions(), np.repeat([50.0, 100.0, 1.0], [3, 3, 20])
+        settings = replace(self.SMALL, alpha=alpha)
+        first, again, other = (
+            weights(offline.learn(data, high.astype(np.float32), settings, seed))
+            for seed in (1, 1, 2)
+        )
+        assert torch.equal(first, again)
+        assert not torch.equal(first, other)
+
+    def test_an_actor_that_changes_nothing_leaves_the_valve_alone(self):
+        actor = offline.Actor(np.repeat([50.0, 100.0, 1.0], [3, 3, 20]).astype(np.float32), 8)
+        torch.nn.init.zeros_(actor.layers[-1].weight)
+        torch.nn.init.zeros_(actor.layers[-1].bias)
+        spec = gymnasium.make("MiddlePoint-v0", **arguments_of("paper")).spec
+        # 5 degC, and nothing done: the square wave's error is 5 all the time.
+        spec.kwargs |= {"setpoint": "square"}
+        assert offline.mean_error(actor, spec, [0, 1]) == pytest.approx(5.0)

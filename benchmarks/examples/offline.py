@@ -28,7 +28,7 @@ LAST_ACTION = 6  # its place in an observation: after three set points and three
 class Arguments:
     """What there is to set."""
 
-    steps: int = 5000
+    steps: int = 3000
     """Gradient steps."""
     batch: int = 256
     """Transitions a step."""
@@ -36,11 +36,11 @@ class Arguments:
     """Nodes of each of two hidden layers."""
     learning_rate: float = 1e-3
     """At the start; it falls linearly to a tenth."""
-    gamma: float = 0.99
+    gamma: float = 0.97
     """Discount a sample."""
     tau: float = 0.01
     """Share by which target networks follow in a step."""
-    alpha: float = 2.5
+    alpha: float = 0.05
     """Weight of the value against that of staying near the data; 0 is behaviour cloning."""
     smoothing: float = 0.1
     """Spread of the noise on target actions."""
@@ -198,7 +198,7 @@ def main(arguments: list[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument("--data", default="middlepoint/paper/mixed-v0", help="data set")
+    parser.add_argument("--data", default="middlepoint/paper/smith-v0", help="data set")
     parser.add_argument("--steps", type=int, default=Arguments.steps, help="gradient steps")
     parser.add_argument("--seeds", type=int, default=5, help="how many runs of each learner")
     options = parser.parse_args(arguments)
