@@ -142,6 +142,16 @@ class TestGradient:
             trainer.advance()
         assert trainer.record()["validation_mae"] < before
 
+    def test_every_step_meets_other_plants(self, monkeypatch):
+        met = []
+        signals = Draw.signals
+        monkeypatch.setattr(Draw, "signals", lambda draw: met.append(signals(draw)) or met[-1])
+        trainer = Trainer(SMALL)
+        for _ in range(2):
+            trainer.advance()
+        first, second = met
+        assert not any(torch.equal(first[name], second[name]) for name in first)
+
     def test_a_price_on_moves_is_paid(self):
         errors, applied = torch.zeros(3, 1), torch.tensor([[0.0], [2.0], [-1.0]])
         assert loss_of(errors, applied, replace(SMALL, move_price=0.1)).item() == (
