@@ -98,7 +98,8 @@ class Actor(Network):
     def act(self, observations: Tensor) -> Tensor:
         """Return actions within [-1, 1], shape (n, 1)."""
         last = observations[:, LAST_ACTION, None]
-        return (last + self(observations)).clamp(-1.0, 1.0)
+        moved: Tensor = last + self(observations)
+        return moved.clamp(-1.0, 1.0)
 
 
 def learn(data: Transitions, high: np.ndarray, arguments: Arguments, seed: int) -> Actor:
@@ -119,9 +120,8 @@ def learn(data: Transitions, high: np.ndarray, arguments: Arguments, seed: int) 
     actor = Actor(high, arguments.width)
     with_action = np.append(high, np.float32(1.0))
     critics = nn.ModuleList(Network(with_action, arguments.width) for _ in range(2))
-    target_actor, target_critics = (
-        copy.deepcopy(module).requires_grad_(False) for module in (actor, critics)
-    )
+    target_actor = copy.deepcopy(actor).requires_grad_(False)
+    target_critics = copy.deepcopy(critics).requires_grad_(False)
     optimizers = [
         torch.optim.Adam(module.parameters(), arguments.learning_rate)
         for module in (actor, critics)
