@@ -29,6 +29,7 @@ from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import SCENARIOS, SETPOINTS, Scenario, scenarios_of
 from benchmarks.watch import rivals
 from benchmarks.watch.hands import HELP, Closed, Hands
+from benchmarks.watch.touched import Touched
 from mptc_gym import MiddlePointEnv, Parameters, drawing
 from mptc_gym.drawing import SIZE
 from mptc_gym.record import Record
@@ -157,7 +158,7 @@ def in_window(
         drawing.show(record, hands.speed)
 
     plants = rivals.touched_plants(scenario.samples, arguments, show)
-    touched = plants.envs[0]
+    touched = cast("Touched", plants.envs[0])
     moves: rivals.Moves = {}
 
     def attend(k: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import pandas as pd
@@ -43,7 +43,7 @@ def replay(name: str, moves: Moves, scenario: Scenario, seed: int) -> Trajectory
     factory = ROSTER[name].members()[0]
     arguments = {**scenario.arguments, **observation(factory)}
     plants = touched_plants(scenario.samples, arguments)
-    touched = plants.envs[0]
+    touched = cast("Touched", plants.envs[0])
 
     def move(k: int) -> None:
         if k in moves:
