@@ -132,7 +132,8 @@ class TestPPO:
         assert parameters.setpoint == "random"
         assert parameters.action_window == parameters.delay + 3
         assert parameters.noise_variance == SMALL.noise_variance
-        assert (Parameters().delay, Parameters().dead_zone) == (ppo_arguments.DELAY, ppo_arguments.DEAD_ZONE)
+        assert Parameters().delay == ppo_arguments.DELAY
+        assert Parameters().dead_zone == ppo_arguments.DEAD_ZONE
 
     def test_some_of_the_plants_are_calm(self):
         arguments = replace(SMALL, n_envs=8, calm=0.75)
