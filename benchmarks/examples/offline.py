@@ -11,7 +11,7 @@ import argparse
 import copy
 import sys
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -98,8 +98,8 @@ class Actor(Network):
     def act(self, observations: Tensor) -> Tensor:
         """Return actions within [-1, 1], shape (n, 1)."""
         last = observations[:, LAST_ACTION, None]
-        moved: Tensor = last + self(observations)
-        return moved.clamp(-1.0, 1.0)
+        changed: Tensor = last + self(observations)
+        return changed.clamp(-1.0, 1.0)
 
 
 def learn(data: Transitions, high: np.ndarray, arguments: Arguments, seed: int) -> Actor:
@@ -152,7 +152,9 @@ def learn(data: Transitions, high: np.ndarray, arguments: Arguments, seed: int) 
                 loss = loss - arguments.alpha * value.mean() / value.abs().mean().detach()
             _descend(optimizers[0], loss)
         with torch.no_grad():
-            for followers, leaders in ((target_actor, actor), (target_critics, critics)):
+            for followers, leaders in zip(
+                (target_actor, target_critics), (actor, critics), strict=True
+            ):
                 pairs = zip(followers.parameters(), leaders.parameters(), strict=True)
                 for follower, leader in pairs:
                     follower.lerp_(leader, arguments.tau)
@@ -181,14 +183,13 @@ def mean_error(actor: Actor, spec: Any, seeds: list[int]) -> float:
     plants = gymnasium.make_vec(
         spec.id, len(seeds), max_episode_steps=spec.max_episode_steps, **spec.kwargs
     )
-    # It takes a seed for each environment, whatever its annotation says.
-    observations, _ = plants.reset(seed=cast("int", seeds))
+    observations, _ = plants.reset(seed=seeds)  # type: ignore[arg-type]
     errors = 0.0
     for _ in range(spec.max_episode_steps):
         actions = actor.act(torch.as_tensor(observations)).numpy()
         observations, _, _, _, infos = plants.step(actions)
         errors += float(np.abs(infos["error"]).mean())
-    return float(errors / spec.max_episode_steps)
+    return errors / int(spec.max_episode_steps)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -6,11 +6,10 @@ import argparse
 import math
 import sys
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import pygame
 from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
@@ -29,7 +28,6 @@ from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import SCENARIOS, SETPOINTS, Scenario, scenarios_of
 from benchmarks.watch import rivals
 from benchmarks.watch.hands import HELP, Closed, Hands
-from benchmarks.watch.touched import Touched
 from mptc_gym import MiddlePointEnv, Parameters, drawing
 from mptc_gym.drawing import SIZE
 from mptc_gym.record import Record
@@ -158,7 +156,7 @@ def in_window(
         drawing.show(record, hands.speed)
 
     plants = rivals.touched_plants(scenario.samples, arguments, show)
-    touched = cast("Touched", plants.envs[0])
+    touched = rivals.touched_one(plants)
     moves: rivals.Moves = {}
 
     def attend(k: int) -> None:
@@ -196,7 +194,7 @@ def in_film(
 
         def draw(k: int) -> None:
             if k % every == 0:
-                put(cast("Sequence[Frame]", plants.render())[0])
+                put(plants.render()[0])
 
         trajectory = rollout(plants, controller, scenario.samples, seed, draw)
     plants.close()
@@ -217,7 +215,7 @@ def _gif(path: Path, fps: float) -> Iterator[Put]:
     kept: list[bytes] = []  # compressed: in memory a minute of them takes a gigabyte
 
     def put(frame: Frame) -> None:
-        kept.append(zlib.compress(frame.data, 1))
+        kept.append(zlib.compress(frame, 1))
 
     yield put
     pictures = (Image.frombytes("RGB", SIZE, zlib.decompress(data)) for data in kept)

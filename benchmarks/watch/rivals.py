@@ -25,7 +25,7 @@ EPISODES = 20  # of the bound, where a plant is drawn
 def touched_plants(
     samples: int, arguments: Mapping[str, Any], show: Callable[[Record], None] | None = None
 ) -> gymnasium.vector.SyncVectorEnv:
-    """Return a batch of one plant that can be touched, `plants.envs[0]`."""
+    """Return a batch of one plant that can be touched."""
     plants = gymnasium.make_vec(
         "MiddlePoint-v0",
         1,
@@ -38,12 +38,17 @@ def touched_plants(
     return plants
 
 
+def touched_one(plants: gymnasium.vector.SyncVectorEnv) -> Touched:
+    """Return the plant of `touched_plants`."""
+    return cast("Touched", plants.envs[0])
+
+
 def replay(name: str, moves: Moves, scenario: Scenario, seed: int) -> Trajectory:
     """Run a controller of the roster, with the noise and the moves of another's run."""
     factory = ROSTER[name].members()[0]
     arguments = {**scenario.arguments, **observation(factory)}
     plants = touched_plants(scenario.samples, arguments)
-    touched = cast("Touched", plants.envs[0])
+    touched = touched_one(plants)
 
     def move(k: int) -> None:
         if k in moves:
@@ -89,13 +94,14 @@ def table(
             arguments["setpoint"] = trajectory.setpoint[:, 0].tolist()
         bound = least_possible(samples=scenario.samples, episodes=EPISODES, **arguments)
         rows.insert(0, ("least possible, on average", bound.value, float("nan")))
-    return pd.DataFrame(
+    found: pd.DataFrame = pd.DataFrame(
         [
             (name, f"{error:.3f}", "" if travel != travel else f"{travel:.0f}")
             for name, error, travel in rows
         ],
         columns=["", "mean |e| (°C)", "valve travel (t/h)"],
     )
+    return found
 
 
 def _travel(run: Trajectory, scenario: Scenario) -> float:
