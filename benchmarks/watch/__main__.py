@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import pygame
 from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
@@ -194,7 +195,7 @@ def in_film(
 
         def draw(k: int) -> None:
             if k % every == 0:
-                put(plants.render()[0])
+                put(cast("tuple[Frame, ...]", plants.render())[0])
 
         trajectory = rollout(plants, controller, scenario.samples, seed, draw)
     plants.close()
@@ -215,7 +216,7 @@ def _gif(path: Path, fps: float) -> Iterator[Put]:
     kept: list[bytes] = []  # compressed: in memory a minute of them takes a gigabyte
 
     def put(frame: Frame) -> None:
-        kept.append(zlib.compress(frame, 1))
+        kept.append(zlib.compress(frame.tobytes(), 1))
 
     yield put
     pictures = (Image.frombytes("RGB", SIZE, zlib.decompress(data)) for data in kept)
