@@ -69,6 +69,33 @@ def check_number(name: str, value: Any, least: float = -math.inf) -> float:
     return float(value)
 
 
+def check_positive(name: str, value: Any) -> float:
+    """Return `value` if it is a finite number above 0; ValueError otherwise."""
+    if not isinstance(value, Real) or isinstance(value, bool) or not 0 < value < math.inf:
+        raise ValueError(f"{name} must be a finite number above 0, got {value!r}")
+    return float(value)
+
+
+def check_limits(u_min: Any, u_max: Any) -> tuple[float, float]:
+    """Return the limits if they are finite and in order; ValueError otherwise."""
+    low, high = check_number("u_min", u_min), check_number("u_max", u_max)
+    if low >= high:
+        raise ValueError(f"u_min must be below u_max = {u_max!r}, got {u_min!r}")
+    if not math.isfinite(high - low):
+        raise ValueError(f"u_min and u_max are too far apart, got {u_min!r}, {u_max!r}")
+    return low, high
+
+
+def check_batch(before: tuple[int, ...], now: tuple[int, ...]) -> None:
+    """Refuse observations of another batch than since `reset`, with a ValueError."""
+    if now != before:
+        shapes = before, now
+        was, given = (f"a batch of {each[0]}" if each else "one loop" for each in shapes)
+        raise ValueError(
+            f"observation must be of {was}, as those before it, until reset; got {given}"
+        )
+
+
 class Controller(ABC):
     """A controller of one loop, or of a batch of loops side by side.
 
@@ -98,12 +125,7 @@ class Controller(ABC):
         self, *, n_obs: int, u_min: float, u_max: float, dead_zone: float = 0.0
     ) -> None:
         self.n_obs = n_obs
-        self.u_min = check_number("u_min", u_min)
-        self.u_max = check_number("u_max", u_max)
-        if self.u_min >= self.u_max:
-            raise ValueError(f"u_min must be below u_max = {u_max!r}, got {u_min!r}")
-        if not math.isfinite(self.u_max - self.u_min):
-            raise ValueError(f"u_min and u_max are too far apart, got {u_min!r}, {u_max!r}")
+        self.u_min, self.u_max = check_limits(u_min, u_max)
         self.dead_zone = check_number("dead_zone", dead_zone, 0)
         self.command: Values = np.float64(0.0)
 
@@ -129,10 +151,13 @@ class Controller(ABC):
         Raises
         ------
         ValueError
-            If the observation has another shape, or a value that is not finite. The controller
-            is unchanged then.
+            If the observation has another shape, or a value that is no finite number. The
+            controller is unchanged then.
         """
-        values = np.asarray(observation, dtype=np.float64)
+        try:
+            values = np.asarray(observation, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"observation must be numbers, got {observation!r}") from None
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs:
             raise ValueError(
                 f"observation must have shape (n_obs,) or (batch, n_obs), n_obs at least "

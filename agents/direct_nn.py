@@ -47,13 +47,19 @@ class Weights:
         Raises
         ------
         ValueError
-            If the file does not hold the four arrays.
+            If the file is damaged or does not hold the four arrays.
         """
-        with np.load(path, allow_pickle=False) as file:
-            missing = [field.name for field in fields(cls) if field.name not in file]
-            if missing:
-                raise ValueError(f"{path} must hold weights, {', '.join(missing)} not found")
-            return cls(**{field.name: file[field.name] for field in fields(cls)})
+        names = [field.name for field in fields(cls)]
+        with Path(path).open("rb") as raw:
+            try:
+                with np.load(raw, allow_pickle=False) as file:
+                    arrays = {name: file[name] for name in names if name in file}
+            except Exception as error:  # damage shows in zip, zlib or NumPy
+                raise ValueError(f"{path} holds no weights, or is damaged: {error}") from error
+        missing = [name for name in names if name not in arrays]
+        if missing:
+            raise ValueError(f"{path} must hold weights, {', '.join(missing)} not found")
+        return cls(**arrays)
 
 
 class DirectNNController(Controller):
@@ -183,6 +189,8 @@ class DirectNNController(Controller):
 
     @weights.setter
     def weights(self, weights: Weights) -> None:
+        if not isinstance(weights, Weights):
+            raise ValueError(f"weights must be a Weights, got {weights!r}")
         arrays = []
         for name, shape in self._shapes.items():
             array = np.asarray(getattr(weights, name), dtype=np.float64)

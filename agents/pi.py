@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import Controller, Values, check_count, check_number
+from agents.controller import (
+    Controller,
+    Values,
+    check_batch,
+    check_count,
+    check_number,
+    check_positive,
+)
 
 # From `python -m benchmarks.tune pi`.
 SEARCHED_GAINS = {"kp": 1.34, "ki": 0.0456}
@@ -122,11 +129,7 @@ class PIController(Controller):
         error: Values = observation[..., self.error_index]
         if self._sum is None:
             self._sum = np.zeros_like(error)
-        if np.shape(self._sum) != np.shape(error):
-            raise ValueError(
-                f"observation must be of {np.shape(self._sum)} loops until reset, "
-                f"got {np.shape(error)}"
-            )
+        check_batch(np.shape(self._sum), np.shape(error))
         total = self._sum + error
         command = -self.kp * error - self.ki * total  # Section 5
         if self.anti_windup:
@@ -152,18 +155,11 @@ def simc_gains(
     k = check_number("gain", gain)
     if k == 0:
         raise ValueError(f"gain must not be 0, got {gain!r}")
-    tau_1 = _positive("time_constant", time_constant)
+    tau_1 = check_positive("time_constant", time_constant)
     theta = check_number("delay", delay, 0)
     tau_c = theta if closed_loop_time_constant is None else closed_loop_time_constant
-    tau_c = _positive("closed_loop_time_constant", tau_c)
-    interval = _positive("sampling_interval", sampling_interval)
+    tau_c = check_positive("closed_loop_time_constant", tau_c)
+    interval = check_positive("sampling_interval", sampling_interval)
     kp = -tau_1 / (k * (tau_c + theta))  # (23), with the sign of u = -Kp e
     tau_i = min(tau_1, 4 * (tau_c + theta))  # (24)
     return kp, kp * interval / tau_i
-
-
-def _positive(name: str, value: float) -> float:
-    number = check_number(name, value, 0)
-    if number == 0:
-        raise ValueError(f"{name} must be above 0, got {value!r}")
-    return number

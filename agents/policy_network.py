@@ -13,7 +13,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.controller import Controller, Values, check_count, check_number
+from agents.controller import (
+    Controller,
+    Values,
+    check_batch,
+    check_count,
+    check_limits,
+    check_number,
+)
 
 Array = NDArray[np.float64]
 
@@ -190,8 +197,10 @@ class PolicyNetwork(Controller):
         FileNotFoundError
             If there is no such file.
         ValueError
-            If the file is damaged or does not hold a network.
+            If the file is damaged or does not hold a network, or if the limits are not finite
+            or not in order.
         """
+        check_limits(u_min, u_max)  # here, so that they are not taken for damage to the file
         with Path(path).open("rb") as raw:
             try:
                 with np.load(raw, allow_pickle=False) as file:
@@ -271,11 +280,7 @@ class PolicyNetwork(Controller):
     def _move(self, output: Values, increments: Increments) -> Values:
         """Move the valve, and return its flow, t/h."""
         before = np.zeros_like(output) if self._position is None else self._position
-        if np.shape(before) != np.shape(output):
-            raise ValueError(
-                f"observation must be of as many runs as before: {np.shape(before)}, "
-                f"got {np.shape(output)}"
-            )
+        check_batch(np.shape(before), np.shape(output))
         position = np.clip(before + increments.max_move * output, -1.0, 1.0)
         self._position = position
         edge = increments.dead_zone
@@ -287,7 +292,10 @@ class PolicyNetwork(Controller):
 
 
 def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.array(value, dtype=np.float64)
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, got {value!r}") from None
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():
@@ -302,7 +310,10 @@ def _checked(
     if not layers:
         raise ValueError("layers must hold at least one")
     checked = []
-    for i, (W, b) in enumerate(layers):
+    for i, layer in enumerate(layers):
+        if not isinstance(layer, Sequence) or len(layer) != 2:
+            raise ValueError(f"layer {i} must be a pair of weights and biases, got {layer!r}")
+        W, b = layer
         last = i == len(layers) - 1
         nodes = 1 if last else len(np.atleast_1d(np.asarray(b)))
         checked.append(

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import Controller, Values, check_count, check_number
+from agents.controller import (
+    Controller,
+    Values,
+    check_batch,
+    check_count,
+    check_number,
+    check_positive,
+)
 
 Array = NDArray[np.float64]
 
@@ -145,16 +152,20 @@ class SelfTuningController(Controller):
         self.gain = check_number("gain", gain)
         if gain == 0:
             raise ValueError(f"gain must not be 0, got {gain!r}")
-        self._interval = _positive("sampling_interval", sampling_interval)
-        samples = _positive("time_constant", time_constant) / self._interval
-        self._closed_loop = _positive("closed_loop_time_constant", closed_loop_time_constant)
+        self._interval = check_positive("sampling_interval", sampling_interval)
+        samples = check_positive("time_constant", time_constant) / self._interval
+        self._closed_loop = check_positive(
+            "closed_loop_time_constant", closed_loop_time_constant
+        )
         if not 0.0 < check_number("forgetting", forgetting) <= 1.0:
             raise ValueError(f"forgetting must be above 0, up to 1, got {forgetting!r}")
         self._forgetting = float(forgetting)
         shortest = check_count("shortest_delay", shortest_delay, 0)
         longest = check_count("longest_delay", longest_delay, shortest)
-        if not isinstance(dead_zones, Sequence) or not len(dead_zones):
-            raise ValueError(f"dead_zones must be a list of numbers, got {dead_zones!r}")
+        if not isinstance(dead_zones, Sequence | np.ndarray) or not len(dead_zones):
+            raise ValueError(
+                f"dead_zones must be a list of one number or more, got {dead_zones!r}"
+            )
         self._zones = np.array([check_number("dead_zones", zone, 0) for zone in dead_zones])
 
         # Responses without delay differ by dead zone and pole, models by delay, too: the
@@ -203,10 +214,7 @@ class SelfTuningController(Controller):
         rows = np.atleast_2d(observation)
         if not self._loops:
             self._start(len(rows))
-        if len(rows) != self._loops:
-            raise ValueError(
-                f"observation must be of {self._loops} loops until reset, got {len(rows)}"
-            )
+        check_batch((self._loops,), (len(rows),))
         setpoint = rows[:, self.setpoint_index]
         output = setpoint - rows[:, self.error_index]
         filtered = (
@@ -344,10 +352,3 @@ def _dot(first: Array, second: Array) -> Array:
     """Return the products of rows with rows."""
     products: Array = np.einsum("ij,ij->i", first, second)
     return products
-
-
-def _positive(name: str, value: float) -> float:
-    number = check_number(name, value, 0)
-    if number == 0:
-        raise ValueError(f"{name} must be above 0, got {value!r}")
-    return number

@@ -6,7 +6,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from agents import Controller, DirectNNController, PIController, SmithPredictor, Weights
+from agents import (
+    Controller,
+    DirectNNController,
+    PIController,
+    PolicyNetwork,
+    SmithPredictor,
+    Weights,
+)
 from agents.controller import action_from_command
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
@@ -109,7 +116,7 @@ class TestPI:
     def test_batch_size_is_fixed_until_reset(self):
         controller = PIController()
         controller.act(np.zeros((3, 6)))
-        with pytest.raises(ValueError, match="loops until reset"):
+        with pytest.raises(ValueError, match="until reset"):
             controller.act(np.zeros((1, 6)))
         controller.reset()
         controller.act(np.zeros((1, 6)))
@@ -474,3 +481,28 @@ class TestSmithPredictor:
     def test_bad_numbers_are_named(self, name, value):
         with pytest.raises(ValueError, match=name):
             self.smith(**{name: value})
+
+
+@pytest.mark.parametrize(
+    "observation",
+    ["text", [0.0, "x", 0.0, 0.0, 0.0, 0.0], (np.zeros(6), {"output": 0.0}), None],
+)
+def test_what_is_no_observation_is_refused_by_name(observation):
+    # The third is what `reset` returns, handed on whole.
+    with pytest.raises(ValueError, match=r"^observation must"):
+        PIController().act(observation)
+
+
+def test_bad_limits_are_not_taken_for_a_damaged_file():
+    with pytest.raises(ValueError, match=r"^u_min must be below u_max"):
+        PolicyNetwork.pretrained("nn-dpc", u_min=3.0, u_max=1.0)
+
+
+def test_damaged_weights_are_refused_by_path(tmp_path):
+    path = tmp_path / "weights.npz"
+    for content in (b"", b"text", b"PK\x03\x04 and no more"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"weights\.npz holds no weights"):
+            Weights.load(path)
+    with pytest.raises(ValueError, match=r"^weights must be"):
+        DirectNNController().weights = 5

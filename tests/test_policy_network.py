@@ -135,7 +135,7 @@ class TestIncrements:
     def test_another_batch_within_an_episode_is_refused(self):
         network = constant(0.5, increments=Increments(max_move=0.8))
         network.act([[0.0], [0.0]])
-        with pytest.raises(ValueError, match="as many runs as before"):
+        with pytest.raises(ValueError, match="until reset"):
             network.act([[0.0]])
 
 
