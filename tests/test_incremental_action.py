@@ -122,7 +122,7 @@ def test_past_actions_tell_the_wanted_flow():
     np.testing.assert_allclose(shown, [[0.1, 0.0], [0.2, 0.1], [0.3, 0.2]], atol=1e-6)
 
 
-@pytest.mark.parametrize("action", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), "x"])
+@pytest.mark.parametrize("action", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), "0.5"])
 def test_a_bad_action_changes_nothing(action):
     env, other = make(RANGES), make(RANGES)
     for each in (env, other):
@@ -241,7 +241,9 @@ def test_a_batch_is_each_of_them_wrapped(rng, mode, undo):
             all_the_same([env.reset(options={"reset_mask": reset.copy()}) for env in envs])
 
 
-@pytest.mark.parametrize("bad", [np.zeros(2), np.zeros((3, 1)), np.full((2, 1), np.nan)])
+@pytest.mark.parametrize(
+    "bad", [np.zeros(2), np.zeros((3, 1)), np.full((2, 1), np.nan), [["0.5"], ["1"]]]
+)
 def test_bad_actions_of_a_batch_change_nothing(bad):
     env, other = (
         many.IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2, **RANGES))

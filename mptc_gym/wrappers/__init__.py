@@ -113,7 +113,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         if self._flow is None:
             raise ResetNeeded("call reset before step")
         try:
-            move = float(np.asarray(action).item())
+            # Text is no number, even where float() reads one.
+            move = float(np.asarray(action).item() - 0.0)
         except (TypeError, ValueError, OverflowError):
             move = math.nan
         if not math.isfinite(move):

@@ -88,7 +88,9 @@ class IncrementalAction(VectorActionWrapper):
     def _moved(self, flows: NDArray[np.float64], actions: Any) -> NDArray[np.float64]:
         """Return the wanted flows after these actions."""
         try:
-            moves = np.array(actions, np.float64)
+            moves = np.array(actions)
+            # Text is no number, even where NumPy reads one.
+            moves = moves.astype(np.float64, casting="same_kind")
         except (TypeError, ValueError, OverflowError):
             moves = np.empty(0)
         if moves.shape != (self.num_envs, 1):
@@ -125,5 +127,5 @@ def _parameters(env: VectorEnv[Any, Any, Any]) -> list[Parameters]:
     except AttributeError:
         plants = []
     if not plants or not all(isinstance(plant, Parameters) for plant in plants):
-        raise ValueError(f"env must be of MiddlePointEnv, got {env}")
+        raise ValueError(f"env must be a vector environment of MiddlePointEnv, got {env}")
     return plants
