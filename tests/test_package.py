@@ -17,9 +17,9 @@ ALLOWED = {
 }
 
 
-def imported(path: Path) -> set[str]:
+def imported(code: str) -> set[str]:
     names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -32,7 +32,7 @@ def test_layers_import_downwards_only(package):
     files = list((ROOT / package).rglob("*.py"))
     assert files
     for path in files:
-        assert imported(path) <= ALLOWED[package] | STDLIB, path
+        assert imported(path.read_text(encoding="utf-8")) <= ALLOWED[package] | STDLIB, path
 
 
 UNPICKLERS = {"pickle", "cloudpickle", "dill", "shelve", "marshal"}
@@ -179,13 +179,19 @@ EXAMPLES = [
 ]
 
 
+COMPARE = {"joblib", "matplotlib", "pandas", "rich", "scipy", "tabulate", "tqdm"}  # the extra
+
+
 @pytest.mark.parametrize("example", EXAMPLES, ids=range(len(EXAMPLES)))
 def test_examples_of_the_readme_run(example, monkeypatch, tmp_path):
-    if "stable_baselines3" in example:
-        pytest.importorskip("stable_baselines3", reason="it is what the example shows")
+    names = imported(example)
+    # `.ci/versions` tests without the extras; then only what needs none of them can run.
+    for name in (names - {"agents", "benchmarks"}) | (
+        COMPARE if "benchmarks" in names else set()
+    ):
+        pytest.importorskip(name, reason=f"the example needs {name}, of an extra")
     monkeypatch.chdir(tmp_path)
-    if "minari" in example:
-        pytest.importorskip("minari", reason="it is what the example shows")
+    if "minari" in names:
         from benchmarks.datasets.__main__ import main  # as it needs Minari
 
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
