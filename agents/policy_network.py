@@ -94,7 +94,7 @@ class PolicyNetwork(Controller):
         environment's arguments: `setpoint_window`, `error_window`, `output_window`,
         `action_window`. A window that is not named is 0.
     input_scale
-        What each element of the observation is multiplied with; shape (n_obs,).
+        Factor of each element of the observation; shape (n_obs,).
     activation
         "elu", "relu" or "tanh".
     output

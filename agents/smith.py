@@ -16,10 +16,11 @@ Array = NDArray[np.float64]
 class SmithPredictor(PIController):
     """A PI controller on the error that a model of the plant, without its delay, foresees.
 
-    The model is of first order with a delay. It runs beside the plant, and its output with the
-    delay and without it tell what the inputs under way will do. The controller acts on the
-    error less that, as if there were no delay, so far as the model is right (O. J. M. Smith,
-    "Closer control of loops with dead time", Chemical Engineering Progress 53, 1957, 217-219).
+    The model is of first order with a delay. It runs beside the plant. Its output without the
+    delay less its output with it is the effect of the inputs that are still in transit. The
+    controller acts on the error less this effect. So far as the model is right, it acts as if
+    there were no delay (O. J. M. Smith, "Closer control of loops with dead time", Chemical
+    Engineering Progress 53, 1957, 217-219).
     Its gains are SIMC's for the plant without delay; it has anti-windup.
 
     Parameters

@@ -8,9 +8,9 @@ from typing import Any, Final, NoReturn
 
 import numpy as np
 
-LARGEST: Final[Any] = (
-    10**9
-)  # of any argument; beyond, float32 observations and squares lose meaning
+# The largest number that an argument takes. Beyond it, float32 observations and squares lose
+# their meaning.
+LARGEST: Final[Any] = 10**9
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
 _LONGEST = 80  # characters of a value that an error message shows

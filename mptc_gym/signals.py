@@ -18,9 +18,7 @@ from mptc_gym.parameters import Parameters, PlantNumbers
 
 BLOCK = 600  # samples of a signal that are made together
 FOREVER = 1 << 62  # samples
-_PLANTS_AT_A_TIME = (
-    32  # plants whose draws are made at a time: they stay in the processor's cache
-)
+_PLANTS_AT_A_TIME = 32  # whose draws are made together: they stay in the processor's cache
 LOAD_INTERVAL = 10  # samples between two changes of the load disturbance
 _LEVELS_AT_A_TIME = 60  # of the load disturbance, made together
 
