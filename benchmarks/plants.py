@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,6 @@ from typing import Any
 
 from benchmarks.lib.command_line import UsageError, blame
 from mptc_gym import PRESETS, Parameters
-
-NAMES = tuple(field.name for field in dataclasses.fields(Parameters))
 
 
 @dataclass(frozen=True)
@@ -77,10 +74,11 @@ def chosen(options: argparse.Namespace) -> Plant:
             arguments[name] = json.loads(value)
         except ValueError:
             arguments[name] = value  # such as random
+    given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(options, name)]
     try:
-        Parameters(**arguments)
+        Parameters.of_environment(arguments)
     except (TypeError, ValueError) as error:
-        raise UsageError(f"--plant, --preset, --set: {error}") from error
+        raise UsageError(f"{', '.join(given)}: {error}") from error
     return Plant(", ".join(names) or "the paper's plant", arguments)
 
 
@@ -115,13 +113,8 @@ def read_plant(path: str | Path) -> dict[str, Any]:
             f"{path} must hold one object of arguments, such as "
             f'{{"delay": 20}}, got {type(arguments).__name__}'
         )
-    unknown = [name for name in arguments if name not in NAMES]
-    if unknown:
-        raise ValueError(
-            f"{path}: MiddlePoint-v0 has no argument {unknown[0]!r}; it has {', '.join(NAMES)}"
-        )
     try:
-        Parameters(**arguments)
-    except ValueError as error:
+        Parameters.of_environment(arguments)
+    except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error
     return arguments

@@ -482,10 +482,10 @@ class TestCompare:
         assert list(runs["agent"]) == ["pi", "pi", "mine", "mine"]
         assert set(runs[runs.agent == "mine"]["saturation_share"]) == {100.0}
 
-    def test_the_example_of_the_readme(self, tmp_path, monkeypatch):
-        readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    def test_the_example_of_the_page(self, tmp_path, monkeypatch):
+        readme = (ROOT / "benchmarks/compare/README.md").read_text(encoding="utf-8")
         (example,) = re.findall(r"```python\n(from agents import PIC.*?)```", readme, re.DOTALL)
-        (option,) = re.findall(r"--agent (\S+)`", readme)
+        (option,) = re.findall(r"--agent (\w+=\S+)`", readme)
         (tmp_path / "my_controllers.py").write_text(example)
         monkeypatch.syspath_prepend(tmp_path)
         run_compare(
@@ -493,7 +493,7 @@ class TestCompare:
             "--runs", 1,
         )  # fmt: skip
         runs = pd.read_csv(tmp_path / "out/runs.csv")
-        assert runs["mae"].iloc[0] == pytest.approx(0.291, abs=0.001)  # as the README says
+        assert runs["mae"].iloc[0] == pytest.approx(0.291, abs=0.001)  # that of the gains
 
     def test_files_of_an_earlier_run_do_not_stay(self, tmp_path):
         out = tmp_path / "out"
@@ -626,19 +626,20 @@ class TestCompare:
         [
             (["--agents", "nn", "pid"], "no 'pid'"),
             (["--scenarios", "circle"], "no 'circle'"),
-            (["--runs", "0"], "must be at least 1"),
-            (["--runs", "many"], "invalid number value"),
+            (["--runs", "0"], "must be an integer of at least 1, got '0'"),
+            (["--runs", "many"], "must be an integer of at least 1, got 'many'"),
             (["--scenarios", ""], "--scenarios"),
             (["--agents"], "no controller"),
             (["--set", "delay=-1"], "delay must be"),
             (["--set", "delay"], "ARGUMENT=VALUE"),
+            (["--set", "dely=3"], "'dely': did you mean 'delay'?"),
             (["--plant", "nowhere.json"], "nowhere.json"),
             (["--agent", "PI=agents:PIController"], "NEW_NAME"),
             (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
             (["--agent", "pi=agents:PIController"], "NEW_NAME"),
             (["--agent", "x=agents:Nothing"], "agents:Nothing"),
-            (["--agent", "x=.:y"], "'.:y' must be module:factory"),
-            (["--agent", "x=..a:y"], "'..a:y' must be module:factory"),
+            (["--agent", "x=.:y"], "'.:y' cannot be imported"),
+            (["--agent", "x=..a:y"], "'..a:y' cannot be imported"),
             (["--agent", "x=tests.cells:ObservesAList"], "observation of .* must be a dict"),
             (["--agent", "x=tests.cells:ObservesText"], "observation of .* must be a dict"),
         ],

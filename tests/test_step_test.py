@@ -97,7 +97,7 @@ def test_plant_file_makes_an_environment(tmp_path):
     [
         ("{", "must be a JSON file"),
         ("[1, 2]", "must hold one object"),
-        ('{"dely": 3}', "no argument 'dely'; it has delay, dead_zone"),
+        ('{"dely": 3}', "'dely': did you mean 'delay'"),
         ('{"delay": -1}', "delay must be"),
     ],
 )

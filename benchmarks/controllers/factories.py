@@ -82,7 +82,7 @@ def load(location: str) -> Callable[..., Any]:
     try:
         found = getattr(importlib.import_module(module_name), name)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
-        raise ValueError(f"{location!r} must be module:factory: {error}") from error
+        raise ValueError(f"{location!r} cannot be imported: {error}") from error
     if not callable(found):
         raise ValueError(f"{location!r} must be callable, got {found!r}")
     return cast("Callable[..., Any]", found)

@@ -105,18 +105,23 @@ def out_folder(folder: Path) -> Path:
 
 
 def number(text: str) -> int:
-    """Read a number of at least 1; argparse shows this function's name in its complaints."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
-    return value
+    """Read a number of at least 1."""
+    return _integer(text, 1)
 
 
 def seed(text: str) -> int:
-    """Read a number of at least 0, as `number` does."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"must be at least 0, got {value}")
+    """Read a number of at least 0."""
+    return _integer(text, 0)
+
+
+def _integer(text: str, least: int) -> int:
+    allowed = f"must be an integer of at least {least}, got {text!r}"
+    try:
+        value = int(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(allowed) from error
+    if value < least:
+        raise argparse.ArgumentTypeError(allowed)
     return value
 
 

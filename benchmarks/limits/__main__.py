@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from rich.console import Console
 from tqdm import tqdm
 
+from benchmarks import plants
 from benchmarks.lib import command_line
 from benchmarks.lib.statistics import bootstrap
 from benchmarks.lib.tables import on_screen
 from benchmarks.limits.bounds import CACHE, EPISODES, LeastPossible, least_possible
 from benchmarks.limits.reference import minimum_variance, scenario_limit
 from benchmarks.limits.verify import mpc_errors, verify
-from benchmarks.scenarios import SCENARIOS
+from benchmarks.scenarios import SCENARIOS, scenarios_of
 from mptc_gym import PRESETS
 
 SAMPLES = 1200  # of an episode of a preset
@@ -41,13 +45,19 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--verify", action="store_true", help="run every controller against the bounds instead"
     )
-    parser.add_argument("--runs", type=command_line.number, default=300, help="of --verify")
+    parser.add_argument(
+        "--runs",
+        type=command_line.number,
+        default=300,
+        help="runs of each controller, of --verify",
+    )
     command_line.add_fan_out(parser, "runs of --verify")
+    plants.add_options(parser)
     parser.add_argument(
         "--episodes",
         type=command_line.number,
         default=EPISODES,
-        help="that the mean is taken over where they are drawn",
+        help="episodes that the mean is taken over, where something is drawn",
     )
     parser.add_argument(
         "--cache", type=Path, default=CACHE, help="where bounds are kept once they are known"
@@ -73,10 +83,16 @@ def main(options: argparse.Namespace, console: Console) -> str:
             console.print(f"Beaten beyond the interval: {'; '.join(beaten)}.")
             raise SystemExit(1)
         return "No controller beats the bound that applies to it, beyond its interval."
+    plant = plants.chosen(options)
+    if plant.arguments:
+        cases = scenarios_of(plant.name, plant.arguments)
+        console.print(f"{plant.name}, mean |e| in °C:")
+        console.print(on_screen(bounds({n: c.arguments for n, c in cases.items()}, options)))
+        return NOTE
     console.print("The scenarios of `python -m benchmarks.compare`, °C:")
     console.print(on_screen(scenarios(options.cache)))
     console.print("The presets, mean |e| in °C:")
-    console.print(on_screen(presets(options.episodes, options.mpc, options.cache)))
+    console.print(on_screen(bounds(PRESETS, options)))
     return NOTE
 
 
@@ -98,27 +114,26 @@ def scenarios(cache: Path) -> pd.DataFrame:
     return pd.DataFrame(rows).fillna("")
 
 
-def presets(episodes: int, runs: int | None, cache: Path) -> pd.DataFrame:
-    """Return the table of the presets, with the predictive controller's errors if `runs`."""
+def bounds(cases: Mapping[str, Mapping[str, Any]], options: argparse.Namespace) -> pd.DataFrame:
+    """Return the table of plants by name, with MPC's errors if `--mpc` asks for them."""
     rows = []
-    for name, arguments in tqdm(PRESETS.items(), unit="preset"):
-        found = {
-            kind: least_possible(
-                samples=SAMPLES, kind=kind, episodes=episodes, folder=cache, **arguments
-            )
-            for kind in ("preview", "news", "reference")
-            if kind != "news" or arguments.get("setpoint") == "random"
-        }
+    for name, arguments in tqdm(cases.items(), unit="plant"):
+        case = {"samples": SAMPLES, "episodes": options.episodes, "folder": options.cache}
+        found = {}
+        for kind in ("preview", "news", "reference"):
+            # "news" is for random set points, "reference" for those that are held long enough.
+            with suppress(ValueError):
+                found[kind] = least_possible(kind=kind, **case, **arguments)
         idle = found["preview"]
         row = {
-            "preset": name,
+            "plant": name,
             "valve left alone": _cell(idle.idle, idle.idle_low, idle.idle_high),
             "with preview": _shown(found["preview"]),
             "without preview": _shown(found["news"]) if "news" in found else "",
-            "reference": _shown(found["reference"]),
+            "reference": _shown(found["reference"]) if "reference" in found else "",
         }
-        if runs:
-            error = bootstrap(mpc_errors(runs, SAMPLES, **arguments), 0)
+        if options.mpc:
+            error = bootstrap(mpc_errors(options.mpc, SAMPLES, **arguments), 0)
             row["MPC"] = _cell(error.value, error.low, error.high)
         rows.append(row)
     return pd.DataFrame(rows)
