@@ -98,7 +98,7 @@ def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
             # A little to the left of it, so that a point on the limit is whole.
             axes.axvline(limit, color="0.4", linewidth=1)
             axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
-            axes.set_xlabel("mean |e| (°C), from the least possible on")
+            axes.set_xlabel("mean |e| (°C)")
         save(figure, path)
 
 
