@@ -138,7 +138,7 @@ ROSTER: dict[str, Controller] = {
             trained="benchmarks.train.ppo:randomised_members",
             account=Account("dead zone; delay range, by the past actions it sees"),
             compared=False,
-            swept=True,
+            swept=False,
         ),
         Controller(
             "nn-dpc",
