@@ -71,9 +71,10 @@ def check_number(name: str, value: Any, least: float = -math.inf) -> float:
 
 def check_positive(name: str, value: Any) -> float:
     """Return `value` if it is a finite number above 0; ValueError otherwise."""
-    if not isinstance(value, Real) or isinstance(value, bool) or not 0 < value < math.inf:
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else 0.0
+    if not 0.0 < number < math.inf:
         raise ValueError(f"{name} must be a finite number above 0, got {value!r}")
-    return float(value)
+    return number
 
 
 def check_limits(u_min: Any, u_max: Any) -> tuple[float, float]:
