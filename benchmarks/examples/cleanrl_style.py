@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from benchmarks.metrics import mean_error
-from benchmarks.rollout import make_plants, rollout
+import mptc_gym  # noqa: F401 (registers the environment)
 
 
 @dataclass(frozen=True)
@@ -88,9 +87,6 @@ class Agent(nn.Module):
         """Return the mean of the actions, shape (n, 1), and the values, shape (n,)."""
         scaled = observations * self.scale
         return self.mean(scaled), self.value(scaled).squeeze(-1)
-
-    def reset(self) -> None:
-        """Do nothing: the observation holds all that the policy remembers."""
 
     @torch.no_grad()
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -196,8 +192,13 @@ def train(arguments: Arguments) -> Agent:
 
 def square_error(agent: Agent) -> float:
     """Return the mean |e| on the default square wave, degC."""
-    trajectory = rollout(make_plants(1, 1200, **OBSERVATION), agent, 1200, seed=0)
-    return float(mean_error(trajectory)[0])
+    plants = gymnasium.make_vec("MiddlePoint-v0", 1, max_episode_steps=1200, **OBSERVATION)
+    observation, infos = plants.reset(seed=0)
+    errors = []
+    for _ in range(1200):
+        errors.append(abs(float(infos["error"][0])))
+        observation, *_, infos = plants.step(agent.act(observation))
+    return float(np.mean(errors))
 
 
 def main(arguments: list[str] | None = None) -> int:
