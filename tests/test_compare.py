@@ -659,6 +659,25 @@ class TestCompare:
         assert (tmp_path / "out/report.md").exists()
 
 
+def test_a_long_legend_leaves_the_responses_their_room(tmp_path, monkeypatch):
+    widths = []
+
+    def measure_width(figure, path):
+        figure.draw_without_rendering()
+        widths.extend(axes.get_position().width for axes in figure.axes)
+
+    monkeypatch.setattr(comparison.plots, "save", measure_width)
+    runs = rollout(make_plants(1, 40, setpoint=5.0), PIController(), 40, seed=0)
+    responses = pd.concat(
+        [
+            comparison.tables.summarise_responses(runs, SCENARIOS["constant"], name)
+            for name in ROSTER
+        ]
+    )
+    comparison.plots.plot_responses(responses, SCENARIOS["constant"], tmp_path / "x.png")
+    assert min(widths) > 0.7
+
+
 class TestOtherPlants:
     @pytest.mark.parametrize("preset", ["disturbed", "hard"])
     def test_what_has_no_bound_or_measure_says_so(self, preset, tmp_path):

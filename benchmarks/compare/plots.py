@@ -47,9 +47,7 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
         )
         above.set_ylabel("temperature y (°C)")
         above.set_title(scenario.title, loc="left")
-        above.legend(loc="upper right", ncols=len(palette) + 1)
-        low, high = above.get_ylim()
-        above.set_ylim(low, high + 0.15 * (high - low))  # room for the legend
+        figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=4)
         # Of drawn actuators, what none of them lets pass, and what none of them exceeds.
         zone, _ = parameters.range_of("dead_zone")
         below.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0)
