@@ -5,37 +5,34 @@ from __future__ import annotations
 import argparse
 import hashlib
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from benchmarks import plants
 from benchmarks.compare.comparison import Comparison
-from benchmarks.controllers.records import POLICIES, Training
-from benchmarks.controllers.roster import ROSTER, chosen
+from benchmarks.controllers import roster
 from benchmarks.lib import command_line
 from benchmarks.lib.tables import on_screen
 from benchmarks.scenarios import PRESET_SCENARIOS, SCENARIOS, scenarios_of
 
 OUT = Path("results/compare")
-COMPARED = [name for name, controller in ROSTER.items() if controller.compared]
+COMPARED = [name for name, controller in roster.ROSTER.items() if controller.compared]
 RUNS = 100
 LONGEST = 60  # characters of a folder's name
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    names: dict[str, Any] = {"nargs": "*", "metavar": "NAME"}
-    add("--agents", default=COMPARED, help="controllers of this repository", **names)
+    roster.add_options(parser, COMPARED, "trainings")
     add(
-        "--agent",
-        action="append",
-        default=[],
-        metavar="NAME=MODULE:FACTORY",
-        help="a controller of your own, beside those of --agents (may be given more than once)",
+        "--scenarios",
+        nargs="*",
+        default=argparse.SUPPRESS,
+        metavar="NAME",
+        help="cases (default: all)",
     )
-    add("--scenarios", default=argparse.SUPPRESS, help="cases (default: all)", **names)
     plants.add_options(parser)
     add(
         "--presets",
@@ -43,19 +40,6 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         help="run all presets of the environment in place of the paper's cases",
     )
     add("--runs", type=command_line.number, default=RUNS, help="number of runs of each case")
-    add(
-        "--training-steps",
-        type=command_line.number,
-        default=argparse.SUPPRESS,
-        help="samples of experience of each policy that is trained (default: the training's)",
-    )
-    add(
-        "--policies",
-        type=command_line.number,
-        default=argparse.SUPPRESS,
-        help="how many policies of each controller that is trained (default: the training's)",
-    )
-    command_line.add_fan_out(parser, "trainings")
     add("--retrain", action="store_true", help="train policies anew")
     add(
         "--out",
@@ -64,18 +48,12 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         help=f"folder to write to (default: {OUT}, and a name of its own beside that for a "
         "comparison of other controllers or cases)",
     )
-    add(
-        "--kept",
-        type=Path,
-        default=POLICIES,
-        help="folder where trained policies are kept; no code in its files is run",
-    )
 
 
 @command_line.command("compare", __doc__, _add_options, width=190)
 def main(options: argparse.Namespace, console: Console) -> str:
     """Run the comparison and write what it finds."""
-    controllers = chosen(options.agents, options.agent)
+    controllers = roster.chosen(options.agents, options.agent)
     options.agents = list(controllers)
     plant = plants.chosen(options)
     if options.presets and plant.arguments:
@@ -87,13 +65,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     names = command_line.known("--scenarios", names, list(scenarios))
     if not names:
         raise command_line.UsageError("--scenarios: none to run")
-    training = Training(
-        command_line.fan_out(options),
-        options.kept,
-        getattr(options, "training_steps", None),
-        getattr(options, "policies", None),
-        options.retrain,
-    )
+    training = replace(roster.training(options), retrain=options.retrain)
     out = getattr(options, "out", None) or _folder(
         [*controllers] if [*controllers] != COMPARED else [],
         names if names != [*scenarios] else [],

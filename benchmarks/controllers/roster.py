@@ -6,11 +6,13 @@ know it then. A user's own controllers (`--agent NAME=MODULE:FACTORY`) become su
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from benchmarks.controllers.factories import load_factory, try_out
-from benchmarks.controllers.records import Account, Controller, Tuning
-from benchmarks.lib.command_line import UsageError, known
+from benchmarks.controllers.records import POLICIES, Account, Controller, Training, Tuning
+from benchmarks.lib.command_line import UsageError, add_fan_out, fan_out, known, number
 
 _STEP_TEST = "gain, time constant, delay"
 
@@ -163,6 +165,64 @@ ROSTER: dict[str, Controller] = {
 def label(agent: str) -> str:
     """Return the name of a controller in tables and plots."""
     return ROSTER[agent].label if agent in ROSTER else agent
+
+
+def add_options(parser: argparse.ArgumentParser, agents: Sequence[str], what: str) -> None:
+    """Add the options that say which controllers are run, and how those that learn are trained.
+
+    Parameters
+    ----------
+    parser
+        Gets them.
+    agents
+        The controllers that are run by default.
+    what
+        Is run by the fan-out, in the words of its help.
+    """
+    add = parser.add_argument
+    add(
+        "--agents",
+        nargs="*",
+        default=agents,
+        metavar="NAME",
+        help="controllers of this repository",
+    )
+    add(
+        "--agent",
+        action="append",
+        default=[],
+        metavar="NAME=MODULE:FACTORY",
+        help="a controller of your own, beside those of --agents (may be given more than once)",
+    )
+    add(
+        "--training-steps",
+        type=number,
+        default=argparse.SUPPRESS,
+        help="samples of experience of each policy that is trained (default: the training's)",
+    )
+    add(
+        "--policies",
+        type=number,
+        default=argparse.SUPPRESS,
+        help="how many policies of each controller that is trained (default: the training's)",
+    )
+    add_fan_out(parser, what)
+    add(
+        "--kept",
+        type=Path,
+        default=POLICIES,
+        help="folder where trained policies are kept; no code in its files is run",
+    )
+
+
+def training(options: argparse.Namespace) -> Training:
+    """Return the training that the options of `add_options` ask for."""
+    return Training(
+        fan_out(options),
+        options.kept,
+        getattr(options, "training_steps", None),
+        getattr(options, "policies", None),
+    )
 
 
 def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controller]:

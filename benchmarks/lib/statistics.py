@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 CONFIDENCE = 0.95
+ENDS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)  # quantiles where an interval ends
 RESAMPLES = 2000  # of a bootstrap
 
 
@@ -147,16 +148,22 @@ def bootstrap(
     table = np.atleast_2d(np.asarray(values, dtype=np.float64))
     if table.ndim != 2 or not table.size or not np.isfinite(table).all():
         raise ValueError(f"values must be finite, one for each run, got {values!r}")
-    members, runs = table.shape
     value = float(statistic(table.reshape(1, -1), axis=-1)[0])
     if np.all(table == table.flat[0]):  # nothing was random
         return Estimate(value, value, value, table.size)
-    generator = np.random.default_rng(seed)
+    drawn = statistic(_resampled(table, np.random.default_rng(seed)), axis=-1)
+    low, high = np.quantile(drawn, ENDS)
+    return Estimate(value, float(low), float(high), table.size)
+
+
+def _resampled(
+    table: NDArray[np.float64], generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return samples of a table (members, runs), shape (RESAMPLES, members * runs)."""
+    members, runs = table.shape
     member = generator.integers(members, size=(RESAMPLES, members, 1))
     run = generator.integers(runs, size=(RESAMPLES, 1, runs))
-    drawn = statistic(table[member, run].reshape(RESAMPLES, -1), axis=-1)
-    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return Estimate(value, float(low), float(high), table.size)
+    return table[member, run].reshape(RESAMPLES, -1)
 
 
 def improvement(
@@ -216,15 +223,9 @@ def stratified(
         )
     if not arrays[0].size or not np.isfinite(arrays).all():
         raise ValueError(f"tables must hold finite values, got {tables!r}")
-    members, runs = arrays[0].shape
     generator = np.random.default_rng(seed)
-    drawn = []
-    for array in arrays:
-        member = generator.integers(members, size=(RESAMPLES, members, 1))
-        run = generator.integers(runs, size=(RESAMPLES, 1, runs))
-        drawn.append(array[member, run].reshape(RESAMPLES, -1))
+    drawn = [_resampled(array, generator) for array in arrays]
     together = np.concatenate([array.ravel() for array in arrays])
     value = float(statistic(together[np.newaxis], axis=-1)[0])
-    ends = [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]
-    low, high = np.quantile(statistic(np.hstack(drawn), axis=-1), ends)
+    low, high = np.quantile(statistic(np.hstack(drawn), axis=-1), ENDS)
     return Estimate(value, float(low), float(high), together.size)

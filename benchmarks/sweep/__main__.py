@@ -14,9 +14,9 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks import plants as plant_options
+from benchmarks.controllers import roster
 from benchmarks.controllers.factories import Factory, provenances
-from benchmarks.controllers.records import POLICIES, Controller, Training
-from benchmarks.controllers.roster import ROSTER, chosen
+from benchmarks.controllers.records import Controller
 from benchmarks.designs import Plant, grid, random_design
 from benchmarks.lib import command_line
 from benchmarks.lib.fingerprint import fingerprint
@@ -26,7 +26,7 @@ from benchmarks.lib.tables import on_screen
 from benchmarks.sweep.cells import agent_cell, limit_cell
 from benchmarks.sweep.report import report, table
 
-SWEPT = [name for name, controller in ROSTER.items() if controller.swept]
+SWEPT = [name for name, controller in roster.ROSTER.items() if controller.swept]
 SEED = 0  # of a plant's first run
 NOTHING = "nothing"  # the controller that sets the scale
 
@@ -44,39 +44,13 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add("--design-seed", type=command_line.seed, default=0, help="of a random design")
     add("--runs", type=command_line.number, default=20, help="of each controller on each plant")
     add("--samples", type=command_line.number, default=1200, help="length of a run")
-    add("--agents", nargs="*", default=SWEPT, metavar="NAME", help="controllers")
-    add(
-        "--agent",
-        action="append",
-        default=[],
-        metavar="NAME=MODULE:FACTORY",
-        help="a controller of your own, beside those of --agents (may be given more than once)",
-    )
+    roster.add_options(parser, SWEPT, "cells and trainings")
     plant_options.add_options(parser)
-    add(
-        "--training-steps",
-        type=command_line.number,
-        default=argparse.SUPPRESS,
-        help="samples of experience of each policy that is trained (default: the training's)",
-    )
-    add(
-        "--policies",
-        type=command_line.number,
-        default=argparse.SUPPRESS,
-        help="how many policies of each controller that is trained (default: the training's)",
-    )
-    command_line.add_fan_out(parser, "cells and trainings")
     add(
         "--out",
         type=Path,
         default=argparse.SUPPRESS,
         help="folder to write to (default: results/sweep-DESIGN)",
-    )
-    add(
-        "--kept",
-        type=Path,
-        default=POLICIES,
-        help="folder where trained policies are kept; no code in its files is run",
     )
 
 
@@ -91,19 +65,13 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, console: Console) -> str:
     """Run the sweep and write what it finds."""
-    controllers = chosen(options.agents, options.agent)
+    controllers = roster.chosen(options.agents, options.agent)
     nominal = plant_options.chosen(options).arguments
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    fan_out = command_line.fan_out(options)
     out = getattr(options, "out", Path(f"results/sweep-{options.design}"))
     out = command_line.out_folder(out)
-    training = Training(
-        fan_out,
-        options.kept,
-        getattr(options, "training_steps", None),
-        getattr(options, "policies", None),
-    )
-    known = {NOTHING: ROSTER[NOTHING], **controllers}
+    training = roster.training(options)
+    known = {NOTHING: roster.ROSTER[NOTHING], **controllers}
     members = {
         name: controller.members_in_service(training) for name, controller in known.items()
     }
@@ -114,13 +82,13 @@ def main(options: argparse.Namespace, console: Console) -> str:
     )
     plants = [{**nominal, **plant} for plant in differing]
     began = time.perf_counter()
-    results = fan_out.run(
+    results = training.fan_out.run(
         _limit_cells(plants, options),
         out / "cells" / _limit_key(plants, options),
         title="limit",
     )
     for name, factories in members.items():
-        results |= fan_out.run(
+        results |= training.fan_out.run(
             _agent_cells(name, factories, plants, nominal, options),
             # A folder for each, so that one more controller leaves the others' cells valid.
             out / "cells" / _agent_key(known[name], factories, plants, nominal, options),
