@@ -81,6 +81,11 @@ class Dynamics:
                 quotient.append(coefficient + pole * quotient[-1])
             self._quotient = (*quotient, 0.0)
 
+    def share(self, age: Any) -> Any:
+        """Return how much of the drifts is over, from 0 to 1: arguments as of `factors`."""
+        share = age / self._samples
+        return share * (share < 1.0) + (share >= 1.0)  # at most 1, of arrays of any library
+
     def factors(self, numbers: PlantNumbers[Any], age: Any) -> tuple[Any, Any]:
         """Return g and t.
 
@@ -91,8 +96,7 @@ class Dynamics:
         age
             k, one number, or an array or tensor.
         """
-        share = age / self._samples
-        share = share * (share < 1.0) + (share >= 1.0)  # at most 1, of arrays of any library
+        share = self.share(age)
         gain, time_constant = numbers.gain_factor, numbers.time_constant_factor
         return (
             gain + gain * (numbers.gain_drift - 1.0) * share,

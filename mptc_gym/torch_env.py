@@ -25,17 +25,16 @@ from mptc_gym.checks import is_count, positive_count
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import PLANT_NUMBERS, Parameters
 from mptc_gym.plant import DRIFT_INTERVAL, action_from_command
-from mptc_gym.signals import LOAD_INTERVAL, Levels
+from mptc_gym.signals import Levels
 from mptc_gym.torch_plant import Number, TorchPlants
 from mptc_gym.torch_signals import (
     LONGEST,
     Draws,
     Given,
     Held,
+    Load,
     Noise,
     Repeated,
-    disturbances,
-    random_levels,
 )
 from mptc_gym.vector_env import checked_limit, checked_mode
 
@@ -114,9 +113,10 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
     reason, actions that are not finite are an error on the CPU only; elsewhere the plants that
     got them show NaN until they are reset. `reset` may wait.
 
-    **Memory.** What a step returns is the caller's, to keep or to overwrite. Tensors of several
-    steps may share one piece of memory, which is freed when none of them is left. Observations
-    lie in it column by column.
+    **Memory.** What a step returns is the caller's, to keep or to overwrite, except that in the
+    infos masks and the factors of drifts may be one tensor for several steps. Tensors of
+    several steps may share one piece of memory, which is freed when none of them is left.
+    Observations lie in it column by column.
     """
 
     __signature__: ClassVar[inspect.Signature] = inspect.Signature(
@@ -204,9 +204,8 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         )
         levels = Levels(parameters)
         self._repeated = None if levels.random else Repeated(levels, nothing)
-        self._following = random_levels(levels, draws)
-        self._random = Held(levels.shortest, self._following, nothing)
-        self._load = Held(LOAD_INTERVAL, disturbances(self._numbers, draws), nothing)
+        self._random = Held(levels, draws)
+        self._load = Load(self._numbers, draws) if parameters.is_disturbed else None
 
         # Each plant's k is the clock less where it started. The host has a copy of the latter,
         # so that it knows when episodes end without asking the device.
@@ -325,14 +324,13 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         command, applied = self._plants.apply(a)
         if self._taken == self._samples:
             self._look_ahead()
-        observations, rewards, terminations, truncations, told = self._ahead[self._taken]
+        rewards, terminations, truncations, told = self._ahead[self._taken]
         self._taken += 1
+        observations = self._front()
 
         if self._move_weight:
             rewards = rewards - self._move_weight * (a - self._action).abs()
             self._action = a.clone()  # the caller may write in it
-        if observations is None:
-            observations = self._front()
         if self._windows[3]:
             observations = self._with_actions(observations, a)
         infos = dict(zip(self._keys, (command, applied, *told), strict=True))
@@ -348,12 +346,8 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self._plants.detach()
         self._action = self._action.detach()
         self._ahead = [
-            (
-                None if front is None else front.detach(),
-                *(each.detach() for each in rest),
-                tuple(each.detach() for each in told),
-            )
-            for front, *rest, told in self._ahead
+            (*(each.detach() for each in shown), tuple(each.detach() for each in told))
+            for *shown, told in self._ahead
         ]
         self._seen = [[row.detach() for row in seen] for seen in self._seen]
         if self._past_actions is not None:
@@ -368,15 +362,15 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             starts = self._starts[:1] if self._aligned else self._starts
             ages = self._offsets[:samples] + (clock - starts)
 
-        def noise_of(source: Noise | None, name: str, variance: str) -> Tensor | None:
+        def noise_of(source: Noise | None, name: str) -> Tensor | None:
             if given is not None and name in given:
                 return given.at(name, ages)
             if source is None:
                 return None
-            return source.take(samples, self._taken, self._numbers[variance])
+            return source.take(samples, self._taken)
 
-        noise = noise_of(self._noise, "noise", "noise_variance")
-        reading = noise_of(self._transmitter, "measurement_noise", "measurement_noise_variance")
+        noise = noise_of(self._noise, "noise")
+        reading = noise_of(self._transmitter, "measurement_noise")
         if given is not None and "setpoint" in given:
             setpoint = given.at("setpoint", ages)
         elif self._repeated is None:
@@ -385,11 +379,10 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             setpoint = self._repeated.at(ages).expand(samples, n)
             setpoint = setpoint.clone(memory_format=torch.contiguous_format)
         load = None
-        if self.parameters.is_disturbed:
-            if given is not None and "disturbance" in given:
-                load = given.at("disturbance", ages)
-            else:
-                load = self._load.take(samples, self._taken)
+        if given is not None and "disturbance" in given:
+            load = given.at("disturbance", ages)
+        elif self._load is not None:
+            load = self._load.take(samples, self._taken, clock)
 
         output, factors = self._plants.outputs(self._taken, clock, samples, noise, load)
         error = setpoint - output
@@ -403,49 +396,31 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         measured = measured.clamp(
             -self.parameters.temperature_span, self.parameters.temperature_span
         )
-        for place, values in enumerate((setpoint, setpoint - measured, measured)):
+        # The set point is told, too, and what is told is the caller's.
+        for place, values in enumerate((setpoint.clone(), setpoint - measured, measured)):
             if self._windows[place]:
                 past = self._seen[place][self._taken :][: self._windows[place]]
                 self._seen[place] = [*past, *values.unbind()]
-        flags = torch.zeros(3, samples, n, dtype=torch.bool, device=self.device)
-        flags[2].fill_(True)  # of all that is told, in the infos
-        terminations, truncations, everyone = (each.unbind() for each in flags)
-        told = [output, setpoint.clone() if self._windows[0] else setpoint, error]
-        told.append(torch.zeros_like(output) if noise is None else noise)
-        if load is not None:
-            told.append(load)
+        flags = torch.zeros(2 * samples, n, dtype=torch.bool, device=self.device).unbind()
+        none = torch.zeros_like(error) if noise is None else noise
+        blocks = [output, setpoint, error, none] + ([] if load is None else [load])
+        told: list[Sequence[Tensor]] = [each.unbind() for each in blocks]
         if self.parameters.drifts:
-            told += [torch.stack(each) for each in zip(*factors, strict=True)]
-        told_rows = [each.unbind() for each in told]
-        masks = [everyone] * len(self._names)
+            told += zip(*factors, strict=True)
+        everyone = torch.ones_like(flags[0])  # all plants have all that is told
         self._ahead = list(
             zip(
-                self._fronts(samples),
                 rewards.unbind(),
-                terminations,
-                truncations,
-                zip(*told_rows, *masks, strict=True),
+                flags[:samples],
+                flags[samples:],
+                zip(*told, *[[everyone] * samples] * len(self._names), strict=True),
                 strict=True,
             )
         )
         self._samples, self._taken = samples, 0
 
-    def _fronts(self, samples: int) -> Sequence[Tensor | None]:
-        """Return what observations show of set points, errors and outputs, each (n, size).
-
-        None is what is better put together when it is asked for.
-        """
-        shown = [(seen, w) for seen, w in zip(self._seen, self._windows, strict=False) if w]
-        size = samples * self.num_envs * sum(w for _, w in shown)
-        if not shown or (self._waits and not self.differentiable and size > _IN_CACHE):
-            return [None] * samples
-        # Newest first, as a window then is a slice.
-        blocks = ((torch.stack(seen[:0:-1]), w) for seen, w in shown)
-        views = [block.unfold(0, w, 1).transpose(1, 2) for block, w in blocks]
-        return torch.cat(views, 1).transpose(1, 2).unbind()[::-1]
-
     def _front(self) -> Tensor:
-        """Return what the present observation shows of these, shape (n, size)."""
+        """Return what the present observation shows of set point, error and output."""
         newest = [
             row
             for seen, window in zip(self._seen, self._windows, strict=False)
@@ -560,20 +535,23 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self._aligned = first == int(self._host_starts.max())
         phases = (
             set(np.unique(self._host_starts % DRIFT_INTERVAL).tolist())
-            if self.parameters.drifts
+            if self.parameters.drifts or self.parameters.is_disturbed
             else ()
         )
-        self._plants.rest(which, self._taken, self._numbers, self._starts, phases)
-        for noise in (self._noise, self._transmitter):
+        starts = first if self._aligned else self._starts
+        self._plants.rest(which, self._taken, self._numbers, starts, phases)
+        for noise, name in (
+            (self._noise, "noise_variance"),
+            (self._transmitter, "measurement_noise_variance"),
+        ):
             if noise is not None:
-                noise.rest(which, self._taken)
-        self._load.rest(which, self._taken, self._nothing.expand(2, -1), LOAD_INTERVAL)
+                noise.rest(which, self._taken, self._numbers[name])
+        if self._load is not None:
+            self._load.rest(which, self._taken, self._starts, phases)
         if given is not None and "setpoint" in given:
             setpoint = given.at("setpoint", torch.zeros_like(self._starts)[None])[0]
         elif self._repeated is None:
-            level, hold = self._following(self._nothing[None])
-            self._random.rest(which, self._taken, level, hold)
-            setpoint = level[0]
+            setpoint = self._random.rest(which, self._taken)
         else:
             setpoint = self._repeated.values[0].expand(self.num_envs)
 

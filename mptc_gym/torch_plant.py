@@ -54,11 +54,11 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
         shrunk = functional.hardshrink(command, edge)  # type: ignore[arg-type]  # it is a float
         return shrunk.clamp_(u_min, u_max)  # type: ignore[arg-type]  # the same, at once
     limited = torch.clamp(command, u_min, u_max)  # type: ignore[arg-type]
-    # 0 inside the dead zone and 1 outside, without conditions: they take a processor many times
-    # as long where it cannot foresee them.
-    passes = command.detach().abs().sub_(edge).sign_().clamp_(min=0.0)
-    if not limited.requires_grad:
-        return limited.mul_(passes)
+    # 0 inside the dead zone and 1 outside: a product takes a processor much less time than a
+    # condition that it cannot foresee.
+    if not command.requires_grad:
+        return limited.mul_(command.abs().gt_(edge))
+    passes = command.detach().abs().gt_(edge)
     return torch.addcmul(limited, limited.detach(), passes.sub_(1.0))
 
 
@@ -94,26 +94,18 @@ class TorchPlants:
         self._nothing = nothing
         self._dynamics = Dynamics(parameters)
         self._drifts, self._scales = parameters.drifts, parameters.changes_dynamics
+        self._drift_samples = parameters.drift_samples
         self._beta = tuple(parameters.b)
         shortest, self._longest = map(int, parameters.range_of("delay"))
         self.most_samples = shortest + 1
-        self._rows = torch.arange(self.most_samples, device=nothing.device)[:, None]
         self._order = len(parameters.a) - 1  # of A
-        self._all_at_once: Any = None  # outputs in terms of what is before and what is added
-        if not parameters.changes_dynamics:
-            alpha, _, _ = self._dynamics.coefficients(1.0, 1.0)
-            units = torch.eye(
-                self._order + self.most_samples, dtype=nothing.dtype, device=nothing.device
-            ).unbind()
-            past, forced = list(units[: self._order]), units[self._order :]
-            self._all_at_once = torch.stack(_follow(past, forced, alpha))
 
     def rest(
         self,
         which: Tensor | None,
         taken: int,
         numbers: Mapping[str, Number],
-        starts: Tensor,
+        starts: Tensor | int,
         phases: Collection[int],
     ) -> None:
         """Bring plants to rest.
@@ -127,48 +119,50 @@ class TorchPlants:
         numbers
             The plant numbers of all plants from now on, by name.
         starts
-            The clock at the beginning of each plant's episode, shape (n,).
+            The clock at the beginning of each plant's episode, shape (n,), or one int if it is
+            the same for all.
         phases
             The remainders of `starts` when divided by `DRIFT_INTERVAL`.
         """
         self._numbers, self._starts, self._phases = numbers, starts, phases
-        self._factors: tuple[Number, Number] | None = None
+        self._now: tuple[Any, Any] | None = None  # factors, and what (28) has for them
+        plants = PlantNumbers(**numbers)
+        first = self._dynamics.factors(plants, 0)
+        last = self._dynamics.factors(plants, self._drift_samples)
+        self._factors = first
+        # At the beginning of drifts, and what has been added at their end.
+        self._drift = [
+            (self._nothing + begin, self._nothing + (end - begin))
+            for begin, end in zip(first, last, strict=True)
+        ]
+        # The flows that are still to have an effect, oldest first, for all terms of B; and the
+        # outputs, also oldest first: what A needs from before the last block, and the block.
         if which is None:
-            # What the inputs so far add to B of the next ones, and B of the latest, z, oldest
-            # first, without the delay. Then y, also oldest first: what A needs from before the
-            # last block, and the block.
-            self._carried = [self._nothing] * (len(self._beta) - 1)
-            self._responses = deque([self._nothing] * (self._longest + 1), self._longest + 1)
+            flows = self._longest + len(self._beta)
+            self._flows = deque([self._nothing] * flows, flows)
             self._history = [self._nothing] * self._order
         else:
             past = self._history[taken : taken + self._order]
             self._history = [each.masked_fill(which, 0.0) for each in past]
-            self._carried = [each.masked_fill(which, 0.0) for each in self._carried]
-            responses = torch.stack([*self._responses]).masked_fill_(which, 0.0)
-            self._responses.extend(responses.unbind())
+            self._flows.extend(torch.stack([*self._flows]).masked_fill_(which, 0.0).unbind())
         u_min, u_max = numbers["u_min"], numbers["u_max"]
         self._middle = self._nothing.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
         self._edge = largest_dead(numbers["dead_zone"], self._nothing)
-        delay = numbers["delay"]
-        self._taken = None
+        delay, n = numbers["delay"], len(self._nothing)
+        self._places = None  # of what each plant is shown, where delays differ
         if isinstance(delay, Tensor):
-            self._taken = self._rows + (self._longest - delay.to(torch.int64))
+            columns = torch.arange(n, device=delay.device)
+            rows = torch.arange(self.most_samples + len(self._beta) - 1, device=delay.device)
+            oldest = self._longest - delay.to(torch.int64)
+            self._places = (rows[:, None] + oldest) * n + columns
 
     def apply(self, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Take a(k) of all plants, shape (n,), and return u(k) and u_a(k), t/h."""
         command = flow_command(actions, self._middle, self._half_range)
         numbers = self._numbers
         applied = applied_flow(command, self._edge, numbers["u_min"], numbers["u_max"])
-        response = applied * self._beta[0]  # B of (28)
-        if self._carried:
-            response = response.add_(self._carried[0])
-            carried = [*self._carried[1:], None]
-            self._carried = [
-                applied * beta if more is None else torch.add(more, applied, alpha=beta)
-                for beta, more in zip(self._beta[1:], carried, strict=True)
-            ]
-        self._responses.append(response)
+        self._flows.append(applied.clone())  # as the caller may write in what is returned
         return command, applied
 
     def outputs(
@@ -198,12 +192,10 @@ class TorchPlants:
             y, degC, shape (samples, n); and of each sample gain and time constant, as multiples
             of those that A and B have.
         """
-        past = self._history[taken : taken + self._order]
-        rows, told = past, []
+        rows, told = self._history[taken : taken + self._order], []
         response = self._response(samples)
         for first, last in self._stretches(clock, samples):
-            factors = self._drifted(clock + first)
-            alpha, scale, load_gain = self._dynamics.coefficients(*factors)
+            factors, (alpha, scale, load_gain) = self._drifted(clock + first)
             forced = response[first:last]
             if noise is not None:
                 forced = _plus(noise[first:last], scale, forced)
@@ -212,29 +204,30 @@ class TorchPlants:
             if load is not None:
                 forced = _plus(forced, load_gain, load[first:last])
             told += [factors] * (last - first)
-            if self._all_at_once is None or not _multiplies_exactly(forced):
-                rows = _follow(rows, forced.unbind(), alpha)
-        if len(rows) > self._order:
-            self._history = rows
-            return torch.stack(rows[self._order :]), told
-        size = self._order + samples
-        known = torch.cat((torch.stack(past), forced)) if past else forced
-        products = torch.mm(self._all_at_once[:size, :size], known)
-        self._history = [*products.unbind()]
-        return products[self._order :].clone(), told
+            rows = _follow(rows, forced.unbind(), alpha)
+        self._history = rows
+        return torch.stack(rows[self._order :]), told
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions."""
         self._history = [each.detach() for each in self._history]
-        self._carried = [each.detach() for each in self._carried]
-        self._responses.extend([each.detach() for each in self._responses])
+        self._flows.extend([each.detach() for each in self._flows])
 
     def _response(self, samples: int) -> Tensor:
-        """Return the response to the inputs, B of (28), shape (samples, n)."""
-        if self._taken is None:
-            return torch.stack([*islice(self._responses, samples)])
-        rows = self._longest - self.most_samples + 1 + samples
-        return torch.stack([*islice(self._responses, rows)]).gather(0, self._taken[:samples])
+        """Return the response to the flows, B of (28), shape (samples, n)."""
+        needed = samples + len(self._beta) - 1
+        if self._places is None:
+            flows = torch.stack([*islice(self._flows, needed)])
+        else:
+            past = self._longest - self.most_samples + 1
+            flows = torch.stack([*islice(self._flows, past + needed)]).reshape(-1)
+            flows = flows.index_select(0, self._places[:needed].reshape(-1)).view(needed, -1)
+        response = flows[-samples:] * self._beta[0]
+        for lag, coefficient in enumerate(self._beta[1:], start=1):
+            response = torch.add(
+                response, flows[needed - samples - lag : needed - lag], alpha=coefficient
+            )
+        return response
 
     def _stretches(self, clock: int, samples: int) -> list[tuple[int, int]]:
         """Return from which to which sample the dynamics of no plant change."""
@@ -246,14 +239,19 @@ class TorchPlants:
         return list(zip(begins, [*begins[1:], samples], strict=True))
 
     def _drifted(self, clock: int) -> tuple[Any, Any]:
-        """Return gain and time constant at a sample."""
-        if self._factors is None or (self._drifts and clock % DRIFT_INTERVAL in self._phases):
-            slow: Any = 0
+        """Return gain and time constant at a sample, and what (28) has for them."""
+        if self._now is None or (self._drifts and clock % DRIFT_INTERVAL in self._phases):
+            factors: tuple[Any, ...] = self._factors
             if self._drifts:
-                ages = clock - self._starts
-                slow = (ages - ages % DRIFT_INTERVAL).to(self._nothing.dtype)
-            self._factors = self._dynamics.factors(PlantNumbers(**self._numbers), slow)
-        return self._factors
+                slow = clock - self._starts
+                slow = slow - slow % DRIFT_INTERVAL
+                if isinstance(slow, Tensor):
+                    slow = slow.to(self._nothing.dtype)
+                share = self._dynamics.share(slow)
+                factors = tuple(_plus(first, share, more) for first, more in self._drift)
+            gain, time_constant = factors
+            self._now = factors, self._dynamics.coefficients(gain, time_constant)
+        return self._now
 
 
 def _follow(
@@ -266,16 +264,6 @@ def _follow(
             output = _plus(output, coefficient, outputs[-lag])
         outputs.append(output)
     return outputs
-
-
-def _multiplies_exactly(tensor: Tensor) -> bool:
-    """Whether nobody has asked for quick products of matrices, with fewer digits."""
-    if tensor.dtype == torch.float64:
-        return True
-    kind = tensor.device.type
-    return kind == "cpu" and not (
-        torch.is_autocast_enabled(kind) or torch.get_float32_matmul_precision() != "highest"
-    )
 
 
 def _plus(first: Tensor, factor: Number, second: Tensor) -> Tensor:

@@ -5,8 +5,7 @@ All of it is made for a block of samples at a time, without a loop over plants.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -35,7 +34,6 @@ class Draws:
 
     def __init__(self, generator: torch.Generator, nothing: Tensor) -> None:
         self.generator, self.nothing = generator, nothing
-        self._place: Any = {"dtype": nothing.dtype, "device": nothing.device}
 
     def normal(self, out: Tensor, deviation: Number) -> Tensor:
         """Fill a tensor, shape (samples, n), with normal numbers around 0, and return it."""
@@ -43,13 +41,15 @@ class Draws:
             return out.normal_(0.0, deviation, generator=self.generator)
         return out.normal_(generator=self.generator).mul_(deviation)
 
-    def uniform(self, rows: int) -> Tensor:
-        """Draw numbers from 0 to 1, the latter excluded, shape (rows, n)."""
-        return torch.rand(rows, len(self.nothing), generator=self.generator, **self._place)
+    def within_one(self, rows: int) -> Tensor:
+        """Draw numbers from -1 to 1, the latter excluded, shape (rows, n)."""
+        drawn = self.nothing.new_empty(rows, len(self.nothing))
+        return drawn.uniform_(-1.0, 1.0, generator=self.generator)
 
     def within(self, low: float, high: float, *, whole: bool) -> Tensor:
         """Draw numbers between two, or whole numbers, both ends included; shape (n,)."""
-        drawn = low + self.uniform(1)[0] * (high - low + whole)
+        drawn = torch.empty_like(self.nothing)
+        drawn.uniform_(low, high + whole, generator=self.generator)
         return (drawn.floor() if whole else drawn).clamp(max=high)
 
 
@@ -66,156 +66,178 @@ class Noise:
 
     def __init__(self, c: Sequence[float], draws: Draws) -> None:
         self._c, self._draws = tuple(c), draws
-        self.rest(None, 0)
 
-    def rest(self, which: Tensor | None, taken: int) -> None:
-        """Begin an episode of some plants, or of all, after so many of the last samples."""
+    def rest(self, which: Tensor | None, taken: int, variance: Number) -> None:
+        """Begin an episode of some plants, or of all, after so many of the last samples.
+
+        The variance, degC^2, is that of all plants from now on.
+        """
         order = len(self._c) - 1
+        self._deviation = variance**0.5
         if which is None:
             self._xi = self._draws.nothing.expand(order, -1)
         else:
             self._xi = self._xi[taken : taken + order].masked_fill(which, 0.0)
 
-    def take(self, samples: int, taken: int, variance: Number) -> Tensor:
+    def take(self, samples: int, taken: int) -> Tensor:
         """Make the next samples, after so many of the last ones; degC, shape (samples, n)."""
         order = len(self._c) - 1
         past = self._xi[taken : taken + order]
         self._xi = past.new_empty(order + samples, past.shape[1])
         self._xi[:order] = past
-        xi = self._draws.normal(self._xi[order:], variance**0.5)
-        noise = xi if order else xi.clone()
+        noise = self._draws.normal(self._xi[order:], self._deviation)
         for lag, coefficient in enumerate(self._c[1:], start=1):
             noise = noise.add(self._xi[order - lag : order - lag + samples], alpha=coefficient)
         return noise
 
 
 class Held:
-    """A signal that holds each level for a random or fixed number of samples.
+    """A set point that holds each random level for a random number of samples.
 
     Parameters
     ----------
-    shortest
-        The fewest samples for which a level is held.
-    following
-        Returns what comes after a state, shape (parts, n), and for how many samples it holds.
-        The signal is the sum of the parts.
-    nothing
-        Zeros of the type and device, shape (n,).
+    levels
+        How large they are, and how long they hold.
+    draws
+        Where they come from.
     """
 
-    def __init__(
-        self,
-        shortest: int,
-        following: Callable[[Tensor], tuple[Tensor, Tensor | int]],
-        nothing: Tensor,
-    ) -> None:
-        self._shortest, self._following = shortest, following
-        self._nothing = nothing
-        self._rows = torch.arange(LONGEST, dtype=nothing.dtype, device=nothing.device)[:, None]
-        # What comes next: in how many samples the state changes, and the state and the next
-        # change then.
-        # Counts are whole numbers of type float, with which a processor is quickest; or one
-        # int if it is the same for all plants.
-        self._ahead: list[tuple[Any, Tensor, Any]] = []
-        self._state = nothing[None]
-        self._left: Any = 0
+    def __init__(self, levels: Levels, draws: Draws) -> None:
+        self._levels, self._draws = levels, draws
+        self._rows = torch.arange(LONGEST, dtype=draws.nothing.dtype).to(draws.nothing.device)
+        # The present level, and in how many samples it changes: whole numbers of type float,
+        # with which a processor is quickest. Then each change to come, in how many samples it
+        # is, and what the level and the next change are from there.
+        self._level = self._left = draws.nothing
+        self._ahead: list[tuple[Tensor, Tensor, Tensor]] = []
         self._horizon = self._passed = 0  # samples that it is known for, and that are over
 
-    def rest(self, which: Tensor | None, taken: int, state: Tensor, hold: Tensor | int) -> None:
-        """Begin some plants, or all, with a state that holds for a number of samples.
+    def rest(self, which: Tensor | None, taken: int) -> Tensor:
+        """Begin an episode of some plants, or of all, after so many of the last samples.
 
-        Before, so many of the last samples have been taken.
+        Returns
+        -------
+        Tensor
+            The levels that all plants have then, shape (n,).
         """
+        self._catch_up(taken)
+        level, hold = self._following()
         if which is not None:
-            self._catch_up(taken)
-            state = torch.where(which, state, self._state)
-            hold = torch.where(which, hold, self._left + self._nothing)
-        self._state, self._left, self._ahead = state, hold, []
-        self._horizon = self._passed = 0
+            level = torch.where(which, level, self._level)
+            hold = torch.where(which, hold, self._left)
+        self._level, self._left = level, hold
+        return level
 
     def take(self, samples: int, taken: int) -> Tensor:
         """Make the next samples, after so many of the last ones; shape (samples, n)."""
+        shortest = self._levels.shortest
         if self._passed + taken + samples > self._horizon:
             self._catch_up(taken)
-            self._foresee(max(samples, self._shortest))
+            self._horizon, left = max(samples, shortest), self._left
+            for _ in range(1 + (self._horizon - 1) // shortest):
+                level, hold = self._following()
+                self._ahead.append((left, level, left + hold))
+                left = left + hold
         else:
             self._passed += taken
-        level, first = self._state.sum(0), self._passed
-        if all(isinstance(change, int) for change, _, _ in self._ahead):
-            levels = [level] * samples
-            for change, state, _ in self._ahead:
-                after = max(change - 1 - first, 0)
-                levels[after:] = [state.sum(0)] * len(levels[after:])
-            return torch.stack(levels)
         # Known are the samples that the next change is away from that before the first one.
-        rows = self._rows[:samples] + (first + 2)
-        for change, state, _ in self._ahead:
-            level = torch.lerp(level, state.sum(0), (rows - change).clamp_(0.0, 1.0))
-        return level
+        rows = (self._rows[:samples] + (self._passed + 1))[:, None]
+        levels = self._level.expand(samples, -1)
+        for change, level, _ in self._ahead:
+            levels = torch.lerp(levels, level, _reached(rows, change))
+        return levels
 
-    def _foresee(self, samples: int) -> None:
-        """Make the changes of the next samples."""
-        state, left = self._state, self._left
-        for _ in range(1 + (samples - 1) // self._shortest):
-            state, hold = self._following(state)
-            self._ahead.append((left, state, left + hold))
-            left = left + hold
-        self._horizon = samples
+    def _following(self) -> tuple[Tensor, Tensor]:
+        """Draw levels, and for how many samples they hold, each of shape (n,)."""
+        levels = self._levels
+        level = self._draws.within_one(1)[0] * levels.amplitude
+        return level, self._draws.within(levels.shortest, levels.longest, whole=True)
 
     def _catch_up(self, taken: int) -> None:
-        """Bring state and next change to where so many more samples have been taken."""
-        passed = self._passed + taken
-        for change, state, next_change in self._ahead:
-            if isinstance(change, int):
-                if change <= passed:
-                    self._state, self._left = state, next_change
-            else:
-                over = (passed + 1 - change).clamp_(0.0, 1.0)
-                self._state = torch.lerp(self._state, state, over)
-                self._left = torch.lerp(self._left, next_change, over)
-        if self._ahead:
-            self._left = self._left - passed
+        """Bring level and next change to where so many more samples have been taken."""
+        passed = self._level.new_full((), self._passed + taken)
+        for change, level, next_change in self._ahead:
+            reached = _reached(passed, change)
+            self._level = torch.lerp(self._level, level, reached)
+            self._left = torch.lerp(self._left, next_change, reached)
+        self._left = self._left - passed
         self._ahead, self._horizon, self._passed = [], 0, 0
 
 
-def random_levels(levels: Levels, draws: Draws) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """Return how random set points follow on one another."""
-    choices = levels.longest - levels.shortest + 1
-
-    def following(_: Tensor) -> tuple[Tensor, Tensor]:
-        drawn = draws.uniform(2)
-        length = (drawn[1] * choices).floor_().clamp_(max=choices - 1)
-        return (2.0 * drawn[:1] - 1.0) * levels.amplitude, length + levels.shortest
-
-    return following
-
-
-def disturbances(
-    numbers: Mapping[str, Number], draws: Draws
-) -> Callable[[Tensor], tuple[Tensor, int]]:
-    """Return how load disturbances go on: see `Disturbance` in `mptc_gym.signals`.
+class Load:
+    """Load disturbances, as of `Disturbance` in `mptc_gym.signals`: steps and a walk.
 
     Parameters
     ----------
     numbers
-        The plant numbers by name, those of the moment when it goes on.
+        The plant numbers by name, those of the moment when a load changes.
     draws
         Where all is drawn from.
     """
 
-    def following(state: Tensor) -> tuple[Tensor, int]:
-        drawn = draws.uniform(2)
+    def __init__(self, numbers: Mapping[str, Number], draws: Draws) -> None:
+        self._numbers, self._draws = numbers, draws
+
+    def rest(
+        self, which: Tensor | None, taken: int, starts: Tensor, phases: Collection[int]
+    ) -> None:
+        """Begin an episode of some plants, or of all, after so many of the last samples.
+
+        `starts`, shape (n,), are the clock at the beginning of each plant's episode, and
+        `phases` their remainders when divided by `LOAD_INTERVAL`.
+        """
+        self._starts, self._phases = starts, phases
+        nothing = self._draws.nothing
+        # Steps and walk of the sample before the last block, and of those in it.
+        if which is None:
+            self._parts = [(nothing, nothing)]
+        else:
+            step, walk = self._parts[min(taken, len(self._parts) - 1)]
+            self._parts = [(step.masked_fill(which, 0.0), walk.masked_fill(which, 0.0))]
+
+    def take(self, samples: int, taken: int, clock: int) -> Tensor:
+        """Make the samples from one of the clock on, after so many of the last ones.
+
+        Returns
+        -------
+        Tensor
+            w, degC, shape (samples, n).
+        """
+        self._parts = [self._parts[taken]]
+        total = torch.add(*self._parts[0])
+        rows = []
+        for now in range(clock, clock + samples):
+            if now % LOAD_INTERVAL in self._phases:
+                self._parts.append(self._changed(now))
+                total = torch.add(*self._parts[-1])
+            else:
+                self._parts.append(self._parts[-1])
+            rows.append(total)
+        return torch.stack(rows)
+
+    def _changed(self, clock: int) -> tuple[Tensor, Tensor]:
+        """Return steps and walk once those have changed whose turn it is."""
+        numbers, (step, walk) = self._numbers, self._parts[-1]
+        drawn = self._draws.within_one(2)
         interval = at_least(numbers["disturbance_interval"], LOAD_INTERVAL)
-        # It jumps if this is below 1, and is then uniform from 0 to there.
-        place = drawn[0] * interval / LOAD_INTERVAL
-        jumps = (1.0 - place).sign_().clamp_(min=0.0)
-        level = (2.0 * place - 1.0) * numbers["disturbance_amplitude"]
+        # It jumps if this is within +-1, and is then uniform there.
+        place = drawn[0] * (interval / LOAD_INTERVAL)
+        jumps = _reached(place.new_ones(()), place.abs())
+        level = place * numbers["disturbance_amplitude"]
         # Uniform within +-h, a step of the walk has the variance h^2 / 3.
         width = (3.0 * LOAD_INTERVAL * numbers["disturbance_walk_variance"]) ** 0.5
-        walk = state[1] + (2.0 * drawn[1] - 1.0) * width
-        return torch.stack((torch.lerp(state[0], level, jumps), walk)), LOAD_INTERVAL
+        moved = walk + drawn[1] * width
+        if len(self._phases) > 1:
+            turn = ((clock - self._starts) % LOAD_INTERVAL == 0).to(place.dtype)
+            moved, jumps = torch.lerp(walk, moved, turn), jumps.mul_(turn)
+        return torch.lerp(step, level, jumps), moved
 
-    return following
+
+def _reached(now: Tensor, change: Tensor) -> Tensor:
+    """Return 1 where a change has been reached, and 0 elsewhere."""
+    # Of the type of these: to use numbers of type bool as factors takes many times as long.
+    past = now - change
+    return past.ge_(past.new_zeros(()))
 
 
 class Repeated:
