@@ -377,7 +377,6 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             setpoint = self._random.take(samples, self._taken)
         else:
             setpoint = self._repeated.at(ages).expand(samples, n)
-            setpoint = setpoint.clone(memory_format=torch.contiguous_format)
         load = None
         if given is not None and "disturbance" in given:
             load = given.at("disturbance", ages)
@@ -393,17 +392,17 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             rewards = error.abs().mul_(-1.0 / scale)
 
         measured = output if reading is None else output + reading
-        measured = measured.clamp(
-            -self.parameters.temperature_span, self.parameters.temperature_span
-        )
-        # The set point is told, too, and what is told is the caller's.
-        for place, values in enumerate((setpoint.clone(), setpoint - measured, measured)):
+        span = self.parameters.temperature_span
+        measured = measured.clamp(-span, span)
+        for place, values in enumerate((setpoint, setpoint - measured, measured)):
             if self._windows[place]:
                 past = self._seen[place][self._taken :][: self._windows[place]]
                 self._seen[place] = [*past, *values.unbind()]
         flags = torch.zeros(2 * samples, n, dtype=torch.bool, device=self.device).unbind()
         none = torch.zeros_like(error) if noise is None else noise
-        blocks = [output, setpoint, error, none] + ([] if load is None else [load])
+        # The set point is shown later, too, and what is told is the caller's.
+        told_setpoint = setpoint.clone(memory_format=torch.contiguous_format)
+        blocks = [output, told_setpoint, error, none] + ([] if load is None else [load])
         told: list[Sequence[Tensor]] = [each.unbind() for each in blocks]
         if self.parameters.drifts:
             told += zip(*factors, strict=True)

@@ -224,9 +224,8 @@ class TorchPlants:
             flows = flows.index_select(0, self._places[:needed].reshape(-1)).view(needed, -1)
         response = flows[-samples:] * self._beta[0]
         for lag, coefficient in enumerate(self._beta[1:], start=1):
-            response = torch.add(
-                response, flows[needed - samples - lag : needed - lag], alpha=coefficient
-            )
+            earlier = flows[needed - samples - lag : needed - lag]
+            response = response.add_(earlier, alpha=coefficient)
         return response
 
     def _stretches(self, clock: int, samples: int) -> list[tuple[int, int]]:
