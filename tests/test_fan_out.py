@@ -240,6 +240,15 @@ def free_port():
         return server.getsockname()[1]
 
 
+def private():
+    """Return an environment that keeps Ray to those who have its token."""
+    return os.environ | {
+        "RAY_AUTH_MODE": "token",  # whatever this machine's settings are
+        "RAY_AUTH_TOKEN": secrets.token_hex(16),
+        "RAY_USAGE_STATS_ENABLED": "0",
+    }
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Ray's clusters are Linux's")
 @pytest.mark.skipif(
     importlib.util.find_spec("ray") is None,
@@ -248,20 +257,11 @@ def free_port():
 class TestRay:
     """In processes of their own: Ray logs, warns and leaves threads behind."""
 
-    def environment(self, port):
-        # A token of its own keeps the cluster private, whatever this machine's settings are.
-        return os.environ | {
-            "RAY_ADDRESS": f"127.0.0.1:{port}",
-            "RAY_AUTH_MODE": "token",
-            "RAY_AUTH_TOKEN": secrets.token_hex(16),
-            "RAY_USAGE_STATS_ENABLED": "0",
-        }
-
     @pytest.fixture
     def cluster(self):
         """Two cores; yields the environment of its users."""
         port = free_port()
-        environment = self.environment(port)
+        environment = private() | {"RAY_ADDRESS": f"127.0.0.1:{port}"}
         with tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True) as folder:
             command = [
                 *(sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block"),
@@ -305,8 +305,8 @@ class TestRay:
         program = "from benchmarks.lib.fan_out import FanOut; FanOut(2, 'ray')"
         done = subprocess.run(
             [sys.executable, "-c", program],
-            env=self.environment(free_port()), cwd=ROOT, timeout=60, capture_output=True,
-            text=True,
+            env=private() | {"RAY_ADDRESS": f"127.0.0.1:{free_port()}"},
+            cwd=ROOT, timeout=60, capture_output=True, text=True,
         )  # fmt: skip
         assert (
             "ValueError: No Ray cluster can be reached: start one with `ray start"
