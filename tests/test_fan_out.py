@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.lib import command_line, fan_out
+from benchmarks.lib import cluster, command_line, fan_out, storage
 from benchmarks.lib.fan_out import CellsFailedError, FanOut
 from tests import cells
 
@@ -226,6 +226,30 @@ class TestOptions:
     def test_an_unknown_backend_is_refused(self):
         with pytest.raises(ValueError, match="loky, ray, got 'dask'"):
             FanOut(1, "dask")
+
+
+class TestNodes:
+    def test_one_with_other_versions_computes_nothing(self):
+        here = storage.versions()
+        assert cluster._answer(partial(cells.draw, 1), here) == (cells.draw(1), "", False)
+        other = {**here, "numpy": "0.1", "more": "1.0"}
+        result, error, lost = cluster._answer(partial(cells.draw, 1), other)
+        assert result is None
+        assert lost
+        assert f"numpy {here['numpy']} instead of 0.1, more missing instead of 1.0" in error
+
+    def test_what_travels_is_code_alone(self, tmp_path, monkeypatch):
+        (tmp_path / "checkout" / "results").mkdir(parents=True)
+        (tmp_path / "checkout" / "mine.py").write_text("")
+        monkeypatch.setattr(cluster, "ROOT", tmp_path / "checkout")
+        there = tmp_path / "there"
+        there.mkdir()
+        cluster._pack(there)
+        top = {path.name for path in there.iterdir()}
+        assert top == {"agents", "benchmarks", "mptc_gym", "mine.py"}
+        files = [path for path in there.rglob("*") if path.is_file()]
+        assert {path.suffix for path in files} <= {".py", ".npz", ".csv", ".typed"}
+        assert sum(path.stat().st_size for path in files) < 2e6
 
 
 def until(condition, seconds=30.0):

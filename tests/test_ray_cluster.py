@@ -62,6 +62,7 @@ class Cluster:
             finally:
                 driver.kill()
         assert driver.returncode == 0, said
+        self.order("join")  # three again
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +109,6 @@ def test_a_sweep_loses_a_node(cluster, results):
 
 def test_a_training_loses_a_node(cluster, results):
     there, here = results / "trained there", results / "trained here"
-    cluster.order("join")
     cluster.run(
         "-m", "tests.nodes.train", str(there),
         files=lambda: list(there.glob("*/checkpoint.pt")), count=2,

@@ -115,16 +115,16 @@ class Cluster:
                 ray.cancel(left, force=True)
 
 
-def _answer(cell: Callable[[], Any], versions_here: dict[str, str]) -> tuple[Any, str, bool]:
+def _answer(cell: Callable[[], Any], here: dict[str, str]) -> tuple[Any, str, bool]:
     """Run a cell; return its result, what went wrong, and whether that was the node's fault."""
-    found = _versions()
-    if found != versions_here:
-        other = [name for name in versions_here if versions_here[name] != found.get(name)]
-        different = ", ".join(
-            f"{name} {found.get(name, '(none)')} instead of {versions_here[name]}"
-            for name in other or set(found) - set(versions_here)
-        )
-        return None, f"a node has {different}, with which the numbers may be others", True
+    there = _versions()
+    other = [
+        f"{name} {there.get(name, 'missing')} instead of {here.get(name, 'none')}"
+        for name in {**here, **there}
+        if here.get(name) != there.get(name)
+    ]
+    if other:
+        return None, f"A node would compute other numbers: it has {', '.join(other)}", True
     try:
         return cell(), "", False
     except Exception:
