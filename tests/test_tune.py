@@ -160,13 +160,14 @@ class TestSearch:
     def test_ppo_is_trained_once_a_trial(self, tmp_path, monkeypatch):
         trained = []
 
-        def train(arguments, folder, **_):
-            trained.append(arguments)
-
-        monkeypatch.setattr(ppo, "_train", train)
         state = ppo_training.begin(SMALL).policy.state_dict()
         network = ppo_training.exported(state, SMALL)
-        monkeypatch.setattr(ppo, "_loaded", lambda file: network)
+
+        def leg(arguments, checkpoint):
+            trained.append(arguments)
+            return network
+
+        monkeypatch.setattr(ppo_training, "leg", leg)
         monkeypatch.setattr(
             objective, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
         )

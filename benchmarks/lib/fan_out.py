@@ -1,16 +1,14 @@
 """Independent pieces of work, called cells, side by side: on this machine or on a Ray cluster.
 
-joblib hands them out. A cell's result is saved as soon as it is known, so that a run that was
-stopped goes on with what is missing. Which process runs a cell, and when, does not matter to
-its result as long as all its randomness comes from its arguments.
+joblib hands them out here, Ray on a cluster. A cell's result is saved as soon as it is known,
+so that a run that was stopped goes on with what is missing. Which process runs a cell, and
+when, does not matter to its result as long as all its randomness comes from its arguments.
 """
 
 from __future__ import annotations
 
 import json
-import logging
 import os
-import socket
 import threading
 import time
 import traceback
@@ -18,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -26,6 +24,7 @@ from urllib.parse import quote
 import joblib
 from tqdm import tqdm
 
+from benchmarks.lib.cluster import Cluster
 from benchmarks.lib.storage import seal, unseal, write_text
 
 BACKENDS = ("loky", "ray")
@@ -34,10 +33,9 @@ GIVE_UP = 10  # when so many cells were to blame, there is another fault
 NAMED = 10  # failed cells in a message
 PATIENCE = 0.5  # s between two looks at whether the parent is still there
 
-INSTALL_RAY = 'Ray is not installed: pip install -e ".[bench,ray]"'
-START_RAY = (
-    "No Ray cluster can be reached: start one with `ray start --head`, or set RAY_ADDRESS"
-)
+Cells = Mapping[str, Callable[[], Any]]
+# The name of a cell, its result, what went wrong, and whether its worker is lost.
+Answer = tuple[str, Any, str, bool]
 
 
 class CellsFailedError(RuntimeError):
@@ -71,7 +69,7 @@ class FanOut:
     ----------
     jobs
         How many cells run at once; None means as many as there are cores. With 1 they run in
-        this process. A cluster runs no more at once than it has cores.
+        this process, if not on a cluster, which runs no more at once than it has cores.
     backend
         "loky", processes on this machine; or "ray", a Ray cluster that is running already.
 
@@ -85,23 +83,14 @@ class FanOut:
         if backend not in BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
         self.backend = backend
-        self._lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
-        self._options: dict[str, Any] = {}
-        if backend == "ray":
-            cores, error = _connect()
-            self._lost += (error,)
-            # The cluster makes up for a lost worker by itself, and no other notices.
-            of_workers = {"num_cpus": 1, "max_restarts": -1, "max_task_retries": LOSSES - 1}
-            # Ray deals cells to its workers in turn, also to those that are busy; the more
-            # each has before it, the less often one has nothing to do.
-            self._options = {"ray_remote_args": of_workers, "pre_dispatch": "8 * n_jobs"}
-            self.jobs = min(jobs or cores, cores)
-        else:
-            self.jobs = jobs or joblib.cpu_count()
+        self._cluster = Cluster() if backend == "ray" else None
+        self._asked = jobs
+        cores = self._cluster.cores if self._cluster else joblib.cpu_count()
+        self.jobs = jobs or cores
 
     def run(
         self,
-        cells: Mapping[str, Callable[[], Any]],
+        cells: Cells,
         folder: Path | None = None,
         *,
         title: str = "cells",
@@ -134,51 +123,83 @@ class FanOut:
             At the end, if cells raised an exception or lost their worker again and again.
         """
         results = {} if folder is None else _saved(cells, folder)
-        missing = {key: cell for key, cell in cells.items() if key not in results}
-        errors: dict[str, str] = {}
-        losses: Counter[str] = Counter()
-        blamed = 0
+        missing = {
+            key: partial(_as_json, cell) for key, cell in cells.items() if key not in results
+        }
         bar = tqdm(total=len(cells), initial=len(results), desc=title, disable=not progress)
         with bar:
-            while missing:
-                suspect = next((key for key in missing if losses[key] >= LOSSES), None)
-                started: list[str] = []
-                try:
-                    tried = missing if suspect is None else {suspect: missing[suspect]}
-                    for key, text, error in self._answers(tried, started):
-                        if error:
-                            errors[key] = error
-                        else:
-                            results[key] = json.loads(text)
-                            if folder is not None:
-                                write_text(_file(folder, key), seal(results[key]))
-                        del missing[key]
-                        bar.update()
-                except self._lost as lost:
-                    if suspect is None:
-                        # Any of these may have been the end of the worker.
-                        in_flight = [key for key in started if key in missing]
-                        if not in_flight:
-                            raise
-                        losses.update(in_flight)
-                        continue
-                    errors[suspect] = f"{lost}\nIts worker was lost each time."
-                    del missing[suspect]
-                    blamed += 1
-                    if blamed == GIVE_UP:
-                        errors |= dict.fromkeys(missing, "Not run: too many lost their worker.")
-                        missing = {}
-        if errors:
-            named = {key: errors[key] for key in cells if key in errors}
-            raise CellsFailedError(named, len(cells))
+            try:
+                for key, text in self.stream(missing):
+                    results[key] = json.loads(text)
+                    if folder is not None:
+                        write_text(_file(folder, key), seal(results[key]))
+                    bar.update()
+            except CellsFailedError as error:
+                raise CellsFailedError(error.errors, len(cells)) from None
         return {key: results[key] for key in cells}
 
-    def _answers(
-        self, cells: Mapping[str, Callable[[], Any]], started: list[str]
-    ) -> Iterator[tuple[str, str, str]]:
+    def stream(self, cells: Cells) -> Iterator[tuple[str, Any]]:
+        """Run cells, and yield each name and result as they come.
+
+        Parameters
+        ----------
+        cells
+            As those of `run`, but what they return need only be such that it can be pickled.
+
+        Raises
+        ------
+        CellsFailedError
+            At the end, if cells raised an exception or lost their worker again and again.
+        """
+        errors: dict[str, str] = {}
+        answered: set[str] = set()
+        blamed = 0
+        answers = (
+            self._cluster.answers(cells, self._asked, LOSSES)
+            if self._cluster
+            else self._local(cells)
+        )
+        for key, result, error, lost in answers:
+            answered.add(key)
+            if not error:
+                yield key, result
+                continue
+            errors[key] = error
+            blamed += lost
+            if blamed == GIVE_UP:
+                break
+        for key in cells.keys() - answered:
+            errors[key] = "Not run: too many lost their worker."
+        if errors:
+            raise CellsFailedError({key: errors[key] for key in cells if key in errors},
+                                   len(cells))  # fmt: skip
+
+    def _local(self, cells: Cells) -> Iterator[Answer]:
+        """Run cells on this machine, those again whose worker is lost."""
+        missing = dict(cells)
+        losses: Counter[str] = Counter()
+        while missing:
+            suspect = next((key for key in missing if losses[key] >= LOSSES), None)
+            started: list[str] = []
+            try:
+                tried = missing if suspect is None else {suspect: missing[suspect]}
+                for key, result, error in self._answers(tried, started):
+                    del missing[key]
+                    yield key, result, error, False
+            except BrokenExecutor as lost:
+                if suspect is None:
+                    # Any of these may have been the end of the worker.
+                    in_flight = [key for key in started if key in missing]
+                    if not in_flight:
+                        raise
+                    losses.update(in_flight)
+                    continue
+                del missing[suspect]
+                yield suspect, None, f"{lost}\nIts worker was lost each time.", True
+
+    def _answers(self, cells: Cells, started: list[str]) -> Iterator[tuple[str, Any, str]]:
         """Run cells, yield their answers as they come, and note which were handed out."""
-        # The workers of a cluster are its own, and end with their driver.
-        parent = os.getpid() if self.backend == "loky" else None
+        parent = os.getpid()
 
         def tasks() -> Iterator[Any]:
             for key, cell in list(cells.items()):
@@ -189,23 +210,26 @@ class FanOut:
         processes = 1 if self.jobs == 1 else max(2, min(self.jobs, len(cells)))
         parallel = joblib.Parallel(
             processes,
-            backend=self.backend,
+            backend="loky",
             return_as="generator_unordered",
             batch_size=1,  # a lost worker takes along no more than it must
-            **self._options,
         )
         yield from parallel(tasks())
 
 
-def _answer(key: str, cell: Callable[[], Any], parent: int | None) -> tuple[str, str, str]:
-    """Run a cell; return its name, its result as JSON, and what went wrong, if anything."""
-    if parent is not None and parent != os.getpid():
+def _as_json(cell: Callable[[], Any]) -> str:
+    return json.dumps(cell())
+
+
+def _answer(key: str, cell: Callable[[], Any], parent: int) -> tuple[str, Any, str]:
+    """Run a cell; return its name, its result, and what went wrong, if anything."""
+    if parent != os.getpid():
         _end_with(parent)
     try:
-        return key, json.dumps(cell()), ""
+        return key, cell(), ""
     except Exception:
         # As text, since not every exception survives the way to another process.
-        return key, "", traceback.format_exc()
+        return key, None, traceback.format_exc()
 
 
 @cache
@@ -234,34 +258,3 @@ def _saved(keys: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         with suppress(FileNotFoundError, ValueError):  # not there, or damaged
             results[key] = unseal(_file(folder, key).read_text(encoding="utf-8"))
     return results
-
-
-def _connect() -> tuple[int, type[BaseException]]:
-    """Connect to the Ray cluster; return the number of its cores, and what a loss raises."""
-    # Ray tells of every worker that it stops at the end, as if that were an error. It reads
-    # this when it is imported.
-    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "__ray_terminate__")
-    try:
-        import ray  # here: an extra, which takes a second to load
-        from ray.util.joblib import register_ray
-        from ray.util.joblib.ray_backend import RayBackend
-    except ImportError as error:
-        raise ValueError(INSTALL_RAY) from error
-    if not ray.is_initialized():
-        try:
-            _knock(os.environ.get("RAY_ADDRESS", ""))
-            ray.init(address="auto", log_to_driver=False, logging_level=logging.ERROR)
-        except OSError as error:
-            raise ValueError(f"{START_RAY} ({error})") from error
-    register_ray()
-    # joblib denies generators to the pools of multiprocessing, whose class this is, because
-    # those hang when a worker dies. Ray's do not: they report it.
-    RayBackend.supports_return_generator = True
-    return int(ray.cluster_resources().get("CPU", 1)), ray.exceptions.RayError
-
-
-def _knock(address: str) -> None:
-    """Raise OSError if nobody listens there: Ray itself would wait for many minutes."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if host and port.isdecimal():
-        socket.create_connection((host, int(port)), timeout=10).close()

@@ -24,10 +24,10 @@ from agents.policy_network import PRETRAINED
 from benchmarks.controllers import records
 from benchmarks.lib import command_line, drawing
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.storage import replacing
+from benchmarks.lib.storage import commit, replacing
 from benchmarks.lib.tables import on_screen
-from benchmarks.train import ppo
-from benchmarks.train.through_plant import TRAININGS, Training, train, training_key
+from benchmarks.train import legs, ppo
+from benchmarks.train.through_plant import TRAININGS, Training, leg, training_key
 
 NETWORKS = 5  # are trained, from seeds in sequence
 
@@ -123,20 +123,20 @@ def run(
     trainings: Sequence[Training], out: Path, fan_out: FanOut, *, retrain: bool = False
 ) -> list[PolicyNetwork]:
     """Train side by side, each in a folder of its own below `out`, and return the networks."""
-    # Absolute, as workers may have been started elsewhere.
-    folders = [(out / training_key(training)).absolute() for training in trainings]
-    bars = fan_out.backend == "loky"  # those of other machines do not come here
-    cells = {
-        f"{folder.name}": partial(_train, training, folder, retrain=retrain, progress=bars)
-        for training, folder in zip(trainings, folders, strict=True)
-    }
-    fan_out.run(cells, title="training", progress=not bars)
-    return [PolicyNetwork.load(folder / "network.npz") for folder in folders]
+    courses = [course(training, out / training_key(training)) for training in trainings]
+    legs.train(courses, fan_out, retrain=retrain)
+    return [PolicyNetwork.load(each.network) for each in courses]
 
 
-def _train(training: Training, folder: Path, *, retrain: bool, progress: bool) -> None:
-    """Train a network, which lies in its folder then."""
-    train(training, folder, retrain=retrain, progress=progress)
+def course(training: Training, folder: Path) -> legs.Course:
+    """Return a training that a folder keeps."""
+    return legs.Course(
+        folder.name,
+        partial(leg, training, commit()),
+        training.steps,
+        folder / "network.npz",
+        folder / "checkpoint.pt",
+    )
 
 
 def summary(networks: Sequence[PolicyNetwork]) -> pd.DataFrame:

@@ -12,8 +12,8 @@ import json
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,6 +22,8 @@ from agents.policy_network import PRETRAINED
 from benchmarks.controllers.records import Account, Training
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import replacing
+from benchmarks.train import legs
+from benchmarks.train.checkpoint import Checkpoint
 from benchmarks.train.ppo_arguments import RANDOMISED, PPOArguments
 from mptc_gym import Parameters
 
@@ -40,21 +42,25 @@ class Policy:
         How it was trained.
     file
         Where it is.
+    network
+        What the file holds. It goes along to machines where the file is not.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged; the message names it, and what to do.
     """
 
     arguments: PPOArguments
     file: Path
+    network: PolicyNetwork = field(init=False, compare=False, repr=False)
 
-    @property
-    def network(self) -> PolicyNetwork:
-        """The policy.
-
-        Raises
-        ------
-        ValueError
-            If the file is damaged; the message names it.
-        """
-        return _loaded(self.file)
+    def __post_init__(self) -> None:
+        try:
+            network = PolicyNetwork.load(self.file)
+        except ValueError as error:
+            raise ValueError(f"{error}: remove it, or --retrain") from error
+        object.__setattr__(self, "network", network)
 
     @property
     def observation(self) -> dict[str, Any]:
@@ -90,16 +96,6 @@ class Policy:
         return network
 
 
-def _load(file: Path) -> PolicyNetwork:
-    try:
-        return PolicyNetwork.load(file)
-    except ValueError as error:
-        raise ValueError(f"{error}: remove it, or --retrain") from error
-
-
-_loaded = cache(_load)
-
-
 def members(
     training: Training, arguments: PPOArguments | None = None, *, shipped: bool = True
 ) -> list[Policy]:
@@ -120,40 +116,38 @@ def members(
     if training.steps is not None:
         arguments = replace(arguments, steps=training.steps)
     seeds = range(arguments.seed, arguments.seed + (training.members or POLICIES))
-    policies = []
-    for each in (replace(arguments, seed=seed) for seed in seeds):
-        # Absolute, as workers may have been started elsewhere.
-        policy = Policy(each, (training.folder / policy_key(each) / POLICY).absolute())
-        if shipped and not (training.retrain or policy.file.exists()):
-            comes = Policy(each, pretrained(each))
-            policy = comes if is_trained_as(comes) else policy
-        policies.append(policy)
-    # A bar for each training; those of other machines do not come here.
-    bars = training.fan_out.backend == "loky"
-    cells = {
-        f"PPO, seed {policy.arguments.seed}": partial(
-            _train,
-            policy.arguments,
-            policy.file.parent,
-            retrain=training.retrain,
-            progress=bars,
-        )
-        for policy in policies
-        if training.retrain or not policy.file.exists()
-    }
-    training.fan_out.run(cells, title="training PPO", progress=bool(cells) and not bars)
-    _loaded.cache_clear()  # what is in the files may be new
-    for policy in policies:
-        if not policy.file.exists():
-            raise FileNotFoundError(
-                f"trained, but not here: the machines of a cluster must share {policy.file}"
-            )
-    return policies
+    wanted = [replace(arguments, seed=seed) for seed in seeds]
+    courses, files = [], []
+    for each in wanted:
+        own = course(each, training.folder / policy_key(each))
+        if shipped and not (training.retrain or own.network.exists()) and _comes(each):
+            files.append(pretrained(each))
+        else:
+            courses.append(own)
+            files.append(own.network)
+    legs.train(courses, training.fan_out, retrain=training.retrain)
+    return [Policy(each, file) for each, file in zip(wanted, files, strict=True)]
 
 
-def _train(arguments: PPOArguments, folder: Path, *, retrain: bool, progress: bool) -> None:
-    """Train a policy, which lies in its folder then."""
-    trained_policy(arguments, folder, retrain=retrain, progress=progress)
+def course(arguments: PPOArguments, folder: Path) -> legs.Course:
+    """Return the training of a policy, which a folder keeps.
+
+    Its files are archives of arrays and JSON, with checksums; reading them runs nothing that
+    they hold.
+    """
+    return legs.Course(
+        f"PPO, seed {arguments.seed}",
+        partial(_leg, arguments),
+        arguments.steps,
+        folder / POLICY,
+        folder / CHECKPOINT,
+    )
+
+
+def _leg(arguments: PPOArguments, checkpoint: Checkpoint | None) -> Checkpoint | PolicyNetwork:
+    from benchmarks.train import ppo_training  # here: torch takes seconds to load
+
+    return ppo_training.leg(arguments, checkpoint)
 
 
 def randomised_members(training: Training) -> list[Policy]:
@@ -166,10 +160,9 @@ def tuned(*, final: bool, member: int, **gains: Any) -> Policy:
     first = FINAL_SEED if final else TUNING_SEED
     arguments = PPOArguments(seed=first + member, **gains)
     with tempfile.TemporaryDirectory() as folder:
-        _train(arguments, Path(folder), retrain=False, progress=False)
-        policy = Policy(arguments, Path(folder) / POLICY)
-        assert policy.network  # is loaded while the folder is there
-        return policy
+        own = course(arguments, Path(folder))
+        legs.train([own], Training().fan_out, progress=False)
+        return Policy(arguments, own.network)
 
 
 def pretrained(arguments: PPOArguments) -> Path:
@@ -177,12 +170,13 @@ def pretrained(arguments: PPOArguments) -> Path:
     return PRETRAINED / f"ppo-{arguments.seed}.npz"
 
 
-def is_trained_as(policy: Policy) -> bool:
-    """Say whether a policy's file exists and holds one that was trained with its arguments."""
-    if not policy.file.exists():
+def _comes(arguments: PPOArguments) -> bool:
+    """Say whether a policy that was trained like this comes with the project."""
+    file = pretrained(arguments)
+    if not file.exists():
         return False
-    asked = json.loads(json.dumps(asdict(policy.arguments)))
-    return bool(policy.network.provenance.get("arguments") == asked)
+    asked = json.loads(json.dumps(asdict(arguments)))
+    return bool(Policy(arguments, file).network.provenance.get("arguments") == asked)
 
 
 def publish(policies: Sequence[Policy], folder: Path = PRETRAINED) -> None:
@@ -195,47 +189,3 @@ def publish(policies: Sequence[Policy], folder: Path = PRETRAINED) -> None:
 def policy_key(arguments: PPOArguments) -> str:
     """Return a name made of everything that shapes a policy."""
     return fingerprint(__name__, arguments=asdict(arguments))
-
-
-def trained_policy(
-    arguments: PPOArguments, folder: Path, *, retrain: bool, progress: bool
-) -> PolicyNetwork:
-    """Load the policy that a folder holds, or finish or begin its training.
-
-    Parameters
-    ----------
-    arguments
-        How to train.
-    folder
-        Where the policy is kept: `policy.npz` when it is finished, `checkpoint.npz` until
-        then. Both are archives of arrays and JSON, with checksums; reading them runs nothing
-        that they hold.
-    retrain
-        Whether to forget what the folder holds.
-    progress
-        Whether to show a progress bar.
-
-    Returns
-    -------
-    PolicyNetwork
-        The policy. Training that was interrupted and resumed ends in the same policy, to the
-        bit, as training that was not.
-
-    Raises
-    ------
-    ValueError
-        If a file is damaged; the message names it, and what to do.
-    """
-    policy, checkpoint = folder / POLICY, folder / CHECKPOINT
-    if retrain:
-        policy.unlink(missing_ok=True)
-        checkpoint.unlink(missing_ok=True)
-    if policy.exists():
-        return _load(policy)
-    from benchmarks.train import ppo_training  # here: torch takes seconds to load
-
-    network = ppo_training.train(arguments, checkpoint, progress=progress)
-    with replacing(policy) as file:
-        network.save(file)
-    checkpoint.unlink(missing_ok=True)
-    return network

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import copy
+import io
 import json
 import math
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
@@ -22,13 +22,13 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
-from tqdm import tqdm
 
 from agents import Increments, PolicyNetwork
-from benchmarks.lib.storage import replacing, versions
+from benchmarks.lib.storage import versions
 from benchmarks.metrics import mean_error
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
+from benchmarks.train.checkpoint import Checkpoint
 from benchmarks.train.ppo_arguments import PPOArguments
 from benchmarks.train.sb3_vec_env import GymnasiumVecEnv
 from mptc_gym import Parameters
@@ -48,52 +48,36 @@ TRAINING_SEEDS = (
 )  # and above: of what the plants meet in training, and nothing else does
 
 
-def train(
-    arguments: PPOArguments, checkpoint: Path | None = None, *, progress: bool = False
-) -> PolicyNetwork:
-    """Train a policy, or finish its training.
+def leg(arguments: PPOArguments, checkpoint: Checkpoint | None) -> Checkpoint | PolicyNetwork:
+    """Train from one start to the next.
 
     Parameters
     ----------
     arguments
         How to train.
     checkpoint
-        Where the training is kept after each start. If the file is there, the training goes on
-        from it, and ends in the same policy, to the bit, as one that was not interrupted.
-    progress
-        Whether to show a progress bar.
+        What to go on from; None at the first.
 
     Returns
     -------
-    PolicyNetwork
-        The policy that did best in validation: on set points that are met neither in training
-        nor in a comparison. Its provenance holds the arguments and the learning curve.
+    Checkpoint or PolicyNetwork
+        What the next leg goes on from; or, at the end, the policy that did best in validation:
+        on set points that are met neither in training nor in a comparison. Its provenance holds
+        the arguments and the learning curve.
 
     Raises
     ------
     ValueError
         If the checkpoint is damaged; the message names it.
     """
-    kept = Progress()
-    if checkpoint is not None and checkpoint.exists():
-        kept = _resume(arguments, checkpoint)
+    kept = Progress() if checkpoint is None else _resume(arguments, checkpoint)
     share = arguments.steps // arguments.starts
-    bar = tqdm(
-        desc=f"training PPO, seed {arguments.seed}",
-        total=share * arguments.starts,
-        initial=share * kept.starts,
-        unit=" samples",
-        unit_scale=True,
-        disable=not progress,
-    )
-    with bar:
-        while kept.starts < arguments.starts:
-            keeper = Keeper(arguments, kept, bar)
-            begin(arguments, start=kept.starts).learn(share, callback=keeper)
-            keeper.record()
-            kept.starts += 1
-            if checkpoint is not None:
-                _save(arguments, kept, checkpoint)
+    keeper = Keeper(arguments, kept)
+    begin(arguments, start=kept.starts).learn(share, callback=keeper)
+    keeper.record()
+    kept.starts += 1
+    if kept.starts < arguments.starts:
+        return Checkpoint(_saved(arguments, kept), steps=share * kept.starts)
     provenance = {
         "algorithm": "PPO of Stable-Baselines3",
         "arguments": asdict(arguments),
@@ -303,14 +287,11 @@ class Keeper(BaseCallback):
         How the policy is trained.
     progress
         How far the training got; it is carried on.
-    bar
-        Shows it.
     """
 
-    def __init__(self, arguments: PPOArguments, progress: Progress, bar: tqdm[Any]) -> None:
+    def __init__(self, arguments: PPOArguments, progress: Progress) -> None:
         super().__init__()
         self.progress = progress
-        self._bar = bar
         self._arguments = arguments
         self._errors: list[float] = []
         self._share = arguments.steps // arguments.starts
@@ -326,7 +307,6 @@ class Keeper(BaseCallback):
     def _on_step(self) -> bool:
         errors = self._plants.infos["error"]
         self._errors.append(float(np.mean(np.abs(errors))))
-        self._bar.update(self._plants.num_envs)
         return True
 
     def _on_rollout_start(self) -> None:
@@ -363,7 +343,6 @@ class Keeper(BaseCallback):
             }
         )
         self._errors.clear()
-        self._bar.set_postfix_str(f"mean |e| {validation:.3f}")
 
     def _mae(self, arguments: dict[str, Any], runs: int, samples: int, seed: int) -> float:
         plants = make_plants(runs, samples, **arguments)
@@ -371,23 +350,24 @@ class Keeper(BaseCallback):
         return float(mean_error(rollout(plants, agent, samples, seed)).mean())
 
 
-def _save(arguments: PPOArguments, progress: Progress, path: Path) -> None:
-    """Write all that a training needs to go on after a start."""
+def _saved(arguments: PPOArguments, progress: Progress) -> bytes:
+    """Return all that a training needs to go on after a start."""
     best = {f"best {name}": value.numpy() for name, value in progress.best.items()}
     about = {
         "arguments": asdict(arguments),
         "starts": progress.starts,
         "curve": progress.curve,
     }
-    with replacing(path) as file:
-        np.savez(file, about=np.array(json.dumps(about)), **best)  # type: ignore[arg-type]
+    content = io.BytesIO()
+    np.savez(content, about=np.array(json.dumps(about)), **best)  # type: ignore[arg-type]
+    return content.getvalue()
 
 
-def _resume(arguments: PPOArguments, path: Path) -> Progress:
-    """Return how far a training got. Reading the file runs nothing that it holds."""
+def _resume(arguments: PPOArguments, checkpoint: Checkpoint) -> Progress:
+    """Return how far a training got. Reading the checkpoint runs nothing that it holds."""
     try:
         # All of it is read, as that is when the checksums are looked at.
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+        with np.load(io.BytesIO(checkpoint.content), allow_pickle=False) as file:
             about = json.loads(str(file["about"]))
             if about["arguments"] != json.loads(json.dumps(asdict(arguments))):
                 raise ValueError("it is of another training")
@@ -397,6 +377,6 @@ def _resume(arguments: PPOArguments, path: Path) -> Progress:
             return Progress(int(about["starts"]), curve, best)
     except Exception as error:  # damage shows in zip, zlib, NumPy, JSON or the shapes
         raise ValueError(
-            f"{path} is no checkpoint of this training, or is damaged: {error}: "
+            f"{checkpoint.name} is no checkpoint of this training, or is damaged: {error}: "
             "remove it, or --retrain"
         ) from error

@@ -10,23 +10,22 @@ nonlinear systems", Journal of Process Control 116, 2022, 80-92) or analytic pol
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import pandas as pd
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from agents import PolicyNetwork
 from benchmarks.designs import SPANS
 from benchmarks.lib.fingerprint import fingerprint
-from benchmarks.lib.storage import commit, replacing, versions
+from benchmarks.lib.storage import versions
+from benchmarks.train.checkpoint import Checkpoint
 from mptc_gym import Parameters
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
@@ -357,8 +356,8 @@ class Trainer:
         network.load_state_dict(self._best)
         return network
 
-    def save(self, path: Path) -> None:
-        """Write a checkpoint, whole or not at all; numbers and tensors alone."""
+    def checkpoint(self) -> Checkpoint:
+        """Return all that it takes to go on; numbers and tensors alone."""
         state = {
             "training": asdict(self.training),
             "step": self.step,
@@ -369,93 +368,73 @@ class Trainer:
             "curve": self.curve,
             "seconds": self._seconds,
         }
-        with replacing(path) as file:
-            torch.save(state, file)
+        content = io.BytesIO()
+        torch.save(state, content)
+        return Checkpoint(content.getvalue(), steps=self.step)
 
-    @classmethod
-    def resume(cls, path: Path, training: Training) -> Trainer:
-        """Go on from a checkpoint. Nothing in the file is executed.
+    def resume(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint. Nothing in it is executed.
 
         Raises
         ------
         ValueError
-            If the file is damaged, or of another training.
+            If it is damaged, or of another training.
         """
         try:
-            state = torch.load(path, weights_only=True)
-            if state["training"] != asdict(training):
+            state = torch.load(io.BytesIO(checkpoint.content), weights_only=True)
+            if state["training"] != asdict(self.training):
                 raise ValueError("it is of another training")
-            trainer = cls(training)
-            trainer._network.load_state_dict(state["network"])
-            trainer.averaged.load_state_dict(state["averaged"])
-            trainer._optimiser.load_state_dict(state["optimiser"])
-            trainer.step, trainer.curve = state["step"], state["curve"]
-            trainer._best, trainer._seconds = state["best"], state["seconds"]
+            self._network.load_state_dict(state["network"])
+            self.averaged.load_state_dict(state["averaged"])
+            self._optimiser.load_state_dict(state["optimiser"])
+            self.step, self.curve = state["step"], state["curve"]
+            self._best, self._seconds = state["best"], state["seconds"]
         except Exception as error:  # damage shows in zip, pickle, PyTorch or here
-            raise ValueError(f"{path} is damaged ({error}): remove it, or --retrain") from error
-        return trainer
+            raise ValueError(
+                f"{checkpoint.name} is damaged ({error}): remove it, or --retrain"
+            ) from error
 
 
-def train(
-    training: Training, folder: Path, *, retrain: bool = False, progress: bool = False
-) -> PolicyNetwork:
-    """Load the network that a folder holds, or finish or begin its training.
+def leg(
+    training: Training, source: str, checkpoint: Checkpoint | None
+) -> Checkpoint | PolicyNetwork:
+    """Train until the next validation.
 
     Parameters
     ----------
     training
         What to do.
-    folder
-        Where it is kept: `network.npz` and `learning.csv` when it is finished, `checkpoint.pt`
-        until then.
-    retrain
-        Whether to forget what the folder holds.
-    progress
-        Whether to show a progress bar.
+    source
+        The commit that this is run from, for the provenance.
+    checkpoint
+        What to go on from; None at the start.
 
     Returns
     -------
-    PolicyNetwork
-        The network that did best in validation. Training that was interrupted and resumed ends
-        in the same network, to the bit, as training that was not.
+    Checkpoint or PolicyNetwork
+        What the next leg goes on from; or, at the end, the network that did best in validation.
     """
-    kept, checkpoint = folder / "network.npz", folder / "checkpoint.pt"
-    if retrain:
-        kept.unlink(missing_ok=True)
-        checkpoint.unlink(missing_ok=True)
-    if kept.exists():
-        return PolicyNetwork.load(kept)
     torch.set_num_threads(1)  # the network is too small for more
-    resumes = checkpoint.exists()
-    trainer = Trainer.resume(checkpoint, training) if resumes else Trainer(training)
-    bar = tqdm(
-        desc=f"training on {training.plants} plants, seed {training.seed}",
-        total=training.steps,
-        initial=trainer.step,
-        disable=not progress,
-    )
-    with bar:
-        while trainer.step < training.steps:
-            trainer.advance()
-            bar.update()
-            if trainer.step % training.validate_every == 0 or trainer.step == training.steps:
-                bar.set_postfix_str(f"mean |e| {trainer.record()['validation_mae']:.3f}")
-                trainer.save(checkpoint)
+    trainer = Trainer(training)
+    if checkpoint is not None:
+        trainer.resume(checkpoint)
+    while trainer.step < training.steps:
+        trainer.advance()
+        if trainer.step == training.steps:
+            trainer.record()
+        elif trainer.step % training.validate_every == 0:
+            trainer.record()
+            return trainer.checkpoint()
     best = min(trainer.curve, key=lambda row: row["score"])
-    network = trainer.best().export(
+    return trainer.best().export(
         training=asdict(training),
         validation={"seed": VALIDATION_SEED, "plants": VALIDATION_PLANTS, **best},
         cpu_seconds=trainer.curve[-1]["cpu_seconds"],
         curve=trainer.curve,
         code=training_key(training),
         versions=versions(),
-        commit=commit(),
+        commit=source,
     )
-    with replacing(folder / "learning.csv") as file:
-        pd.DataFrame(trainer.curve).to_csv(file, index=False)
-    network.save(kept)
-    checkpoint.unlink(missing_ok=True)
-    return network
 
 
 def training_key(training: Training) -> str:

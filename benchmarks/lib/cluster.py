@@ -1,0 +1,153 @@
+"""Cells on a Ray cluster: the code travels with the job, results come back as objects.
+
+The nodes need Ray and the packages that a cell imports. They share no folder, and no checkout
+is on them: Ray unpacks the code where its workers run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import shutil
+import socket
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from benchmarks.lib.storage import ROOT, versions
+
+TRAVELS = ("agents", "benchmarks", "mptc_gym")  # and the modules beside them
+STAYS = ("__pycache__", "published", "*.md")
+QUEUED = 4  # cells a core that are handed out; also for nodes that come later
+
+INSTALL_RAY = 'Ray is not installed: pip install -e ".[bench,ray]"'
+START_RAY = (
+    "No Ray cluster can be reached: start one with `ray start --head`, or set RAY_ADDRESS"
+)
+
+
+class Cluster:
+    """The Ray cluster of RAY_ADDRESS, or of this machine.
+
+    Attributes
+    ----------
+    cores
+        How many it has now.
+
+    Raises
+    ------
+    ValueError
+        If Ray is not installed, or no cluster is found.
+    """
+
+    def __init__(self) -> None:
+        try:
+            import ray  # here: an extra, which takes a second to load
+        except ImportError as error:
+            raise ValueError(INSTALL_RAY) from error
+        if not ray.is_initialized():
+            # Code that `ray job submit` has brought there is the same.
+            os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
+            address = os.environ.get("RAY_ADDRESS", "")
+            try:
+                _knock(address)
+                with tempfile.TemporaryDirectory() as folder:
+                    _pack(Path(folder))
+                    ray.init(
+                        address=address or "auto",
+                        runtime_env={"working_dir": folder},
+                        log_to_driver=False,
+                        logging_level=logging.ERROR,
+                    )
+            except OSError as error:
+                raise ValueError(f"{START_RAY} ({error})") from error
+        self._ray = ray
+        self.cores = int(ray.cluster_resources().get("CPU", 1))
+
+    def answers(
+        self, cells: Mapping[str, Callable[[], Any]], jobs: int | None, tries: int
+    ) -> Iterator[tuple[str, Any, str, bool]]:
+        """Run cells and yield their answers as they come.
+
+        Parameters
+        ----------
+        cells
+            What to run, by name.
+        jobs
+            How many at once; None for as many as the cluster has cores.
+        tries
+            How often a cell is begun at most, if its worker or node is lost.
+
+        Yields
+        ------
+        tuple
+            The name of a cell, its result, what went wrong, if anything, and whether that was
+            on the side of the cluster.
+        """
+        ray = self._ray
+        task = ray.remote(num_cpus=1, max_retries=tries - 1)(_answer)
+        waiting = iter(cells.items())
+        running: dict[Any, str] = {}
+        here = versions()
+        try:
+            while True:
+                room = (jobs or QUEUED * self.cores) - len(running)
+                for key, cell in islice(waiting, room):
+                    running[task.remote(cell, here)] = key
+                if not running:
+                    return
+                for done in ray.wait(list(running))[0]:
+                    key = running.pop(done)
+                    try:
+                        result, error, other = ray.get(done)
+                    except ray.exceptions.RayError as lost:
+                        reason = f"No result came back: {type(lost).__name__}"
+                        yield key, None, f"{lost}\n{reason}", True
+                    else:
+                        yield key, result, error, other
+        finally:
+            for left in running:
+                ray.cancel(left, force=True)
+
+
+def _answer(cell: Callable[[], Any], here: dict[str, str]) -> tuple[Any, str, bool]:
+    """Run a cell; return its result, what went wrong, and whether that was the node's fault."""
+    there = _versions()
+    other = [
+        f"{name} {there.get(name, 'missing')} instead of {here.get(name, 'none')}"
+        for name in {**here, **there}
+        if here.get(name) != there.get(name)
+    ]
+    if other:
+        return None, f"A node would compute other numbers: it has {', '.join(other)}", True
+    try:
+        return cell(), "", False
+    except Exception:
+        # As text, since not every exception survives the way to another process.
+        return None, traceback.format_exc(), False
+
+
+_versions = cache(versions)
+
+
+def _pack(folder: Path) -> None:
+    """Copy the code that cells import."""
+    stays = shutil.ignore_patterns(*STAYS)
+    for name in TRAVELS:
+        package = importlib.import_module(name)  # mptc_gym may be installed
+        assert package.__file__ is not None
+        shutil.copytree(Path(package.__file__).parent, folder / name, ignore=stays)
+    for module in ROOT.glob("*.py"):  # such as those of controllers of one's own
+        shutil.copy(module, folder)
+
+
+def _knock(address: str) -> None:
+    """Raise OSError if nobody listens there: Ray itself would wait for many minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=10).close()
