@@ -1,8 +1,10 @@
 """The examples run, with little to learn from, and do what they say."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +17,7 @@ from stable_baselines3 import PPO
 from benchmarks.datasets.history import arguments_of, record
 from benchmarks.examples import cleanrl_style, offline, ppo_torch, sb3
 from benchmarks.train import defaults
+from benchmarks.train.sb3_vec_env import GymnasiumVecEnv
 
 ROOT = Path(__file__).parent.parent
 
@@ -60,6 +63,20 @@ class TestSB3:
         studied = defaults.square_error(defaults.PolicyController(model), plant)
         # One counts the error from k = 0, the other from k = 1, when it is as large.
         assert sb3.mean_error(model) == pytest.approx(studied, abs=0.02)
+
+
+def test_stable_baselines3_learns_with_the_lines_of_the_page():
+    page = (ROOT / "benchmarks/examples/clients.md").read_text(encoding="utf-8")
+    lines = re.findall(r"^\| Stable-Baselines3.*?`(.+?)`", page, re.MULTILINE)
+    short = partial(PPO, device="cpu", n_steps=8, batch_size=8, n_epochs=1, seed=0)
+    names = {"PPO": short, "GymnasiumVecEnv": GymnasiumVecEnv, "gymnasium": gymnasium}
+    models = [eval(line, names) for line in lines]
+    assert [model.n_envs for model in models] == [1, 64]
+    for model in models:
+        before = weights(model.policy)
+        model.learn(1)
+        assert model.num_timesteps == 8 * model.n_envs
+        assert not torch.equal(before, weights(model.policy))
 
 
 class TestOnOnePage:
