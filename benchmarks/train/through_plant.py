@@ -27,6 +27,7 @@ from agents import PolicyNetwork
 from benchmarks.designs import SPANS
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import commit, replacing, versions
+from benchmarks.lib.tables import write_csv
 from mptc_gym import Parameters
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
@@ -451,8 +452,7 @@ def train(
         versions=versions(),
         commit=commit(),
     )
-    with replacing(folder / "learning.csv") as file:
-        pd.DataFrame(trainer.curve).to_csv(file, index=False)
+    write_csv(folder / "learning.csv", pd.DataFrame(trainer.curve))
     network.save(kept)
     checkpoint.unlink(missing_ok=True)
     return network
