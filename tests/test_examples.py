@@ -189,17 +189,6 @@ runpy.run_module("benchmarks.examples.torch_free", run_name="__main__")
     assert 0.9 < errors["NN"] < errors["PI"] < 5.0
 
 
-def test_rllib_trains_on_it():
-    found = run("-c", "import ray.rllib")
-    if found.returncode:
-        why = found.stderr.strip().splitlines()[-1]
-        pytest.skip(f"RLlib is not installed (pip install -e '.[bench,rllib]'): {why}")
-    done = run("-m", "benchmarks.examples.rllib", "--steps", "500", "--batch", "250")
-    assert done.returncode == 0, done.stderr
-    shown = [line for line in done.stdout.splitlines() if "mean |e|" in line]
-    assert [line.split()[0] for line in shown] == ["250", "500"]
-
-
 class TestOffline:
     SMALL = offline.Arguments(steps=4, batch=8, width=8)
 
