@@ -1,11 +1,40 @@
-"""Try one reinforcement-learning library on the environment, with the lines of clients.md."""
+"""Try one reinforcement-learning library on the environment, with its lines of clients.md.
 
+Each line is taken from the page, word for word, and used to train or to step. Commands get the
+options that make them short.
+"""
+
+import re
+import subprocess
 import sys
+import zipfile
+from importlib import metadata
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 
 import mptc_gym  # noqa: F401 (registers the environment)
+
+ROOT = Path(__file__).parent.parent
+PAGE = ROOT / "benchmarks/examples/clients.md"
+
+
+def lines(library: str) -> list[str]:
+    """Return what the page's table gives as the lines that work with a library."""
+    rows = [line.split(" | ") for line in PAGE.read_text(encoding="utf-8").splitlines()]
+    found = [row[2] for row in rows if re.fullmatch(rf"\| {library}(,.*)?", row[0])]
+    assert found, f"the page has no line of {library}"
+    return [line.strip("`") for line in found]
+
+
+def run(line: str, *options: str, folder: Path | None = None) -> subprocess.CompletedProcess:
+    """Run a command of the page with the Python that runs this."""
+    program, *words = line.split()
+    assert program == "python", line
+    return subprocess.run(
+        [sys.executable, *words, *options], cwd=folder, capture_output=True, text=True
+    )
 
 
 def torchrl() -> None:
@@ -13,9 +42,12 @@ def torchrl() -> None:
     from torchrl.envs import GymEnv, GymWrapper
     from torchrl.envs.utils import check_env_specs
 
-    env = GymEnv("MiddlePoint-v0", setpoint="random", action_window=20)
+    names = {"GymEnv": GymEnv, "GymWrapper": GymWrapper, "gymnasium": gymnasium}
+    env, batch = (eval(line, names) for line in lines("TorchRL"))
     check_env_specs(env)
     assert env.rollout(50)["next", "reward"].shape == (50, 1)
+    check_env_specs(batch)
+    assert batch.rollout(50)["next", "reward"].shape == (64, 50, 1)
     for mode in ("Disabled", "SameStep"):
         plants = gymnasium.make_vec(
             "MiddlePoint-v0", num_envs=4, max_episode_steps=20, autoreset_mode=mode
@@ -54,7 +86,8 @@ def skrl() -> None:
         def compute(self, inputs: dict, role: str) -> tuple:
             return self.value(inputs["observations"]), {}
 
-    env = wrap_env(gymnasium.make_vec("MiddlePoint-v0", num_envs=8, action_window=20))
+    (line,) = lines("skrl")
+    env = eval(line, {"wrap_env": wrap_env, "gymnasium": gymnasium})
     spaces = {
         "observation_space": env.observation_space,
         "action_space": env.action_space,
@@ -67,7 +100,7 @@ def skrl() -> None:
     before = policy.mean.weight.clone()
     agent = PPO(
         models={"policy": policy, "value": Value(**spaces)},
-        memory=RandomMemory(memory_size=16, num_envs=8, device="cpu"),
+        memory=RandomMemory(memory_size=16, num_envs=env.num_envs, device="cpu"),
         cfg=settings,
         **spaces,
     )
@@ -76,46 +109,110 @@ def skrl() -> None:
     assert not torch.equal(before, policy.mean.weight)
 
 
-def cleanrl() -> None:
-    """Wrap as CleanRL's PPO for continuous actions does, in its order."""
-
-    def thunk() -> gymnasium.Env:
-        env = gymnasium.make("mptc_gym:MiddlePoint-v0")
-        wrappers = gymnasium.wrappers
-        env = wrappers.RecordEpisodeStatistics(wrappers.FlattenObservation(env))
-        env = wrappers.NormalizeObservation(wrappers.ClipAction(env))
-        env = wrappers.TransformObservation(
-            env, lambda observation: np.clip(observation, -10, 10), env.observation_space
-        )
-        env = wrappers.NormalizeReward(env, gamma=0.99)
-        return wrappers.TransformReward(env, lambda reward: np.clip(reward, -10, 10))
-
-    envs = gymnasium.vector.SyncVectorEnv(
-        [thunk] * 2, autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP
-    )
-    envs.reset(seed=1)
-    rng = np.random.default_rng(0)
-    for k in range(1, 1201):
-        _, _, _, truncations, infos = envs.step(rng.normal(size=(2, 1)).astype(np.float32))
-        assert truncations.all() == (k == 1200)
-    assert infos["final_info"]["episode"]["l"].tolist() == [1200, 1200]
-
-
 def tianshou() -> None:
-    """Step Tianshou's own batch of plants, which has no autoreset, to the end of an episode."""
+    """PPO on Tianshou's own batch of plants, for two episodes of each."""
+    import torch
+    from tianshou.algorithm import PPO
+    from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
+    from tianshou.algorithm.optim import AdamOptimizerFactory
+    from tianshou.data import Collector, VectorReplayBuffer
     from tianshou.env import DummyVectorEnv
+    from tianshou.trainer import OnPolicyTrainerParams
+    from tianshou.utils.net.common import Net
+    from tianshou.utils.net.continuous import ContinuousActorProbabilistic, ContinuousCritic
 
-    plants = DummyVectorEnv(
-        [lambda: gymnasium.make("MiddlePoint-v0", action_window=20) for _ in range(4)]
-    )
+    (line,) = lines("Tianshou")
+    plants = eval(line, {"DummyVectorEnv": DummyVectorEnv, "gymnasium": gymnasium})
     observations, _ = plants.reset(seed=0)
-    assert observations.shape == (4, 26)
-    for k in range(1, 1201):
-        observations, rewards, _, truncations, _ = plants.step(np.zeros((4, 1), np.float32))
+    assert observations.shape == (8, 26)
+    for k in range(1, 1201):  # this batch has no autoreset
+        observations, rewards, _, truncations, _ = plants.step(np.zeros((8, 1), np.float32))
         assert np.isfinite(rewards).all()
         assert truncations.all() == (k == 1200)
 
+    observation, action = plants.observation_space[0], plants.action_space[0]
+    actor = ContinuousActorProbabilistic(
+        preprocess_net=Net(state_shape=observation.shape, hidden_sizes=(32,)),
+        action_shape=action.shape,
+        unbounded=True,  # the policy clips
+    )
+    policy = ProbabilisticActorPolicy(
+        actor=actor,
+        dist_fn=lambda of: torch.distributions.Independent(torch.distributions.Normal(*of), 1),
+        action_space=action,
+        observation_space=observation,
+    )
+    algorithm = PPO(
+        policy=policy,
+        critic=ContinuousCritic(
+            preprocess_net=Net(state_shape=observation.shape, hidden_sizes=(32,))
+        ),
+        optim=AdamOptimizerFactory(lr=1e-3),
+    )
+    before = actor.mu.model[0].weight.detach().clone()
+    steps = 8 * 1200
+    found = algorithm.run_training(
+        OnPolicyTrainerParams(
+            training_collector=Collector(algorithm, plants, VectorReplayBuffer(steps, 8)),
+            max_epochs=2,
+            epoch_num_steps=steps,
+            collection_step_num_env_steps=steps,
+            batch_size=256,
+            show_progress=False,
+            verbose=False,
+        )
+    )
+    assert (found.train_step, found.train_episode) == (2 * steps, 16)
+    assert not torch.equal(before, actor.mu.model[0].weight)
+
+
+def rl_zoo3() -> None:
+    """Train, then look at what was trained, as two commands."""
+    train, enjoy = lines("RL Baselines3 Zoo")
+    done = run(train, "-n", "2048")
+    assert done.returncode == 0, done.stderr
+    assert "total_timesteps | 2048" in done.stdout
+    done = run(enjoy, "-n", "1200")
+    assert done.returncode == 0, done.stderr
+    assert "Mean episode length: 1200" in done.stdout
+
+
+def rllib() -> None:
+    """Run the example, which starts Ray itself."""
+    (line,) = lines("RLlib")
+    done = run(line, "--steps", "500", "--batch", "250", folder=ROOT)
+    assert done.returncode == 0, done.stderr
+    shown = [each.split() for each in done.stdout.splitlines() if "mean |e|" in each]
+    assert [each[0] for each in shown] == ["250", "500"]
+
+
+def cleanrl() -> None:
+    """CleanRL's file, which lies in its wheel: as it is, and with the page's one change."""
+    (line,) = lines("CleanRL")
+    (wheel,) = Path().glob("cleanrl-*.whl")
+    file = Path("ppo_continuous_action.py")
+    text = zipfile.ZipFile(wheel).read(f"cleanrl/{file}").decode()
+    options = ("--total-timesteps", "4096", "--cuda", "False")
+
+    file.write_text(text, encoding="utf-8")
+    done = run(line, *options)
+    # Once this passes, the page need not speak of a change any more.
+    assert done.returncode, "the file runs unchanged"
+    assert "TransformObservation.__init__() missing" in done.stderr, done.stderr
+
+    page = " ".join(PAGE.read_text(encoding="utf-8").split())
+    (change,) = re.findall(r"change `(.+?)` to `(.+?)`", page)
+    assert text.count(change[0]) == 1
+    file.write_text(text.replace(*change), encoding="utf-8")
+    done = run(line, *options)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("SPS:") == 2  # rounds of 2,048 steps
+
 
 if __name__ == "__main__":
-    locals()[sys.argv[1]]()
-    print(f"{sys.argv[1]}: the environment works")
+    sys.path.insert(0, str(ROOT))  # for what the examples import
+    name = sys.argv[1]
+    locals()[name]()
+    packages = {"rllib": "ray", "cleanrl": "torch"}.get(name, name), "gymnasium", "torch"
+    versions = ", ".join(f"{each} {metadata.version(each)}" for each in dict.fromkeys(packages))
+    print(f"{name}: the environment works ({versions})")

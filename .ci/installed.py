@@ -1,5 +1,6 @@
 """Check an installed mptc_gym: what came with it, what did not, and that it runs."""
 
+import re
 import sys
 import warnings
 from importlib.metadata import distribution
@@ -27,7 +28,20 @@ assert not present, present
 about = installed.metadata
 assert about["License-Expression"] == "MIT"
 assert about["Description-Content-Type"] == "text/markdown"
-assert "MiddlePoint-v0" in str(about.get_payload())  # the README
+readme = str(about.get_payload())
+assert "MiddlePoint-v0" in readme
+# Pictures and pages are not in the package; with an address, its README has them from there.
+links = re.findall(r"(!?)\[[^]]*\]\(([^)]*)\)", readme)
+relative = [target for _, target in links if not target.startswith("https:")]
+pictures = [target for picture, target in links if picture]
+urls = dict(each.split(", ", 1) for each in about.get_all("Project-URL", []))
+if "Repository" in urls:
+    assert not relative, relative
+    files_at = urls["Repository"].rstrip("/") + "/raw/HEAD/"
+    assert all(picture.startswith(files_at) for picture in pictures), pictures
+else:
+    assert relative
+assert pictures
 needed = [each for each in installed.requires or () if "extra ==" not in each]
 assert sorted(each.partition(">=")[0] for each in needed) == ["gymnasium", "numpy"], needed
 

@@ -1,6 +1,8 @@
 """Scenarios, measures, tables and the comparison, on small budgets."""
 
+import _pyio
 import errno
+import io
 import json
 import math
 import os
@@ -326,8 +328,8 @@ class TestStorage:
         path = tmp_path / "file.txt"
         storage.write_text(path, "old")
 
-        def full(self, text, encoding):
-            with self.open("w", encoding=encoding) as file:
+        def full(self, text, encoding, newline):
+            with self.open("w", encoding=encoding, newline=newline) as file:
                 file.write(text[:3])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -336,6 +338,38 @@ class TestStorage:
             storage.write_text(path, "new text")
         assert path.read_text() == "old"
         assert list(tmp_path.iterdir()) == [path]
+
+    def test_a_file_that_is_open_elsewhere_for_a_moment(self, tmp_path, monkeypatch):
+        # Windows refuses to replace it then.
+        path, replace, refused = tmp_path / "file.txt", Path.replace, []
+
+        def busy(self, target):
+            if len(refused) < 3:
+                refused.append(target)
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            return replace(self, target)
+
+        monkeypatch.setattr(Path, "replace", busy)
+        monkeypatch.setattr(storage, "WAITS", (0.0, 0.0, 0.0))
+        storage.write_text(path, "new")
+        assert path.read_text() == "new"
+        refused[:] = []
+        monkeypatch.setattr(storage, "WAITS", (0.0, 0.0))
+        with pytest.raises(storage.NotWrittenError, match=r"file\.txt .* Permission denied"):
+            storage.write_text(path, "newer")
+        assert path.read_text() == "new"
+        assert list(tmp_path.iterdir()) == [path]
+
+    def test_lines_end_alike_on_every_system(self, tmp_path, monkeypatch):
+        # Python's own model of its files, as it ends lines on Windows.
+        monkeypatch.setattr(io, "open", _pyio.open)
+        monkeypatch.setattr(os, "linesep", "\r\n")
+        (tmp_path / "control").write_text("a\n", encoding="utf-8")
+        assert (tmp_path / "control").read_bytes() == b"a\r\n"
+        storage.write_text(tmp_path / "page.md", "a\nb\n")
+        assert (tmp_path / "page.md").read_bytes() == b"a\nb\n"
+        tables.write_csv(tmp_path / "table.csv", pd.DataFrame({"a": [1, 2]}))
+        assert (tmp_path / "table.csv").read_bytes() == b"a\n1\n2\n"
 
     @pytest.mark.parametrize("text", ["", "null", "[1]", "{", "\0\0"])
     def test_a_damaged_object_is_named(self, tmp_path, text):

@@ -1,8 +1,10 @@
 """The examples run, with little to learn from, and do what they say."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +17,7 @@ from stable_baselines3 import PPO
 from benchmarks.datasets.history import arguments_of, record
 from benchmarks.examples import cleanrl_style, offline, ppo_torch, sb3
 from benchmarks.train import defaults
+from benchmarks.train.sb3_vec_env import GymnasiumVecEnv
 
 ROOT = Path(__file__).parent.parent
 
@@ -60,6 +63,20 @@ class TestSB3:
         studied = defaults.square_error(defaults.PolicyController(model), plant)
         # One counts the error from k = 0, the other from k = 1, when it is as large.
         assert sb3.mean_error(model) == pytest.approx(studied, abs=0.02)
+
+
+def test_stable_baselines3_learns_with_the_lines_of_the_page():
+    page = (ROOT / "benchmarks/examples/clients.md").read_text(encoding="utf-8")
+    lines = re.findall(r"^\| Stable-Baselines3.*?`(.+?)`", page, re.MULTILINE)
+    short = partial(PPO, device="cpu", n_steps=8, batch_size=8, n_epochs=1, seed=0)
+    names = {"PPO": short, "GymnasiumVecEnv": GymnasiumVecEnv, "gymnasium": gymnasium}
+    models = [eval(line, names) for line in lines]
+    assert [model.n_envs for model in models] == [1, 64]
+    for model in models:
+        before = weights(model.policy)
+        model.learn(1)
+        assert model.num_timesteps == 8 * model.n_envs
+        assert not torch.equal(before, weights(model.policy))
 
 
 class TestOnOnePage:
@@ -170,17 +187,6 @@ runpy.run_module("benchmarks.examples.torch_free", run_name="__main__")
     assert done.returncode == 0, done.stderr
     errors = {line.split(":")[0]: float(line.split()[-2]) for line in done.stdout.splitlines()}
     assert 0.9 < errors["NN"] < errors["PI"] < 5.0
-
-
-def test_rllib_trains_on_it():
-    found = run("-c", "import ray.rllib")
-    if found.returncode:
-        why = found.stderr.strip().splitlines()[-1]
-        pytest.skip(f"RLlib is not installed (pip install -e '.[bench,rllib]'): {why}")
-    done = run("-m", "benchmarks.examples.rllib", "--steps", "500", "--batch", "250")
-    assert done.returncode == 0, done.stderr
-    shown = [line for line in done.stdout.splitlines() if "mean |e|" in line]
-    assert [line.split()[0] for line in shown] == ["250", "500"]
 
 
 class TestOffline:

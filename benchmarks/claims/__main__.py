@@ -19,8 +19,8 @@ from benchmarks.claims.claims import CLAIMS
 from benchmarks.claims.plots import PLOTS
 from benchmarks.claims.runs import Batch
 from benchmarks.lib import command_line
-from benchmarks.lib.storage import replacing, write_text
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.storage import write_text
+from benchmarks.lib.tables import on_screen, write_csv
 
 RUNS = 1000
 SEED = 0  # run i starts from the weights, and meets the noise, of seed SEED + i
@@ -61,12 +61,10 @@ def write(
     out: Path, entries: Sequence[verdicts.Entry], tables: dict[str, pd.DataFrame], called: str
 ) -> None:
     """Write the verdicts so far, and the tables and pictures of the latest claim."""
-    with replacing(out / "claims.csv") as file:
-        verdicts.table(entries).to_csv(file, index=False)
+    write_csv(out / "claims.csv", verdicts.table(entries))
     write_text(out / "claims.md", verdicts.markdown(entries, called))
     for name, table in tables.items():
-        with replacing(out / f"{name}.csv") as file:
-            table.to_csv(file, index=False)
+        write_csv(out / f"{name}.csv", table)
         PLOTS[name](table, out / f"{name}.png")
 
 

@@ -27,7 +27,8 @@ from benchmarks.controllers.factories import Factory, build, curve, observation,
 from benchmarks.controllers.records import Account, Controller, Training
 from benchmarks.controllers.roster import label
 from benchmarks.lib.report import Section, provenance_line, write_report
-from benchmarks.lib.storage import commit, read_object, replacing, versions, write_json
+from benchmarks.lib.storage import commit, read_object, versions, write_json
+from benchmarks.lib.tables import write_csv
 from benchmarks.metrics import join, mean_error, measure
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import Scenario
@@ -291,8 +292,7 @@ class Comparison:
         return self._out / name
 
     def _write_csv(self, name: str, table: pd.DataFrame) -> None:
-        with replacing(self._path(name)) as file:
-            tables.for_csv(table).to_csv(file, index=False)
+        write_csv(self._path(name), tables.for_csv(table))
 
     def _write_runs(self, *, complete: bool) -> None:
         self._write_csv("runs.csv", self.runs)

@@ -72,7 +72,8 @@ def main(arguments: list[str] | None = None) -> int:
         .training(train_batch_size_per_learner=options.batch, lr=3e-4)
         .debugging(seed=options.seed, log_level="ERROR")
     )
-    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
+    # "local": a cluster that happens to run here, or that RAY_ADDRESS names, is left alone.
+    ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False)
     torch.set_num_threads(1)  # the network is too small for more
     algorithm = config.build_algo()
     for iteration in range(-(-options.steps // options.batch)):

@@ -24,8 +24,7 @@ from agents import PIController
 from benchmarks.claims.runs import Batch
 from benchmarks.figures import plots
 from benchmarks.lib import command_line
-from benchmarks.lib.storage import replacing
-from benchmarks.lib.tables import percentiles
+from benchmarks.lib.tables import percentiles, write_csv
 from benchmarks.metrics import mean_error
 from benchmarks.rollout import Trajectory
 from mptc_gym import PRESETS, Parameters
@@ -119,8 +118,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     for name in tqdm(CASES, unit="case"):
         trajectory = CASES[name].run(Batch(options.runs, SEED))
         curves[name] = summarise(trajectory)
-        with replacing(options.out / f"{name}.csv") as file:
-            curves[name].to_csv(file, index=False)
+        write_csv(options.out / f"{name}.csv", curves[name])
         for figure in FIGURES:
             if figure.case == name:
                 _draw([figure], curves, options.out / figure.file)

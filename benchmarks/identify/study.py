@@ -26,8 +26,8 @@ from benchmarks.identify.log import Log
 from benchmarks.lib import command_line
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import share
-from benchmarks.lib.storage import replacing, write_text
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.storage import write_text
+from benchmarks.lib.tables import on_screen, write_csv
 from benchmarks.scenarios import plain
 from mptc_gym import Parameters
 
@@ -133,8 +133,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     results = command_line.fan_out(options).run(cells, out / "cells" / key, title="logs")
     found = list(results.values())
     rows = pd.DataFrame([_row(plant, each) for plant, each in zip(plants, found, strict=True)])
-    with replacing(out / "identify_study.csv") as file:
-        rows.to_csv(file, index=False)
+    write_csv(out / "identify_study.csv", rows)
     summary = table(found)
     seconds = np.array([each["seconds"] for each in found])
     closing = (

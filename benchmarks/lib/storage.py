@@ -8,6 +8,7 @@ import os
 import platform
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib import metadata
@@ -18,6 +19,7 @@ import mptc_gym
 
 PACKAGES = ("gymnasium", "numpy", "stable_baselines3", "torch")
 ROOT = Path(__file__).parent.parent.parent  # the checkout
+WAITS = (0.01, 0.05, 0.2, 0.5)  # s until a file is put in place once more
 
 
 class NotWrittenError(RuntimeError):
@@ -41,12 +43,25 @@ def replacing(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield partial
-            partial.replace(path)
+            _move(partial, path)
         finally:
             partial.unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or error
         raise NotWrittenError(f"{path} could not be written: {reason}") from error
+
+
+def _move(partial: Path, path: Path) -> None:
+    """Put a file in place of another, also where that is open elsewhere for a moment.
+
+    Windows refuses then, for example while a virus scanner reads a file that was just written.
+    """
+    for wait in WAITS:
+        with suppress(PermissionError):
+            partial.replace(path)
+            return
+        time.sleep(wait)
+    partial.replace(path)
 
 
 def check_folder(folder: Path) -> None:
@@ -71,7 +86,8 @@ def check_folder(folder: Path) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all."""
     with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        # Windows would end lines otherwise, and the bytes would not be those of other systems.
+        partial.write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -1,8 +1,9 @@
-"""Tables on the screen, and percentiles over runs."""
+"""Tables on the screen and in files, and percentiles over runs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -11,9 +12,17 @@ from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from benchmarks.lib.storage import replacing
+
 PERCENTILES = {"median": 50, "p10": 10, "p90": 90}
 _NAMES = ("scenario", "agent", "controller", "case")
 _TEXTS = (*_NAMES, "claim", "verdict", "question", "command", "page")
+
+
+def write_csv(path: Path, table: pd.DataFrame) -> None:
+    """Write a table without its index, whole or not at all, the same on every system."""
+    with replacing(path) as partial:
+        table.to_csv(partial, index=False, lineterminator="\n")
 
 
 def percentiles(

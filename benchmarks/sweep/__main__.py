@@ -21,8 +21,8 @@ from benchmarks.designs import Plant, grid, random_design
 from benchmarks.lib import command_line
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.report import provenance_line, write_report
-from benchmarks.lib.storage import commit, replacing, versions, write_json
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.storage import commit, versions, write_json
+from benchmarks.lib.tables import on_screen, write_csv
 from benchmarks.sweep.cells import agent_cell, limit_cell
 from benchmarks.sweep.report import report, table
 
@@ -98,8 +98,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
 
     runs = table(plants, list(controllers), results)
     sections = report(runs, out, options.design)
-    with replacing(out / "runs.csv") as file:
-        runs.to_csv(file, index=False)
+    write_csv(out / "runs.csv", runs)
     origin = {
         "started": started,
         "seconds": round(seconds, 1),

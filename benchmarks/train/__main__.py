@@ -24,8 +24,8 @@ from agents.policy_network import PRETRAINED
 from benchmarks.controllers import records
 from benchmarks.lib import command_line, drawing
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.storage import commit, replacing
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.storage import commit
+from benchmarks.lib.tables import on_screen, write_csv
 from benchmarks.train import legs, ppo
 from benchmarks.train.through_plant import TRAININGS, Training, leg, training_key
 
@@ -77,8 +77,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     console.print(on_screen(table.map("{:.6g}".format)))
     if options.prices:
         files = [out / f"{options.network}-prices.{suffix}" for suffix in ("csv", "png")]
-        with replacing(files[0]) as file:
-            table.to_csv(file, index=False)
+        write_csv(files[0], table)
         draw_prices(table, files[1])
         return f"Error against valve travel is in {files[0]} and {files[1]}"
     best = networks[int(table["score"].argmin())]

@@ -31,7 +31,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from agents import PIController
 from benchmarks.lib import command_line
 from benchmarks.lib.drawing import STYLE, colours, save
-from benchmarks.lib.storage import replacing
+from benchmarks.lib.tables import write_csv
 from benchmarks.metrics import METRICS, mean_error
 from benchmarks.rollout import Agent, make_plants, rollout
 from mptc_gym import Parameters
@@ -174,8 +174,7 @@ def add(rows: pd.DataFrame, path: Path) -> None:
     key = ["case", "seed", "steps"]
     if path.exists():
         rows = pd.concat([pd.read_csv(path), rows]).drop_duplicates(key, keep="last")
-    with replacing(path) as partial:
-        rows.sort_values(key).to_csv(partial, index=False)
+    write_csv(path, rows.sort_values(key))
 
 
 def is_done(name: str, steps: int, seed: int, path: Path) -> bool:

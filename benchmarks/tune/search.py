@@ -19,7 +19,8 @@ from benchmarks.controllers.records import Controller, Tuning
 from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import code, fingerprint
-from benchmarks.lib.storage import replacing, seal, unseal, write_text
+from benchmarks.lib.storage import seal, unseal, write_text
+from benchmarks.lib.tables import write_csv
 from benchmarks.tune.objective import SCENARIOS, score
 
 RUNS = 100  # of each scenario in a trial, each with noise and initial weights of its own
@@ -174,8 +175,7 @@ class Search:
             while len(self._rows) < trials:
                 self._add(self._try())
                 write_text(self._kept, seal({"settings": self._settings, "trials": self._rows}))
-                with replacing(self.path) as file:
-                    self.trials.to_csv(file, index=False)
+                write_csv(self.path, self.trials)
                 bar.set_postfix(best=f"{self._study.best_value:.3f}")
                 bar.update()
 

@@ -14,9 +14,9 @@ from mptc_gym.plant import action_from_command
 from mptc_gym.record import Record
 
 HELP = (
-    "keys: ↑ ↓ or the mouse in the lower chart move the flow (with --agent you), Home sets it "
-    "to 0; Page Up and Page Down move the set point, L and K the load, by 1 °C; + and - change "
-    "the speed; space pauses, Esc ends"
+    "keys: Up, Down or the mouse in the lower chart move the flow (with --agent you), Home "
+    "sets it to 0; Page Up and Page Down move the set point, L and K the load, by 1 °C; "
+    "+ and - change the speed; space pauses, Esc ends"
 )
 FLOW_STEP = 0.5  # t/h
 STEP = 1.0  # of set point and load, degC
