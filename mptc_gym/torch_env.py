@@ -21,7 +21,8 @@ except ImportError as error:
     ) from error
 from torch import Tensor
 
-from mptc_gym.checks import is_count, positive_count
+from mptc_gym import rendering
+from mptc_gym.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import PLANT_NUMBERS, Parameters
 from mptc_gym.plant import DRIFT_INTERVAL, action_from_command
@@ -36,13 +37,26 @@ from mptc_gym.torch_signals import (
     Noise,
     Repeated,
 )
-from mptc_gym.vector_env import checked_limit, checked_mode
+from mptc_gym.vector_env import checked_limit, checked_mode, checked_options
 
 Infos = dict[str, Any]
 
 SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
 _IN_CACHE = 1 << 17  # numbers that are worked on at once
 _ROOM = 64  # steps until the window of past actions is moved back
+
+
+def _usable(device: str | torch.device) -> torch.device:
+    """Return a device on which there can be tensors and a generator; ValueError otherwise."""
+    try:
+        usable = torch.device(device)
+        torch.zeros(1, device=usable)
+        torch.Generator(usable)
+    except (AssertionError, RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"device must be one that PyTorch can use here, got {device!r}: {error}"
+        ) from error
+    return usable
 
 
 class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
@@ -151,8 +165,9 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         differentiable: bool = False,
         **arguments: Any,
     ) -> None:
+        rendering.check_mode(arguments.pop("render_mode", None), [])
         single = MiddlePointEnv(**arguments)
-        self.num_envs = num_envs = positive_count("num_envs", num_envs)
+        self.num_envs = num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
         self._limit = checked_limit(max_episode_steps)
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.metadata = {
@@ -160,14 +175,11 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             "render_modes": [],
             "autoreset_mode": self.autoreset_mode,
         }
-        if dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}")
+        if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
+            reject("dtype", dtype, "torch.float32 or torch.float64")
         if not isinstance(differentiable, bool):
-            raise ValueError(f"differentiable must be True or False, got {differentiable!r}")
-        try:
-            self.device = torch.device(device)
-        except (RuntimeError, TypeError) as error:
-            raise ValueError(f"device must be one of PyTorch's, got {device!r}") from error
+            reject("differentiable", differentiable, "True or False")
+        self.device = _usable(device)
         self.dtype = dtype
         self.differentiable = differentiable
         self.parameters = parameters = single.parameters
@@ -269,16 +281,14 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             If the first reset is not one of all plants.
         """
         if seed is not None and not (is_count(seed) and seed < 1 << 63):
-            raise ValueError(
-                f"seed must be None or an integer from 0 to 2^63 - 1, got {seed!r}"
-            )
-        options = options or {}
-        which = self._checked_mask(options)
+            reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
+        chosen = checked_options(options)
+        which = self._checked_mask(chosen)
         if which is not None and self._seed is None:
             raise ResetNeeded("reset all environments before some of them")
         if which is None:
-            self._given = self._checked_signals(options.get("signals"))
-        elif "signals" in options:
+            self._given = self._checked_signals(chosen.get("signals"))
+        elif "signals" in chosen:
             raise ValueError("options['signals'] needs a reset of all plants, not of some")
         if seed is not None:
             self._seed = int(seed)
@@ -581,7 +591,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
                 begun[name] = self._nothing + self._numbers[name]
         return begun
 
-    def _checked_mask(self, options: dict[str, Any]) -> Tensor | None:
+    def _checked_mask(self, options: Mapping[str, Any]) -> Tensor | None:
         if "reset_mask" not in options:
             return None
         mask = options["reset_mask"]
@@ -593,10 +603,8 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             or mask.shape != (self.num_envs,)
             or not mask.any()
         ):
-            raise ValueError(
-                f"options['reset_mask'] must be a tensor of bool, shape ({self.num_envs},), at "
-                f"least one of them True, got {mask!r}"
-            )
+            allowed = f"a tensor of bool, shape ({self.num_envs},), at least one of them True"
+            reject("options['reset_mask']", mask, allowed)
         return mask.to(self.device, copy=True)
 
     def _checked_signals(self, signals: Any) -> Given | None:
@@ -604,17 +612,17 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             return None
         n = self.num_envs
         numbers = self.parameters.ranges
-        allowed = {*SIGNALS, *numbers}
+        names = {*SIGNALS, *numbers}
         if not self.parameters.is_disturbed:
-            allowed.remove("disturbance")
-        if not isinstance(signals, Mapping) or not signals or not allowed >= {*signals}:
-            raise ValueError(
-                f"options['signals'] must be a dict with some of {sorted(allowed)}, got "
-                f"{signals!r}"
-            )
+            names.remove("disturbance")
+        if not isinstance(signals, Mapping) or not signals or not names >= {*signals}:
+            given = [*signals] if isinstance(signals, Mapping) else signals
+            reject("options['signals']", given, f"a dict with some of {sorted(names)}")
         tensors = {}
         for name, values in signals.items():
-            tensor = torch.as_tensor(values, dtype=self.dtype, device=self.device)
+            tensor = self._tensor(values)
+            if tensor is None:
+                reject(f"options['signals'][{name!r}]", values, "numbers")
             dimensions = 1 if name in numbers else 2
             if tensor.ndim == dimensions:
                 tensor = tensor[None]
@@ -630,12 +638,19 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
                 low, high = tensor.new_tensor(self.parameters.range_of(name))
                 whole = name != "delay" or bool((tensor == tensor.round()).all())
                 if not (whole and bool(((low <= tensor) & (tensor <= high)).all())):
-                    raise ValueError(
-                        f"options['signals'][{name!r}] must be within its range, "
-                        f"{list(self.parameters.range_of(name))}, got {values!r}"
-                    )
+                    allowed = f"within its range, {list(self.parameters.range_of(name))}"
+                    reject(f"options['signals'][{name!r}]", values, allowed)
             tensors[name] = tensor
         return Given(tensors, self._nothing)
+
+    def _tensor(self, values: Any) -> Tensor | None:
+        """Return real numbers as a tensor of the environment's type, None if they are not."""
+        if "complex" in str(getattr(values, "dtype", "")):  # PyTorch would drop a part of them
+            return None
+        try:
+            return torch.as_tensor(values, dtype=self.dtype, device=self.device)
+        except (TypeError, ValueError, RuntimeError, OverflowError):
+            return None
 
     def _checked_actions(self, actions: Tensor) -> Tensor:
         """Return the actions, shape (num_envs,); 0 where they are ignored."""
@@ -643,14 +658,10 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             raise ResetNeeded("call reset before step")
         given = actions
         if not (isinstance(actions, Tensor) and actions.dtype is self.dtype):
-            try:
-                given = torch.as_tensor(actions, dtype=self.dtype, device=self.device)
-            except (TypeError, ValueError, RuntimeError, OverflowError):
-                given = self._nothing
+            tensor = self._tensor(actions)
+            given = self._nothing if tensor is None else tensor
         if given.shape != (self.num_envs, 1):
-            raise ValueError(
-                f"actions must be numbers, shape ({self.num_envs}, 1), got {actions!r}"
-            )
+            reject("actions", actions, f"numbers, shape ({self.num_envs}, 1)")
         if given.requires_grad and not self.differentiable:
             given = given.detach()
         a = given.reshape(-1)
@@ -667,7 +678,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             and not math.isfinite(plain.dot(plain).item())
             and not plain.isfinite().all()
         ):
-            raise ValueError(f"actions must be finite, got {actions!r}")
+            reject("actions", actions, "finite")
         if self._given is not None:
             going = (
                 self._host_starts if self._ended is None else self._host_starts[~self._ended]

@@ -583,7 +583,8 @@ def test_help_shows_every_argument():
         ("num_envs", 0), ("num_envs", 2.0), ("max_episode_steps", 0),
         ("autoreset_mode", "Never"), ("dead_zone", -1.0), ("delay", 1.5),
         ("dtype", torch.float16), ("dtype", "float32"),
-        ("device", "toaster"), ("differentiable", "yes"),
+        ("device", "toaster"), ("differentiable", "yes"), ("device", "meta"),
+        ("render_mode", "rgb_array"), ("num_envs", 10**9), ("dtype", np.ones(2)),
     ],
 )  # fmt: skip
 def test_bad_argument_is_named(name, value):
@@ -621,12 +622,20 @@ def test_bad_reset_mask_is_refused(mask):
         ({"disturbance": torch.zeros(5, 2)}, "disturbance"),
         ({"delay": torch.zeros(2)}, "delay"), ({"delay": torch.full((2,), 7.5)}, "delay"),
         ({"dead_zone": torch.zeros(2)}, "dead_zone"),
+        ({"noise": "x"}, r"\['noise'\] must be numbers"), ({"noise": None}, "noise"),
+        ({"noise": torch.zeros(5, 2) * 1j}, "noise"), ({"noise": [[1.0, 2.0], [3.0]]}, "noise"),
     ],
 )  # fmt: skip
 def test_bad_signals_are_named(signals, named):
     env = make(delay=[5, 9])
     with pytest.raises(ValueError, match=named):
         env.reset(options={"signals": signals})
+
+
+@pytest.mark.parametrize("options", ["reset_mask", 5, [True, False]])
+def test_options_that_are_no_dict_are_refused(options):
+    with pytest.raises(ValueError, match=r"^options must be a dict or None"):
+        make().reset(options=options)
 
 
 def test_signals_end_with_an_error_and_with_a_reset_without():
@@ -646,7 +655,8 @@ def test_signals_end_with_an_error_and_with_a_reset_without():
 
 BAD_ACTIONS = [
     torch.zeros(2), torch.zeros(1, 1), torch.zeros(2, 2), torch.tensor([[torch.nan], [0.0]]),
-    torch.tensor([[0.0], [torch.inf]]), [["up"], ["down"]], None,
+    torch.tensor([[0.0], [torch.inf]]), [["up"], ["down"]], None, np.zeros((2, 1)) * 1j,
+    torch.zeros(2, 1) * 1j,
 ]  # fmt: skip
 
 
