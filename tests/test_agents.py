@@ -412,11 +412,16 @@ class TestSimc:
         [
             ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
             ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0),
+            ("gain", 10**400), ("time_constant", 10**400), ("anti_windup", "no"),
         ],
     )  # fmt: skip
     def test_bad_numbers_are_named(self, name, value):
         with pytest.raises(ValueError, match=name):
             PIController.simc(**{**PLANT, name: value})
+
+    def test_without_delay_it_asks_for_the_time_constant_of_the_loop(self):
+        with pytest.raises(ValueError, match="must be given where delay is 0"):
+            PIController.simc(**{**PLANT, "delay": 0.0})
 
     def test_other_arguments_reach_the_controller(self):
         controller = PIController.simc(**PLANT, u_min=-4.0, u_max=8.0, error_index=1)
@@ -477,7 +482,9 @@ class TestSmithPredictor:
             alone = [c.act(row) for c, row in zip(singles, observation, strict=True)]
             assert np.array_equal(batch.act(observation), alone)
 
-    @pytest.mark.parametrize(("name", "value"), [("delay", -8.0), ("dead_zone", np.nan)])
+    @pytest.mark.parametrize(
+        ("name", "value"), [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)]
+    )
     def test_bad_numbers_are_named(self, name, value):
         with pytest.raises(ValueError, match=name):
             self.smith(**{name: value})
@@ -485,7 +492,15 @@ class TestSmithPredictor:
 
 @pytest.mark.parametrize(
     "observation",
-    ["text", [0.0, "x", 0.0, 0.0, 0.0, 0.0], (np.zeros(6), {"output": 0.0}), None],
+    [
+        "text",
+        [0.0, "x", 0.0, 0.0, 0.0, 0.0],
+        (np.zeros(6), {"output": 0.0}),
+        None,
+        ["1"] * 6,
+        np.zeros(6) * 1j,
+        [10**400] * 6,
+    ],
 )
 def test_what_is_no_observation_is_refused_by_name(observation):
     # The third is what `reset` returns, handed on whole.
