@@ -76,8 +76,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
       +-`disturbance_amplitude`, at random times, `disturbance_interval` samples apart on
       average; and of a random walk that gains `disturbance_walk_variance` a sample.
     - Other dynamics: `gain_factor` times the steady-state gain, `time_constant_factor` times the
-      dominant time constant. With p the slowest pole (0.9515), A = (1 - p z^-1) Q(z^-1),
-      and the time constant is 1 / (1 - p) = 20.6 samples. For t times the time constant and g times the
+      dominant time constant. With p the slowest pole (0.9515), A = (1 - p z^-1) Q(z^-1), and the
+      time constant is 1 / (1 - p) = 20.6 samples. For t times the time constant and g times the
       gain, 1 - p is divided by t, Q stays, and B is multiplied by g / t.
     - Fouling: over `drift_samples` samples gain and time constant drift, linearly, to `gain_drift`
       and `time_constant_drift` times what they were at k = 0. They change every 10 samples.

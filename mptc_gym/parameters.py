@@ -309,13 +309,8 @@ class Parameters(PlantNumbers[Number]):
         """Refuse a change of dynamics that A has no meaning for."""
         name = "time_constant_factor"
         if self.changes_time_constant:
-            names, given = (
-                f"{name}, time_constant_drift",
-                (
-                    self.time_constant_factor,
-                    self.time_constant_drift,
-                ),
-            )
+            names = f"{name}, time_constant_drift"
+            given = self.time_constant_factor, self.time_constant_drift
             pole = slowest_pole(self.a)
             if pole is None:
                 reject(names, given, "1 for this a, which has no pole")

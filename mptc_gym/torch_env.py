@@ -24,7 +24,7 @@ from torch import Tensor
 from mptc_gym import rendering
 from mptc_gym.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.env import MiddlePointEnv
-from mptc_gym.parameters import PLANT_NUMBERS, Parameters
+from mptc_gym.parameters import PLANT_NUMBERS, argument_signature
 from mptc_gym.plant import DRIFT_INTERVAL, action_from_command
 from mptc_gym.signals import Levels
 from mptc_gym.torch_plant import Number, TorchPlants
@@ -71,16 +71,12 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
 
     Parameters
     ----------
-    num_envs
-        n, number of plants.
+    num_envs, max_episode_steps, autoreset_mode
+        As for `MiddlePointVectorEnv`. `final_obs` is a tensor, 0 where no episode has ended.
     device
         Where everything is computed and all tensors are.
     dtype
         torch.float32 or torch.float64, of all that is computed; the spaces say float32.
-    max_episode_steps
-        Samples after which an episode is truncated; None or -1 for never.
-    autoreset_mode
-        As for `MiddlePointVectorEnv`. `final_obs` is a tensor, 0 where no episode has ended.
     differentiable
         Whether observations, rewards and infos carry the graph back to the actions, through
         time; see Gradients.
@@ -123,14 +119,14 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
     backpropagation. An action shows after `delay` + 1 samples: shorter pieces have no gradient.
     Without `differentiable` nothing of a graph is kept.
 
-    **The device is never waited for** by `step`: the host knows when episodes end. For the same
-    reason, actions that are not finite are an error on the CPU only; elsewhere the plants that
-    got them show NaN until they are reset. `reset` may wait.
+    **Waiting.** `step` never waits for the device: the host knows when episodes end. For the
+    same reason, actions that are not finite are an error on the CPU only; elsewhere the plants
+    that got them show NaN until they are reset. `reset` may wait.
 
     **Memory.** What a step returns is the caller's, to keep or to overwrite, except that in the
     infos masks and the factors of drifts may be one tensor for several steps. Tensors of
     several steps may share one piece of memory, which is freed when none of them is left.
-    Observations lie in it column by column.
+    Observations are transposed views: their columns lie one after the other in memory.
     """
 
     __signature__: ClassVar[inspect.Signature] = inspect.Signature(
@@ -150,7 +146,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
                     ("differentiable", False, "bool"),
                 )
             ),
-            *inspect.signature(Parameters).parameters.values(),
+            *argument_signature(),
         ]
     )
 

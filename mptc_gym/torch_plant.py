@@ -1,6 +1,6 @@
 """Plant and actuator in PyTorch, (28) and (29): many plants, a block of samples at a time.
 
-`Plants` in `mptc_gym.plant` is the same in NumPy, a sample at a time.
+`PlantBatch` in `mptc_gym.plant` is the same in NumPy, a sample at a time.
 """
 
 from __future__ import annotations

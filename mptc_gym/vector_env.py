@@ -76,7 +76,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     Parameters
     ----------
     num_envs
-        n, number of plants.
+        n, number of plants, at most 10 million.
     max_episode_steps
         Samples after which an episode is truncated; None or -1 for never.
     autoreset_mode
