@@ -352,6 +352,43 @@ class TestDraws:
         assert abs(gains.mean() - 1.125) < 5 * 0.75 / (12 * n) ** 0.5
         assert abs(np.corrcoef(delays, gains)[0, 1]) < 5 / n**0.5
 
+    def test_partial_resets_leave_the_distributions_as_they_are(self):
+        n, steps, variance, walk = 1500, 250, 2.0, 0.01
+        env = make(
+            n, noise_variance=variance, c=[1.0, 3.0], disturbance_walk_variance=walk,
+            setpoint="random", setpoint_period=60, max_episode_steps=None,
+        )  # fmt: skip
+        _, infos = env.reset(seed=6)
+        rng = np.random.default_rng(0)
+        age, begun = np.zeros(n, int), np.zeros(n, int)  # of the episode; when it last changed
+        level = infos["setpoint"].numpy()
+        noise, load, ages, lengths = [], [], [], []
+        for _ in range(steps):
+            *_, infos = env.step(torch.zeros(n, 1))
+            age += 1
+            changed = infos["setpoint"].numpy() != level
+            lengths.append((age - begun)[changed])
+            begun[changed], level = age[changed], infos["setpoint"].numpy()
+            noise.append(infos["noise"].numpy())
+            load.append(infos["disturbance"].numpy())
+            ages.append(age.copy())
+            mask = rng.random(n) < 0.02
+            if mask.any():
+                _, infos = env.reset(options={"reset_mask": torch.tensor(mask)})
+                level = np.where(mask, infos["setpoint"].numpy(), level)
+                age[mask] = begun[mask] = 0
+        noise, load, ages = np.array(noise), np.array(load), np.array(ages)
+        for found, expected in (
+            (noise[ages == 1], variance),
+            (noise[ages == 2], 10.0 * variance),  # 1 + 3^2
+            (load[ages == 10], 10.0 * walk),
+            (load[ages == 45], 40.0 * walk),
+        ):
+            assert abs(found.var() / expected - 1.0) < 5 * (2 / found.size) ** 0.5
+        assert not load[ages < 10].any()
+        lengths = np.concatenate(lengths)
+        assert (lengths.min(), lengths.max()) == (10, 30)
+
     def test_the_seed_is_all_that_differs(self):
         def trajectory(seed):
             env = make(5, **PRESETS["hard"], max_episode_steps=50)
