@@ -150,6 +150,8 @@ class Controller(ABC):
         If the limits are not finite or not in order, or the dead zone is negative.
     """
 
+    _advice = ""  # in the error that observations of a wrong shape bring
+
     def __init__(
         self, *, n_obs: int, u_min: float, u_max: float, dead_zone: float = 0.0
     ) -> None:
@@ -187,7 +189,7 @@ class Controller(ABC):
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs:
             raise ValueError(
                 f"observation must have shape (n_obs,) or (batch, n_obs), n_obs at least "
-                f"{self.n_obs}, got {values.shape}"
+                f"{self.n_obs}, got {values.shape}{self._advice}"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")

@@ -126,6 +126,8 @@ class PolicyNetwork(Controller):
         If arguments are out of range or do not fit together; the message names them.
     """
 
+    _advice = "; the environment needs the network's `observation` as arguments"
+
     def __init__(
         self,
         layers: Sequence[tuple[ArrayLike, ArrayLike]],
@@ -270,7 +272,7 @@ class PolicyNetwork(Controller):
         if observation.shape[-1] != self.n_obs:
             raise ValueError(
                 f"observation must have {self.n_obs} elements, those of {self.observation}, "
-                f"got {observation.shape[-1]}"
+                f"got {observation.shape[-1]}{self._advice}"
             )
         x = observation * self.input_scale
         *hidden, (last_W, last_b) = self.layers

@@ -27,7 +27,7 @@ from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import PLANT_NUMBERS, argument_signature
 from mptc_gym.plant import DRIFT_INTERVAL, action_from_command
 from mptc_gym.signals import Levels
-from mptc_gym.torch_plant import Number, TorchPlants
+from mptc_gym.torch_plant import TorchPlants
 from mptc_gym.torch_signals import (
     LONGEST,
     Draws,
@@ -35,6 +35,7 @@ from mptc_gym.torch_signals import (
     Held,
     Load,
     Noise,
+    Number,
     Repeated,
 )
 from mptc_gym.vector_env import checked_limit, checked_mode, checked_options
@@ -193,7 +194,8 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self._seed: int | None = None  # None until the first reset
         self._nothing = nothing = torch.zeros(num_envs, dtype=dtype, device=self.device)
         self._draws = draws = Draws(torch.Generator(self.device), nothing)
-        # Changed in place, as what draws disturbances looks them up here.
+        # Changed in place, as what draws disturbances looks them up here. If one limit is
+        # drawn, both are tensors: PyTorch clamps between two numbers or between two tensors.
         alike = not {"u_min", "u_max"} & {*parameters.ranges}
         self._numbers: dict[str, Number] = {
             name: parameters.range_of(name)[0]

@@ -94,6 +94,11 @@ class TestForward:
         with pytest.raises(ValueError, match="observation must have 5 elements"):
             policy().act(np.zeros(6))
 
+    @pytest.mark.parametrize("size", [4, 6])
+    def test_the_error_then_says_what_the_environment_needs(self, size):
+        with pytest.raises(ValueError, match="environment needs the network's `observation`"):
+            policy().act(np.zeros(size))
+
     def test_observation_names_every_window(self):
         assert policy().observation == {**WINDOWS, "error_window": 0}
 
