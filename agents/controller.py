@@ -1,4 +1,4 @@
-"""What every controller is: something that resets and acts."""
+"""What every controller is: something that resets and acts. And checks of arguments."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Values = NDArray[np.float64] | np.float64  # one value a loop: shape (), or (batch,)
+MOST = 1_000_000  # nodes, loops, elements or samples: beyond it, a number is a mistake
 
 
 def action_from_command(
@@ -49,21 +50,22 @@ def action_from_command(
     return action[..., np.newaxis]
 
 
-def check_count(name: str, value: Any, least: int) -> int:
-    """Return `value` if it is an integer of at least `least`; ValueError otherwise."""
-    if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
-        raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+def check_count(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """Return `value` if it is an integer within bounds; ValueError otherwise."""
+    if (
+        not isinstance(value, Integral)
+        or isinstance(value, bool)
+        or value < least
+        or (most is not None and int(value) > most)
+    ):
+        bound = f"of at least {least}" if most is None else f"from {least} to {most:,}"
+        raise ValueError(f"{name} must be an integer {bound}, got {value!r}")
     return int(value)
 
 
 def check_number(name: str, value: Any, least: float = -math.inf) -> float:
     """Return `value` if it is a finite number of at least `least`; ValueError otherwise."""
-    if (
-        not isinstance(value, Real)
-        or isinstance(value, bool)
-        or not math.isfinite(value)
-        or value < least
-    ):
+    if not _is_finite(value) or value < least:
         bound = "" if least == -math.inf else f" of at least {least:g}"
         raise ValueError(f"{name} must be a finite number{bound}, got {value!r}")
     return float(value)
@@ -71,10 +73,36 @@ def check_number(name: str, value: Any, least: float = -math.inf) -> float:
 
 def check_positive(name: str, value: Any) -> float:
     """Return `value` if it is a finite number above 0; ValueError otherwise."""
-    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else 0.0
-    if not 0.0 < number < math.inf:
+    if not _is_finite(value) or float(value) <= 0.0:
         raise ValueError(f"{name} must be a finite number above 0, got {value!r}")
-    return number
+    return float(value)
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """Return `value` if it is True or False; ValueError otherwise."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
+def _is_finite(value: Any) -> bool:
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond all floats
+        return False
+
+
+def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    """Return `value` in float64 if it is made of real numbers; ValueError otherwise."""
+    try:
+        given = np.asarray(value)
+        if given.dtype.kind in "biufO":  # no text, which NumPy would read, and nothing complex
+            return given.astype(np.float64, copy=False)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
+        pass
+    raise ValueError(f"{name} must be numbers, got {value!r}")
 
 
 def check_limits(u_min: Any, u_max: Any) -> tuple[float, float]:
@@ -122,6 +150,8 @@ class Controller(ABC):
         If the limits are not finite or not in order, or the dead zone is negative.
     """
 
+    _advice = ""  # in the error that observations of a wrong shape bring
+
     def __init__(
         self, *, n_obs: int, u_min: float, u_max: float, dead_zone: float = 0.0
     ) -> None:
@@ -155,14 +185,11 @@ class Controller(ABC):
             If the observation has another shape, or a value that is no finite number. The
             controller is unchanged then.
         """
-        try:
-            values = np.asarray(observation, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ValueError(f"observation must be numbers, got {observation!r}") from None
+        values = check_numbers("observation", observation)
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs:
             raise ValueError(
                 f"observation must have shape (n_obs,) or (batch, n_obs), n_obs at least "
-                f"{self.n_obs}, got {values.shape}"
+                f"{self.n_obs}, got {values.shape}{self._advice}"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")

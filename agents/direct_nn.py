@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import Controller, Values, check_count, check_number
+from agents.controller import (
+    MOST,
+    Controller,
+    Values,
+    check_count,
+    check_flag,
+    check_number,
+    check_numbers,
+)
 
 Array = NDArray[np.float64]
 
@@ -132,8 +140,8 @@ class DirectNNController(Controller):
         u_min: float = -10.0,
         u_max: float = 10.0,
     ) -> None:
-        self.n_inputs = check_count("n_inputs", n_inputs, 1)
-        self.n_hidden = check_count("n_hidden", n_hidden, 1)
+        self.n_inputs = check_count("n_inputs", n_inputs, 1, MOST)
+        self.n_hidden = check_count("n_hidden", n_hidden, 1, MOST)
         self.error_index = check_count("error_index", error_index, 0)
         n_obs = max(self.n_inputs, self.error_index + 1)
         super().__init__(n_obs=n_obs, u_min=u_min, u_max=u_max)
@@ -141,16 +149,16 @@ class DirectNNController(Controller):
         self.eta_1 = check_number("eta_1", eta_1, 0)
         self.eta_theta = check_number("eta_theta", eta_theta, 0)
         self.eta_1_theta = check_number("eta_1_theta", eta_1_theta, 0)
-        if direction not in (-1, 1):
+        if abs(check_number("direction", direction)) != 1.0:
             raise ValueError(f"direction must be -1 or 1, got {direction!r}")
         self.direction = direction
         self.input_scale = check_number("input_scale", input_scale)
         self.weight_scale = check_number("weight_scale", weight_scale, 0)
         if not np.isfinite(2.0 * self.weight_scale):  # how wide the initial weights lie
             raise ValueError(f"weight_scale must be at most 8.9e307, got {weight_scale!r}")
-        self.num_envs = None if num_envs is None else check_count("num_envs", num_envs, 1)
+        self.num_envs = None if num_envs is None else check_count("num_envs", num_envs, 1, MOST)
         self._batch = () if self.num_envs is None else (self.num_envs,)  # the leading axis
-        self.learning = learning
+        self.learning = check_flag("learning", learning)
         self.update_interval = check_count("update_interval", update_interval, 1)
         seed = check_count("seed", seed, 0)
         self._shapes = {
@@ -193,7 +201,7 @@ class DirectNNController(Controller):
             raise ValueError(f"weights must be a Weights, got {weights!r}")
         arrays = []
         for name, shape in self._shapes.items():
-            array = np.asarray(getattr(weights, name), dtype=np.float64)
+            array = check_numbers(f"weights.{name}", getattr(weights, name))
             full_shape = self._batch + shape
             if array.shape not in (shape, full_shape):
                 raise ValueError(

@@ -12,6 +12,7 @@ from agents.controller import (
     Values,
     check_batch,
     check_count,
+    check_flag,
     check_number,
     check_positive,
 )
@@ -61,7 +62,7 @@ class PIController(Controller):
         super().__init__(n_obs=self.error_index + 1, u_min=u_min, u_max=u_max)
         self.kp = check_number("kp", kp)
         self.ki = check_number("ki", ki)
-        self.anti_windup = anti_windup
+        self.anti_windup = check_flag("anti_windup", anti_windup)
         self._sum: Values | None = None  # of all errors so far
 
     @classmethod
@@ -157,6 +158,8 @@ def simc_gains(
         raise ValueError(f"gain must not be 0, got {gain!r}")
     tau_1 = check_positive("time_constant", time_constant)
     theta = check_number("delay", delay, 0)
+    if closed_loop_time_constant is None and theta == 0.0:
+        raise ValueError("closed_loop_time_constant must be given where delay is 0")
     tau_c = theta if closed_loop_time_constant is None else closed_loop_time_constant
     tau_c = check_positive("closed_loop_time_constant", tau_c)
     interval = check_positive("sampling_interval", sampling_interval)

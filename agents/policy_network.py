@@ -20,6 +20,7 @@ from agents.controller import (
     check_count,
     check_limits,
     check_number,
+    check_numbers,
 )
 
 Array = NDArray[np.float64]
@@ -125,6 +126,8 @@ class PolicyNetwork(Controller):
         If arguments are out of range or do not fit together; the message names them.
     """
 
+    _advice = "; the environment needs the network's `observation` as arguments"
+
     def __init__(
         self,
         layers: Sequence[tuple[ArrayLike, ArrayLike]],
@@ -140,6 +143,8 @@ class PolicyNetwork(Controller):
         u_min: float = -10.0,
         u_max: float = 10.0,
     ) -> None:
+        if not isinstance(observation, Mapping):
+            raise ValueError(f"observation must be a dict of windows, got {observation!r}")
         for name in observation:
             if name not in WINDOWS:
                 raise ValueError(f"observation must name {', '.join(WINDOWS)}, got {name!r}")
@@ -147,6 +152,10 @@ class PolicyNetwork(Controller):
             name: check_count(f"observation[{name!r}]", observation.get(name, 0), 0)
             for name in WINDOWS
         }
+        if not (increments is None or isinstance(increments, Increments)):
+            raise ValueError(f"increments must be None or an Increments, got {increments!r}")
+        if not (provenance is None or isinstance(provenance, Mapping)):
+            raise ValueError(f"provenance must be None or a dict, got {provenance!r}")
         dead_zone = 0.0 if increments is None else increments.dead_zone
         super().__init__(
             n_obs=sum(self.observation.values()), u_min=u_min, u_max=u_max, dead_zone=dead_zone
@@ -156,9 +165,9 @@ class PolicyNetwork(Controller):
                 f"increments.dead_zone must be inside the limits {u_min!r} and {u_max!r}, "
                 f"got {dead_zone!r}"
             )
-        if activation not in ACTIVATIONS:
+        if not isinstance(activation, str) or activation not in ACTIVATIONS:
             raise ValueError(f"activation must be one of {[*ACTIVATIONS]}, got {activation!r}")
-        if output not in OUTPUTS:
+        if not isinstance(output, str) or output not in OUTPUTS:
             raise ValueError(f"output must be one of {[*OUTPUTS]}, got {output!r}")
         self.activation, self.output = activation, output
         self.output_scale = check_number("output_scale", output_scale)
@@ -182,7 +191,7 @@ class PolicyNetwork(Controller):
             If there is none of this name.
         """
         names = sorted(path.stem for path in PRETRAINED.glob("*.npz"))
-        if name not in names:
+        if not isinstance(name, str) or name not in names:
             raise ValueError(f"name must be one of {', '.join(names)}, got {name!r}")
         return cls.load(PRETRAINED / f"{name}.npz", u_min=u_min, u_max=u_max)
 
@@ -263,7 +272,7 @@ class PolicyNetwork(Controller):
         if observation.shape[-1] != self.n_obs:
             raise ValueError(
                 f"observation must have {self.n_obs} elements, those of {self.observation}, "
-                f"got {observation.shape[-1]}"
+                f"got {observation.shape[-1]}{self._advice}"
             )
         x = observation * self.input_scale
         *hidden, (last_W, last_b) = self.layers
@@ -292,10 +301,7 @@ class PolicyNetwork(Controller):
 
 
 def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers, got {value!r}") from None
+    array = np.array(check_numbers(name, value))  # a copy
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():
@@ -307,19 +313,19 @@ def _checked(
     layers: Sequence[tuple[ArrayLike, ArrayLike]], inputs: int
 ) -> list[tuple[Array, Array]]:
     """Return the layers in float64 if each fits the one before it and the last has one node."""
-    if not layers:
-        raise ValueError("layers must hold at least one")
+    if not isinstance(layers, list | tuple) or not layers:
+        raise ValueError(f"layers must be a list of at least one layer, got {layers!r}")
     checked = []
     for i, layer in enumerate(layers):
         if not isinstance(layer, Sequence) or len(layer) != 2:
-            raise ValueError(f"layer {i} must be a pair of weights and biases, got {layer!r}")
+            raise ValueError(f"layers[{i}] must be a pair of weights and biases, got {layer!r}")
         W, b = layer
         last = i == len(layers) - 1
         nodes = 1 if last else len(np.atleast_1d(np.asarray(b)))
         checked.append(
             (
-                _finite(f"weights of layer {i}", W, (nodes, inputs)),
-                _finite(f"biases of layer {i}", b, (nodes,)),
+                _finite(f"weights of layers[{i}]", W, (nodes, inputs)),
+                _finite(f"biases of layers[{i}]", b, (nodes,)),
             )
         )
         inputs = nodes

@@ -39,6 +39,7 @@ BLEND = 0.5  # share of a design that is taken over
 BIAS_RATE = 0.005  # a sample, of the offset's estimate
 DISTURBANCE_POLE = 0.5  # of the filter of the disturbance
 CLEARANCE = 0.2  # t/h that a command passes a dead zone by
+MOST_DELAY = 10_000  # samples: beyond it, the bank would be too large for any computer
 _ROOM = 64  # samples until the histories are moved back
 
 
@@ -161,8 +162,13 @@ class SelfTuningController(Controller):
             raise ValueError(f"forgetting must be above 0, up to 1, got {forgetting!r}")
         self._forgetting = float(forgetting)
         shortest = check_count("shortest_delay", shortest_delay, 0)
-        longest = check_count("longest_delay", longest_delay, shortest)
-        if not isinstance(dead_zones, Sequence | np.ndarray) or not len(dead_zones):
+        longest = check_count("longest_delay", longest_delay, shortest, MOST_DELAY)
+        if (
+            not isinstance(dead_zones, Sequence | np.ndarray)
+            or isinstance(dead_zones, str | bytes)
+            or not np.size(dead_zones)
+            or not np.ndim(dead_zones)
+        ):
             raise ValueError(
                 f"dead_zones must be a list of one number or more, got {dead_zones!r}"
             )
@@ -245,6 +251,8 @@ class SelfTuningController(Controller):
 
     def _start(self, loops: int) -> None:
         """Bring everything to rest, and the models to what the step test has shown."""
+        if not loops:
+            raise ValueError("observation must have a row for each loop, got none")
         models = len(self._prior)
         history = self._history + 1
         self._loops, self._samples, self._now = loops, 0, history - 1

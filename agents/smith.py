@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import Values, check_number
+from agents.controller import MOST, Values, check_number
 from agents.pi import PIController, simc_gains
 
 Array = NDArray[np.float64]
@@ -75,7 +75,13 @@ class SmithPredictor(PIController):
         self.dead_zone = check_number("dead_zone", dead_zone, 0)
         self._pole = math.exp(-sampling_interval / time_constant)
         self._input_gain = gain * (1.0 - self._pole)
-        self._delay = max(round(check_number("delay", delay, 0) / sampling_interval), 1)
+        samples = check_number("delay", delay, 0) / sampling_interval
+        if samples > MOST:
+            raise ValueError(
+                f"delay must be at most {MOST:,} times sampling_interval = "
+                f"{sampling_interval!r}, got {delay!r}"
+            )
+        self._delay = max(round(samples), 1)
         self._model: list[Values] = []  # its last outputs without delay, newest last
 
     def reset(self) -> None:

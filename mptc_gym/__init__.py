@@ -18,5 +18,5 @@ gymnasium.register(
     entry_point="mptc_gym.env:MiddlePointEnv",
     vector_entry_point="mptc_gym.vector_env:MiddlePointVectorEnv",
     max_episode_steps=1200,
-    order_enforce=False,
+    order_enforce=False,  # the environments themselves ask for a reset
 )

@@ -11,9 +11,13 @@ import numpy as np
 # The largest number that an argument takes. Beyond it, float32 observations and squares lose
 # their meaning.
 LARGEST: Final[Any] = 10**9
+# Far more than any plant needs. Beyond them, a mistyped number would fill the memory.
+LONGEST: Final = 100_000  # samples of a delay or of a window
+MOST_COEFFICIENTS: Final = 1_000
+MOST_PLANTS: Final = 10_000_000  # of one environment
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
-_LONGEST = 80  # characters of a value that an error message shows
+_SHOWN = 80  # characters of a value that an error message shows
 
 Number = float | Sequence[float]  # or a range, [low, high]
 Check = Callable[[str, Any], Any]
@@ -21,7 +25,7 @@ Check = Callable[[str, Any], Any]
 
 def reject(name: str, value: object, allowed: str) -> NoReturn:
     """Raise the ValueError that says what an argument must be and what it is."""
-    raise ValueError(f"{name} must be {allowed}, got {shortened(value)}")
+    raise ValueError(f"{name} must be {allowed}, got {shortened(value)}") from None
 
 
 def shortened(value: object) -> str:
@@ -30,10 +34,12 @@ def shortened(value: object) -> str:
         text = repr(value)
     except ValueError:  # Python writes no integers of more than some thousand digits
         return "a number of thousands of digits"
-    if len(text) <= _LONGEST:
+    if len(text) <= _SHOWN:
         return text
-    length = f" ({len(value)} elements)" if isinstance(value, list | tuple) else ""
-    return f"{text[:_LONGEST]}...{length}"
+    size = f" ({len(value)} elements)" if isinstance(value, list | tuple) else ""
+    if hasattr(value, "shape"):  # an array or a tensor, which is written in several lines
+        text, size = " ".join(text.split()), f" (shape {tuple(value.shape)})"
+    return f"{text[:_SHOWN]}...{size}"
 
 
 def plain(value: Any) -> Any:
@@ -84,16 +90,21 @@ def at_least_1(name: str, value: Any) -> float:
     return float(value)
 
 
-def count(name: str, value: Any, minimum: int = 0) -> int:
-    """Return an integer of at least `minimum`."""
-    if not is_count(value, minimum):
-        reject(name, value, f"an integer of at least {minimum}")
+def count(name: str, value: Any, minimum: int, maximum: int) -> int:
+    """Return an integer from `minimum` to `maximum`."""
+    if not is_count(value, minimum) or value > maximum:
+        reject(name, value, f"an integer from {minimum} to {maximum:,}")
     return int(value)
 
 
-def positive_count(name: str, value: Any) -> int:
-    """Return an integer of at least 1."""
-    return count(name, value, minimum=1)
+def samples(name: str, value: Any) -> int:
+    """Return how many samples are kept."""
+    return count(name, value, 0, LONGEST)
+
+
+def duration(name: str, value: Any) -> int:
+    """Return for how many samples something lasts, at least 1."""
+    return count(name, value, 1, LARGEST)
 
 
 def numbers(
@@ -111,13 +122,22 @@ def numbers(
     return tuple(float(element) for element in value)
 
 
+def coefficients(name: str, value: Any, condition: str = "") -> tuple[float, ...]:
+    """Return coefficients, up to `MOST_COEFFICIENTS`; an error also tells the `condition`."""
+    allowed = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9{condition}"
+    checked = numbers(name, value, allowed)
+    if len(checked) > MOST_COEFFICIENTS:
+        reject(name, value, allowed)
+    return checked
+
+
 def polynomial(name: str, value: Any) -> tuple[float, ...]:
     """Return coefficients of which the first is 1."""
-    allowed = "a list of numbers within +-1e9, the first of them 1"
-    coefficients = numbers(name, value, allowed)
-    if coefficients[0] != 1.0:
-        reject(name, value, allowed)
-    return coefficients
+    condition = ", the first of them 1"
+    checked = coefficients(name, value, condition)
+    if checked[0] != 1.0:
+        reject(name, value, f"a list of numbers within +-1e9{condition}")
+    return checked
 
 
 def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:

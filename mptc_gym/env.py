@@ -13,6 +13,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym import rendering
+from mptc_gym.checks import shortened
 from mptc_gym.parameters import Parameters, argument_signature, argument_table
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.ranges import Ranges
@@ -75,8 +76,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
       +-`disturbance_amplitude`, at random times, `disturbance_interval` samples apart on
       average; and of a random walk that gains `disturbance_walk_variance` a sample.
     - Other dynamics: `gain_factor` times the steady-state gain, `time_constant_factor` times the
-      dominant time constant. With p the slowest pole (0.9515), A = (1 - p z^-1) Q(z^-1),
-      and the time constant is 1 / (1 - p) = 20.6 samples. For t times the time constant and g times the
+      dominant time constant. With p the slowest pole (0.9515), A = (1 - p z^-1) Q(z^-1), and the
+      time constant is 1 / (1 - p) = 20.6 samples. For t times the time constant and g times the
       gain, 1 - p is divided by t, Q stays, and B is multiplied by g / t.
     - Fouling: over `drift_samples` samples gain and time constant drift, linearly, to `gain_drift`
       and `time_constant_drift` times what they were at k = 0. They change every 10 samples.
@@ -140,7 +141,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     <arguments>
 
     `render_mode` is None, "human", "rgb_array" or "ansi"; see Rendering. A list or tuple may also
-    be a NumPy array. For `setpoint`, [-5, 5] means two samples, not a range.
+    be a NumPy array. Numbers are within +-1e9, the delay and each window at most 100,000 samples,
+    and `a`, `b` and `c` have at most 1,000 coefficients each.
 
     ## Info
 
@@ -316,7 +318,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         # This is the hot path: what runs in every step avoids function calls.
         try:
             a = float(action.item() - 0.0)  # text is no number, even where float() reads one
-        except (AttributeError, TypeError, ValueError, OverflowError):
+        except (AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
             a = _scalar(action)
         shown = a if -1.0 <= a <= 1.0 else _beyond_the_box(a)
         if not self._ahead:
@@ -425,7 +427,7 @@ def _limited(value: float, limit: float) -> float:
 def _scalar(action: Any) -> float:
     try:
         return float(np.asarray(action).item() - 0.0)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
         raise _bad_action(action) from None
 
 
@@ -436,4 +438,4 @@ def _beyond_the_box(action: float) -> float:
 
 
 def _bad_action(action: Any) -> ValueError:
-    return ValueError(f"action must be one finite number, shape (1,), got {action!r}")
+    return ValueError(f"action must be one finite number, shape (1,), got {shortened(action)}")

@@ -81,7 +81,7 @@ class PlantNumbers(Generic[Value]):
     """
 
     delay: Value = _argument(
-        18, checks.count, "samples", "transport delay d of the plant (28)", draw=0
+        18, checks.samples, "samples", "transport delay d of the plant (28)", draw=0
     )
     dead_zone: Value = _argument(
         5.0, checks.not_negative, "t/h", "half width of the actuator's dead zone (29)", draw=1
@@ -192,7 +192,7 @@ class Parameters(PlantNumbers[Number]):
     )
     b: Sequence[float] = _argument(
         (-0.04560, -0.00404),
-        checks.numbers,
+        checks.coefficients,
         "degC per t/h",
         "coefficients of B in (28), from z^-1 on",
     )
@@ -203,7 +203,7 @@ class Parameters(PlantNumbers[Number]):
         "coefficients of C in (28), from z^0 on; the first is 1",
     )
     drift_samples: int = _argument(
-        1200, checks.positive_count, "samples", "how long gain and time constant drift"
+        1200, checks.duration, "samples", "how long gain and time constant drift"
     )
     sampling_interval: float = _argument(  # Section 5
         8.0, checks.positive, "s", "scale of the time axis, without effect on the dynamics"
@@ -225,7 +225,7 @@ class Parameters(PlantNumbers[Number]):
     )
     setpoint_period: int = _argument(
         600,
-        checks.positive_count,
+        checks.duration,
         "samples",
         'period of "square". "random": each level is held for a length uniform in '
         "[period/6, period/2]",
@@ -233,11 +233,13 @@ class Parameters(PlantNumbers[Number]):
     # The observation. By default it is the six inputs of the paper's network: y_d(k), y_d(k-1),
     # y_d(k-2), e(k), e(k-1), e(k-2).
     setpoint_window: int = _argument(
-        3, checks.count, "samples", "how many of the latest set points the observation holds"
+        3, checks.samples, "samples", "how many of the latest set points the observation holds"
     )
-    error_window: int = _argument(3, checks.count, "samples", "the same for errors")
-    output_window: int = _argument(0, checks.count, "samples", "the same for measured outputs")
-    action_window: int = _argument(0, checks.count, "samples", "the same for past actions")
+    error_window: int = _argument(3, checks.samples, "samples", "the same for errors")
+    output_window: int = _argument(
+        0, checks.samples, "samples", "the same for measured outputs"
+    )
+    action_window: int = _argument(0, checks.samples, "samples", "the same for past actions")
     temperature_span: float = _argument(
         50.0,
         checks.positive,
@@ -307,13 +309,8 @@ class Parameters(PlantNumbers[Number]):
         """Refuse a change of dynamics that A has no meaning for."""
         name = "time_constant_factor"
         if self.changes_time_constant:
-            names, given = (
-                f"{name}, time_constant_drift",
-                (
-                    self.time_constant_factor,
-                    self.time_constant_drift,
-                ),
-            )
+            names = f"{name}, time_constant_drift"
+            given = self.time_constant_factor, self.time_constant_drift
             pole = slowest_pole(self.a)
             if pole is None:
                 reject(names, given, "1 for this a, which has no pole")

@@ -5,7 +5,7 @@ Pictures in pixels are made by `mptc_gym.drawing`, which is loaded with the firs
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from types import ModuleType
 from typing import cast
 
@@ -14,17 +14,17 @@ from gymnasium import logger
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from numpy.typing import NDArray
 
+from mptc_gym.checks import reject
 from mptc_gym.record import Axis, Record
 
 Frame = NDArray[np.uint8]
 _TEXT_COLUMNS = 72
 
 
-def check_mode(mode: str | None, modes: Iterable[str]) -> None:
-    """Raise a ValueError that names a render mode which is not None or one of `modes`."""
-    if mode is not None and mode not in modes:
-        allowed = ", ".join(map(repr, modes))
-        raise ValueError(f"render_mode must be None or one of {allowed}, got {mode!r}")
+def check_mode(mode: str | None, modes: Sequence[str]) -> None:
+    """Refuse a render mode that is not None or one of `modes`, with a ValueError."""
+    if mode is not None and not (isinstance(mode, str) and mode in modes):
+        reject("render_mode", mode, " or ".join(["None", *map(repr, modes)]))
 
 
 def warn_no_mode() -> None:

@@ -36,12 +36,8 @@ class EpisodeStream:
         plants have streams that are never used.
     """
 
-    __slots__ = (
-        "_episode",
-        "_generator",
-        "_origin",
-        "_seeds",
-    )  # one of 100,000 plants is small
+    # Without a dict each, the streams of 100,000 plants take little memory.
+    __slots__ = ("_episode", "_generator", "_origin", "_seeds")
 
     def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
         self._seeds = entropy, spawn_key, pool_size
@@ -432,9 +428,8 @@ class DisturbanceBatch:
         self._shapes = np.zeros((num_envs, 3))
         self._last = np.zeros((num_envs, 2))
         self._levels = np.zeros((num_envs, _LEVELS_AT_A_TIME))  # those ahead
-        self._ends = (
-            np.arange(1, num_envs + 1) * _LEVELS_AT_A_TIME
-        )  # of each plant's, when all lie in a row
+        # Where each plant's end, when all lie in a row.
+        self._ends = np.arange(1, num_envs + 1) * _LEVELS_AT_A_TIME
         self._places = self._ends.copy()  # of the next level, there
         self._now = np.zeros(num_envs)
         self._changes = np.zeros(num_envs, np.int64)  # by the clock, of the next level

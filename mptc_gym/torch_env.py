@@ -21,12 +21,13 @@ except ImportError as error:
     ) from error
 from torch import Tensor
 
-from mptc_gym.checks import is_count, positive_count
+from mptc_gym import rendering
+from mptc_gym.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.env import MiddlePointEnv
-from mptc_gym.parameters import PLANT_NUMBERS, Parameters
+from mptc_gym.parameters import PLANT_NUMBERS, argument_signature
 from mptc_gym.plant import DRIFT_INTERVAL, action_from_command
 from mptc_gym.signals import Levels
-from mptc_gym.torch_plant import Number, TorchPlants
+from mptc_gym.torch_plant import TorchPlants
 from mptc_gym.torch_signals import (
     LONGEST,
     Draws,
@@ -34,15 +35,29 @@ from mptc_gym.torch_signals import (
     Held,
     Load,
     Noise,
+    Number,
     Repeated,
 )
-from mptc_gym.vector_env import checked_limit, checked_mode
+from mptc_gym.vector_env import checked_limit, checked_mode, checked_options
 
 Infos = dict[str, Any]
 
 SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
 _IN_CACHE = 1 << 17  # numbers that are worked on at once
 _ROOM = 64  # steps until the window of past actions is moved back
+
+
+def _usable(device: str | torch.device) -> torch.device:
+    """Return a device on which there can be tensors and a generator; ValueError otherwise."""
+    try:
+        usable = torch.device(device)
+        torch.zeros(1, device=usable)
+        torch.Generator(usable)
+    except (AssertionError, RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"device must be one that PyTorch can use here, got {device!r}: {error}"
+        ) from error
+    return usable
 
 
 class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
@@ -57,16 +72,12 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
 
     Parameters
     ----------
-    num_envs
-        n, number of plants.
+    num_envs, max_episode_steps, autoreset_mode
+        As for `MiddlePointVectorEnv`. `final_obs` is a tensor, 0 where no episode has ended.
     device
         Where everything is computed and all tensors are.
     dtype
         torch.float32 or torch.float64, of all that is computed; the spaces say float32.
-    max_episode_steps
-        Samples after which an episode is truncated; None or -1 for never.
-    autoreset_mode
-        As for `MiddlePointVectorEnv`. `final_obs` is a tensor, 0 where no episode has ended.
     differentiable
         Whether observations, rewards and infos carry the graph back to the actions, through
         time; see Gradients.
@@ -109,14 +120,14 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
     backpropagation. An action shows after `delay` + 1 samples: shorter pieces have no gradient.
     Without `differentiable` nothing of a graph is kept.
 
-    **The device is never waited for** by `step`: the host knows when episodes end. For the same
-    reason, actions that are not finite are an error on the CPU only; elsewhere the plants that
-    got them show NaN until they are reset. `reset` may wait.
+    **Waiting.** `step` never waits for the device: the host knows when episodes end. For the
+    same reason, actions that are not finite are an error on the CPU only; elsewhere the plants
+    that got them show NaN until they are reset. `reset` may wait.
 
     **Memory.** What a step returns is the caller's, to keep or to overwrite, except that in the
     infos masks and the factors of drifts may be one tensor for several steps. Tensors of
     several steps may share one piece of memory, which is freed when none of them is left.
-    Observations lie in it column by column.
+    Observations are transposed views: their columns lie one after the other in memory.
     """
 
     __signature__: ClassVar[inspect.Signature] = inspect.Signature(
@@ -136,7 +147,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
                     ("differentiable", False, "bool"),
                 )
             ),
-            *inspect.signature(Parameters).parameters.values(),
+            *argument_signature(),
         ]
     )
 
@@ -151,8 +162,9 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         differentiable: bool = False,
         **arguments: Any,
     ) -> None:
+        rendering.check_mode(arguments.pop("render_mode", None), [])
         single = MiddlePointEnv(**arguments)
-        self.num_envs = num_envs = positive_count("num_envs", num_envs)
+        self.num_envs = num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
         self._limit = checked_limit(max_episode_steps)
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.metadata = {
@@ -160,14 +172,11 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             "render_modes": [],
             "autoreset_mode": self.autoreset_mode,
         }
-        if dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}")
+        if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
+            reject("dtype", dtype, "torch.float32 or torch.float64")
         if not isinstance(differentiable, bool):
-            raise ValueError(f"differentiable must be True or False, got {differentiable!r}")
-        try:
-            self.device = torch.device(device)
-        except (RuntimeError, TypeError) as error:
-            raise ValueError(f"device must be one of PyTorch's, got {device!r}") from error
+            reject("differentiable", differentiable, "True or False")
+        self.device = _usable(device)
         self.dtype = dtype
         self.differentiable = differentiable
         self.parameters = parameters = single.parameters
@@ -185,7 +194,8 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self._seed: int | None = None  # None until the first reset
         self._nothing = nothing = torch.zeros(num_envs, dtype=dtype, device=self.device)
         self._draws = draws = Draws(torch.Generator(self.device), nothing)
-        # Changed in place, as what draws disturbances looks them up here.
+        # Changed in place, as what draws disturbances looks them up here. If one limit is
+        # drawn, both are tensors: PyTorch clamps between two numbers or between two tensors.
         alike = not {"u_min", "u_max"} & {*parameters.ranges}
         self._numbers: dict[str, Number] = {
             name: parameters.range_of(name)[0]
@@ -269,16 +279,14 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             If the first reset is not one of all plants.
         """
         if seed is not None and not (is_count(seed) and seed < 1 << 63):
-            raise ValueError(
-                f"seed must be None or an integer from 0 to 2^63 - 1, got {seed!r}"
-            )
-        options = options or {}
-        which = self._checked_mask(options)
+            reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
+        chosen = checked_options(options)
+        which = self._checked_mask(chosen)
         if which is not None and self._seed is None:
             raise ResetNeeded("reset all environments before some of them")
         if which is None:
-            self._given = self._checked_signals(options.get("signals"))
-        elif "signals" in options:
+            self._given = self._checked_signals(chosen.get("signals"))
+        elif "signals" in chosen:
             raise ValueError("options['signals'] needs a reset of all plants, not of some")
         if seed is not None:
             self._seed = int(seed)
@@ -581,7 +589,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
                 begun[name] = self._nothing + self._numbers[name]
         return begun
 
-    def _checked_mask(self, options: dict[str, Any]) -> Tensor | None:
+    def _checked_mask(self, options: Mapping[str, Any]) -> Tensor | None:
         if "reset_mask" not in options:
             return None
         mask = options["reset_mask"]
@@ -593,10 +601,8 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             or mask.shape != (self.num_envs,)
             or not mask.any()
         ):
-            raise ValueError(
-                f"options['reset_mask'] must be a tensor of bool, shape ({self.num_envs},), at "
-                f"least one of them True, got {mask!r}"
-            )
+            allowed = f"a tensor of bool, shape ({self.num_envs},), at least one of them True"
+            reject("options['reset_mask']", mask, allowed)
         return mask.to(self.device, copy=True)
 
     def _checked_signals(self, signals: Any) -> Given | None:
@@ -604,17 +610,17 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             return None
         n = self.num_envs
         numbers = self.parameters.ranges
-        allowed = {*SIGNALS, *numbers}
+        names = {*SIGNALS, *numbers}
         if not self.parameters.is_disturbed:
-            allowed.remove("disturbance")
-        if not isinstance(signals, Mapping) or not signals or not allowed >= {*signals}:
-            raise ValueError(
-                f"options['signals'] must be a dict with some of {sorted(allowed)}, got "
-                f"{signals!r}"
-            )
+            names.remove("disturbance")
+        if not isinstance(signals, Mapping) or not signals or not names >= {*signals}:
+            given = [*signals] if isinstance(signals, Mapping) else signals
+            reject("options['signals']", given, f"a dict with some of {sorted(names)}")
         tensors = {}
         for name, values in signals.items():
-            tensor = torch.as_tensor(values, dtype=self.dtype, device=self.device)
+            tensor = self._tensor(values)
+            if tensor is None:
+                reject(f"options['signals'][{name!r}]", values, "numbers")
             dimensions = 1 if name in numbers else 2
             if tensor.ndim == dimensions:
                 tensor = tensor[None]
@@ -630,12 +636,19 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
                 low, high = tensor.new_tensor(self.parameters.range_of(name))
                 whole = name != "delay" or bool((tensor == tensor.round()).all())
                 if not (whole and bool(((low <= tensor) & (tensor <= high)).all())):
-                    raise ValueError(
-                        f"options['signals'][{name!r}] must be within its range, "
-                        f"{list(self.parameters.range_of(name))}, got {values!r}"
-                    )
+                    allowed = f"within its range, {list(self.parameters.range_of(name))}"
+                    reject(f"options['signals'][{name!r}]", values, allowed)
             tensors[name] = tensor
         return Given(tensors, self._nothing)
+
+    def _tensor(self, values: Any) -> Tensor | None:
+        """Return real numbers as a tensor of the environment's type, None if they are not."""
+        if "complex" in str(getattr(values, "dtype", "")):  # PyTorch would drop a part of them
+            return None
+        try:
+            return torch.as_tensor(values, dtype=self.dtype, device=self.device)
+        except (TypeError, ValueError, RuntimeError, OverflowError):
+            return None
 
     def _checked_actions(self, actions: Tensor) -> Tensor:
         """Return the actions, shape (num_envs,); 0 where they are ignored."""
@@ -643,14 +656,10 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             raise ResetNeeded("call reset before step")
         given = actions
         if not (isinstance(actions, Tensor) and actions.dtype is self.dtype):
-            try:
-                given = torch.as_tensor(actions, dtype=self.dtype, device=self.device)
-            except (TypeError, ValueError, RuntimeError, OverflowError):
-                given = self._nothing
+            tensor = self._tensor(actions)
+            given = self._nothing if tensor is None else tensor
         if given.shape != (self.num_envs, 1):
-            raise ValueError(
-                f"actions must be numbers, shape ({self.num_envs}, 1), got {actions!r}"
-            )
+            reject("actions", actions, f"numbers, shape ({self.num_envs}, 1)")
         if given.requires_grad and not self.differentiable:
             given = given.detach()
         a = given.reshape(-1)
@@ -667,7 +676,7 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
             and not math.isfinite(plain.dot(plain).item())
             and not plain.isfinite().all()
         ):
-            raise ValueError(f"actions must be finite, got {actions!r}")
+            reject("actions", actions, "finite")
         if self._given is not None:
             going = (
                 self._host_starts if self._ended is None else self._host_starts[~self._ended]

@@ -1,6 +1,6 @@
 """Plant and actuator in PyTorch, (28) and (29): many plants, a block of samples at a time.
 
-`Plants` in `mptc_gym.plant` is the same in NumPy, a sample at a time.
+`PlantBatch` in `mptc_gym.plant` is the same in NumPy, a sample at a time.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from torch.nn import functional
 
 from mptc_gym.parameters import Parameters, PlantNumbers
 from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
-
-Number = float | Tensor  # the same for all plants, or one for each, shape (n,)
+from mptc_gym.torch_signals import Number
 
 
 def flow_command(actions: Tensor, middle: Tensor, half_range: Number) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mptc_gym import rendering
-from mptc_gym.checks import is_count, positive_count
+from mptc_gym.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
@@ -40,9 +40,12 @@ _STEPS_PER_SHIFT = 64  # steps until the window of the observations is moved bac
 
 def checked_limit(max_episode_steps: int | None) -> int:
     """Return the samples of an episode; `FOREVER` if there is no limit, None or -1."""
-    if max_episode_steps is None or max_episode_steps == -1:
+    if max_episode_steps is None:
         return FOREVER
-    return min(FOREVER, positive_count("max_episode_steps", max_episode_steps))
+    if not is_count(max_episode_steps, -1) or max_episode_steps == 0:
+        allowed = "an integer of at least 1, or None or -1 for no limit"
+        reject("max_episode_steps", max_episode_steps, allowed)
+    return FOREVER if max_episode_steps == -1 else min(FOREVER, int(max_episode_steps))
 
 
 def checked_mode(autoreset_mode: str | AutoresetMode) -> AutoresetMode:
@@ -51,9 +54,16 @@ def checked_mode(autoreset_mode: str | AutoresetMode) -> AutoresetMode:
         return AutoresetMode(autoreset_mode)
     except ValueError:
         allowed = ", ".join(repr(mode.value) for mode in AutoresetMode)
-        raise ValueError(
-            f"autoreset_mode must be one of {allowed}, got {autoreset_mode!r}"
-        ) from None
+        reject("autoreset_mode", autoreset_mode, f"one of {allowed}")
+
+
+def checked_options(options: Any) -> Mapping[str, Any]:
+    """Return the options of a reset, none for None; ValueError if they are no dict."""
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        reject("options", options, "a dict or None")
+    return options
 
 
 class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
@@ -66,7 +76,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     Parameters
     ----------
     num_envs
-        n, number of plants.
+        n, number of plants, at most 10 million.
     max_episode_steps
         Samples after which an episode is truncated; None or -1 for never.
     autoreset_mode
@@ -134,7 +144,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
     ) -> None:
         rendering.check_mode(render_mode, self.metadata["render_modes"])
         single = MiddlePointEnv(**arguments)
-        self.num_envs = num_envs = positive_count("num_envs", num_envs)
+        self.num_envs = num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
         self._limit = checked_limit(max_episode_steps)
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
@@ -231,7 +241,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             If the first reset is not one of all plants.
         """
         seeds = self._checked_seeds(seed)
-        mask = self._checked_mask(options)
+        mask = self._checked_mask(checked_options(options))
         which = np.flatnonzero(mask)
         if len(which) < self.num_envs and not self._streams:
             raise ResetNeeded("reset all environments before some of them")
@@ -481,14 +491,11 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         ):
             seeds = list(seed)
         if len(seeds) != n or not all(s is None or is_count(s) for s in seeds):
-            raise ValueError(
-                f"seed must be an integer of at least 0, or a list of {n} of them or None, got "
-                f"{seed!r}"
-            )
+            reject("seed", seed, f"an integer of at least 0, or a list of {n} of them or None")
         return [None if s is None else int(s) for s in seeds]
 
-    def _checked_mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_]:
-        if options is None or "reset_mask" not in options:
+    def _checked_mask(self, options: Mapping[str, Any]) -> NDArray[np.bool_]:
+        if "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)
         mask = options["reset_mask"]
         if (
@@ -497,10 +504,8 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             or mask.shape != (self.num_envs,)
             or not mask.any()
         ):
-            raise ValueError(
-                f"options['reset_mask'] must be an array of bool, shape ({self.num_envs},), at "
-                f"least one of them True, got {mask!r}"
-            )
+            allowed = f"an array of bool, shape ({self.num_envs},), at least one of them True"
+            reject("options['reset_mask']", mask, allowed)
         return mask
 
     def _checked_actions(self, actions: NDArray[np.float32]) -> Values:
@@ -518,7 +523,7 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
         except (TypeError, ValueError, OverflowError):
             given = np.empty(0)
         if given.shape != (n, 1):
-            raise ValueError(f"actions must be numbers, shape ({n}, 1), got {actions!r}")
+            reject("actions", actions, f"numbers, shape ({n}, 1)")
         a = given.ravel()
         if self._ended is not None:
             if self.autoreset_mode is AutoresetMode.DISABLED:
@@ -527,5 +532,5 @@ class MiddlePointVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], N
             a[self._ended] = 0.0
         # One call tells that all are finite, unless some are huge.
         if not a.dot(a) < math.inf and not np.isfinite(a).all():
-            raise ValueError(f"actions must be finite, got {actions!r}")
+            reject("actions", actions, "finite")
         return a

@@ -1,5 +1,7 @@
 """The controllers: equations by hand and by automatic differentiation, batches, files."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from agents import (
     DirectNNController,
     PIController,
     PolicyNetwork,
+    SelfTuningController,
     SmithPredictor,
     Weights,
 )
@@ -99,13 +102,6 @@ class TestPI:
         assert controller.command == pytest.approx(-2.2 * 5 - 0.3 * 500)
         assert action[0] < -10  # beyond the actuator's range, as printed
 
-    def test_reset_forgets_the_integral(self):
-        controller = PIController()
-        first = controller.act([0, 0, 0, 1.0, 0, 0])
-        controller.reset()
-        assert controller.command == 0.0
-        assert np.array_equal(controller.act([0, 0, 0, 1.0, 0, 0]), first)
-
     def test_batch_equals_singles(self, rng):
         observations = rng.normal(size=(30, 5, 6)).astype(np.float32)
         batch, singles = PIController(), [PIController() for _ in range(5)]
@@ -122,9 +118,18 @@ class TestPI:
         controller.act(np.zeros((1, 6)))
 
 
-@pytest.fixture(params=[PIController, DirectNNController])
-def controller(request):
-    return request.param()
+PLANT = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of first order, nearly
+MAKERS = {
+    "PI": PIController,
+    "NN": DirectNNController,
+    "Smith": partial(SmithPredictor, **PLANT, closed_loop_time_constant=80.0),
+    "self-tuning": partial(SelfTuningController, **PLANT),
+}
+
+
+@pytest.fixture(params=MAKERS)
+def make(request):
+    return MAKERS[request.param]
 
 
 class TestDefaults:
@@ -139,7 +144,8 @@ class TestDefaults:
 
 
 class TestEveryController:
-    def test_action_is_one_of_the_environment(self, controller):
+    def test_action_is_one_of_the_environment(self, make):
+        controller = make()
         env = gymnasium.make("MiddlePoint-v0")
         action = controller.act(env.reset(seed=0)[0])
         assert action.shape == (1,)
@@ -148,8 +154,8 @@ class TestEveryController:
         assert info["command"] == pytest.approx(controller.command, rel=1e-6)
 
     @pytest.mark.parametrize("bad", [np.zeros(3), np.zeros((2, 2, 6)), np.full(6, np.nan)])
-    def test_bad_observation_changes_nothing(self, controller, bad):
-        twin = type(controller)()
+    def test_bad_observation_changes_nothing(self, make, bad):
+        controller, twin = make(), make()
         controller.act(np.ones(6)), twin.act(np.ones(6))
         with pytest.raises(ValueError, match="observation must"):
             controller.act(bad)
@@ -158,14 +164,25 @@ class TestEveryController:
     @pytest.mark.parametrize(
         "limits", [(1.0, 1.0), (2.0, 1.0), (-np.inf, 1.0), (-1e308, 1e308)]
     )
-    def test_bad_limits(self, controller, limits):
+    def test_bad_limits(self, make, limits):
         with pytest.raises(ValueError, match="u_min"):
-            type(controller)(u_min=limits[0], u_max=limits[1])
+            make(u_min=limits[0], u_max=limits[1])
 
-    def test_it_reads_no_more_than_it_needs(self, controller):
-        twin = type(controller)()
+    def test_it_reads_no_more_than_it_needs(self, make):
         longer = np.r_[np.arange(6.0), 99.0, -99.0]
-        assert np.array_equal(controller.act(longer), twin.act(np.arange(6.0)))
+        assert np.array_equal(make().act(longer), make().act(np.arange(6.0)))
+
+    def test_reset_forgets_the_episode(self, make, rng):
+        observations = rng.normal(size=(60, 6))
+        controller, new = make(), make()
+        if isinstance(controller, DirectNNController):
+            controller.learning = new.learning = False  # what was learnt stays
+        for observation in observations:
+            controller.act(observation + 1.0)
+        controller.reset()
+        assert controller.command == 0.0
+        for observation in observations:
+            assert np.array_equal(controller.act(observation), new.act(observation))
 
 
 class TestDirectNN:
@@ -361,9 +378,6 @@ class TestDirectNN:
             DirectNNController().act(np.zeros((2, 6)))
 
 
-PLANT = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of first order, nearly
-
-
 class TestAntiWindup:
     def test_by_hand(self):
         # Kp 1, Ki 0.5, limits +-4. e = 3: -3 - 1.5 = -4.5 is beyond the limit: the sum stays 0.
@@ -412,11 +426,16 @@ class TestSimc:
         [
             ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
             ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0),
+            ("gain", 10**400), ("time_constant", 10**400), ("anti_windup", "no"),
         ],
     )  # fmt: skip
     def test_bad_numbers_are_named(self, name, value):
         with pytest.raises(ValueError, match=name):
             PIController.simc(**{**PLANT, name: value})
+
+    def test_without_delay_it_asks_for_the_time_constant_of_the_loop(self):
+        with pytest.raises(ValueError, match="must be given where delay is 0"):
+            PIController.simc(**{**PLANT, "delay": 0.0})
 
     def test_other_arguments_reach_the_controller(self):
         controller = PIController.simc(**PLANT, u_min=-4.0, u_max=8.0, error_index=1)
@@ -464,12 +483,6 @@ class TestSmithPredictor:
         controller.kp, controller.ki = 7.0, 0.0  # u = -7 at e = 1
         assert np.float64(controller.act([0.0, 0, 0, 1.0])[0]) * 10.0 <= -7.0
 
-    def test_reset_forgets_the_model(self):
-        controller = self.smith()
-        first = [controller.act([5.0, 5, 5, 5, 5, 5]) for _ in range(30)]
-        controller.reset()
-        assert [controller.act([5.0, 5, 5, 5, 5, 5]) for _ in range(30)] == first
-
     def test_batch_equals_singles(self, rng):
         observations = rng.normal(size=(40, 3, 6)).astype(np.float32)
         batch, singles = self.smith(), [self.smith() for _ in range(3)]
@@ -477,7 +490,9 @@ class TestSmithPredictor:
             alone = [c.act(row) for c, row in zip(singles, observation, strict=True)]
             assert np.array_equal(batch.act(observation), alone)
 
-    @pytest.mark.parametrize(("name", "value"), [("delay", -8.0), ("dead_zone", np.nan)])
+    @pytest.mark.parametrize(
+        ("name", "value"), [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)]
+    )
     def test_bad_numbers_are_named(self, name, value):
         with pytest.raises(ValueError, match=name):
             self.smith(**{name: value})
@@ -485,7 +500,15 @@ class TestSmithPredictor:
 
 @pytest.mark.parametrize(
     "observation",
-    ["text", [0.0, "x", 0.0, 0.0, 0.0, 0.0], (np.zeros(6), {"output": 0.0}), None],
+    [
+        "text",
+        [0.0, "x", 0.0, 0.0, 0.0, 0.0],
+        (np.zeros(6), {"output": 0.0}),
+        None,
+        ["1"] * 6,
+        np.zeros(6) * 1j,
+        [10**400] * 6,
+    ],
 )
 def test_what_is_no_observation_is_refused_by_name(observation):
     # The third is what `reset` returns, handed on whole.

@@ -307,6 +307,10 @@ BAD = [
     ("action_window", -3), ("temperature_span", 0.0), ("temperature_span", float("inf")),
     ("reward", "cubic"), ("reward", 2), ("error_scale", 0.0), ("error_scale", -5.0),
     ("move_weight", -1.0), ("move_weight", float("nan")),
+    # These would fill the memory, or take hours.
+    ("delay", 10**12), ("action_window", 10**9), ("error_window", 100_001),
+    ("setpoint_period", 10**400), ("drift_samples", 10**10),
+    ("a", [1.0] + [0.1] * 1000), ("b", [0.1] * 1001), ("c", [1.0] + [0.1] * 1000),
 ]  # fmt: skip
 
 
@@ -362,6 +366,11 @@ def test_arrays_are_taken_where_lists_are():
         MiddlePointEnv(delay=np.array([12.0, 24.0]))
 
 
+def test_the_longest_delay_and_window_are_taken():
+    env = MiddlePointEnv(delay=100_000, action_window=100_000, b=[0.1] * 1000)
+    assert run(env, np.ones(2))["observation"].shape == (3, 100_006)
+
+
 def test_numpy_scalars_are_taken():
     env = MiddlePointEnv(delay=np.int64(3), dead_zone=np.float32(2.0), setpoint=np.float64(1))
     assert run(env, np.ones(5))["setpoint"][0] == 1.0
@@ -385,6 +394,15 @@ def test_bad_action_leaves_the_plant_untouched(action):
             env.step(action)
         _, _, _, _, info = env.step(np.ones(1, np.float32))
         assert info["output"] == reference["output"][k + 1]
+
+
+def test_a_tensor_of_two_numbers_is_refused_as_an_array_of_two_is():
+    torch = pytest.importorskip("torch", reason="the action is a tensor")
+    env = MiddlePointEnv()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action must be one finite number"):
+        env.step(torch.zeros(2))
+    env.step(torch.zeros(1))
 
 
 def test_step_before_reset():

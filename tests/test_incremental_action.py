@@ -139,6 +139,7 @@ def test_a_bad_action_changes_nothing(action):
         ("max_move", 0.0), ("max_move", 2.1), ("max_move", float("nan")), ("max_move", "x"),
         ("max_move", True), ("undo_dead_zone", -1.0), ("undo_dead_zone", float("inf")),
         ("undo_dead_zone", "yes"), ("undo_dead_zone", None),
+        ("undo_dead_zone", 10**400),
     ],
 )  # fmt: skip
 def test_bad_arguments_are_named(name, value):
@@ -157,6 +158,23 @@ def test_other_environments_are_refused():
     ):
         with pytest.raises(ValueError, match="env"):
             many.IncrementalAction(others)
+
+
+def test_numpy_scalars_are_taken():
+    for wrapped in (
+        make(max_move=np.float32(0.5), undo_dead_zone=np.float32(2.0)),
+        many.IncrementalAction(
+            gymnasium.make_vec("MiddlePoint-v0", 2), max_move=np.float32(0.5)
+        ),
+    ):
+        wrapped.reset(seed=0)
+        wrapped.step(np.ones(wrapped.action_space.shape, np.float32))
+
+
+def test_many_plants_in_pytorch_are_refused():
+    torch_env = pytest.importorskip("mptc_gym.torch_env", reason="it is what is refused")
+    with pytest.raises(ValueError, match="in NumPy"):
+        many.IncrementalAction(torch_env.MiddlePointTorchEnv(2))
 
 
 def test_the_spec_makes_it_again():

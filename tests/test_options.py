@@ -289,7 +289,7 @@ class TestRanges:
         ({"time_constant_factor": 2, "a": [1.0, 0.0, 0.5]}, "slowest poles are complex"),
         ({"time_constant_factor": 2, "a": [1.0, -1.0]}, "slowest pole, 1, is not between"),
         ({"disturbance_amplitude": 1, "a": [1.0, -1.0]}, "not stable"),
-        ({"drift_samples": 0}, "drift_samples must be an integer of at least 1"),
+        ({"drift_samples": 0}, "drift_samples must be an integer from 1 to 1,000,000,000"),
         ({"setpoint_period": [1, 2]}, "setpoint_period must be an integer"),
     ],
 )  # fmt: skip

@@ -94,6 +94,11 @@ class TestForward:
         with pytest.raises(ValueError, match="observation must have 5 elements"):
             policy().act(np.zeros(6))
 
+    @pytest.mark.parametrize("size", [4, 6])
+    def test_the_error_then_says_what_the_environment_needs(self, size):
+        with pytest.raises(ValueError, match="environment needs the network's `observation`"):
+            policy().act(np.zeros(size))
+
     def test_observation_names_every_window(self):
         assert policy().observation == {**WINDOWS, "error_window": 0}
 
@@ -218,7 +223,7 @@ class TestFile:
         [
             ({"format": 99}, "format is 99"),
             ({"activation": "swish"}, "activation"),
-            ({"layers": 2}, "weights of layer 1"),
+            ({"layers": 2}, r"weights of layers\[1\]"),
             ({"observation": {"flow_window": 3}}, "flow_window"),
             ({"increments": {"step": 1}}, "step"),
             ({"observation": 3}, "damaged"),
@@ -241,7 +246,7 @@ class TestFile:
             arrays = dict(file)
         arrays["W1"][2, 3] = np.nan
         np.savez(path, **arrays)
-        with pytest.raises(ValueError, match="weights of layer 1 must be finite"):
+        with pytest.raises(ValueError, match=r"weights of layers\[1\] must be finite"):
             PolicyNetwork.load(path)
 
     def test_a_missing_file(self, tmp_path):
@@ -266,6 +271,13 @@ class TestFile:
         ({"direct": [1.0]}, "direct"),
         ({"u_min": 10.0}, "u_max"),
         ({"increments": Increments(0.1, 10.0)}, "increments.dead_zone"),
+        ({"observation": 5}, "observation must be a dict"),
+        ({"activation": ["elu"]}, "activation must be"),
+        ({"output": ["tanh"]}, "output must be"),
+        ({"increments": 0.1}, "increments must be"),
+        ({"provenance": "a paper"}, "provenance must be"),
+        ({"u_max": 10**400}, "u_max must be"),
+        ({"direct": ["1"] * 5}, "direct must be numbers"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
@@ -276,10 +288,12 @@ def test_bad_arguments_are_named(arguments, message):
 def test_layers_that_do_not_fit_are_named():
     given = {"observation": WINDOWS, "input_scale": np.ones(5)}
     for bad, message in (
-        ([], "layers"),
-        (layers(4, 3, 1), r"weights of layer 0 must have shape \(3, 5\)"),
-        (layers(5, 3, 2), r"weights of layer 1 must have shape \(1, 3\)"),
-        ([(np.zeros((3, 5)), np.zeros(2))], "weights of layer 0"),
+        ([], "layers must be a list"),
+        (5, "layers must be a list"),
+        ([5], r"layers\[0\] must be a pair"),
+        (layers(4, 3, 1), r"weights of layers\[0\] must have shape \(3, 5\)"),
+        (layers(5, 3, 2), r"weights of layers\[1\] must have shape \(1, 3\)"),
+        ([(np.zeros((3, 5)), np.zeros(2))], r"weights of layers\[0\]"),
     ):
         with pytest.raises(ValueError, match=message):
             PolicyNetwork(bad, **given)

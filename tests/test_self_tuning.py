@@ -182,6 +182,9 @@ def test_the_number_of_loops_is_fixed_until_reset():
         controller.act(np.zeros((3, 6)))
     controller.reset()
     controller.act(np.zeros((3, 6)))
+    controller.reset()
+    with pytest.raises(ValueError, match="observation must have a row"):
+        controller.act(np.zeros((0, 6)))
 
 
 @pytest.mark.parametrize(
@@ -192,7 +195,8 @@ def test_the_number_of_loops_is_fixed_until_reset():
         ("shortest_delay", -1), ("longest_delay", 5), ("longest_delay", 10.0),
         ("closed_loop_time_constant", 0.0), ("forgetting", 0.0), ("forgetting", 1.1),
         ("sampling_interval", 0.0), ("setpoint_index", -1), ("error_index", 1.5),
-        ("u_min", 10.0),
+        ("u_min", 10.0), ("longest_delay", 10**9), ("dead_zones", b"15"),
+        ("dead_zones", np.array(5.0)), ("gain", 10**400),
     ],
 )  # fmt: skip
 def test_bad_arguments_are_named(name, value):

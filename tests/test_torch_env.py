@@ -352,6 +352,43 @@ class TestDraws:
         assert abs(gains.mean() - 1.125) < 5 * 0.75 / (12 * n) ** 0.5
         assert abs(np.corrcoef(delays, gains)[0, 1]) < 5 / n**0.5
 
+    def test_partial_resets_leave_the_distributions_as_they_are(self):
+        n, steps, variance, walk = 1500, 250, 2.0, 0.01
+        env = make(
+            n, noise_variance=variance, c=[1.0, 3.0], disturbance_walk_variance=walk,
+            setpoint="random", setpoint_period=60, max_episode_steps=None,
+        )  # fmt: skip
+        _, infos = env.reset(seed=6)
+        rng = np.random.default_rng(0)
+        age, begun = np.zeros(n, int), np.zeros(n, int)  # of the episode; when it last changed
+        level = infos["setpoint"].numpy()
+        noise, load, ages, lengths = [], [], [], []
+        for _ in range(steps):
+            *_, infos = env.step(torch.zeros(n, 1))
+            age += 1
+            changed = infos["setpoint"].numpy() != level
+            lengths.append((age - begun)[changed])
+            begun[changed], level = age[changed], infos["setpoint"].numpy()
+            noise.append(infos["noise"].numpy())
+            load.append(infos["disturbance"].numpy())
+            ages.append(age.copy())
+            mask = rng.random(n) < 0.02
+            if mask.any():
+                _, infos = env.reset(options={"reset_mask": torch.tensor(mask)})
+                level = np.where(mask, infos["setpoint"].numpy(), level)
+                age[mask] = begun[mask] = 0
+        noise, load, ages = np.array(noise), np.array(load), np.array(ages)
+        for found, expected in (
+            (noise[ages == 1], variance),
+            (noise[ages == 2], 10.0 * variance),  # 1 + 3^2
+            (load[ages == 10], 10.0 * walk),
+            (load[ages == 45], 40.0 * walk),
+        ):
+            assert abs(found.var() / expected - 1.0) < 5 * (2 / found.size) ** 0.5
+        assert not load[ages < 10].any()
+        lengths = np.concatenate(lengths)
+        assert (lengths.min(), lengths.max()) == (10, 30)
+
     def test_the_seed_is_all_that_differs(self):
         def trajectory(seed):
             env = make(5, **PRESETS["hard"], max_episode_steps=50)
@@ -583,7 +620,8 @@ def test_help_shows_every_argument():
         ("num_envs", 0), ("num_envs", 2.0), ("max_episode_steps", 0),
         ("autoreset_mode", "Never"), ("dead_zone", -1.0), ("delay", 1.5),
         ("dtype", torch.float16), ("dtype", "float32"),
-        ("device", "toaster"), ("differentiable", "yes"),
+        ("device", "toaster"), ("differentiable", "yes"), ("device", "meta"),
+        ("render_mode", "rgb_array"), ("num_envs", 10**9), ("dtype", np.ones(2)),
     ],
 )  # fmt: skip
 def test_bad_argument_is_named(name, value):
@@ -621,12 +659,20 @@ def test_bad_reset_mask_is_refused(mask):
         ({"disturbance": torch.zeros(5, 2)}, "disturbance"),
         ({"delay": torch.zeros(2)}, "delay"), ({"delay": torch.full((2,), 7.5)}, "delay"),
         ({"dead_zone": torch.zeros(2)}, "dead_zone"),
+        ({"noise": "x"}, r"\['noise'\] must be numbers"), ({"noise": None}, "noise"),
+        ({"noise": torch.zeros(5, 2) * 1j}, "noise"), ({"noise": [[1.0, 2.0], [3.0]]}, "noise"),
     ],
 )  # fmt: skip
 def test_bad_signals_are_named(signals, named):
     env = make(delay=[5, 9])
     with pytest.raises(ValueError, match=named):
         env.reset(options={"signals": signals})
+
+
+@pytest.mark.parametrize("options", ["reset_mask", 5, [True, False]])
+def test_options_that_are_no_dict_are_refused(options):
+    with pytest.raises(ValueError, match=r"^options must be a dict or None"):
+        make().reset(options=options)
 
 
 def test_signals_end_with_an_error_and_with_a_reset_without():
@@ -646,7 +692,8 @@ def test_signals_end_with_an_error_and_with_a_reset_without():
 
 BAD_ACTIONS = [
     torch.zeros(2), torch.zeros(1, 1), torch.zeros(2, 2), torch.tensor([[torch.nan], [0.0]]),
-    torch.tensor([[0.0], [torch.inf]]), [["up"], ["down"]], None,
+    torch.tensor([[0.0], [torch.inf]]), [["up"], ["down"]], None, np.zeros((2, 1)) * 1j,
+    torch.zeros(2, 1) * 1j,
 ]  # fmt: skip
 
 

@@ -303,12 +303,13 @@ def test_a_plant_costs_a_few_kib(limit):
     [
         ("num_envs", 0), ("num_envs", 2.0), ("num_envs", True), ("max_episode_steps", 0),
         ("max_episode_steps", 1.5), ("autoreset_mode", "Never"), ("dead_zone", -1.0),
-        ("delay", 1.5),
+        ("delay", 1.5), ("num_envs", 10**9), ("max_episode_steps", np.ones(2)),
+        ("max_episode_steps", -2), ("render_mode", np.ones(2)),
     ],
 )  # fmt: skip
 def test_bad_argument_is_named(name, value):
     arguments = {"num_envs": 2, name: value}
-    with pytest.raises(ValueError, match=name):
+    with pytest.raises(ValueError, match=f"^{name} must be"):
         MiddlePointVectorEnv(**arguments)
 
 
@@ -342,6 +343,23 @@ def test_bad_reset_mask_is_refused(mask):
     envs.reset(seed=0)
     with pytest.raises(ValueError, match="reset_mask"):
         envs.reset(options={"reset_mask": mask})
+
+
+@pytest.mark.parametrize("options", ["reset_mask", 5, [True, False]])
+def test_options_that_are_no_dict_are_refused(options):
+    with pytest.raises(ValueError, match=r"^options must be a dict or None"):
+        MiddlePointVectorEnv(2).reset(options=options)
+
+
+def test_an_error_shows_the_beginning_of_a_large_array_and_its_shape():
+    envs = MiddlePointVectorEnv(2)
+    envs.reset(seed=0)
+    with pytest.raises(
+        ValueError, match=r"shape \(2, 1\), got array.*shape \(300, 3\)"
+    ) as error:
+        envs.step(np.zeros((300, 3)))
+    assert len(str(error.value)) < 200
+    assert "\n" not in str(error.value)
 
 
 BAD_ACTIONS = [

@@ -16,6 +16,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from mptc_gym.checks import is_number, reject
 from mptc_gym.parameters import Parameters
 from mptc_gym.plant import action_from_command, float32_action
 
@@ -115,10 +116,10 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         try:
             # Text is no number, even where float() reads one.
             move = float(np.asarray(action).item() - 0.0)
-        except (TypeError, ValueError, OverflowError):
+        except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
             move = math.nan
         if not math.isfinite(move):
-            raise ValueError(f"action must be one finite number, shape (1,), got {action!r}")
+            reject("action", action, "one finite number, shape (1,)")
         actuator = self._actuator
         flow = self._flow + actuator.move * max(-1.0, min(1.0, move))
         self._flow = max(actuator.u_min, min(actuator.u_max, flow))
@@ -171,16 +172,9 @@ class Actuator:
 
 def check_arguments(max_move: Any, undo_dead_zone: Any) -> None:
     """Refuse arguments of the wrappers that are out of range, with a ValueError."""
-    if not _is_number(max_move) or not 0.0 < max_move <= 2.0:
-        raise ValueError(f"max_move must be a number above 0, up to 2, got {max_move!r}")
+    if not is_number(max_move) or not 0.0 < max_move <= 2.0:
+        reject("max_move", max_move, "a number above 0, up to 2")
     if not isinstance(undo_dead_zone, bool) and not (
-        _is_number(undo_dead_zone) and 0.0 <= undo_dead_zone < math.inf
+        is_number(undo_dead_zone) and undo_dead_zone >= 0.0
     ):
-        raise ValueError(
-            "undo_dead_zone must be True, False or a finite number of at least 0, got "
-            f"{undo_dead_zone!r}"
-        )
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+        reject("undo_dead_zone", undo_dead_zone, "True, False or a number from 0 to 1e9")

@@ -11,7 +11,9 @@ from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from mptc_gym.checks import reject
 from mptc_gym.parameters import Parameters
+from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import NUMBERS, Actuator, check_arguments
 
 __all__ = ["IncrementalAction"]
@@ -91,16 +93,14 @@ class IncrementalAction(VectorActionWrapper):
             moves = np.array(actions)
             # Text is no number, even where NumPy reads one.
             moves = moves.astype(np.float64, casting="same_kind")
-        except (TypeError, ValueError, OverflowError):
+        except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
             moves = np.empty(0)
         if moves.shape != (self.num_envs, 1):
-            raise ValueError(
-                f"actions must be numbers, shape ({self.num_envs}, 1), got {actions!r}"
-            )
+            reject("actions", actions, f"numbers, shape ({self.num_envs}, 1)")
         moves = moves[:, 0]
         moves[self._ended] = 0.0  # ignored
         if not np.isfinite(moves).all():
-            raise ValueError(f"actions must be finite, got {actions!r}")
+            reject("actions", actions, "finite")
         actuator = self._actuator
         moved: NDArray[np.float64] = flows + actuator.move * moves.clip(-1.0, 1.0)
         return moved.clip(actuator.u_min, actuator.u_max)
@@ -119,13 +119,14 @@ class IncrementalAction(VectorActionWrapper):
 def _parameters(env: VectorEnv[Any, Any, Any]) -> list[Parameters]:
     """Return the arguments of each environment."""
     inner = env.unwrapped
-    own = getattr(inner, "parameters", None)
-    if isinstance(own, Parameters):
-        return [own] * env.num_envs
+    if isinstance(inner, MiddlePointVectorEnv):
+        return [inner.parameters] * env.num_envs
     try:
         plants = list(inner.get_attr("parameters"))  # type: ignore[attr-defined]
     except AttributeError:
         plants = []
     if not plants or not all(isinstance(plant, Parameters) for plant in plants):
-        raise ValueError(f"env must be a vector environment of MiddlePointEnv, got {env}")
+        raise ValueError(
+            f"env must be a vector environment of MiddlePointEnv in NumPy, got {env}"
+        )
     return plants
