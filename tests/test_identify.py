@@ -13,8 +13,9 @@ from agents import PIController
 from benchmarks.identify import log as log_module
 from benchmarks.identify.__main__ import main
 from benchmarks.identify.armax import Orders, Rows
-from benchmarks.identify.fit import CannotTellError, Options, identify
+from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Columns, Log, read_log
+from benchmarks.identify.model import CannotTellError, Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges, simulation
 from benchmarks.identify.study import cell, synthetic_plants, table
 from benchmarks.rollout import make_plants, rollout

@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.identify.armax import Orders
-from benchmarks.identify.fit import Options, identify
+from benchmarks.identify.fit import identify
 from benchmarks.identify.log import (
     FLOW_UNITS,
     MOST_ROWS,
@@ -20,6 +20,7 @@ from benchmarks.identify.log import (
     Columns,
     read_log,
 )
+from benchmarks.identify.model import Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import report
 from benchmarks.lib import command_line

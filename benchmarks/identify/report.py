@@ -12,8 +12,8 @@ import pandas as pd
 from benchmarks.controllers.engineered import simc_pi, smith
 from benchmarks.controllers.step_test import step_test
 from benchmarks.identify import plots
-from benchmarks.identify.fit import Interval, Model
 from benchmarks.identify.log import Log
+from benchmarks.identify.model import Interval, Model
 from benchmarks.identify.plant import explained, plant_arguments
 from benchmarks.lib.report import Section
 from benchmarks.limits import least_possible

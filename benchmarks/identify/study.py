@@ -21,8 +21,9 @@ from rich.console import Console
 
 import mptc_gym  # noqa: F401 (registers the environment)
 from benchmarks.designs import Plant, random_design
-from benchmarks.identify.fit import CannotTellError, Interval, identify
+from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
+from benchmarks.identify.model import CannotTellError, Interval
 from benchmarks.lib import command_line
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import share

@@ -23,8 +23,9 @@ import tclab  # type: ignore[import-untyped, unused-ignore]
 from numpy.typing import NDArray
 
 from agents import PIController, SmithPredictor
-from benchmarks.identify.fit import Model, Options, identify
+from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
+from benchmarks.identify.model import Model, Options
 from benchmarks.identify.plant import plant_arguments
 from benchmarks.identify.report import tuned
 from mptc_gym import Parameters
