@@ -108,11 +108,24 @@ def cell(plant: Plant, samples: int, seed: int) -> dict[str, Any]:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--logs", type=command_line.number, default=100, help="how many plants")
-    add("--samples", type=command_line.number, default=1200, help="rows of a log")
-    add("--seed", type=command_line.seed, default=1, help="of plants, steps and noise")
+    count = command_line.number
+    add("--logs", type=count, default=100, metavar="N", help="logs, each of another plant")
+    add("--samples", type=count, default=1200, metavar="N", help="rows of a log")
+    add(
+        "--seed",
+        type=command_line.seed,
+        default=1,
+        metavar="N",
+        help="seed that plants, steps of the flow and noise are drawn with",
+    )
     command_line.add_fan_out(parser, "identifications")
-    add("--out", type=Path, default=Path("results/identify-study"), help="folder to write to")
+    add(
+        "--out",
+        type=Path,
+        default=Path("results/identify-study"),
+        metavar="FOLDER",
+        help="folder to write to",
+    )
 
 
 @command_line.command(

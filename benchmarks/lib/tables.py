@@ -13,7 +13,7 @@ from rich.table import Table
 
 PERCENTILES = {"median": 50, "p10": 10, "p90": 90}
 _NAMES = ("scenario", "agent", "controller", "case")
-_TEXTS = (*_NAMES, "claim", "verdict", "question", "command", "page")
+_TEXTS = (*_NAMES, "claim", "verdict", "question", "command", "page", "writes", "what")
 
 
 def percentiles(
