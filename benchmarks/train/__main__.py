@@ -166,7 +166,10 @@ def draw_prices(table: pd.DataFrame, path: Path) -> None:
         axes.plot(medians[travel], medians[error], "o-", color=drawing.COLOURS[0])
         for price, (x, y) in zip(medians.index, medians.to_numpy(), strict=True):
             axes.annotate(f"{price:g}", (x, y), (4, 4), textcoords="offset points")
-        axes.set(xlabel=travel, ylabel=error, title="What a price of valve travel buys")
+        axes.locator_params(nbins=5)
+        axes.set(xlabel=travel, ylabel=error)
+        axes.set_title("beside each point: price of valve travel (°C for each t/h a sample)",
+                       fontsize="medium")  # fmt: skip
         drawing.save(figure, path)
         plt.close(figure)
 
