@@ -31,8 +31,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add("claims", nargs="*", default=list(CLAIMS), metavar="CLAIM",
         help="which claims to test")  # fmt: skip
     add("--runs", type=command_line.number, default=RUNS, metavar="N", help="runs of each case")
-    add("--out", type=Path, default=Path("results/claims"), metavar="FOLDER",
-        help="folder to write to")  # fmt: skip
+    command_line.add_out(parser, "results/claims")
 
 
 @command_line.command(

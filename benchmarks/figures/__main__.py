@@ -106,8 +106,7 @@ FIGURES = (
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--runs", type=command_line.number, default=RUNS, metavar="N", help="runs of each case")
-    add("--out", type=Path, default=Path("results/figures"), metavar="FOLDER",
-        help="folder to write to")  # fmt: skip
+    command_line.add_out(parser, "results/figures")
 
 
 @command_line.command(

@@ -40,13 +40,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         help="table with a heading; a row holds the temperature at its time and the flow that "
         "is commanded from that time on",
     )
-    add(
-        "--out",
-        type=Path,
-        default=Path("results/identify"),
-        metavar="FOLDER",
-        help="folder to write to",
-    )
+    command_line.add_out(parser, "results/identify")
     add(
         "--time",
         default=columns.time,

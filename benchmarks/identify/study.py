@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -19,7 +18,6 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-import mptc_gym  # noqa: F401 (registers the environment)
 from benchmarks.designs import Plant, random_design
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
@@ -119,13 +117,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         help="seed that plants, steps of the flow and noise are drawn with",
     )
     command_line.add_fan_out(parser, "identifications")
-    add(
-        "--out",
-        type=Path,
-        default=Path("results/identify-study"),
-        metavar="FOLDER",
-        help="folder to write to",
-    )
+    command_line.add_out(parser, "results/identify-study")
 
 
 @command_line.command(

@@ -184,6 +184,13 @@ def known(option: str, given: Sequence[str], names: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(chosen))
 
 
+def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
+    """Add `--out`, with the folder that is written to unless told otherwise."""
+    parser.add_argument(
+        "--out", type=Path, default=Path(folder), metavar="FOLDER", help="folder to write to"
+    )
+
+
 def add_fan_out(parser: argparse.ArgumentParser, what: str) -> None:
     """Add the options that say where and how many at once; `what` names what runs."""
     parser.add_argument(

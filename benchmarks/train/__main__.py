@@ -47,8 +47,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "draw what it buys")  # fmt: skip
     add("--retrain", action="store_true", help="train even what is finished")
     add("--keep", action="store_true", help="put what is chosen into agents/pretrained")
-    add("--out", type=Path, default=Path("results/networks"), metavar="FOLDER",
-        help="folder to write to")  # fmt: skip
+    command_line.add_out(parser, "results/networks")
     command_line.add_fan_out(parser, "trainings")
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
 import optuna
 from rich.console import Console
@@ -42,13 +41,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         help="runs of each case in a trial",
     )
     plants.add_options(parser)
-    add(
-        "--out",
-        type=Path,
-        default=Path("results/tune"),
-        metavar="FOLDER",
-        help="folder to write to",
-    )
+    command_line.add_out(parser, "results/tune")
     command_line.add_fan_out(parser, "runs and trainings")
 
 
