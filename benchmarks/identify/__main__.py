@@ -128,7 +128,9 @@ def main(options: argparse.Namespace, console: Console) -> str:
     began = time.process_time()
     out = command_line.out_folder(options.out)
     if options.orders and min(options.orders[:2]) < 1:
-        raise UsageError(f"--orders: A and B must have at least 1, got {options.orders[:2]}")
+        raise UsageError(
+            f"--orders: A and B must have at least 1 coefficient, got {options.orders[:2]}"
+        )
     columns = Columns(
         options.time, options.flow, options.temperature, options.sampling_interval,
         options.time_unit, options.flow_unit, options.temperature_unit,

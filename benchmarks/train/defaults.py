@@ -243,7 +243,9 @@ def main(options: argparse.Namespace, _console: Console) -> str:
     torch.set_num_threads(1)  # the networks are too small for more
     table = command_line.out_folder(options.out) / f"{NAME}.csv" if options.out else None
     if options.plot and table and not table.exists():
-        raise command_line.UsageError(f"--out: {table} is missing, so that --plot has nothing")
+        raise command_line.UsageError(
+            f"--out: {table} is missing, so that --plot has nothing to draw"
+        )
     if not options.plot:
         for seed in range(options.seed, options.seed + options.seeds):
             if not (table and is_done(options.case, options.steps, seed, table)):
