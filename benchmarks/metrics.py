@@ -48,7 +48,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
         - `mae`: mean of |e|;
         - `ise`: integral of e^2;
         - `itae`: integral of t |e|, t counted from the latest set-point change;
-        - `total_variation`: of the applied input, sum of |u_a(k) - u_a(k-1)| from rest;
+        - `total_variation`: of the applied input; see `travel`;
         - `overshoot`: how far the output goes beyond the new set point, as a percentage of the
           set-point change; the largest of all changes;
         - `settling_time`: from a set-point change until the error stays within
@@ -62,7 +62,6 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     interval = parameters.sampling_interval / 60.0  # min
     command = trajectory.command
     error = trajectory.setpoint - trajectory.output
-    moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
     drawn = {"dead_zone", "u_min", "u_max"} & set(parameters.ranges)
     inside = saturated = np.full(command.shape, np.nan)
     if not drawn:
@@ -77,7 +76,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
         "mae": np.abs(error).mean(axis=0),
         "ise": interval * np.square(error).sum(axis=0),
         "itae": interval**2 * samples_itae,
-        "total_variation": np.abs(moves).sum(axis=0),
+        "total_variation": travel(trajectory),
         "overshoot": 100.0 * overshoot,
         "settling_time": interval * settling,
         "dead_zone_share": 100.0 * inside.mean(axis=0),
@@ -109,6 +108,13 @@ def mean_error(trajectory: Trajectory) -> Array:
     """Return the mean |e| of each run, degC, shape (runs,)."""
     error: Array = np.abs(trajectory.setpoint - trajectory.output).mean(axis=0)
     return error
+
+
+def travel(trajectory: Trajectory) -> Array:
+    """Return how far the valve moves in each run, from rest at 0, t/h, shape (runs,)."""
+    moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
+    distance: Array = np.abs(moves).sum(axis=0)
+    return distance
 
 
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from typing import Any
 
 from benchmarks.lib.command_line import UsageError, blame
 from mptc_gym import PRESETS, Parameters
+from mptc_gym.parameters import slowest_pole
 
 
 @dataclass(frozen=True)
@@ -35,16 +36,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--plant",
         type=Path,
         metavar="FILE",
-        help="JSON file with arguments of the environment, as benchmarks.identify writes it",
+        help="JSON file with arguments of the environment, such as the plant.json that "
+        "benchmarks.identify writes",
     )
-    add("--preset", choices=PRESETS, help="arguments by name, of mptc_gym.PRESETS")
+    add(
+        "--preset",
+        choices=PRESETS,
+        metavar="NAME",
+        help=f"a plant that comes with the environment: {', '.join(PRESETS)}",
+    )
     add(
         "--set",
         action="append",
         default=[],
         metavar="ARGUMENT=VALUE",
         help="an argument of the environment, such as delay=30 or delay=[12,24] (may be given "
-        "more than once; it goes before those of --plant and --preset)",
+        "more than once; it overrides those of --plant, and these override --preset)",
     )
 
 
@@ -76,9 +83,14 @@ def chosen(options: argparse.Namespace) -> Plant:
             arguments[name] = value  # such as random
     given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(options, name)]
     try:
-        Parameters.of_environment(arguments)
+        parameters = Parameters.of_environment(arguments)
     except (TypeError, ValueError) as error:
         raise UsageError(f"{', '.join(given)}: {error}") from error
+    if abs(slowest_pole(parameters.a) or 0.0) > 1.0:
+        raise UsageError(
+            f"{', '.join(given)}: a must not have a root beyond the unit circle, as nothing "
+            f"holds such a plant, got {list(parameters.a)}"
+        )
     return Plant(", ".join(names) or "the paper's plant", arguments)
 
 

@@ -210,7 +210,7 @@ class TestCommand:
             run_claims(tmp_path / name, "noise")
         one, two = ((tmp_path / name / "claims.csv").read_text() for name in ("one", "two"))
         assert one == two
-        assert "holds" in one or "does not hold" in one
+        assert "standard deviation of y without control" in one
 
     def test_other_seeds_other_numbers(self):
         first, second = (
@@ -237,11 +237,9 @@ class TestCommand:
         assert "no 'everything'" in capsys.readouterr().err
 
     @pytest.mark.parametrize("name", claims.CLAIMS)
-    def test_every_claim_is_examined(self, name):
+    def test_every_claim_but_that_of_the_curves_can_be_tested(self, name):
         results = claims.CLAIMS[name].examine(Batch(6, 500))
-        assert verdict(results.findings) is Verdict.UNTESTABLE or any(
-            finding.criterion for finding in results.findings
-        )
+        assert (verdict(results.findings) is Verdict.UNTESTABLE) is (name == "figures")
         for finding in results.findings:
             estimate = finding.estimate
             assert estimate.low <= estimate.value <= estimate.high, finding.quantity

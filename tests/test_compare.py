@@ -666,6 +666,12 @@ class TestCompare:
             (["--agents"], "no controller"),
             (["--set", "delay=-1"], "delay must be"),
             (["--set", "delay"], "ARGUMENT=VALUE"),
+            (["--set", "a=[1,-1.5]"], "--set: a must not have a root beyond the unit circle"),
+            (
+                ["--set", "a=[1,-1]", "--agents", "pi-simc"],
+                "pi-simc on .*: a must be of a stable",
+            ),
+            (["--kept", __file__], "--kept: .* cannot be written to: it is no folder"),
             (["--set", "dely=3"], "'dely': did you mean 'delay'?"),
             (["--plant", "nowhere.json"], "nowhere.json"),
             (["--agent", "PI=agents:PIController"], "NEW_NAME"),
@@ -713,13 +719,15 @@ def test_a_long_legend_leaves_the_responses_their_room(tmp_path, monkeypatch):
 
 
 class TestOtherPlants:
-    @pytest.mark.parametrize("preset", ["disturbed", "hard"])
-    def test_what_has_no_bound_or_measure_says_so(self, preset, tmp_path):
+    @pytest.mark.parametrize(("preset", "drawn"), [("disturbed", False), ("hard", True)])
+    def test_what_needs_the_actuators_numbers_is_not_measured_where_they_are_drawn(
+        self, preset, drawn, tmp_path
+    ):
         options = ("--preset", preset, "--agents", "nothing", "pi", "--runs", 2)
         assert run_compare(tmp_path / "out", *options) == 0
         report = (tmp_path / "out/report.md").read_text()
-        assert "PI" in report
-        assert ("not known" in report) or ("least possible" in report)
+        assert "| PI" in report
+        assert ("not measured" in report) is drawn
         provenance = json.loads((tmp_path / "out/provenance.json").read_text())
         assert provenance["complete"] is True
 

@@ -167,6 +167,14 @@ def test_bad_options_are_named(arguments, named, minari, capsys):
     assert named in capsys.readouterr().err
 
 
+def test_a_place_that_cannot_be_written_to_is_named(minari, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "file"))
+    with pytest.raises(SystemExit):
+        datasets.main(["middlepoint/paper/pi-v0", "--episodes", "1"])
+    assert "MINARI_DATASETS_PATH: " in capsys.readouterr().err
+
+
 def test_bad_names_are_named():
     with pytest.raises(ValueError, match="plant must be one of paper"):
         history.record("hard", "pi")

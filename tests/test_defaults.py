@@ -81,6 +81,24 @@ def test_nothing_is_drawn_from_nowhere(capsys):
     assert "--plot needs --out" in capsys.readouterr().err
 
 
+def test_a_folder_without_curves_or_no_folder_is_named(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    for arguments, complaint in (
+        (["--plot", "--out", str(tmp_path)], "sb3_defaults.csv is missing"),
+        (["--out", str(tmp_path / "file")], "cannot be written to: it is no folder"),
+    ):
+        with pytest.raises(SystemExit):
+            defaults.main(arguments)
+        assert f"--out: {tmp_path}" in (shown := capsys.readouterr().err)
+        assert complaint in shown
+
+
+def test_a_training_too_short_for_a_test_says_so(tmp_path, capsys):
+    arguments = ["--seeds", "1", "--steps", "64", "--interval", "5000", "--out", str(tmp_path)]
+    assert defaults.main(arguments) == 0
+    assert "Nothing was kept" in capsys.readouterr().out
+
+
 def test_looking_does_not_disturb_the_training():
     models = [defaults.train("ppo-velocity", 64, 0, interval, None) for interval in (7, 1000)]
     assert torch.equal(*map(weights, models))

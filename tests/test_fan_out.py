@@ -336,3 +336,15 @@ class TestRay:
             "ValueError: No Ray cluster can be reached: start one with `ray start"
             in done.stderr
         )
+
+    def test_a_cluster_that_is_gone_is_not_waited_for(self, tmp_path):
+        (tmp_path / "ray").mkdir()
+        (tmp_path / "ray/ray_current_cluster").write_text(f"127.0.0.1:{free_port()}")
+        environment = private() | {"RAY_TMPDIR": str(tmp_path)}
+        environment.pop("RAY_ADDRESS", None)
+        program = "from benchmarks.lib.fan_out import FanOut; FanOut(2, 'ray')"
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            env=environment, cwd=ROOT, timeout=60, capture_output=True, text=True,
+        )  # fmt: skip
+        assert "ValueError: No Ray cluster can be reached" in done.stderr

@@ -2,6 +2,7 @@
 
 import json
 import tracemalloc
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -13,14 +14,16 @@ from agents import PIController
 from benchmarks.identify import log as log_module
 from benchmarks.identify.__main__ import main
 from benchmarks.identify.armax import Orders, Rows
-from benchmarks.identify.fit import CannotTellError, Options, identify
+from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Columns, Log, read_log
+from benchmarks.identify.model import CannotTellError, Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges, simulation
 from benchmarks.identify.study import cell, synthetic_plants, table
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
 PAPER = Parameters()
+EXAMPLE = Path(log_module.__file__).with_name("example.csv")
 
 
 def steps(generator, samples, low=-10.0, high=10.0):
@@ -457,6 +460,25 @@ class TestCommand:
         assert ended.value.code == 2
         assert "the flow is constant" in capsys.readouterr().err
         assert not (tmp_path / "out" / "plant.json").exists()
+
+    @pytest.mark.parametrize(
+        ("options", "complaint"),
+        [
+            (["--orders", "0", "1", "0"], "--orders: A and B must have at least 1"),
+            (["--orders", "2", "0", "2"], "--orders: A and B must have at least 1"),
+            (["--u-min", "nan"], "--u-min: must be a finite number, got 'nan'"),
+            (["--u-max", "full"], "--u-max: must be a finite number, got 'full'"),
+            (["--operating-flow", "inf"], "--operating-flow: must be a finite number"),
+            (["--operating-flow", "1e9"], "b must have a sum other than 0"),
+            (["--sampling-interval", "0"], "--sampling-interval: must be a number above 0"),
+        ],
+    )
+    def test_bad_options_are_named(self, options, complaint, tmp_path, capsys):
+        with pytest.raises(SystemExit) as ended:
+            main([str(EXAMPLE), "--out", str(tmp_path), *options])
+        assert ended.value.code == 2
+        assert complaint in capsys.readouterr().err
+        assert not (tmp_path / "plant.json").exists()
 
 
 class TestStudy:

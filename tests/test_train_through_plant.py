@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -311,10 +312,26 @@ class TestCommand:
         assert list(table["price"]) == [0.0, 0.1]
         assert (tmp_path / "nn-dpc-prices.png").stat().st_size > 1000
 
-    def test_bad_prices_are_named(self, capsys):
+    def test_policies_of_ppo_are_listed_by_their_seeds(self, tmp_path, capsys):
+        arguments = ["ppo", "--networks", "2", "--steps", "8", "--jobs", "1"]
+        assert command.main([*arguments, "--out", str(tmp_path)]) == 0
+        seeds = {"10000", "10001"}
+        assert seeds <= set(capsys.readouterr().out.split())
+        assert {file.stem for file in tmp_path.glob("*.npz")} == {f"ppo-{s}" for s in seeds}
+
+    def test_a_price_given_twice_is_trained_once(self, tmp_path):
+        arguments = ["nn-dpc", "--networks", "1", "--prices", "0.1", "0.1", "--jobs", "1"]
+        assert command.main([*arguments, "--steps", "1", "--out", str(tmp_path)]) == 0
+        assert len(pd.read_csv(tmp_path / "nn-dpc-prices.csv")) == 1
+
+    @pytest.mark.parametrize("prices", [["-1"], ["nan"], ["cheap"], ["0.1", "--keep"]])
+    def test_bad_prices_are_named(self, prices, capsys):
         with pytest.raises(SystemExit):
-            command.main(["nn-dpc", "--prices", "-1"])
-        assert "--prices" in capsys.readouterr().err
+            command.main(["nn-dpc", "--prices", *prices])
+        shown = capsys.readouterr().err
+        assert re.search(
+            "--prices: (must be a number of at least 0|goes without --keep)", shown
+        )
 
 
 @pytest.mark.parametrize("name", ["nn-dpc", "nn-adaptive"])

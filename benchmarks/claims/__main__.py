@@ -28,9 +28,10 @@ SEED = 0  # run i starts from the weights, and meets the noise, of seed SEED + i
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("claims", nargs="*", default=list(CLAIMS), metavar="CLAIM", help="which ones")
-    add("--runs", type=command_line.number, default=RUNS, help="of each case")
-    add("--out", type=Path, default=Path("results/claims"), help="folder to write to")
+    add("claims", nargs="*", default=list(CLAIMS), metavar="CLAIM",
+        help="which claims to test")  # fmt: skip
+    add("--runs", type=command_line.number, default=RUNS, metavar="N", help="runs of each case")
+    command_line.add_out(parser, "results/claims")
 
 
 @command_line.command(

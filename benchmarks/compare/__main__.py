@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import sys
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -13,9 +14,12 @@ from rich.console import Console
 from benchmarks import plants
 from benchmarks.compare.comparison import Comparison
 from benchmarks.controllers import roster
+from benchmarks.controllers.factories import build, load_factory, observation
+from benchmarks.controllers.records import Controller
 from benchmarks.lib import command_line
 from benchmarks.lib.tables import on_screen
-from benchmarks.scenarios import PRESET_SCENARIOS, SCENARIOS, scenarios_of
+from benchmarks.scenarios import PRESET_SCENARIOS, SCENARIOS, SETPOINTS, Scenario, scenarios_of
+from mptc_gym import Parameters
 
 OUT = Path("results/compare")
 COMPARED = [name for name, controller in roster.ROSTER.items() if controller.compared]
@@ -31,7 +35,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         default=argparse.SUPPRESS,
         metavar="NAME",
-        help="cases (default: all)",
+        help=f"which cases to run, out of {', '.join(SCENARIOS)}; with --presets the presets, "
+        f"on a plant of your own {', '.join(name for name, *_ in SETPOINTS)} (default: all)",
     )
     plants.add_options(parser)
     add(
@@ -39,18 +44,35 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="run all presets of the environment in place of the paper's cases",
     )
-    add("--runs", type=command_line.number, default=RUNS, help="number of runs of each case")
-    add("--retrain", action="store_true", help="train policies anew")
+    add(
+        "--runs",
+        type=command_line.number,
+        default=RUNS,
+        metavar="N",
+        help="runs of each controller in each case",
+    )
+    add(
+        "--retrain",
+        action="store_true",
+        help="train policies of PPO anew, which takes many minutes",
+    )
     add(
         "--out",
         type=Path,
         default=argparse.SUPPRESS,
+        metavar="FOLDER",
         help=f"folder to write to (default: {OUT}, and a name of its own beside that for a "
         "comparison of other controllers or cases)",
     )
 
 
-@command_line.command("compare", __doc__, _add_options, width=190)
+@command_line.command(
+    "compare",
+    "Run controllers on the same cases in the same noise, and write a report with tables, data "
+    "and pictures.",
+    _add_options,
+    width=190,
+)
 def main(options: argparse.Namespace, console: Console) -> str:
     """Run the comparison and write what it finds."""
     controllers = roster.chosen(options.agents, options.agent)
@@ -65,7 +87,9 @@ def main(options: argparse.Namespace, console: Console) -> str:
     names = command_line.known("--scenarios", names, list(scenarios))
     if not names:
         raise command_line.UsageError("--scenarios: none to run")
-    training = replace(roster.training(options), retrain=options.retrain)
+    training = roster.training(options, retrain=options.retrain)
+    if plant.arguments:
+        _try_out(controllers.values(), [scenarios[name] for name in names])
     out = getattr(options, "out", None) or _folder(
         [*controllers] if [*controllers] != COMPARED else [],
         names if names != [*scenarios] else [],
@@ -87,6 +111,16 @@ def main(options: argparse.Namespace, console: Console) -> str:
         if section.table is not None:
             console.print(on_screen(section.table))
     return f"The report, tables, data and plots are in {out}/"
+
+
+def _try_out(controllers: Iterable[Controller], scenarios: Sequence[Scenario]) -> None:
+    """Make each controller once, as not every one can be set up for every plant."""
+    for controller, scenario in itertools.product(controllers, scenarios):
+        if controller.factory:
+            factory = load_factory(controller.factory)
+            arguments = {**scenario.arguments, **observation(factory)}
+            with command_line.blame(f"{controller.name} on {scenario.title}"):
+                build(factory, Parameters(**arguments), num_envs=1, seed=0)
 
 
 def _folder(*differences: list[str]) -> Path:

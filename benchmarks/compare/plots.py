@@ -89,10 +89,6 @@ def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
             axes.set_yticks(range(len(rows)), [label(agent) for agent in rows["agent"]])
             axes.invert_yaxis()
             limit, worst = rows["limit"].iloc[0], rows["mean_high"].max()
-            if math.isnan(limit):
-                axes.set_xlim(left=0.0)
-                axes.set_xlabel("mean |e| (°C)")
-                continue
             # A little to the left of it, so that a point on the limit is whole.
             axes.axvline(limit, color="0.4", linewidth=1)
             axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
@@ -173,8 +169,14 @@ def plot_travel(
             across = np.geomspace(0.7 * travels.min(), 1.4 * travels.max(), 200)
             if frontiers[name]:
                 travel, error = np.transpose(frontiers[name][::-1])
-                axes.plot(across, np.interp(across, travel, error), color="0.4", linewidth=1)
-            axes.axhline(limit, color="0.4", linewidth=1, linestyle="--")
+                axes.plot(
+                    across, np.interp(across, travel, error), color="0.4", linewidth=1,
+                    label="least possible for this travel",
+                )  # fmt: skip
+            axes.axhline(
+                limit, color="0.4", linewidth=1, linestyle="--",
+                label="least possible for any travel",
+            )  # fmt: skip
             axes.set_xscale("log")
             axes.set_xlim(across[0], across[-1])
             axes.set_ylim(0.9 * min(limit, moving["mae"].min()), 1.1 * moving["mae"].max())
@@ -183,8 +185,10 @@ def plot_travel(
             axes.xaxis.set_minor_formatter("")
             axes.set_xlabel("valve travel (t/h)")
             axes.set_ylabel("mean |e| (°C)")
-        handles, names = panels[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=6)
+        shown = [axes.get_legend_handles_labels() for axes in panels]
+        # Each once, although not every panel has all.
+        entries = {name: handle for pair in shown for handle, name in zip(*pair, strict=True)}
+        figure.legend(entries.values(), entries, loc="outside lower center", ncols=5)
         save(figure, path)
 
 
@@ -213,5 +217,6 @@ def plot_learning(curves: pd.DataFrame, path: Path) -> None:
             axes.set_xlabel("samples of experience (thousands)")
             axes.set_ylabel(METRICS["mae"])
             axes.set_title(f"{label(agent)}: a line a policy", loc="left")
-            axes.legend()
+        handles, names = panels[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=3)
         save(figure, path)

@@ -12,7 +12,14 @@ from pathlib import Path
 
 from benchmarks.controllers.factories import load_factory, try_out
 from benchmarks.controllers.records import POLICIES, Account, Controller, Training, Tuning
-from benchmarks.lib.command_line import UsageError, add_fan_out, fan_out, known, number
+from benchmarks.lib.command_line import (
+    UsageError,
+    add_fan_out,
+    fan_out,
+    known,
+    number,
+    out_folder,
+)
 
 _STEP_TEST = "gain, time constant, delay"
 
@@ -185,7 +192,7 @@ def add_options(parser: argparse.ArgumentParser, agents: Sequence[str], what: st
         nargs="*",
         default=agents,
         metavar="NAME",
-        help="controllers of this repository",
+        help=f"which controllers to run, out of {', '.join(ROSTER)}",
     )
     add(
         "--agent",
@@ -198,31 +205,40 @@ def add_options(parser: argparse.ArgumentParser, agents: Sequence[str], what: st
         "--training-steps",
         type=number,
         default=argparse.SUPPRESS,
-        help="samples of experience of each policy that is trained (default: the training's)",
+        metavar="N",
+        help="train each policy of PPO with N samples of experience (default: take those that "
+        "come with the project)",
     )
     add(
         "--policies",
         type=number,
         default=argparse.SUPPRESS,
-        help="how many policies of each controller that is trained (default: the training's)",
+        metavar="N",
+        help="how many policies of PPO to run, each from a seed of its own (default: 5)",
     )
     add_fan_out(parser, what)
     add(
         "--kept",
         type=Path,
         default=POLICIES,
-        help="folder where trained policies are kept; no code in its files is run",
+        metavar="FOLDER",
+        help="where policies that are trained here are kept; no code in its files is run",
     )
 
 
-def training(options: argparse.Namespace) -> Training:
-    """Return the training that the options of `add_options` ask for."""
-    return Training(
-        fan_out(options),
-        options.kept,
-        getattr(options, "training_steps", None),
-        getattr(options, "policies", None),
-    )
+def training(options: argparse.Namespace, *, retrain: bool = False) -> Training:
+    """Return the training that the options of `add_options` ask for.
+
+    Raises
+    ------
+    UsageError
+        If policies are to be trained and their folder cannot be written to.
+    """
+    steps, policies = (getattr(options, name, None) for name in ("training_steps", "policies"))
+    is_folder = options.kept.is_dir() or not options.kept.exists()
+    if retrain or steps or policies or not is_folder:
+        out_folder(options.kept, "--kept")
+    return Training(fan_out(options), options.kept, steps, policies, retrain)
 
 
 def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controller]:

@@ -53,13 +53,14 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         default=argparse.SUPPRESS,
         metavar="ID",
-        help=f"of the data sets to write (default: all): {', '.join(IDS)}",
+        help=f"data sets to write (default: all): {', '.join(IDS)}",
     )
     add(
         "--episodes",
         type=command_line.number,
         default=EPISODES,
-        help=f"of a data set, {SAMPLES:,} transitions each",
+        metavar="N",
+        help=f"episodes of a data set, {SAMPLES:,} transitions each",
     )
 
 
@@ -73,11 +74,24 @@ def main(options: argparse.Namespace, console: Console) -> str:
         raise command_line.UsageError(
             f'data sets need Minari with its HDF5 storage: pip install -e ".[data]" ({error})'
         ) from error
+    try:
+        root = minari.storage.get_dataset_path()
+    except OSError as error:
+        raise command_line.UsageError(
+            f"{VARIABLE}: {error.filename} cannot be written to: {error.strerror}"
+        ) from error
+    command_line.out_folder(root, VARIABLE)
+    for name in ids:
+        needed = len(BEHAVIOURS[IDS[name][1]])  # one for each controller
+        if options.episodes < needed:
+            raise command_line.UsageError(
+                f"--episodes: episodes must be at least {needed} for {name}, "
+                f"got {options.episodes}"
+            )
     rows = []
     for name in ids:
         plant, behaviour = IDS[name]
-        with command_line.blame("--episodes"):
-            history = record(plant, behaviour, options.episodes)
+        history = record(plant, behaviour, options.episodes)
         judged_by = scale(plant)
         write(name, history, judged_by)
         rows.append(
@@ -92,7 +106,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
         )
         console.print(f"{name} is written")
     console.print(on_screen(pd.DataFrame(rows)))
-    return f"The data sets are in {minari.storage.get_dataset_path()}"
+    return f"The data sets are in {root}"
 
 
 def write(name: str, history: History, judged_by: Scale) -> None:

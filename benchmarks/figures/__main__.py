@@ -104,8 +104,8 @@ FIGURES = (
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--runs", type=command_line.number, default=RUNS, help="of each case")
-    add("--out", type=Path, default=Path("results/figures"), help="folder to write to")
+    add("--runs", type=command_line.number, default=RUNS, metavar="N", help="runs of each case")
+    command_line.add_out(parser, "results/figures")
 
 
 @command_line.command(

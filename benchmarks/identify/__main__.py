@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.identify.armax import Orders
-from benchmarks.identify.fit import Options, identify
+from benchmarks.identify.fit import identify
 from benchmarks.identify.log import (
     FLOW_UNITS,
     MOST_ROWS,
@@ -20,6 +20,7 @@ from benchmarks.identify.log import (
     Columns,
     read_log,
 )
+from benchmarks.identify.model import Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import report
 from benchmarks.lib import command_line
@@ -39,41 +40,79 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         help="table with a heading; a row holds the temperature at its time and the flow that "
         "is commanded from that time on",
     )
-    add("--out", type=Path, default=Path("results/identify"), help="folder to write to")
-    add("--time", default=columns.time, metavar="COLUMN", help="numbers, or dates as ISO 8601")
-    add("--flow", default=columns.flow, metavar="COLUMN")
-    add("--temperature", default=columns.temperature, metavar="COLUMN")
-    add("--sampling-interval", type=float, metavar="S", help="in place of the times, s")
-    add("--time-unit", choices=TIME_UNITS)
-    add("--flow-unit", choices=FLOW_UNITS)
-    add("--temperature-unit", choices=TEMPERATURE_UNITS)
-    add("--rows", type=command_line.number, default=MOST_ROWS, help="of a long log, the latest")
+    command_line.add_out(parser, "results/identify")
+    add(
+        "--time",
+        default=columns.time,
+        metavar="COLUMN",
+        help="column of the times: numbers, or dates as ISO 8601",
+    )
+    add("--flow", default=columns.flow, metavar="COLUMN", help="column of the flow")
+    add(
+        "--temperature",
+        default=columns.temperature,
+        metavar="COLUMN",
+        help="column of the temperature",
+    )
+    add(
+        "--sampling-interval",
+        type=command_line.positive,
+        metavar="S",
+        help="s from one row to the next; the column of the times is not read then",
+    )
+    for what, units, default in (
+        ("time", TIME_UNITS, "s"),
+        ("flow", FLOW_UNITS, "t/h"),
+        ("temperature", TEMPERATURE_UNITS, "degC"),
+    ):
+        add(
+            f"--{what}-unit",
+            choices=units,
+            metavar="UNIT",
+            help=f"unit of the {what}: {', '.join(units)} (default: what the heading has in "
+            f"brackets, else {default})".replace("%", "%%"),
+        )
+    add(
+        "--rows",
+        type=command_line.number,
+        default=MOST_ROWS,
+        metavar="N",
+        help="of a longer log, the last N rows are fitted",
+    )
     add(
         "--longest-delay",
         type=command_line.number,
         default=options.longest_delay,
         metavar="SAMPLES",
-        help="up to which to look",
+        help="longest delay to look for",
     )
     add(
         "--orders",
         type=command_line.seed,
         nargs=3,
         metavar=("A", "B", "C"),
-        help="how many coefficients the polynomials have; not given: chosen by a criterion",
+        help="how many coefficients the polynomials A, B and C have, without the leading 1 of "
+        "A and C (default: chosen by a criterion)",
     )
     add(
         "--applied",
         action="store_true",
         help="the flow was measured behind the actuator, so that no dead zone is looked for",
     )
-    add("--u-min", type=float, help="limit of the flow, as a deviation; else the log's least")
-    add("--u-max", type=float, help="likewise; else the log's largest")
+    for option, extreme in (("--u-min", "least"), ("--u-max", "largest")):
+        add(
+            option,
+            type=command_line.finite,
+            metavar="FLOW",
+            help=f"{extreme} flow that the actuator can apply, t/h from the operating point "
+            f"(default: the log's {extreme})",
+        )
     add(
         "--operating-flow",
-        type=float,
+        type=command_line.finite,
         metavar="FLOW",
-        help="t/h; not given: 0 if the log has flows of both signs, else its first flow",
+        help="flow of the operating point, t/h (default: 0 if the log has flows of both signs, "
+        "else its first flow)",
     )
 
 
@@ -88,6 +127,10 @@ def main(options: argparse.Namespace, console: Console) -> str:
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     began = time.process_time()
     out = command_line.out_folder(options.out)
+    if options.orders and min(options.orders[:2]) < 1:
+        raise UsageError(
+            f"--orders: A and B must have at least 1 coefficient, got {options.orders[:2]}"
+        )
     columns = Columns(
         options.time, options.flow, options.temperature, options.sampling_interval,
         options.time_unit, options.flow_unit, options.temperature_unit,
@@ -106,11 +149,11 @@ def main(options: argparse.Namespace, console: Console) -> str:
             ),
         )
         plant, ranges = plant_arguments(model), plant_ranges(model)
+        sections = report(log, model, out)
     except ValueError as error:
         raise UsageError(str(error)) from error
     write_json(out / "plant.json", plant)
     write_json(out / "ranges.json", ranges)
-    sections = report(log, model, out)
     origin = {"started": started, "commit": commit(), "versions": versions()}
     write_report(out, f"The plant of {options.log.name}", sections,
                  provenance_line("identify", origin))  # fmt: skip

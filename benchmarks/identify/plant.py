@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from benchmarks.controllers.step_test import step_response, step_test
-from benchmarks.identify.fit import Interval, Model
 from benchmarks.identify.log import Log
+from benchmarks.identify.model import Interval, Model
 from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
 

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.controllers.step_test import StepTest
-from benchmarks.identify.fit import Model
 from benchmarks.identify.log import Log
+from benchmarks.identify.model import Model
 from benchmarks.identify.plant import simulation, step_band
 from benchmarks.lib.drawing import COLOURS, STYLE, save
 

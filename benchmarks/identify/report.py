@@ -12,13 +12,13 @@ import pandas as pd
 from benchmarks.controllers.engineered import simc_pi, smith
 from benchmarks.controllers.step_test import step_test
 from benchmarks.identify import plots
-from benchmarks.identify.fit import Interval, Model
 from benchmarks.identify.log import Log
+from benchmarks.identify.model import Interval, Model
 from benchmarks.identify.plant import explained, plant_arguments
 from benchmarks.lib.report import Section
 from benchmarks.limits import least_possible
 from benchmarks.margins import Loop, Margins, margins, plot_margins
-from benchmarks.metrics import mean_error, reversals
+from benchmarks.metrics import mean_error, reversals, travel
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
@@ -190,7 +190,7 @@ def _on_the_plant(arguments: dict[str, Any]) -> Section:
     for name, agent in tuned(parameters).items():
         run = rollout(make_plants(RUNS, samples, **arguments), agent, samples, SEED)
         mean = float(mean_error(run).mean())
-        moves = np.abs(np.diff(run.applied, axis=0, prepend=0.0)).sum(axis=0).mean()
+        moves = travel(run).mean()
         turns = reversals(run.applied, parameters.sampling_interval).mean()
         rows.append(
             (name, f"{mean:.4g}", f"{mean / unaware:.2f}", f"{moves:.0f}", f"{turns:.2f}")

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -19,10 +18,10 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-import mptc_gym  # noqa: F401 (registers the environment)
 from benchmarks.designs import Plant, random_design
-from benchmarks.identify.fit import CannotTellError, Interval, identify
+from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
+from benchmarks.identify.model import CannotTellError, Interval
 from benchmarks.lib import command_line
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import share
@@ -107,11 +106,18 @@ def cell(plant: Plant, samples: int, seed: int) -> dict[str, Any]:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--logs", type=command_line.number, default=100, help="how many plants")
-    add("--samples", type=command_line.number, default=1200, help="rows of a log")
-    add("--seed", type=command_line.seed, default=1, help="of plants, steps and noise")
+    count = command_line.number
+    add("--logs", type=count, default=100, metavar="N", help="logs, each of another plant")
+    add("--samples", type=count, default=1200, metavar="N", help="rows of a log")
+    add(
+        "--seed",
+        type=command_line.seed,
+        default=1,
+        metavar="N",
+        help="seed that plants, steps of the flow and noise are drawn with",
+    )
     command_line.add_fan_out(parser, "identifications")
-    add("--out", type=Path, default=Path("results/identify-study"), help="folder to write to")
+    command_line.add_out(parser, "results/identify-study")
 
 
 @command_line.command(

@@ -13,9 +13,11 @@ percent, stands for the flow. The page
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import random
+import sys
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,8 +25,9 @@ import tclab  # type: ignore[import-untyped, unused-ignore]
 from numpy.typing import NDArray
 
 from agents import PIController, SmithPredictor
-from benchmarks.identify.fit import Model, Options, identify
+from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
+from benchmarks.identify.model import Model, Options
 from benchmarks.identify.plant import plant_arguments
 from benchmarks.identify.report import tuned
 from mptc_gym import Parameters
@@ -122,8 +125,13 @@ def run(controller: PIController | SmithPredictor, seed: int = 1) -> NDArray[np.
     return np.array(rows)
 
 
-def main(_: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print what was identified, and what the controllers make of the twin."""
+    argparse.ArgumentParser(
+        prog="python -m benchmarks.identify.tclab_twin",
+        description="Identify TCLab's digital twin, a simulated heater, from steps of its "
+        "power, and compare controllers on it.",
+    ).parse_args([] if arguments is None else arguments)
     log = experiment()
     model = model_of(log)
     for name in ("delay", "gain", "time_constant"):
@@ -138,4 +146,4 @@ def main(_: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

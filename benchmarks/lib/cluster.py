@@ -55,7 +55,7 @@ class Cluster:
             os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
             address = os.environ.get("RAY_ADDRESS", "")
             try:
-                _knock(address)
+                _knock(address or _latest())
                 with tempfile.TemporaryDirectory() as folder:
                     _pack(Path(folder))
                     ray.init(
@@ -144,6 +144,13 @@ def _pack(folder: Path) -> None:
         shutil.copytree(Path(package.__file__).parent, folder / name, ignore=stays)
     for module in ROOT.glob("*.py"):  # such as those of controllers of one's own
         shutil.copy(module, folder)
+
+
+def _latest() -> str:
+    """Return the address of the latest `ray start` here, which may be gone; "" if none."""
+    folder = os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
+    file = Path(folder, "ray", "ray_current_cluster")
+    return file.read_text().strip() if file.exists() else ""
 
 
 def _knock(address: str) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,13 +13,30 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.lib.fan_out import BACKENDS, CellsFailedError, FanOut
-from benchmarks.lib.storage import NotWrittenError, check_folder
+from benchmarks.lib.storage import ROOT, NotWrittenError, check_folder
 
 Main = Callable[[Sequence[str] | None], int]
 
 
 class UsageError(ValueError):
     """An option that does not fit. The message names it."""
+
+
+class _HelpFormatter(argparse.HelpFormatter):
+    """Shows the defaults that tell something, as one would type them, and keeps names whole."""
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text, default = action.help or "", action.default
+        if default is None or default is False or default is argparse.SUPPRESS:
+            return text
+        if isinstance(default, list):
+            default = " ".join(default)
+        elif isinstance(default, Path) and default.is_relative_to(ROOT):
+            default = default.relative_to(ROOT)
+        return f"{text} (default: {default})" if str(default) else text
 
 
 def command(
@@ -58,7 +77,7 @@ def command(
             parser = argparse.ArgumentParser(
                 prog=f"python -m benchmarks.{name}",
                 description=description,
-                formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+                formatter_class=_HelpFormatter,
             )
             add_options(parser)
             options = parser.parse_args(arguments)
@@ -95,12 +114,12 @@ def blame(option: str) -> Iterator[None]:
         raise UsageError(f"{option}: {error}") from error
 
 
-def out_folder(folder: Path) -> Path:
-    """Return the folder of `--out`, which is made; `UsageError` if it cannot be written to."""
+def out_folder(folder: Path, option: str = "--out") -> Path:
+    """Return the folder of an option, which is made; `UsageError` if it is not writable."""
     try:
         check_folder(folder)
     except NotWrittenError as error:
-        raise UsageError(f"--out: {error}") from error
+        raise UsageError(f"{option}: {error}") from error
     return folder
 
 
@@ -125,6 +144,31 @@ def _integer(text: str, least: int) -> int:
     return value
 
 
+def finite(text: str) -> float:
+    """Read a number that is neither infinite nor NaN."""
+    return _number(text, "a finite number", lambda value: True)
+
+
+def positive(text: str) -> float:
+    """Read a finite number above 0."""
+    return _number(text, "a number above 0", lambda value: value > 0.0)
+
+
+def price(text: str) -> float:
+    """Read a finite number of at least 0."""
+    return _number(text, "a number of at least 0", lambda value: value >= 0.0)
+
+
+def _number(text: str, what: str, fits: Callable[[float], bool]) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and fits(value)):
+        raise argparse.ArgumentTypeError(f"must be {what}, got {text!r}")
+    return value
+
+
 def known(option: str, given: Sequence[str], names: Sequence[str]) -> list[str]:
     """Return the names that an option lists, with spaces or commas between them, each once.
 
@@ -140,19 +184,27 @@ def known(option: str, given: Sequence[str], names: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(chosen))
 
 
+def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
+    """Add `--out`, with the folder that is written to unless told otherwise."""
+    parser.add_argument(
+        "--out", type=Path, default=Path(folder), metavar="FOLDER", help="folder to write to"
+    )
+
+
 def add_fan_out(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add the options that say where and how many at once; `what` names what is run."""
+    """Add the options that say where and how many at once; `what` names what runs."""
     parser.add_argument(
         "--jobs",
         type=number,
         default=argparse.SUPPRESS,
-        help=f"how many {what} to run at once (default: as many as there are cores)",
+        metavar="N",
+        help=f"how many {what} run at once (default: as many as there are cores)",
     )
     parser.add_argument(
         "--backend",
         choices=BACKENDS,
         default=BACKENDS[0],
-        help=f"where to run {what}: loky, on this machine; ray, on a Ray cluster",
+        help=f"where {what} run: loky, on this machine; ray, on a Ray cluster",
     )
 
 

@@ -39,8 +39,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mpc",
         type=command_line.number,
-        metavar="RUNS",
-        help="run the predictive controller on each preset, too, so many times",
+        metavar="N",
+        help="run the predictive controller on each plant, too, N times",
     )
     parser.add_argument(
         "--verify", action="store_true", help="run every controller against the bounds instead"
@@ -49,7 +49,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--runs",
         type=command_line.number,
         default=300,
-        help="runs of each controller, of --verify",
+        metavar="N",
+        help="runs of each controller in each case of --verify",
     )
     command_line.add_fan_out(parser, "runs of --verify")
     plants.add_options(parser)
@@ -57,16 +58,22 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--episodes",
         type=command_line.number,
         default=EPISODES,
-        help="episodes that the mean is taken over, where something is drawn",
+        metavar="N",
+        help="episodes that a bound is the mean of, where plants or set points are drawn",
     )
     parser.add_argument(
-        "--cache", type=Path, default=CACHE, help="where bounds are kept once they are known"
+        "--cache",
+        type=Path,
+        default=CACHE,
+        metavar="FOLDER",
+        help="where bounds are kept once they are known",
     )
 
 
 @command_line.command(
     "limits",
-    __doc__,
+    "Print the least possible mean error of the comparison's cases and of the presets, or of "
+    "another plant.",
     _add_options,
     width=150,
     interrupted="bounds that are known are kept.",
@@ -76,6 +83,12 @@ def main(options: argparse.Namespace, console: Console) -> str:
 
     With `--verify` the exit status is 1 if a controller beats a bound beyond its interval.
     """
+    plant = plants.chosen(options)
+    if options.verify and (plant.arguments or options.mpc):
+        raise command_line.UsageError(
+            "--verify: goes without --mpc, --plant, --preset and --set"
+        )
+    command_line.out_folder(options.cache, "--cache")
     if options.verify:
         table, beaten = verify(options.runs, options.cache, command_line.fan_out(options))
         console.print(on_screen(table))
@@ -83,7 +96,6 @@ def main(options: argparse.Namespace, console: Console) -> str:
             console.print(f"Beaten beyond the interval: {'; '.join(beaten)}.")
             raise SystemExit(1)
         return "No controller beats the bound that applies to it, beyond its interval."
-    plant = plants.chosen(options)
     if plant.arguments:
         cases = scenarios_of(plant.name, plant.arguments)
         console.print(f"{plant.name}, mean |e| in °C:")

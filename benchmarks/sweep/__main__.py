@@ -40,16 +40,24 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         help="grid: 20 delays by 10 gains; random: plants that differ in everything, half of "
         "which drift",
     )
-    add("--plants", type=command_line.number, default=200, help="of a random design")
-    add("--design-seed", type=command_line.seed, default=0, help="of a random design")
-    add("--runs", type=command_line.number, default=20, help="of each controller on each plant")
-    add("--samples", type=command_line.number, default=1200, help="length of a run")
-    roster.add_options(parser, SWEPT, "cells and trainings")
+    count = command_line.number
+    add("--plants", type=count, default=200, metavar="N", help="plants of a random design")
+    add(
+        "--design-seed",
+        type=command_line.seed,
+        default=0,
+        metavar="N",
+        help="seed that the plants of a random design are drawn with",
+    )
+    add("--runs", type=count, default=20, metavar="N", help="runs of a controller on a plant")
+    add("--samples", type=count, default=1200, metavar="N", help="samples of 8 s in a run")
+    roster.add_options(parser, SWEPT, "runs and trainings")
     plant_options.add_options(parser)
     add(
         "--out",
         type=Path,
         default=argparse.SUPPRESS,
+        metavar="FOLDER",
         help="folder to write to (default: results/sweep-DESIGN)",
     )
 

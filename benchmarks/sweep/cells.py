@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from benchmarks.controllers.factories import Factory, build, observation
 from benchmarks.designs import Plant
 from benchmarks.limits import least_possible, steady_stretches
-from benchmarks.metrics import mean_error
+from benchmarks.metrics import mean_error, travel
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
@@ -62,12 +62,11 @@ def agent_cell(
     trajectory = rollout(plants, controller, samples, seed)
     error = trajectory.setpoint - trajectory.output
     steady = steady_stretches(trajectory.setpoint[:, 0])
-    moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
     measures = {
         "mae": mean_error(trajectory),
         "late": np.abs(error[samples // 2 :]).mean(axis=0),
         "swing": _swing(error, steady),
-        "travel": np.abs(moves).sum(axis=0),
+        "travel": travel(trajectory),
     }
     return {name: values.tolist() for name, values in measures.items()}
 

@@ -27,30 +27,27 @@ from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import commit
 from benchmarks.lib.tables import on_screen, write_csv
 from benchmarks.train import legs, ppo
+from benchmarks.train.ppo_arguments import PPOArguments
 from benchmarks.train.through_plant import TRAININGS, Training, leg, training_key
 
 NETWORKS = 5  # are trained, from seeds in sequence
 
 
-def _price(text: str) -> float:
-    """Read a price; argparse shows this function's name in its complaints."""
-    value = float(text)
-    if not 0.0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be a number of at least 0, got {text}")
-    return value
-
-
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("network", choices=[*TRAININGS, "ppo"], help="what to train")
-    add("--networks", type=command_line.number, default=NETWORKS, help="how many")
-    add("--steps", type=command_line.number, default=argparse.SUPPRESS,
-        help="of the optimiser, or samples of PPO (default: the network's own)")  # fmt: skip
-    add("--prices", type=_price, nargs="+", metavar="PRICE", default=[],
-        help="of valve travel: train with each, and draw what it buys")  # fmt: skip
+    add("--networks", type=command_line.number, default=NETWORKS, metavar="N",
+        help="how many to train, each from a seed of its own")  # fmt: skip
+    add("--steps", type=command_line.number, default=argparse.SUPPRESS, metavar="N",
+        help="steps of the optimiser, for PPO samples of experience (default: "
+        + ", ".join(f"{each.steps} for {name}" for name, each in TRAININGS.items())
+        + f", {PPOArguments.steps} for ppo)")  # fmt: skip
+    add("--prices", type=command_line.price, nargs="+", metavar="PRICE", default=[],
+        help="train with each of these prices of valve travel, °C for each t/h a sample, and "
+        "draw what it buys")  # fmt: skip
     add("--retrain", action="store_true", help="train even what is finished")
     add("--keep", action="store_true", help="put what is chosen into agents/pretrained")
-    add("--out", type=Path, default=Path("results/networks"), help="folder to write to")
+    command_line.add_out(parser, "results/networks")
     command_line.add_fan_out(parser, "trainings")
 
 
@@ -61,13 +58,15 @@ def main(options: argparse.Namespace, console: Console) -> str:
     """Train, say how the networks do in validation, and choose one."""
     if options.network == "ppo":
         return _train_ppo(options, console)
+    if options.prices and options.keep:
+        raise command_line.UsageError("--prices: goes without --keep, as none is chosen")
     training = TRAININGS[options.network]
     if "steps" in options:
         training = replace(training, steps=options.steps)
     seeds = range(training.seed, training.seed + options.networks)
     trainings = [
         replace(training, seed=seed, move_price=price)
-        for price in options.prices or [training.move_price]
+        for price in dict.fromkeys(options.prices) or [training.move_price]
         for seed in seeds
     ]
     fan_out = command_line.fan_out(options)
@@ -112,7 +111,8 @@ def _train_ppo(options: argparse.Namespace, console: Console) -> str:
                 "CPU (s)": policy.curve[-1]["seconds"],
             }
         )
-    console.print(on_screen(pd.DataFrame(rows).map("{:.4g}".format)))
+    shown = pd.DataFrame(rows).map(lambda x: f"{x:.4g}" if isinstance(x, float) else str(x))
+    console.print(on_screen(shown))
     target = PRETRAINED if options.keep else out
     ppo.publish(policies, target)
     return f"The policies are in {target}"
@@ -164,7 +164,10 @@ def draw_prices(table: pd.DataFrame, path: Path) -> None:
         axes.plot(medians[travel], medians[error], "o-", color=drawing.COLOURS[0])
         for price, (x, y) in zip(medians.index, medians.to_numpy(), strict=True):
             axes.annotate(f"{price:g}", (x, y), (4, 4), textcoords="offset points")
-        axes.set(xlabel=travel, ylabel=error, title="What a price of valve travel buys")
+        axes.locator_params(nbins=5)
+        axes.set(xlabel=travel, ylabel=error)
+        axes.set_title("beside each point: price of valve travel (°C for each t/h a sample)",
+                       fontsize="medium")  # fmt: skip
         drawing.save(figure, path)
         plt.close(figure)
 

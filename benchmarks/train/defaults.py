@@ -225,12 +225,13 @@ def plot(curves: pd.DataFrame, path: Path) -> None:
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--case", choices=CASES, default="ppo-velocity", help="what learns, and on which plant")
-    add("--steps", type=command_line.number, default=300_000, help="samples of each training")
-    add("--seed", type=command_line.seed, default=0, help="the first seed")
-    add("--seeds", type=command_line.number, default=3, help="how many")
-    add("--interval", type=command_line.number, default=20_000, help="samples between tests")
-    add("--out", type=Path, help=f"folder of {NAME}.csv and {NAME}.png (default: none)")
-    add("--plot", action="store_true", help="train nothing, only draw --out")
+    count = command_line.number
+    add("--steps", type=count, default=300_000, metavar="N", help="samples of each training")
+    add("--seed", type=command_line.seed, default=0, metavar="N", help="the first seed")
+    add("--seeds", type=count, default=3, metavar="N", help="how many seeds to train with")
+    add("--interval", type=count, default=20_000, metavar="N", help="samples between tests")
+    add("--out", type=Path, metavar="FOLDER", help=f"where {NAME}.csv and {NAME}.png are kept")
+    add("--plot", action="store_true", help="train nothing, only draw what --out holds")
 
 
 @command_line.command("train.defaults", __doc__, _add_options)
@@ -239,13 +240,19 @@ def main(options: argparse.Namespace, _console: Console) -> str:
     if options.plot and not options.out:
         raise command_line.UsageError("--plot needs --out")
     torch.set_num_threads(1)  # the networks are too small for more
-    table = options.out / f"{NAME}.csv" if options.out else None
+    table = command_line.out_folder(options.out) / f"{NAME}.csv" if options.out else None
+    if options.plot and table and not table.exists():
+        raise command_line.UsageError(
+            f"--out: {table} is missing, so that --plot has nothing to draw"
+        )
     if not options.plot:
         for seed in range(options.seed, options.seed + options.seeds):
             if not (table and is_done(options.case, options.steps, seed, table)):
                 train(options.case, options.steps, seed, options.interval, table)
     if not table:
         return "Nothing was kept: --out names a folder."
+    if not table.exists():
+        return "Nothing was kept: no test came before the end, see --interval and --steps."
     plot(pd.read_csv(table), table.with_suffix(".png"))
     return f"Written to {options.out}"
 

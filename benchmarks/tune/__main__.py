@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
 import optuna
 from rich.console import Console
@@ -31,11 +30,18 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--trials",
         type=command_line.number,
         default=argparse.SUPPRESS,
-        help=f"how many gains to try (default: {trials})",
+        metavar="N",
+        help=f"how many sets of gains to try (default: {trials})",
     )
-    add("--runs", type=command_line.number, default=RUNS, help="of each scenario")
+    add(
+        "--runs",
+        type=command_line.number,
+        default=RUNS,
+        metavar="N",
+        help="runs of each case in a trial",
+    )
     plants.add_options(parser)
-    add("--out", type=Path, default=Path("results/tune"), help="folder to write to")
+    command_line.add_out(parser, "results/tune")
     command_line.add_fan_out(parser, "runs and trainings")
 
 
@@ -51,7 +57,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     fan_out = command_line.fan_out(options)
     plant = plants.chosen(options)
     command_line.out_folder(options.out)
-    with command_line.blame("--out, --runs"):
+    with command_line.blame("--out"):
         search = Search(controller, options.runs, options.out, fan_out, plant.arguments)
     search.run(trials)
     report = search.report(trials)

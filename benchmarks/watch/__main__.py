@@ -60,18 +60,36 @@ class Film:
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     names = ", ".join(ROSTER)
-    add("--agent", default="nn", help=f"{names}, you, or MODULE:FACTORY for one of your own")
+    add(
+        "--agent",
+        default="nn",
+        metavar="NAME",
+        help=f"who controls: {names}, {YOU}, or MODULE:FACTORY for a controller of your own",
+    )
     own = ", ".join(name for name, *_ in SETPOINTS)
     add(
         "--scenario",
         default="square",
-        help=f"case: {', '.join(SCENARIOS)}; on a plant of your own {own}, or run if it has a "
-        "set point of its own",
+        metavar="NAME",
+        help=f"case to run: {', '.join(SCENARIOS)}; on a plant of your own {own}, or run if it "
+        "has a set point of its own",
     )
     plants.add_options(parser)
-    add("--seed", type=command_line.seed, default=0, help="of noise and initial weights")
-    add("--speed", type=command_line.number, default=SPEED, help="samples a second")
-    add("--video", type=Path, help="file to write, .mp4 or .gif, in place of a window")
+    add(
+        "--seed",
+        type=command_line.seed,
+        default=0,
+        metavar="N",
+        help="seed of noise and initial weights",
+    )
+    add("--speed", type=command_line.number, default=SPEED, metavar="N",
+        help="samples a second")  # fmt: skip
+    add(
+        "--video",
+        type=Path,
+        metavar="FILE",
+        help="write a film to this file, .mp4 or .gif, in place of a window",
+    )
 
 
 @command_line.command("watch", __doc__, _add_options, interrupted="nothing is kept.")

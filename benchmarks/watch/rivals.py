@@ -11,7 +11,7 @@ import pandas as pd
 from benchmarks.controllers.factories import build, observation
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.limits import least_possible
-from benchmarks.metrics import mean_error, measure
+from benchmarks.metrics import mean_error, travel
 from benchmarks.rollout import Trajectory, rollout
 from benchmarks.scenarios import Scenario
 from benchmarks.watch.touched import Touched
@@ -85,7 +85,7 @@ def table(
         if controller.compared and not controller.trained and controller.label != label
     }
     rows = [
-        (name, float(mean_error(run)[0]), _travel(run, scenario)) for name, run in runs.items()
+        (name, float(mean_error(run)[0]), float(travel(run)[0])) for name, run in runs.items()
     ]
     rows.sort(key=lambda row: row[1])
     if not any(load for _, load in moves.values()):
@@ -96,13 +96,9 @@ def table(
         rows.insert(0, ("least possible, on average", bound.value, float("nan")))
     found: pd.DataFrame = pd.DataFrame(
         [
-            (name, f"{error:.3f}", "" if travel != travel else f"{travel:.0f}")
-            for name, error, travel in rows
+            (name, f"{error:.3f}", "" if moved != moved else f"{moved:.0f}")
+            for name, error, moved in rows
         ],
         columns=["", "mean |e| (°C)", "valve travel (t/h)"],
     )
     return found
-
-
-def _travel(run: Trajectory, scenario: Scenario) -> float:
-    return float(measure(run, scenario.parameters)["total_variation"][0])
