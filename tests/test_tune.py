@@ -1,5 +1,7 @@
 """The search for gains, on small budgets."""
 
+import json
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -233,6 +235,10 @@ class TestKeptTrials:
         ]
         cut = [text[:i] for i in rng.integers(len(text), size=20)]
         for damaged in (*flipped, *cut, "", "null", "[]", "{}", "\0\0"):
+            # The last of 17 digits can be another without a change of the number.
+            with suppress(ValueError):
+                if json.loads(damaged) == json.loads(text):
+                    continue
             kept.write_text(damaged)
             with pytest.raises(ValueError, match=r"pi\.json is damaged .* remove"):
                 search(3)
