@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -155,14 +156,16 @@ def plot_travel(
     ).reset_index()
     with mpl.rc_context(STYLE):
         figure, panels = _scenario_panels(medians, 3.0)
-        shades = colours(list(medians["agent"].unique()))
+        agents = list(medians["agent"].unique())
+        shades = colours(agents)
+        marks = dict(zip(agents, itertools.cycle("osD^vPX"), strict=False))
         for axes, (name, rows) in zip(panels, groups(medians, "scenario"), strict=True):
             # A valve that never moves has no place on this axis.
             moving = rows[rows["total_variation"] > 0.0]
             for _, row in moving.iterrows():
                 agent = row["agent"]
                 axes.plot(
-                    row["total_variation"], row["mae"], "o", color=shades[agent],
+                    row["total_variation"], row["mae"], marks[agent], color=shades[agent],
                     label=label(agent),
                 )  # fmt: skip
             limit, travels = limits[name], moving["total_variation"]
