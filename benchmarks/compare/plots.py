@@ -158,7 +158,8 @@ def plot_travel(
         figure, panels = _scenario_panels(medians, 3.0)
         agents = list(medians["agent"].unique())
         shades = colours(agents)
-        marks = dict(zip(agents, itertools.cycle("osD^vPX"), strict=False))
+        # Not as many as hues, so that two of like colour have other marks.
+        marks = dict(zip(agents, itertools.cycle("osD^v"), strict=False))
         for axes, (name, rows) in zip(panels, groups(medians, "scenario"), strict=True):
             # A valve that never moves has no place on this axis.
             moving = rows[rows["total_variation"] > 0.0]
