@@ -100,8 +100,9 @@ class MiddlePointTorchEnv(VectorEnv[Tensor, Tensor, Tensor]):
     Notes
     -----
     **Random numbers.** All come from one `torch.Generator` on the device, which `reset(seed=)`
-    starts anew: the same seed, arguments and resets give the same numbers on the same device.
-    They are other numbers than those of the environments in NumPy, of the same distributions.
+    starts anew: the same seed, arguments and resets give the same numbers on the same device,
+    with the same versions of this package and of PyTorch. They are other numbers than those of
+    the environments in NumPy, which stay from version to version, of the same distributions.
     There, the j-th episode of a plant is the same however long the episodes before it were, and
     whatever the other plants do; here it is not. So compare controllers with those, or hand the
     signals in.

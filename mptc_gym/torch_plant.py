@@ -126,14 +126,14 @@ class TorchPlants:
         self._numbers, self._starts, self._phases = numbers, starts, phases
         self._now: tuple[Any, Any] | None = None  # factors, and what (28) has for them
         plants = PlantNumbers(**numbers)
-        first = self._dynamics.factors(plants, 0)
-        last = self._dynamics.factors(plants, self._drift_samples)
-        self._factors = first
-        # At the beginning of drifts, and what has been added at their end.
-        self._drift = [
-            (self._nothing + begin, self._nothing + (end - begin))
-            for begin, end in zip(first, last, strict=True)
-        ]
+        self._factors = self._dynamics.factors(plants, 0)
+        if self._drifts:
+            # At the beginning of drifts, and what has been added at their end.
+            last = self._dynamics.factors(plants, self._drift_samples)
+            self._drift = [
+                (self._nothing + begin, self._nothing + (end - begin))
+                for begin, end in zip(self._factors, last, strict=True)
+            ]
         # The flows that are still to have an effect, oldest first, for all terms of B; and the
         # outputs, also oldest first: what A needs from before the last block, and the block.
         if which is None:

@@ -192,6 +192,7 @@ class Load:
         if which is None:
             self._parts = [(nothing, nothing)]
         else:
+            # None have been made where loads are handed in.
             step, walk = self._parts[min(taken, len(self._parts) - 1)]
             self._parts = [(step.masked_fill(which, 0.0), walk.masked_fill(which, 0.0))]
 

@@ -171,8 +171,8 @@ class FanOut:
         for key in cells.keys() - answered:
             errors[key] = "Not run: too many lost their worker."
         if errors:
-            raise CellsFailedError({key: errors[key] for key in cells if key in errors},
-                                   len(cells))  # fmt: skip
+            in_order = {key: errors[key] for key in cells if key in errors}
+            raise CellsFailedError(in_order, len(cells))
 
     def _local(self, cells: Cells) -> Iterator[Answer]:
         """Run cells on this machine, those again whose worker is lost."""
