@@ -21,7 +21,8 @@ from benchmarks.compare import __main__ as compare
 from benchmarks.compare import comparison
 from benchmarks.compare.estimates import beaten, estimate, scale_of, verdict
 from benchmarks.controllers.factories import build, load_factory, observation
-from benchmarks.controllers.roster import ROSTER, chosen
+from benchmarks.controllers.options import chosen
+from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage, tables
 from benchmarks.lib.command_line import UsageError
 from benchmarks.lib.report import Section, write_report

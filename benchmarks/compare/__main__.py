@@ -13,23 +13,24 @@ from rich.console import Console
 
 from benchmarks import plants
 from benchmarks.compare.comparison import Comparison
-from benchmarks.controllers import roster
+from benchmarks.controllers import options as controller_options
 from benchmarks.controllers.factories import build, load_factory, observation
 from benchmarks.controllers.records import Controller
+from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import command_line
 from benchmarks.lib.tables import on_screen
 from benchmarks.scenarios import PRESET_SCENARIOS, SCENARIOS, SETPOINTS, Scenario, scenarios_of
 from mptc_gym import Parameters
 
 OUT = Path("results/compare")
-COMPARED = [name for name, controller in roster.ROSTER.items() if controller.compared]
+COMPARED = [name for name, controller in ROSTER.items() if controller.compared]
 RUNS = 100
 LONGEST = 60  # characters of a folder's name
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    roster.add_options(parser, COMPARED, "trainings")
+    controller_options.add_options(parser, COMPARED, "trainings")
     add(
         "--scenarios",
         nargs="*",
@@ -75,7 +76,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, console: Console) -> str:
     """Run the comparison and write what it finds."""
-    controllers = roster.chosen(options.agents, options.agent)
+    controllers = controller_options.chosen(options.agents, options.agent)
     options.agents = list(controllers)
     plant = plants.chosen(options)
     if options.presets and plant.arguments:
@@ -87,7 +88,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     names = command_line.known("--scenarios", names, list(scenarios))
     if not names:
         raise command_line.UsageError("--scenarios: none to run")
-    training = roster.training(options, retrain=options.retrain)
+    training = controller_options.training(options, retrain=options.retrain)
     if plant.arguments:
         _try_out(controllers.values(), [scenarios[name] for name in names])
     out = getattr(options, "out", None) or _folder(

@@ -14,9 +14,10 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks import plants as plant_options
-from benchmarks.controllers import roster
+from benchmarks.controllers import options as controller_options
 from benchmarks.controllers.factories import Factory, provenances
 from benchmarks.controllers.records import Controller
+from benchmarks.controllers.roster import ROSTER
 from benchmarks.designs import Plant, grid, random_design
 from benchmarks.lib import command_line
 from benchmarks.lib.fingerprint import fingerprint
@@ -26,7 +27,7 @@ from benchmarks.lib.tables import on_screen, write_csv
 from benchmarks.sweep.cells import agent_cell, limit_cell
 from benchmarks.sweep.report import report, table
 
-SWEPT = [name for name, controller in roster.ROSTER.items() if controller.swept]
+SWEPT = [name for name, controller in ROSTER.items() if controller.swept]
 SEED = 0  # of a plant's first run
 NOTHING = "nothing"  # the controller that sets the scale
 
@@ -51,7 +52,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
     add("--runs", type=count, default=20, metavar="N", help="runs of a controller on a plant")
     add("--samples", type=count, default=1200, metavar="N", help="samples of 8 s in a run")
-    roster.add_options(parser, SWEPT, "runs and trainings")
+    controller_options.add_options(parser, SWEPT, "runs and trainings")
     plant_options.add_options(parser)
     add(
         "--out",
@@ -73,13 +74,13 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, console: Console) -> str:
     """Run the sweep and write what it finds."""
-    controllers = roster.chosen(options.agents, options.agent)
+    controllers = controller_options.chosen(options.agents, options.agent)
     nominal = plant_options.chosen(options).arguments
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     out = getattr(options, "out", Path(f"results/sweep-{options.design}"))
     out = command_line.out_folder(out)
-    training = roster.training(options)
-    known = {NOTHING: roster.ROSTER[NOTHING], **controllers}
+    training = controller_options.training(options)
+    known = {NOTHING: ROSTER[NOTHING], **controllers}
     members = {
         name: controller.members_in_service(training) for name, controller in known.items()
     }

@@ -19,8 +19,9 @@ from rich.console import Console
 
 from benchmarks import plants
 from benchmarks.controllers.factories import Factory, build, observation
+from benchmarks.controllers.options import own_controller
 from benchmarks.controllers.records import Controller, Training
-from benchmarks.controllers.roster import ROSTER, own_controller
+from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import command_line
 from benchmarks.lib.storage import replacing
 from benchmarks.lib.tables import on_screen
