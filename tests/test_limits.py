@@ -12,7 +12,14 @@ from agents import PIController
 from benchmarks import limits
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.lib.statistics import interquartile_mean, stratified
-from benchmarks.limits import bounds, frontier, least_possible, minimum_variance, scenario_limit
+from benchmarks.limits import (
+    bounds,
+    frontier,
+    least_possible,
+    minimum_variance,
+    programme,
+    scenario_limit,
+)
 from benchmarks.limits.__main__ import main
 from benchmarks.limits.course import course
 from benchmarks.limits.news import News
@@ -172,6 +179,23 @@ class TestSetPointChanges:
 
 
 class TestProgramme:
+    def test_zero_outside_the_unit_circle(self):
+        # HiGHS' presolve gives up. A flow of one sign cannot do better than an error of 17 in
+        # the half periods at -17, and a plain step of it is a plan, and so no better.
+        plant = {"a": [1, 0.0875, 0.0495, -0.0053], "b": [-8.6, 96.0, -26.3], "delay": 18}
+        limits = {"dead_zone": 0, "u_min": 0, "u_max": 0.386, "setpoint_amplitude": 17}
+        found = least_possible(samples=1200, folder=None, **plant, **limits)
+        u = np.where(np.arange(1200) % 600 < 281, 17.0 * sum(plant["a"]) / sum(plant["b"]), 0.0)
+        y = signal.lfilter([0.0] * 19 + plant["b"], plant["a"], u)
+        setpoint = np.where(np.arange(1200) % 600 < 300, 17.0, -17.0)
+        assert 8.5 < found.value <= np.abs(setpoint - y).mean() < 9.5
+
+    def test_what_cannot_be_solved_is_said(self, monkeypatch):
+        hopeless = ("highs-ds", {"presolve": False, "maxiter": 1})
+        monkeypatch.setattr(programme, "ATTEMPTS", [hopeless] * 2)
+        with pytest.raises(programme.NotSolvedError, match="not solved by any of 2 methods"):
+            best_plan(np.repeat([1.5, -1.0], 300))
+
     @pytest.mark.parametrize("plant", ODD)
     def test_descent_on_the_plant_comes_to_the_same(self, plant):
         # Another method on another model: L-BFGS-B on sqrt(e^2 + s^2), s falling, with the

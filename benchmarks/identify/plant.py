@@ -73,7 +73,8 @@ def plant_ranges(model: Model) -> dict[str, Any]:
     if math.isfinite(constant.low) and pole.imag == 0.0 and 0.0 < pole.real < 1.0:
         # The environment's time constant is 1 / (1 - pole) samples.
         rates = Interval(
-            *(-math.expm1(-model.sampling_interval / t) for t in _ordered(constant))
+            # A log may leave it open whether the plant has any time constant at all.
+            *(-math.expm1(-model.sampling_interval / max(t, 1e-12)) for t in _ordered(constant))
         )
         low, high = (rates.value / rates.high, rates.value / max(rates.low, 1e-12))
         if low < high:
