@@ -1,6 +1,7 @@
-"""How fast everything steps, beside Gymnasium's own environments: `python -m benchmarks.speed`.
+"""Measures environment steps a second beside other environments: `python -m benchmarks.speed`.
 
-What is compared is measured alternately in one run and reported as a ratio, with its spread.
+What is compared takes turns in one run and is reported as a ratio, with its spread. EnvPool and
+gymnax are measured where they are installed.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import argparse
 import copy
 import importlib.util
+import os
 import subprocess
 import sys
 import time
@@ -36,10 +38,9 @@ ROUNDS = 15
 SINGLE_STEPS = 20_000
 FRAMES = 400  # with a chart that is full for half of them
 EPISODE = 1200
-BATCHES = (1, 8, 64, 1024, 16384)
+BATCHES = (8, 64, 1024, 16384)
 LOOPS = (64, 1000)
 MEMORY_PLANTS = 100
-LONG = 100_000  # steps, to see whether memory grows
 NOISE: dict[str, Any] = {"noise_variance": 0.5}
 RANDOM = {**NOISE, "setpoint": "random"}
 IN_TORCH: dict[str, dict[str, Any]] = {
@@ -50,7 +51,8 @@ IN_TORCH: dict[str, dict[str, Any]] = {
 DEVICE_BATCHES = tuple(4**power for power in range(5, 12))  # 1,024 to 4,194,304 plants
 DEVICE_STEPS = 200
 GRADIENTS, BACKWARD = 1024, 300  # plants, and samples
-WITH_ENVPOOL = importlib.util.find_spec("envpool") is not None  # if it is installed
+PEER_STEPS = 100  # of each environment of EnvPool and gymnax
+INSTALL_PEERS = "pip install envpool gymnax six"
 REFERENCE = "CartPole-v1"
 SINGLE: dict[str, tuple[str, dict[str, Any]]] = {
     REFERENCE: (REFERENCE, {}),
@@ -103,8 +105,6 @@ def main(options: argparse.Namespace, console: Console) -> str:
         return f"Medians of {rounds} rounds."
     cases = [_single(name, *made) for name, made in SINGLE.items()]
     show("One environment, from gymnasium.make", compare(cases, rounds))
-    cases = [_single(name, *made, bare=True) for name, made in SINGLE.items()]
-    show("One environment, without gymnasium.make's wrappers", compare(cases, rounds))
     cases = [_drawn(name) for name in (REFERENCE, "MiddlePoint-v0")]
     show('Steps with a picture of each, render_mode="rgb_array"', compare(cases, rounds))
     for n in BATCHES:
@@ -124,7 +124,11 @@ def main(options: argparse.Namespace, console: Console) -> str:
     ]
     taken = 1000 * pd.DataFrame(_alternately(imports, rounds))
     more = taken["mptc_gym"] - taken["gymnasium"]
-    return (
+    missing = " and ".join(peer for peer in PEERS if not importlib.util.find_spec(peer))
+    left_out = (
+        f"Without {missing}: {INSTALL_PEERS}, in a virtual environment.\n" if missing else ""
+    )
+    return left_out + (
         f"import gymnasium: {taken['gymnasium'].median():.0f} ms; import mptc_gym: "
         f"{more.median():+.0f} ms ({more.quantile(0.1):+.0f} to {more.quantile(0.9):+.0f})\n"
         f"Medians of {rounds} rounds; in parentheses, 10th to 90th percentile."
@@ -161,7 +165,7 @@ def compare(cases: list[Case], rounds: int) -> pd.DataFrame:
 
 
 def memory() -> pd.DataFrame:
-    """Measure the memory of a plant, in a batch and alone, and whether it grows."""
+    """Measure the memory of a plant, in a batch and alone."""
     rows = []
     cases: dict[str, dict[str, Any]] = {"R = 0": {}, "R = 0.5, random set point": RANDOM}
     for name, arguments in cases.items():
@@ -169,69 +173,43 @@ def memory() -> pd.DataFrame:
             MEMORY_PLANTS, max_episode_steps=EPISODE, action_window=20, **arguments
         )
         alone = MiddlePointEnv(action_window=20, **arguments)
-        of_batch = _memory(batch, np.zeros((MEMORY_PLANTS, 1), np.float32), (1, LONG))
-        sizes = [size / MEMORY_PLANTS for size in of_batch]
-        sizes += _memory(alone, np.zeros(1, np.float32), (1, LONG))
+        sizes = _memory(batch) / MEMORY_PLANTS, _memory(alone)
         rows.append([name, *(f"{size / 1024:.1f} KiB" for size in sizes)])
-    where = f"in a batch of {MEMORY_PLANTS:,}", "alone"
-    later = f"after {LONG:,} steps"
-    return pd.DataFrame(
-        rows,
-        columns=["case", where[0], f"{where[0]}, {later}", where[1], f"{where[1]}, {later}"],
-    )
+    return pd.DataFrame(rows, columns=["case", f"in a batch of {MEMORY_PLANTS:,}", "alone"])
 
 
-def _memory(env: Any, action: Any, moments: Iterable[int]) -> list[int]:
-    """Return the bytes in use after some numbers of steps."""
-    sizes = []
+def _memory(env: Any) -> int:
+    """Return the bytes that an environment uses after a step."""
     tracemalloc.start()
     env = copy.deepcopy(env)
     env.reset(seed=0)
-    taken = 0
-    for moment in moments:
-        for _ in range(moment - taken):
-            env.step(action)
-        taken = moment
-        sizes.append(tracemalloc.get_traced_memory()[0])
+    env.step(np.zeros(env.action_space.shape, np.float32))
+    size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    return sizes
+    return size
 
 
-def _single(name: str, env_id: str, arguments: dict[str, Any], *, bare: bool = False) -> Case:
+def _single(name: str, env_id: str, arguments: dict[str, Any]) -> Case:
     env = gymnasium.make(env_id, **arguments)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(SINGLE_STEPS)]
-    episodes = [actions]
-    if bare:  # nothing else limits an episode then
-        env = env.unwrapped
-        limit = gymnasium.spec(env_id).max_episode_steps or SINGLE_STEPS
-        episodes = [actions[k : k + limit] for k in range(0, SINGLE_STEPS, limit)]
-
-    def step() -> None:
-        for episode in episodes:
-            env.reset(seed=0)
-            for action in episode:
-                _, _, terminated, truncated, _ = env.step(action)
-                if terminated or truncated:
-                    env.reset()
-
-    return Case(name, step, SINGLE_STEPS)
+    return Case(name, lambda: _episodes(env, actions), SINGLE_STEPS)
 
 
 def _drawn(name: str) -> Case:
     env = gymnasium.make(name, render_mode="rgb_array")
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(FRAMES)]
+    return Case(name, lambda: _episodes(env, actions, env.render), FRAMES)
 
-    def draw() -> None:
-        env.reset(seed=0)
-        for action in actions:
-            _, _, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
-                env.reset()
-            env.render()
 
-    return Case(name, draw, FRAMES)
+def _episodes(env: Any, actions: list[Any], after: Callable[[], object] = lambda: None) -> None:
+    env.reset(seed=0)
+    for action in actions:
+        _, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            env.reset()
+        after()
 
 
 def _vector(n: int) -> Iterable[Case]:
@@ -252,14 +230,59 @@ def _vector(n: int) -> Iterable[Case]:
         yield Case(name, _stepper(envs, actions, EPISODE + 1), n * (EPISODE + 1))
     for name, arguments in IN_TORCH.items():
         yield _in_torch(name, n, "cpu", EPISODE + 1, arguments)
-    if WITH_ENVPOOL:
-        import envpool
+    for peer in filter(importlib.util.find_spec, PEERS):
+        yield from PEERS[peer](n)
 
-        envs = envpool.make_gymnasium(REFERENCE, num_envs=n, num_threads=1, seed=0)
-        envs.reset()
-        actions = list(np.random.default_rng(0).integers(0, 2, (20, n), dtype=np.int32))
-        steps = 100  # fewer, as it takes longer
-        yield Case(f"{REFERENCE} of envpool", _stepper(envs, actions, steps), n * steps)
+
+def _envpool(n: int) -> Iterable[Case]:
+    """Yield CartPole in C++, on one thread."""
+    import envpool
+
+    envs = envpool.make_gymnasium(REFERENCE, num_envs=n, num_threads=1, seed=0)
+    envs.reset()
+    actions = list(np.random.default_rng(0).integers(0, 2, (20, n), dtype=np.int32))
+    step = _stepper(envs, actions, PEER_STEPS)
+    yield Case(f"{REFERENCE} of envpool", step, n * PEER_STEPS)
+
+
+def _gymnax(n: int) -> Iterable[Case]:
+    """Yield CartPole in JAX on one thread of the CPU: step by step, and all steps compiled."""
+    flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ.setdefault("XLA_FLAGS", flags)  # read when JAX is first used
+    import gymnax
+    import jax
+
+    env, parameters = gymnax.make(REFERENCE)
+    step_all = jax.vmap(env.step, (0, 0, 0, None))
+    actions = jax.random.randint(jax.random.key(1), (PEER_STEPS, n), 0, 2)
+
+    def advance(carry: tuple[Any, Any], action: Any) -> tuple[tuple[Any, Any], Any]:
+        keys = jax.random.split(carry[0], n + 1)
+        observations, state, *others = step_all(keys[1:], carry[1], action, parameters)
+        return (keys[0], state), (observations, others)
+
+    step, one_by_one = jax.jit(advance), list(actions)
+    scan = jax.jit(lambda carry: jax.lax.scan(advance, carry, actions))
+    _, states = jax.vmap(env.reset, (0, None))(
+        jax.random.split(jax.random.key(0), n), parameters
+    )
+    start = jax.random.key(2), states
+
+    def stepped() -> None:
+        carry = start
+        for action in one_by_one:
+            carry, returned = step(carry, action)
+        jax.block_until_ready(returned)
+
+    def compiled() -> None:
+        jax.block_until_ready(scan(start))
+
+    for name, run in {"": stepped, ", one compiled loop": compiled}.items():
+        run()  # compiled the first time
+        yield Case(f"{REFERENCE} of gymnax{name}", run, n * PEER_STEPS)
+
+
+PEERS: dict[str, Callable[[int], Iterable[Case]]] = {"envpool": _envpool, "gymnax": _gymnax}
 
 
 def _in_torch(name: str, n: int, device: str, steps: int, arguments: dict[str, Any]) -> Case:

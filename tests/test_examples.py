@@ -15,7 +15,7 @@ import torch
 from stable_baselines3 import PPO
 
 from benchmarks.datasets.history import arguments_of, record
-from benchmarks.examples import cleanrl_style, offline, ppo_torch, sb3
+from benchmarks.examples import offline, ppo_torch, sb3
 from benchmarks.train import defaults
 from benchmarks.train.sb3_vec_env import GymnasiumVecEnv
 
@@ -79,18 +79,18 @@ def test_stable_baselines3_learns_with_the_lines_of_the_page():
         assert not torch.equal(before, weights(model.policy))
 
 
-class TestOnOnePage:
-    SMALL = cleanrl_style.Arguments(
+class TestPPOInPyTorch:
+    SMALL = ppo_torch.Arguments(
         steps=512, num_envs=8, num_steps=16, epochs=2, minibatches=2, evaluations=2
     )
 
     def test_it_runs(self, capsys):
-        cleanrl_style.main(["--steps", "1024", "--num-envs", "8", "--evaluations", "2"])
+        ppo_torch.main(["--steps", "1024", "--num-envs", "8", "--evaluations", "2"])
         assert capsys.readouterr().out.count("mean |e|") == 2
 
     def test_the_seed_is_all_that_differs(self):
         first, again, other = (
-            weights(cleanrl_style.train(replace(self.SMALL, seed=seed))) for seed in (1, 1, 2)
+            weights(ppo_torch.train(replace(self.SMALL, seed=seed))) for seed in (1, 1, 2)
         )
         assert torch.equal(first, again)
         assert not torch.equal(first, other)
@@ -101,15 +101,15 @@ class TestOnOnePage:
         # plus 3.25/4. The last, of the next episode: 1 + 6/2 - 0 = 4.
         rewards, values = torch.tensor([1.0, 2.0, 3.0, 1.0]), torch.tensor([4.0, 2.0, 2.0, 0.0])
         following, ends = torch.tensor([2.0, 4.0, 8.0, 6.0]), torch.tensor([0.0, 0.0, 1.0, 0.0])
-        arguments = cleanrl_style.Arguments(gamma=0.5, gae_lambda=0.5)
-        found = cleanrl_style.estimate(
+        arguments = ppo_torch.Arguments(gamma=0.5, gae_lambda=0.5)
+        found = ppo_torch.estimate(
             *(x[:, None] for x in (rewards, values, following, ends)), arguments
         )
         assert found[:, 0].tolist() == [-1.1875, 3.25, 5.0, 4.0]
 
     def test_values_at_an_end_are_those_of_the_last_observation(self, monkeypatch):
-        monkeypatch.setitem(cleanrl_style.TRAINING, "max_episode_steps", 5)
-        forward, estimate, kept = cleanrl_style.Agent.forward, cleanrl_style.estimate, []
+        monkeypatch.setitem(ppo_torch.TRAINING, "max_episode_steps", 5)
+        forward, estimate, kept = ppo_torch.Agent.forward, ppo_torch.estimate, []
 
         def error_for_a_value(agent, observations):
             return forward(agent, observations)[0], observations[:, 3]
@@ -118,9 +118,9 @@ class TestOnOnePage:
             kept.append([x.clone() for x in (rewards, values, next_values, ends)])
             return estimate(rewards, values, next_values, ends, arguments)
 
-        monkeypatch.setattr(cleanrl_style.Agent, "forward", error_for_a_value)
-        monkeypatch.setattr(cleanrl_style, "estimate", spy)
-        cleanrl_style.train(self.SMALL)
+        monkeypatch.setattr(ppo_torch.Agent, "forward", error_for_a_value)
+        monkeypatch.setattr(ppo_torch, "estimate", spy)
+        ppo_torch.train(self.SMALL)
         for rewards, values, next_values, ends in kept:
             # The reward is that of the error that a step leads to, also at an end.
             torch.testing.assert_close(next_values.abs(), -50.0 * rewards)
@@ -128,51 +128,6 @@ class TestOnOnePage:
             assert torch.equal(next_values[:-1][went_on], values[1:][went_on])
             assert not torch.equal(next_values[:-1][~went_on], values[1:][~went_on])
         assert torch.stack([ends for *_, ends in kept]).mean() == pytest.approx(0.2, abs=0.02)
-
-
-class TestInPyTorch:
-    SMALL = ppo_torch.Arguments(
-        steps=1024, num_envs=8, num_steps=16, epochs=2, minibatches=2, seed=1
-    )
-
-    def test_times_of_both_are_shown(self, monkeypatch, capsys):
-        monkeypatch.setattr(ppo_torch, "SIZES", (4, 8))
-        ppo_torch.main(["--times", "--num-steps", "8", "--epochs", "1"])
-        lines = capsys.readouterr().out.splitlines()
-        assert [line.split()[0] for line in lines] == ["4", "4", "8", "8"]
-        assert [line.split()[3].rstrip(":") for line in lines] == ["PyTorch", "NumPy"] * 2
-
-    def test_the_seed_is_all_that_differs(self):
-        first, again, other = (
-            weights(ppo_torch.train(replace(self.SMALL, seed=seed))[0]) for seed in (1, 1, 2)
-        )
-        assert torch.equal(first, again)
-        assert not torch.equal(first, other)
-
-    def test_values_at_an_end_are_those_of_the_last_observation(self, monkeypatch):
-        # What the value function is asked for at an end is the error that the step led to,
-        # which the reward tells, and not the first one of the next episode.
-        asked = []
-        forward, step = ppo_torch.Agent.forward, ppo_torch.MiddlePointTorchEnv.step
-
-        def spy_forward(agent, observations):
-            asked.append(observations[:, 3].clone())
-            return forward(agent, observations)
-
-        told = []
-
-        def spy_step(plants, actions):
-            returned = step(plants, actions)
-            told.append((returned[1].clone(), returned[3].clone(), len(asked)))
-            return returned
-
-        monkeypatch.setattr(ppo_torch.Agent, "forward", spy_forward)
-        monkeypatch.setattr(ppo_torch.MiddlePointTorchEnv, "step", spy_step)
-        monkeypatch.setitem(ppo_torch.TRAINING, "max_episode_steps", 5)
-        ppo_torch.train(self.SMALL)
-        assert torch.stack([ends for _, ends, _ in told]).any()
-        for rewards, _, following in told:
-            torch.testing.assert_close(asked[following].abs(), -50.0 * rewards)
 
 
 def test_controllers_need_neither_torch_nor_sb3():

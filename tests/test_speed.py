@@ -15,10 +15,14 @@ def test_ratios_compare_rounds_with_each_other(monkeypatch):
     assert list(table["ratio to slow"]) == ["1.00 (1.00 to 1.00)", "2.00 (1.20 to 6.80)"]
 
 
+def peer(n):
+    yield speed.Case(f"{n} of a peer", lambda: None, n)
+
+
 def test_it_runs(monkeypatch, capsys):
     small = {
-        "SINGLE_STEPS": 50, "FRAMES": 3, "EPISODE": 5, "LONG": 5, "BATCHES": (1, 3),
-        "LOOPS": (2,), "WITH_ENVPOOL": False, "GRADIENTS": 2, "BACKWARD": 25,
+        "SINGLE_STEPS": 50, "FRAMES": 3, "EPISODE": 5, "BATCHES": (1, 3), "LOOPS": (2,),
+        "GRADIENTS": 2, "BACKWARD": 25, "PEERS": {"sys": peer, "not_installed": peer},
     }  # fmt: skip
     for name, value in small.items():
         monkeypatch.setattr(speed, name, value)
@@ -33,6 +37,8 @@ def test_it_runs(monkeypatch, capsys):
         "PyTorch",
         "gradient",
         "import mptc_gym",
+        "3 of a peer",
+        "Without not_installed: pip install",
     ):
         assert words in shown
 
