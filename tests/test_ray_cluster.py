@@ -111,8 +111,8 @@ def test_a_training_loses_a_node(cluster, results):
     there, here = results / "trained there", results / "trained here"
     cluster.run(
         "-m", "tests.nodes.train", str(there),
-        files=lambda: list(there.glob("*/checkpoint.pt")), count=2,
-        last=lambda: list(there.glob("*/network.npz")),
+        files=lambda: list(there.glob("*/network.npz")), count=1,
+        last=lambda: len(list(there.glob("*/network.npz"))) == len(TRAININGS),
     )  # fmt: skip
     networks = train(TRAININGS, here, FanOut(1))
     for network in networks:
@@ -121,4 +121,3 @@ def test_a_training_loses_a_node(cluster, results):
         for layer, same in zip(network.layers, other.layers, strict=True):
             assert all(map(np.array_equal, layer, same))
         assert other.provenance["commit"] == network.provenance["commit"]
-        assert not (there / key / "checkpoint.pt").exists()

@@ -1,7 +1,6 @@
-"""Training through the plant: what is drawn, differentiated, kept, resumed and chosen."""
+"""Training through the plant: what is drawn, differentiated, kept and chosen."""
 
 import json
-import pickle
 import re
 from dataclasses import replace
 
@@ -13,10 +12,10 @@ torch = pytest.importorskip("torch")
 
 from agents import PolicyNetwork  # noqa: E402
 from benchmarks.designs import SPANS  # noqa: E402
-from benchmarks.lib.fan_out import CellsFailedError, FanOut  # noqa: E402
+from benchmarks.lib.fan_out import FanOut  # noqa: E402
 from benchmarks.rollout import make_plants, rollout  # noqa: E402
 from benchmarks.train import __main__ as command  # noqa: E402
-from benchmarks.train import legs, through_plant  # noqa: E402
+from benchmarks.train import through_plant  # noqa: E402
 from benchmarks.train.through_plant import (  # noqa: E402
     TRAININGS,
     Draw,
@@ -40,13 +39,8 @@ def small(monkeypatch):
     monkeypatch.setattr(through_plant, "VALIDATION_SAMPLES", 40)
 
 
-DAMAGED = (CellsFailedError, ValueError)  # a checkpoint is read by a leg, a network here
-
-
 def train(training, folder, *, retrain=False):
-    course = command.course(training, folder)
-    legs.train([course], FanOut(1), retrain=retrain, progress=False)
-    return PolicyNetwork.load(course.network)
+    return command.run([training], folder, FanOut(1), retrain=retrain)[0]
 
 
 def weights(network):
@@ -187,42 +181,16 @@ class TestGradient:
 
 
 class TestKept:
-    @pytest.mark.parametrize("steps", [1, 3, 5])
-    def test_interrupted_training_resumes_to_the_same_network(
-        self, tmp_path, monkeypatch, steps
-    ):
-        whole = train(SMALL, tmp_path / "whole")
-        advance = Trainer.advance
-
-        def interrupt(self):
-            if self.step == steps:
-                raise KeyboardInterrupt
-            return advance(self)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(Trainer, "advance", interrupt)
-            with pytest.raises(KeyboardInterrupt):
-                train(SMALL, tmp_path / "parts")
-        assert (tmp_path / "parts" / "checkpoint.pt").exists() == (steps >= 2)
-        torch.manual_seed(7)  # whatever happens between
-        parts = train(SMALL, tmp_path / "parts")
-        assert np.array_equal(weights(parts), weights(whole))
-        curves = [
-            pd.DataFrame(network.provenance["curve"]).drop(columns="cpu_seconds")
-            for network in (whole, parts)
-        ]
-        pd.testing.assert_frame_equal(*curves)
-        assert not (tmp_path / "parts" / "checkpoint.pt").exists()
-
     def test_a_finished_network_is_loaded(self, tmp_path, monkeypatch):
         trained = train(SMALL, tmp_path)
         with monkeypatch.context() as patch:
             patch.setattr(Trainer, "advance", None)  # training again would raise
             loaded = train(SMALL, tmp_path)
         assert np.array_equal(weights(loaded), weights(trained))
-        stamp = (tmp_path / "network.npz").stat().st_mtime_ns
+        (file,) = tmp_path.glob("*/network.npz")
+        stamp = file.stat().st_mtime_ns
         train(SMALL, tmp_path, retrain=True)
-        assert (tmp_path / "network.npz").stat().st_mtime_ns > stamp
+        assert file.stat().st_mtime_ns > stamp
 
     def test_seed_is_honoured(self, tmp_path):
         first, again, other = (
@@ -232,32 +200,14 @@ class TestKept:
         assert np.array_equal(first, again)
         assert not np.array_equal(first, other)
 
-    @pytest.mark.parametrize("name", ["network.npz", "checkpoint.pt"])
-    def test_a_damaged_file_is_named(self, tmp_path, name):
-        (tmp_path / name).write_bytes(b"half of it")
-        with pytest.raises(DAMAGED, match="damaged") as error:
+    def test_a_damaged_file_is_named(self, tmp_path):
+        file = tmp_path / training_key(SMALL) / "network.npz"
+        file.parent.mkdir()
+        file.write_bytes(b"half of it")
+        with pytest.raises(ValueError, match="damaged") as error:
             train(SMALL, tmp_path)
-        assert str(tmp_path / name) in str(error.value)
+        assert str(file) in str(error.value)
         train(SMALL, tmp_path, retrain=True)
-
-    def test_a_checkpoint_of_another_training_is_refused(self, tmp_path):
-        kept = Trainer(SMALL).checkpoint()
-        (tmp_path / "checkpoint.pt").write_bytes(kept.content)
-        with pytest.raises(CellsFailedError, match="another training"):
-            train(replace(SMALL, move_price=0.5), tmp_path)
-
-    def test_nothing_in_a_checkpoint_is_executed(self, tmp_path, capsys):
-        class Harm:
-            def __reduce__(self):
-                return print, ("executed",)
-
-        torch.save({"training": Harm()}, tmp_path / "checkpoint.pt")
-        with pytest.raises(DAMAGED, match="damaged"):
-            train(SMALL, tmp_path)
-        (tmp_path / "checkpoint.pt").write_bytes(pickle.dumps(Harm()))
-        with pytest.raises(DAMAGED, match="damaged"):
-            train(SMALL, tmp_path)
-        assert capsys.readouterr().out == ""
 
     def test_the_best_in_validation_is_kept(self, tmp_path, monkeypatch):
         scores = iter([3.0, 1.0, 2.0])
@@ -274,8 +224,7 @@ class TestKept:
         assert kept.provenance["validation"]["step"] == 4
 
     def test_provenance_is_kept(self, tmp_path):
-        train(SMALL, tmp_path)
-        kept = PolicyNetwork.load(tmp_path / "network.npz").provenance
+        kept = train(SMALL, tmp_path).provenance
         assert kept["training"]["seed"] == SMALL.seed
         assert kept["training"]["steps"] == 6
         assert kept["validation"]["seed"] >= 3_000_000

@@ -165,11 +165,11 @@ class TestSearch:
         state = ppo_training.begin(SMALL).policy.state_dict()
         network = ppo_training.exported(state, SMALL)
 
-        def leg(arguments, checkpoint):
+        def train(arguments):
             trained.append(arguments)
             return network
 
-        monkeypatch.setattr(ppo_training, "leg", leg)
+        monkeypatch.setattr(ppo_training, "train", train)
         monkeypatch.setattr(
             objective, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
         )

@@ -2,8 +2,8 @@
 
 `nn-dpc` is for the paper's plant, `nn-adaptive` for many plants. Several networks are trained,
 which differ in their seeds, and validation chooses one. `ppo` trains the policies of
-Stable-Baselines3's PPO, all of which are compared. What is finished is kept; the same
-command goes on with what was interrupted, and ends in the same networks.
+Stable-Baselines3's PPO, all of which are compared. What is finished is kept: the same command,
+run again after it was interrupted, trains what is missing.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from benchmarks.lib import command_line, drawing
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import commit
 from benchmarks.lib.tables import on_screen, write_csv
-from benchmarks.train import legs, ppo
+from benchmarks.train import kept, ppo
 from benchmarks.train.ppo_arguments import PPOArguments
-from benchmarks.train.through_plant import TRAININGS, Training, leg, training_key
+from benchmarks.train.through_plant import TRAININGS, Training, train, training_key
 
 NETWORKS = 5  # are trained, from seeds in sequence
 
@@ -52,7 +52,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 @command_line.command(
-    "train", __doc__, _add_options, interrupted="the same command goes on from here."
+    "train", __doc__, _add_options, interrupted="the same command trains what is missing."
 )
 def main(options: argparse.Namespace, console: Console) -> str:
     """Train, say how the networks do in validation, and choose one."""
@@ -122,20 +122,13 @@ def run(
     trainings: Sequence[Training], out: Path, fan_out: FanOut, *, retrain: bool = False
 ) -> list[PolicyNetwork]:
     """Train side by side, each in a folder of its own below `out`, and return the networks."""
-    courses = [course(training, out / training_key(training)) for training in trainings]
-    legs.train(courses, fan_out, retrain=retrain)
-    return [PolicyNetwork.load(each.network) for each in courses]
-
-
-def course(training: Training, folder: Path) -> legs.Course:
-    """Return a training that a folder keeps."""
-    return legs.Course(
-        folder.name,
-        partial(leg, training, commit()),
-        training.steps,
-        folder / "network.npz",
-        folder / "checkpoint.pt",
+    files = {out / training_key(each) / "network.npz": each for each in trainings}
+    kept.train(
+        {file: partial(train, each, commit()) for file, each in files.items()},
+        fan_out,
+        retrain=retrain,
     )
+    return [PolicyNetwork.load(file) for file in files]
 
 
 def summary(networks: Sequence[PolicyNetwork]) -> pd.DataFrame:

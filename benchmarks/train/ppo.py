@@ -22,14 +22,12 @@ from agents.policy_network import PRETRAINED
 from benchmarks.controllers.records import Account, Training
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import replacing
-from benchmarks.train import legs
-from benchmarks.train.checkpoint import Checkpoint
+from benchmarks.train import kept
 from benchmarks.train.ppo_arguments import RANDOMISED, PPOArguments
 from mptc_gym import Parameters
 
 POLICIES = 5  # are trained and compared, from seeds in sequence
 TUNING_SEED, FINAL_SEED = 1000, 2000  # of policies in a search, others than a comparison uses
-POLICY, CHECKPOINT = "policy.npz", "checkpoint.npz"
 
 
 @dataclass(frozen=True)
@@ -117,37 +115,24 @@ def members(
         arguments = replace(arguments, steps=training.steps)
     seeds = range(arguments.seed, arguments.seed + (training.members or POLICIES))
     wanted = [replace(arguments, seed=seed) for seed in seeds]
-    courses, files = [], []
+    files: dict[Path, PPOArguments] = {}
+    missing = {}
     for each in wanted:
-        own = course(each, training.folder / policy_key(each))
-        if shipped and not (training.retrain or own.network.exists()) and _comes(each):
-            files.append(pretrained(each))
+        own = training.folder / policy_key(each) / "policy.npz"
+        if shipped and not (training.retrain or own.exists()) and _comes(each):
+            files[pretrained(each)] = each
         else:
-            courses.append(own)
-            files.append(own.network)
-    legs.train(courses, training.fan_out, retrain=training.retrain)
-    return [Policy(each, file) for each, file in zip(wanted, files, strict=True)]
+            files[own] = each
+            missing[own] = partial(train, each)
+    kept.train(missing, training.fan_out, retrain=training.retrain)
+    return [Policy(each, file) for file, each in files.items()]
 
 
-def course(arguments: PPOArguments, folder: Path) -> legs.Course:
-    """Return the training of a policy, which a folder keeps.
-
-    Its files are archives of arrays and JSON, with checksums; reading them runs nothing that
-    they hold.
-    """
-    return legs.Course(
-        f"PPO, seed {arguments.seed}",
-        partial(_leg, arguments),
-        arguments.steps,
-        folder / POLICY,
-        folder / CHECKPOINT,
-    )
-
-
-def _leg(arguments: PPOArguments, checkpoint: Checkpoint | None) -> Checkpoint | PolicyNetwork:
+def train(arguments: PPOArguments) -> PolicyNetwork:
+    """Train a policy, and return the one that did best in validation."""
     from benchmarks.train import ppo_training  # here: torch takes seconds to load
 
-    return ppo_training.leg(arguments, checkpoint)
+    return ppo_training.train(arguments)
 
 
 def randomised_members(training: Training) -> list[Policy]:
@@ -160,9 +145,9 @@ def tuned(*, final: bool, member: int, **gains: Any) -> Policy:
     first = FINAL_SEED if final else TUNING_SEED
     arguments = PPOArguments(seed=first + member, **gains)
     with tempfile.TemporaryDirectory() as folder:
-        own = course(arguments, Path(folder))
-        legs.train([own], Training().fan_out, progress=False)
-        return Policy(arguments, own.network)
+        file = Path(folder) / "policy.npz"
+        train(arguments).save(file)
+        return Policy(arguments, file)
 
 
 def pretrained(arguments: PPOArguments) -> Path:

@@ -1,10 +1,8 @@
-"""How PPO of Stable-Baselines3 learns to control the plant, and its checkpoints."""
+"""Trains PPO of Stable-Baselines3 to control the plant."""
 
 from __future__ import annotations
 
 import copy
-import io
-import json
 import math
 import time
 from collections.abc import Mapping
@@ -28,7 +26,6 @@ from benchmarks.lib.storage import versions
 from benchmarks.metrics import mean_error
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
-from benchmarks.train.checkpoint import Checkpoint
 from benchmarks.train.ppo_arguments import PPOArguments
 from benchmarks.train.sb3_vec_env import GymnasiumVecEnv
 from mptc_gym import Parameters
@@ -48,36 +45,18 @@ TRAINING_SEEDS = (
 )  # and above: of what the plants meet in training, and nothing else does
 
 
-def leg(arguments: PPOArguments, checkpoint: Checkpoint | None) -> Checkpoint | PolicyNetwork:
-    """Train from one start to the next.
+def train(arguments: PPOArguments) -> PolicyNetwork:
+    """Train, and return the policy that did best in validation.
 
-    Parameters
-    ----------
-    arguments
-        How to train.
-    checkpoint
-        What to go on from; None at the first.
-
-    Returns
-    -------
-    Checkpoint or PolicyNetwork
-        What the next leg goes on from; or, at the end, the policy that did best in validation:
-        on set points that are met neither in training nor in a comparison. Its provenance holds
-        the arguments and the learning curve.
-
-    Raises
-    ------
-    ValueError
-        If the checkpoint is damaged; the message names it.
+    Validation is on set points that are met neither in training nor in a comparison. The
+    policy's provenance holds the arguments and the learning curve.
     """
-    kept = Progress() if checkpoint is None else _resume(arguments, checkpoint)
-    share = arguments.steps // arguments.starts
-    keeper = Keeper(arguments, kept)
-    begin(arguments, start=kept.starts).learn(share, callback=keeper)
-    keeper.record()
-    kept.starts += 1
-    if kept.starts < arguments.starts:
-        return Checkpoint(_saved(arguments, kept), steps=share * kept.starts)
+    kept = Progress()
+    for start in range(arguments.starts):
+        keeper = Keeper(arguments, kept)
+        begin(arguments, start=start).learn(keeper.share, callback=keeper)
+        keeper.record()
+        kept.starts += 1
     provenance = {
         "algorithm": "PPO of Stable-Baselines3",
         "arguments": asdict(arguments),
@@ -294,8 +273,8 @@ class Keeper(BaseCallback):
         self.progress = progress
         self._arguments = arguments
         self._errors: list[float] = []
-        self._share = arguments.steps // arguments.starts
-        self._before = progress.starts * self._share
+        self.share = arguments.steps // arguments.starts
+        self._before = progress.starts * self.share
         self._recorded = 0  # when, in samples of this start
         spent = progress.curve[-1]["seconds"] if progress.curve else 0.0
         self._began = time.process_time() - spent
@@ -311,7 +290,7 @@ class Keeper(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         with torch.no_grad():
-            done = self.num_timesteps / self._share
+            done = self.num_timesteps / self.share
             log_std = np.interp(done, (0.0, 1.0), self._arguments.log_std)
             cast("torch.Tensor", self.model.policy.log_std).fill_(float(log_std))
         if self.num_timesteps - self._recorded >= VALIDATION_INTERVAL:
@@ -348,35 +327,3 @@ class Keeper(BaseCallback):
         plants = make_plants(runs, samples, **arguments)
         agent = exported(self.model.policy.state_dict(), self._arguments)
         return float(mean_error(rollout(plants, agent, samples, seed)).mean())
-
-
-def _saved(arguments: PPOArguments, progress: Progress) -> bytes:
-    """Return all that a training needs to go on after a start."""
-    best = {f"best {name}": value.numpy() for name, value in progress.best.items()}
-    about = {
-        "arguments": asdict(arguments),
-        "starts": progress.starts,
-        "curve": progress.curve,
-    }
-    content = io.BytesIO()
-    np.savez(content, about=np.array(json.dumps(about)), **best)  # type: ignore[arg-type]
-    return content.getvalue()
-
-
-def _resume(arguments: PPOArguments, checkpoint: Checkpoint) -> Progress:
-    """Return how far a training got. Reading the checkpoint runs nothing that it holds."""
-    try:
-        # All of it is read, as that is when the checksums are looked at.
-        with np.load(io.BytesIO(checkpoint.content), allow_pickle=False) as file:
-            about = json.loads(str(file["about"]))
-            if about["arguments"] != json.loads(json.dumps(asdict(arguments))):
-                raise ValueError("it is of another training")
-            names = begin(arguments).policy.state_dict()
-            best = {name: torch.from_numpy(file[f"best {name}"]) for name in names}
-            curve = [dict(point) for point in about["curve"]]
-            return Progress(int(about["starts"]), curve, best)
-    except Exception as error:  # damage shows in zip, zlib, NumPy, JSON or the shapes
-        raise ValueError(
-            f"{checkpoint.name} is no checkpoint of this training, or is damaged: {error}: "
-            "remove it, or --retrain"
-        ) from error

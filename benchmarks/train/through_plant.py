@@ -10,7 +10,6 @@ nonlinear systems", Journal of Process Control 116, 2022, 80-92) or analytic pol
 
 from __future__ import annotations
 
-import io
 import itertools
 import math
 import time
@@ -25,7 +24,6 @@ from agents import PolicyNetwork
 from benchmarks.designs import SPANS
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import versions
-from benchmarks.train.checkpoint import Checkpoint
 from mptc_gym import Parameters
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
@@ -74,7 +72,7 @@ class Training:
     averaging: float = 0.95
     """What is kept and validated is the exponential mean of the weights of past steps."""
     validate_every: int = 25
-    """Steps between two validations, each with a checkpoint."""
+    """Steps between two validations."""
 
 
 TRAININGS: dict[str, Training] = {
@@ -283,7 +281,7 @@ def validate(network: Network, training: Training) -> dict[str, float]:
 
 
 class Trainer:
-    """A training, step by step, that can be saved and resumed to the bit.
+    """A training, step by step.
 
     Parameters
     ----------
@@ -320,7 +318,6 @@ class Trainer:
         training = self.training
         left = max(1.0 - self.step / training.steps, LAST_RATE)
         self._optimiser.param_groups[0]["lr"] = training.learning_rate * left
-        # The seed tells what a step meets, so that there is no generator to be saved.
         draw = Draw(training, training.batch, training.samples, training.seed, self.step)
         errors, applied = run(self._plants, self._network, draw.signals(), training.samples)
         loss = loss_of(errors, applied, training)
@@ -356,49 +353,9 @@ class Trainer:
         network.load_state_dict(self._best)
         return network
 
-    def checkpoint(self) -> Checkpoint:
-        """Return all that it takes to go on; numbers and tensors alone."""
-        state = {
-            "training": asdict(self.training),
-            "step": self.step,
-            "network": self._network.state_dict(),
-            "averaged": self.averaged.state_dict(),
-            "optimiser": self._optimiser.state_dict(),
-            "best": self._best,
-            "curve": self.curve,
-            "seconds": self._seconds,
-        }
-        content = io.BytesIO()
-        torch.save(state, content)
-        return Checkpoint(content.getvalue(), steps=self.step)
 
-    def resume(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint. Nothing in it is executed.
-
-        Raises
-        ------
-        ValueError
-            If it is damaged, or of another training.
-        """
-        try:
-            state = torch.load(io.BytesIO(checkpoint.content), weights_only=True)
-            if state["training"] != asdict(self.training):
-                raise ValueError("it is of another training")
-            self._network.load_state_dict(state["network"])
-            self.averaged.load_state_dict(state["averaged"])
-            self._optimiser.load_state_dict(state["optimiser"])
-            self.step, self.curve = state["step"], state["curve"]
-            self._best, self._seconds = state["best"], state["seconds"]
-        except Exception as error:  # damage shows in zip, pickle, PyTorch or here
-            raise ValueError(
-                f"{checkpoint.name} is damaged ({error}): remove it, or --retrain"
-            ) from error
-
-
-def leg(
-    training: Training, source: str, checkpoint: Checkpoint | None
-) -> Checkpoint | PolicyNetwork:
-    """Train until the next validation.
+def train(training: Training, source: str) -> PolicyNetwork:
+    """Train, and return the network that did best in validation.
 
     Parameters
     ----------
@@ -406,25 +363,13 @@ def leg(
         What to do.
     source
         The commit that this is run from, for the provenance.
-    checkpoint
-        What to go on from; None at the start.
-
-    Returns
-    -------
-    Checkpoint or PolicyNetwork
-        What the next leg goes on from; or, at the end, the network that did best in validation.
     """
     torch.set_num_threads(1)  # the network is too small for more
     trainer = Trainer(training)
-    if checkpoint is not None:
-        trainer.resume(checkpoint)
     while trainer.step < training.steps:
         trainer.advance()
-        if trainer.step == training.steps:
+        if trainer.step == training.steps or trainer.step % training.validate_every == 0:
             trainer.record()
-        elif trainer.step % training.validate_every == 0:
-            trainer.record()
-            return trainer.checkpoint()
     best = min(trainer.curve, key=lambda row: row["score"])
     return trainer.best().export(
         training=asdict(training),
