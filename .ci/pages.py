@@ -1,0 +1,50 @@
+"""Adds the repository's pages, pictures and tables to the site, and its source files as pages.
+
+MkDocs looks for pages in one folder, and those of this project lie beside the code.
+"""
+
+import re
+import subprocess
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parent.parent
+SHOWN = {".csv", ".gif", ".ipynb", ".json", ".md", ".png", ".txt"}
+PICTURE = re.compile(r'(<img [^>]*src="([^"]+)"[^>]*>)')
+TO_SOURCE = re.compile(r"(\]\((?!https?:)[^)#]+\.py)\)")
+
+
+@event_priority(100)  # before the plugins that look for files of theirs, such as notebooks
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add what git tracks: pages and what they show, and a page for each source file."""
+    tracked = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    for name in tracked.stdout.splitlines():
+        path = ROOT / name
+        if name.startswith((".", "tests")) or not path.exists():
+            continue
+        if path.suffix in SHOWN or name == "LICENSE":
+            files.append(File.generated(config, name, abs_src_path=str(path)))
+        elif path.suffix == ".py":
+            code = path.read_text(encoding="utf-8")
+            head = f"---\nsearch: {{exclude: true}}\nhide: [toc]\n---\n# {name}"
+            page = f"{head}\n\n~~~~python\n{code}~~~~\n"
+            files.append(File.generated(config, f"{name}.md", content=page))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Lead links to source files to their pages."""
+    return TO_SOURCE.sub(r"\1.md)", markdown)
+
+
+def on_page_content(html: str, **_: object) -> str:
+    """Lead each picture to its full size, for small screens.
+
+    The mark before literal blocks in docstrings goes, which Markdown does not know.
+    """
+    return PICTURE.sub(r'<a href="\2">\1</a>', html.replace("<p>::</p>\n", ""))
