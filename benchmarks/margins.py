@@ -15,8 +15,8 @@ from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 from scipy import optimize
 
-from benchmarks.controllers.step_test import nominal
 from benchmarks.lib.drawing import STYLE, colours, save
+from benchmarks.linear import nominal
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
@@ -92,16 +92,13 @@ class Loop:
             The plant's. A range stands for its middle, and a plant that drifts is taken at
             k = 0.
         """
-        plant = nominal(parameters)
-        delay = int(plant.range_of("delay")[0])
-        b = np.concatenate([np.zeros(delay + 1), plant.b])
-        numerator, denominator = controller.transfer()
         # u follows e, and y follows u: L = G_u G.
-        return cls(
-            np.convolve(numerator, b),
-            np.convolve(denominator, plant.a),
-            plant.sampling_interval,
+        up, down = controller.transfer()
+        b, a = nominal(parameters).transfer()
+        numerator, denominator = (
+            np.convolve(*pair).astype(np.float64) for pair in ((up, b), (down, a))
         )
+        return cls(numerator, denominator, parameters.sampling_interval)
 
     def response(self, frequency: Array) -> Complex:
         """Return L at frequencies, rad/s."""

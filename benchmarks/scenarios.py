@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from mptc_gym import PRESETS, Parameters
-from mptc_gym.plant import Dynamics
 
 
 @dataclass(frozen=True)
@@ -98,33 +97,3 @@ def scenarios_of(name: str, arguments: Mapping[str, Any]) -> dict[str, Scenario]
         setpoint: Scenario(setpoint, f"{title}, {name}", samples, {**arguments, **more})
         for setpoint, title, samples, more in cases
     }
-
-
-def plain(parameters: Parameters) -> Parameters:
-    """Return the same plant with its gain and time-constant factors worked into A and B.
-
-    Raises
-    ------
-    ValueError
-        If it is more than (28) and (29) with other numbers: if it has a range, a drift, a load
-        disturbance or a noisy transmitter.
-    """
-    more = {
-        "a range": bool(parameters.ranges),
-        "a drift": parameters.drifts,
-        "a load disturbance": parameters.is_disturbed,
-        "a noisy transmitter": parameters.range_of("measurement_noise_variance")[1] > 0.0,
-    }
-    for what, has in more.items():
-        if has:
-            raise ValueError(f"parameters must be of a plant without {what}, got {parameters}")
-    alpha, scale, _ = Dynamics(parameters).coefficients(
-        parameters.gain_factor, parameters.time_constant_factor
-    )
-    return replace(
-        parameters,
-        a=[1.0, *(-coefficient for coefficient in alpha)],
-        b=[scale * coefficient for coefficient in parameters.b],
-        gain_factor=1.0,
-        time_constant_factor=1.0,
-    )

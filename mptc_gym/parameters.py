@@ -1,6 +1,6 @@
 """Every argument of the environment, each declared once, in a dataclass that checks itself."""
 
-# ruff: noqa: RUF009 (`_argument` makes fields)
+# ruff: noqa: RUF009 (`_linear` makes fields)
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import difflib
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any, Final, Generic, TypeVar
 
@@ -39,6 +39,9 @@ class Argument:
     draw
         If it can be a range: which of the draws at a reset it takes. Once released, this number
         never changes, as it is part of what a seed means. A new argument takes the next number.
+    linear
+        Whether the plant is (28) and (29) whatever its value: linear between the limits. An
+        analysis that supposes this refuses any other argument that is not at its default.
     """
 
     default: Any
@@ -46,6 +49,7 @@ class Argument:
     unit: str
     meaning: str
     draw: int | None
+    linear: bool
 
     def checked(self, name: str, value: Any) -> Any:
         """Return a valid value in plain Python types; ValueError, naming it, otherwise."""
@@ -65,11 +69,20 @@ class Argument:
 
 
 def _argument(
-    default: Any, check: checks.Check, unit: str, meaning: str, *, draw: int | None = None
+    default: Any,
+    check: checks.Check,
+    unit: str,
+    meaning: str,
+    *,
+    draw: int | None = None,
+    linear: bool = False,
 ) -> Any:
     """Declare an argument: a field of a dataclass that carries an `Argument`."""
-    declared = Argument(default, check, unit, meaning, draw)
+    declared = Argument(default, check, unit, meaning, draw, linear)
     return field(default=default, metadata={"argument": declared})
+
+
+_linear = partial(_argument, linear=True)  # one that leaves the plant (28) and (29)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,22 +93,22 @@ class PlantNumbers(Generic[Value]):
     they are a float each for one plant, and an array each for many.
     """
 
-    delay: Value = _argument(
+    delay: Value = _linear(
         18, checks.samples, "samples", "transport delay d of the plant (28)", draw=0
     )
-    dead_zone: Value = _argument(
+    dead_zone: Value = _linear(
         5.0, checks.not_negative, "t/h", "half width of the actuator's dead zone (29)", draw=1
     )
-    u_min: Value = _argument(
+    u_min: Value = _linear(
         -10.0, checks.number, "t/h", "lower limit of the actuator, U_min in (29)", draw=2
     )
-    u_max: Value = _argument(
+    u_max: Value = _linear(
         10.0, checks.number, "t/h", "upper limit of the actuator, U_max in (29)", draw=3
     )
-    noise_variance: Value = _argument(
+    noise_variance: Value = _linear(
         0.0, checks.not_negative, "degC^2", "R, the variance of xi in (28)", draw=4
     )
-    measurement_noise_variance: Value = _argument(
+    measurement_noise_variance: Value = _linear(
         0.0,
         checks.not_negative,
         "degC^2",
@@ -103,45 +116,45 @@ class PlantNumbers(Generic[Value]):
         "does not",
         draw=5,
     )
-    disturbance_amplitude: Value = _argument(
+    disturbance_amplitude: Value = _linear(
         0.0,
         checks.not_negative,
         "degC",
         "largest level of the steps of the load disturbance, up or down",
         draw=6,
     )
-    disturbance_interval: Value = _argument(
+    disturbance_interval: Value = _linear(
         150.0,
         checks.at_least_1,
         "samples",
         "mean interval between these steps; below 10 it is 10",
         draw=7,
     )
-    disturbance_walk_variance: Value = _argument(
+    disturbance_walk_variance: Value = _linear(
         0.0,
         checks.not_negative,
         "degC^2",
         "variance that the random walk of the load disturbance adds in each sample",
         draw=8,
     )
-    gain_factor: Value = _argument(
+    gain_factor: Value = _linear(
         1.0,
         checks.positive,
         "",
         "steady-state gain, as a multiple of the gain that `a` and `b` have",
         draw=9,
     )
-    time_constant_factor: Value = _argument(
+    time_constant_factor: Value = _linear(
         1.0,
         checks.positive,
         "",
         "dominant time constant, as a multiple of the one that `a` has",
         draw=10,
     )
-    gain_drift: Value = _argument(
+    gain_drift: Value = _linear(
         1.0, checks.positive, "", "factor by which the gain changes in `drift_samples`", draw=11
     )
-    time_constant_drift: Value = _argument(
+    time_constant_drift: Value = _linear(
         1.0,
         checks.positive,
         "",
@@ -183,47 +196,47 @@ class Parameters(PlantNumbers[Number]):
     """
 
     # The plant, (28): A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k).
-    a: Sequence[float] = _argument(
+    a: Sequence[float] = _linear(
         (1.0, -0.45181, -0.47546),
         checks.polynomial,
         "",
         "coefficients of A in (28), from z^0 on; the first is 1. A may be unstable, and y may "
         "then grow beyond all floats",
     )
-    b: Sequence[float] = _argument(
+    b: Sequence[float] = _linear(
         (-0.04560, -0.00404),
         checks.coefficients,
         "degC per t/h",
         "coefficients of B in (28), from z^-1 on",
     )
-    c: Sequence[float] = _argument(
+    c: Sequence[float] = _linear(
         (1.0, -0.35740, -0.03392),
         checks.polynomial,
         "",
         "coefficients of C in (28), from z^0 on; the first is 1",
     )
-    drift_samples: int = _argument(
+    drift_samples: int = _linear(
         1200, checks.duration, "samples", "how long gain and time constant drift"
     )
-    sampling_interval: float = _argument(  # Section 5
+    sampling_interval: float = _linear(  # Section 5
         8.0, checks.positive, "s", "scale of the time axis, without effect on the dynamics"
     )
     # The paper plots the set point and does not state it.
-    setpoint: str | float | Sequence[float] = _argument(
+    setpoint: str | float | Sequence[float] = _linear(
         "square",
         checks.setpoint,
         "degC",
         '"square", "random", a number (constant), or a list with a number for each sample, of '
         "which the last one is held. [-5, 5] is a list of two samples, not a range",
     )
-    setpoint_amplitude: float = _argument(
+    setpoint_amplitude: float = _linear(
         5.0,
         checks.not_negative,
         "degC",
         'A. "square": A for the first half period, then -A. "random": levels uniform in '
         "[-A, A]",
     )
-    setpoint_period: int = _argument(
+    setpoint_period: int = _linear(
         600,
         checks.duration,
         "samples",
@@ -232,28 +245,26 @@ class Parameters(PlantNumbers[Number]):
     )
     # The observation. By default it is the six inputs of the paper's network: y_d(k), y_d(k-1),
     # y_d(k-2), e(k), e(k-1), e(k-2).
-    setpoint_window: int = _argument(
+    setpoint_window: int = _linear(
         3, checks.samples, "samples", "how many of the latest set points the observation holds"
     )
-    error_window: int = _argument(3, checks.samples, "samples", "the same for errors")
-    output_window: int = _argument(
-        0, checks.samples, "samples", "the same for measured outputs"
-    )
-    action_window: int = _argument(0, checks.samples, "samples", "the same for past actions")
-    temperature_span: float = _argument(
+    error_window: int = _linear(3, checks.samples, "samples", "the same for errors")
+    output_window: int = _linear(0, checks.samples, "samples", "the same for measured outputs")
+    action_window: int = _linear(0, checks.samples, "samples", "the same for past actions")
+    temperature_span: float = _linear(
         50.0,
         checks.positive,
         "degC",
         "range of the transmitter: the measurement saturates at +-`temperature_span`",
     )
-    reward: str = _argument("quadratic", checks.reward, "", '"quadratic" or "absolute"')
-    error_scale: float = _argument(
+    reward: str = _linear("quadratic", checks.reward, "", '"quadratic" or "absolute"')
+    error_scale: float = _linear(
         5.0,
         checks.positive,
         "degC",
         'the error that costs 1/2 ("quadratic") or 1 ("absolute") in each sample',
     )
-    move_weight: float = _argument(
+    move_weight: float = _linear(
         0.0, checks.not_negative, "", "cost of a change of the normalised action by 1"
     )
 

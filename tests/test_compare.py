@@ -26,7 +26,7 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage, tables
 from benchmarks.lib.command_line import UsageError
 from benchmarks.lib.report import Section, write_report
-from benchmarks.limits import scenario_limit
+from benchmarks.limits import least_possible
 from benchmarks.metrics import METRICS, measure
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
@@ -413,7 +413,7 @@ class TestCompare:
         assert float(row["median"].iloc[0]) == pytest.approx(nn.median())
         assert float(row["p90"].iloc[0]) == pytest.approx(nn.quantile(0.9))
 
-        limit = scenario_limit(SCENARIOS["constant"]).mae
+        limit = least_possible(samples=600, kind="reference", setpoint=5.0).value
         page, screen = (out / "report.md").read_text(), capsys.readouterr().out
         for shown in (page, (out / "report.html").read_text(), screen):
             assert f"{nn.median():.3f}" in shown

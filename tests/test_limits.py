@@ -2,38 +2,29 @@
 
 import itertools
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import linalg, optimize, signal
 
 from agents import PIController
-from benchmarks import limits
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.lib.statistics import interquartile_mean, stratified
-from benchmarks.limits import (
-    bounds,
-    frontier,
-    least_possible,
-    minimum_variance,
-    programme,
-    scenario_limit,
-)
+from benchmarks.limits import bounds, frontier, least_possible, programme
 from benchmarks.limits.__main__ import main
-from benchmarks.limits.course import course
 from benchmarks.limits.news import News
 from benchmarks.limits.programme import plan
-from benchmarks.limits.reference import TAIL, least_square, reference
+from benchmarks.limits.reference import TAIL, reference
 from benchmarks.limits.unknown import noise_variance, unknown
 from benchmarks.limits.verify import Counting, beats, errors
+from benchmarks.linear import course
 from benchmarks.metrics import mean_error
 from benchmarks.rollout import make_plants, rollout
-from benchmarks.scenarios import SCENARIOS, Scenario, plain
-from mptc_gym import PRESETS, MiddlePointEnv, Parameters
+from benchmarks.scenarios import SCENARIOS
+from mptc_gym import PRESETS, Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.ranges import Ranges
-from tests.conftest import run
 
 CALM = Parameters()
 
@@ -43,9 +34,10 @@ def run_mpc(runs, samples, seed=0, **arguments):
     return rollout(make_plants(runs, samples, **arguments), controller, samples, seed)
 
 
-def sums(trajectory):
-    error = trajectory.setpoint - trajectory.output
-    return np.abs(error).sum(axis=0), np.square(error).sum(axis=0)
+def minimum_variance(parameters):
+    """Return R times the sum of squares of the first d + 1 coefficients of C/A (Astrom)."""
+    f = signal.lfilter(parameters.c, parameters.a, np.eye(1, parameters.delay + 1)[0])
+    return parameters.noise_variance * f @ f
 
 
 def course_of(samples, **arguments):
@@ -106,8 +98,6 @@ class TestSetPointChanges:
         # 1.875, 1.9375; so 1.9 is reached with the fifth. Errors 1.9, 0.9, 0.4, 0.15, 0.025.
         by_hand = [1.9, 0.9, 0.4, 0.15, 0.025]
         assert change(0.0, 1.9, 12, **FIRST_ORDER) == pytest.approx(sum(by_hand))
-        least = least_square(Parameters(**FIRST_ORDER), 0.0, 1.9, 12)
-        assert least == pytest.approx(sum(e * e for e in by_hand))
 
     def test_with_preview_a_plant_of_first_order_by_hand(self):
         # From 0 to 1.5 at k = 3, known beforehand. On the way up by full input are 1 and 1.5.
@@ -122,8 +112,7 @@ class TestSetPointChanges:
         # Bang-bang inputs with one switch of level, the shape that optimal ones have, and
         # random ones, on the plant itself.
         samples = 120
-        absolute = change(before, after, samples)
-        square = least_square(CALM, before, after, samples)
+        least = change(before, after, samples)
         gain = sum(CALM.b) / sum(CALM.a)
         steady, end = before / gain, after / gain
         full = CALM.u_max if end > steady else CALM.u_min
@@ -135,10 +124,9 @@ class TestSetPointChanges:
             tried.append(u)
         tried += list(rng.uniform(-10, 10, (50, samples)))
         y = self.responses(np.array(tried) - steady) + before
-        of_tried = np.abs(after - y).sum(axis=1), np.square(after - y).sum(axis=1)
-        for found, least in zip(of_tried, (absolute, square), strict=True):
-            assert found.min() >= least * (1 - 1e-6)
-            assert found.min() == pytest.approx(least, rel=0.01)
+        found = np.abs(after - y).sum(axis=1)
+        assert found.min() >= least * (1 - 1e-6)
+        assert found.min() == pytest.approx(least, rel=0.01)
 
     @staticmethod
     def responses(u):
@@ -147,11 +135,6 @@ class TestSetPointChanges:
 
     def test_a_short_time_leaves_no_choice(self):
         assert change(0.0, 5.0, 19) == pytest.approx(95.0)
-        assert least_square(CALM, 0.0, 5.0, 19) == pytest.approx(475.0)
-
-    def test_from_beyond_the_reach_of_the_flow(self):
-        with pytest.raises(ValueError, match=r"before .* got 8\.0"):
-            least_square(CALM, 8.0, 5.0, 50)
 
     @pytest.mark.parametrize(
         ("name", "mae"),
@@ -162,20 +145,15 @@ class TestSetPointChanges:
         ],
     )  # fmt: skip
     def test_the_reference_of_the_papers_cases(self, name, mae):
-        assert scenario_limit(SCENARIOS[name]).mae == pytest.approx(mae, abs=1.5e-4)
+        case = {"samples": SCENARIOS[name].samples, **SCENARIOS[name].arguments}
+        found = least_possible(kind="reference", folder=None, **case).value
+        assert found == pytest.approx(mae, abs=1.5e-4)
 
     @pytest.mark.parametrize("period", [38, 76, 100])
     def test_there_is_no_reference_for_holds_too_short_to_settle(self, period):
-        with pytest.raises(
-            ValueError, match="setpoint must be held until the plant has settled"
-        ):
-            scenario_limit(Scenario("short", "", 600, {"setpoint_period": period}))
-        with pytest.raises(ValueError, match="setpoint must be held"):
+        complaint = "setpoint must be held until the plant has settled"
+        with pytest.raises(ValueError, match=complaint):
             least_possible(samples=600, kind="reference", folder=None, setpoint_period=period)
-
-    def test_other_scenarios_are_not_taken_for_known_ones(self):
-        other = Scenario("square", "", 600, {"setpoint": 4.0})
-        assert scenario_limit(other).mae < scenario_limit(SCENARIOS["constant"]).mae
 
 
 class TestProgramme:
@@ -267,21 +245,6 @@ class TestProgramme:
 
 
 class TestUnknown:
-    def test_minimum_variance_of_a_first_order_process(self):
-        # C/A = 1 / (1 - p z^-1): variance R (1 + p^2 + ... + p^2d).
-        plant = Parameters(a=(1.0, -0.8), b=(-1.0,), c=(1.0,), delay=3, noise_variance=2.0)
-        expected = 2.0 * (1 - 0.8**8) / (1 - 0.8**2)
-        assert minimum_variance(plant) == pytest.approx(expected)
-
-    def test_it_grows_with_the_delay_up_to_no_control(self):
-        noisy = {"noise_variance": 0.5}
-        variances = [minimum_variance(Parameters(delay=d, **noisy)) for d in (0, 9, 18, 400)]
-        assert variances[0] == 0.5
-        assert variances == sorted(variances)
-        plants = make_plants(300, 1500, setpoint=0.0, **noisy)
-        idle = rollout(plants, PIController(0.0, 0.0), 1500, seed=0)
-        assert variances[-1] == pytest.approx(idle.output[500:].var(), rel=0.03)
-
     def test_the_variance_begins_with_the_episode(self):
         variance = noise_variance(course_of(60, noise_variance=0.5))
         assert variance[0] == 0.0  # y(0) = 0
@@ -408,7 +371,7 @@ class TestLeastPossible:
     def test_one_who_counts_samples_beats_the_reference_alone(self):
         found = errors(Counting, 1, 1200)[0]
         assert least_possible(samples=1200, folder=None).value < found
-        assert found < 0.7 * scenario_limit(SCENARIOS["square"]).mae
+        assert found < 0.7 * least_possible(samples=1200, kind="reference").value
 
     def test_the_controller_that_knows_most_attains_it_where_nothing_changes(self):
         least = least_possible(samples=600, folder=None, setpoint=5.0)
@@ -516,20 +479,18 @@ def test_stratified_bootstrap():
 
 class TestPredictiveController:
     def test_it_reaches_the_limit_without_noise(self):
-        limit = limits.scenario_limit(SCENARIOS["constant"]).mae
-        (absolute,), _ = sums(run_mpc(1, 600, setpoint=5.0))
-        assert limit * (1 - 1e-6) <= absolute / 600 <= 1.05 * limit
+        limit = least_possible(samples=600, kind="reference", setpoint=5.0).value
+        (found,) = mean_error(run_mpc(1, 600, setpoint=5.0))
+        assert limit * (1 - 1e-4) <= found <= 1.05 * limit
 
     @pytest.mark.parametrize("name", ["square-noise", "constant-noise"])
     def test_it_comes_near_the_limit_with_noise_and_does_not_beat_it(self, name):
         scenario, runs = SCENARIOS[name], 200
-        limit = limits.scenario_limit(scenario)
-        absolute, square = sums(run_mpc(runs, scenario.samples, 77, **scenario.arguments))
-        for total, least in ((absolute, limit.mae), (square, limit.mse)):
-            mean = total.mean() / scenario.samples
-            error = total.std() / scenario.samples / np.sqrt(runs)
-            assert mean > least - 3 * error
-            assert mean < 1.01 * least + 3 * error
+        case = {"samples": scenario.samples, **scenario.arguments}
+        least = least_possible(kind="reference", **case).value
+        found = mean_error(run_mpc(runs, seed=77, **case))
+        error = found.std() / np.sqrt(runs)
+        assert least - 3 * error < found.mean() < 1.01 * least + 3 * error
 
     def test_it_foresees_the_plant_exactly(self):
         # Without a dead zone and far from the limits the output comes to the set point at the
@@ -595,39 +556,14 @@ def test_command(capsys, tmp_path):
     shown = capsys.readouterr().out
     for name in (*SCENARIOS, *PRESETS):
         assert name in shown
-    assert f"{limits.scenario_limit(SCENARIOS['square']).mae:.4f}" in shown
+    assert "0.9073" in shown
 
 
 class TestOtherDynamics:
-    def test_factors_are_worked_into_a_and_b(self, rng):
-        given = Parameters(gain_factor=1.3, time_constant_factor=2.0, delay=9)
-        worked_in = plain(given)
-        assert worked_in.gain_factor == worked_in.time_constant_factor == 1.0
-        actions = rng.uniform(-1, 1, 500)
-        ours, theirs = (
-            run(MiddlePointEnv(**asdict(parameters)), actions)["output"]
-            for parameters in (given, worked_in)
-        )
-        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12)
-        assert np.ptp(ours) > 1.0
-
     def test_the_bound_of_a_stronger_plant_is_attained_too(self):
         arguments = {"setpoint": 5.0, "gain_factor": 1.3, "time_constant_factor": 0.8}
-        scenario = Scenario("stronger", "", 600, arguments)
+        least = least_possible(samples=600, folder=None, **arguments).value
         plants = make_plants(1, 600, **arguments)
         controller = PredictiveController(Parameters(**arguments), 1)
         error = mean_error(rollout(plants, controller, 600, seed=0))[0]
-        assert 1.0 <= error / scenario_limit(scenario).mae < 1.02
-
-    @pytest.mark.parametrize(
-        "more",
-        [
-            {"delay": [3, 4]},
-            {"gain_drift": 2.0},
-            {"disturbance_amplitude": 1.0},
-            {"measurement_noise_variance": 0.1},
-        ],
-    )
-    def test_there_is_no_limit_for_what_is_not_derived(self, more):
-        with pytest.raises(ValueError, match="parameters must be of a plant without"):
-            scenario_limit(Scenario("more", "", 600, more))
+        assert 1.0 <= error / least < 1.02

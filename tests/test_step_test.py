@@ -6,7 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from benchmarks.controllers.step_test import StepTest, step_response, step_test
+from benchmarks.controllers.step_test import StepTest, step_test
+from benchmarks.linear import nominal
 from benchmarks.metrics import reversals
 from benchmarks.plants import read_plant
 from mptc_gym import PRESETS, Parameters
@@ -43,7 +44,7 @@ def test_model_is_close_to_the_response_of_a_plant_of_higher_order():
         -np.maximum(times - found.delay + 8.0, 0) / found.time_constant
     )
     model[times < found.delay] = 0.0
-    assert np.abs(model - step_response(plant, 300)).max() < 0.1 * found.gain
+    assert np.abs(model - nominal(plant).step_response(300)).max() < 0.1 * found.gain
 
 
 def test_sampling_interval_scales_times():
@@ -62,13 +63,6 @@ def test_factors_are_those_of_the_plant_and_ranges_their_middle():
 
 def test_drift_and_disturbances_do_not_show():
     assert step_test(Parameters(**PRESETS["fouling"])) == step_test(Parameters())
-
-
-def test_response_is_that_of_the_environment():
-    env = gymnasium.make("MiddlePoint-v0", dead_zone=0.0, disable_env_checker=True)
-    env.reset()
-    outputs = [0.0] + [env.step(np.array([0.1], np.float32))[-1]["output"] for _ in range(60)]
-    np.testing.assert_allclose(step_response(Parameters(), 61), outputs, atol=1e-7)
 
 
 @pytest.mark.parametrize(

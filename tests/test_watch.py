@@ -15,7 +15,9 @@ from agents import PIController
 from benchmarks.train import ppo
 from benchmarks.watch import __main__ as watch
 from benchmarks.watch import rivals
-from mptc_gym import PRESETS, MiddlePointEnv, drawing
+from mptc_gym import PRESETS, MiddlePointEnv, Parameters, drawing
+from mptc_gym.plant import Plant
+from mptc_gym.ranges import Ranges
 from tests.conftest import run
 from tests.small_training import SMALL
 
@@ -340,6 +342,19 @@ def test_the_observation_is_that_of_the_touched_plant():
             touched.envs[0].setpoint = 2.0
         ours, theirs = touched.step(np.array([[0.9]])), other.step(np.array([0.9]))
         assert ours[0][0] == pytest.approx(theirs[0], abs=1e-5)
+
+
+def test_a_load_by_hand_is_a_load_of_the_plant_while_it_drifts():
+    drift = {"gain_drift": 0.5, "time_constant_drift": 2.0, "drift_samples": 60}
+    touched = rivals.touched_plants(50, drift)
+    parameters = Parameters(**drift)
+    plant = Plant(parameters, Ranges(parameters).given)
+    touched.reset(seed=0)
+    touched.envs[0].load = 2.0
+    for _ in range(45):
+        *_, infos = touched.step(np.array([[0.9]]))
+        _, _, output = plant.step(0.9, noise=0.0, load=2.0)
+        assert infos["output"][0] == pytest.approx(output, abs=1e-12)
 
 
 def test_your_hands_need_a_window(capsys):

@@ -12,6 +12,7 @@ from agents import DirectNNController, PIController, SelfTuningController, Smith
 from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.step_test import step_test
+from benchmarks.linear import nominal
 from mptc_gym import Parameters
 
 
@@ -39,7 +40,7 @@ def direct_nn(
     parameters: Parameters, num_envs: int, seed: int, u_min: float, u_max: float, **gains: Any
 ) -> DirectNNController:
     """Return the paper's network, which is told the direction of the plant's response."""
-    direction = 1 if sum(parameters.b) / sum(parameters.a) > 0.0 else -1
+    direction = 1 if nominal(parameters).gain > 0.0 else -1
     return DirectNNController(
         num_envs=num_envs, seed=seed, u_min=u_min, u_max=u_max, direction=direction, **gains
     )

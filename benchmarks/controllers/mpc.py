@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import action_from_command
+from benchmarks.linear import Coefficients, coefficients
 from benchmarks.rollout import make_plants
 from mptc_gym import Parameters
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
-from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
+from mptc_gym.plant import DRIFT_INTERVAL
 from mptc_gym.ranges import Ranges
 from mptc_gym.signals import LOAD_INTERVAL
 
@@ -50,7 +51,6 @@ class PredictiveController:
     def __init__(self, parameters: Parameters, num_envs: int, seed: int = 0) -> None:
         self._p = parameters
         self._num_envs = num_envs
-        self._dynamics = Dynamics(parameters)
         self._numbers = numbers = _numbers(parameters, num_envs, seed)
         self._delay = numbers.delay.astype(np.intp)
         self._u_min, self._u_max = numbers.u_min, numbers.u_max
@@ -75,7 +75,7 @@ class PredictiveController:
         # u(k-1), u(k-2), ..., after a 0 that stands for inputs to come.
         self._inputs = np.zeros((n, 1 + int(self._delay.max()) + len(self._p.b)))
         self._plan = np.zeros((n, HORIZON))
-        self._models: dict[int, _Model] = {}
+        self._models = {0: self._made(0)}  # by age, samples
 
     def act(self, observation: Array) -> NDArray[np.float32]:
         """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
@@ -126,20 +126,14 @@ class PredictiveController:
 
     def _transition(self, k: int, model: _Model) -> tuple[Array, Array]:
         """Return what moves the state from k - 1 to k, and the covariance of what is added."""
-        load, n_y = self._load, self._n_y
+        load = self._load
         changes = k % LOAD_INTERVAL == 0
         F = np.zeros((self._num_envs, self._size, self._size))
-        F[:, 0, : len(self._p.a) - 1] = model.alpha
-        F[:, 0, n_y:-2] = self._p.c[1:]
-        for i in range(1, self._size - 2):
-            if i != n_y:
-                F[:, i, i - 1] = 1.0
+        xi, steps, walk = np.zeros((3, self._num_envs, self._size))
+        F[:, :-2, :-2], xi[:, :-2] = model.state_space(self._p.c)
         F[:, -2, -2] = load.stays if changes else 1.0
         F[:, -1, -1] = 1.0
         F[:, 0, -2:] = model.load[:, np.newaxis] * F[:, [-2, -1], [-2, -1]]
-        xi, steps, walk = np.zeros((3, self._num_envs, self._size))
-        xi[:, 0] = 1.0
-        xi[:, n_y : min(n_y + 1, self._size - 2)] = 1.0
         steps[:, 0], steps[:, -2] = model.load, 1.0
         walk[:, 0], walk[:, -1] = model.load, 1.0
         Q = _outer(xi, self._numbers.noise_variance + TINY)
@@ -172,16 +166,11 @@ class PredictiveController:
         """Return the plant's coefficients for the step to sample k."""
         age = k // DRIFT_INTERVAL * DRIFT_INTERVAL if self._p.drifts else 0
         if age not in self._models:
-            gain, time_constant = self._dynamics.factors(self._numbers, age)
-            alpha, scale, load = self._dynamics.coefficients(gain, time_constant)
-            ones = np.ones(self._num_envs)
-            poles = [ones * coefficient for coefficient in alpha]
-            self._models[age] = _Model.of(
-                np.stack(poles, axis=1) if poles else np.zeros((len(ones), 0)),
-                (ones * scale)[:, np.newaxis] * np.array(self._p.b),
-                ones * load,
-            )
+            self._models[age] = self._made(age)
         return self._models[age]
+
+    def _made(self, age: int) -> _Model:
+        return _Model.of(coefficients(self._p, self._numbers, age))
 
     def _optimise(
         self, Q: Array, target: Array, start: Array, first: Array | None = None
@@ -202,28 +191,19 @@ class PredictiveController:
 
 
 @dataclass(frozen=True)
-class _Model:
+class _Model(Coefficients):
     """Coefficients of the loops at a time; G and Q weigh planned inputs."""
 
-    alpha: Array
-    beta: Array
-    load: Array
     G: Array
     Q: Array
 
     @classmethod
-    def of(cls, alpha: Array, beta: Array, load: Array) -> _Model:
-        # The response to a unit input, from the first sample on in which it shows.
-        y = np.zeros((len(beta), HORIZON))
-        for k in range(HORIZON):
-            if k < beta.shape[1]:
-                y[:, k] = beta[:, k]
-            for i in range(min(alpha.shape[1], k)):
-                y[:, k] += alpha[:, i] * y[:, k - 1 - i]
-        G = np.zeros((len(beta), HORIZON, HORIZON))
+    def of(cls, now: Coefficients) -> _Model:
+        response = now.impulse_response(HORIZON)
+        G = np.zeros((len(response), HORIZON, HORIZON))
         for j in range(HORIZON):
-            G[:, j:, j] = y[:, : HORIZON - j]
-        return cls(alpha, beta, load, G, G.transpose(0, 2, 1) @ G)
+            G[:, j:, j] = response[:, : HORIZON - j]
+        return cls(**vars(now), G=G, Q=G.transpose(0, 2, 1) @ G)
 
 
 @dataclass(frozen=True)

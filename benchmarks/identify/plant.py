@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from benchmarks.controllers.step_test import step_response, step_test
+from benchmarks.controllers.step_test import step_test
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import Interval, Model
+from benchmarks.linear import LinearModel, nominal
 from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
 
@@ -161,11 +162,10 @@ def step_band(model: Model, samples: int, draws: int, seed: int) -> tuple[Array,
     delays = generator.choice(list(model.profile), draws, p=weights / weights.sum())
     responses = []
     for coefficients, delay in zip(drawn, delays, strict=True):
-        a = [1.0, *coefficients[:order_a].tolist()]
-        if np.max(np.abs(np.roots(a)), initial=0.0) < 1.0:
-            plant = Parameters(
-                a=a, b=coefficients[order_a:].tolist(), delay=int(delay), dead_zone=0.0
-            )
-            responses.append(step_response(plant, samples))
+        a, b = np.split(coefficients, [order_a])
+        plant = LinearModel([1.0, *a.tolist()], b.tolist(), delay=int(delay))
+        if np.max(np.abs(plant.poles), initial=0.0) < 1.0:
+            responses.append(plant.step_response(samples))
     low, high = np.percentile(responses, [2.5, 97.5], axis=0)
-    return step_response(Parameters(**plant_arguments(model)), samples), low, high
+    found = nominal(Parameters(**plant_arguments(model)))
+    return found.step_response(samples), low, high

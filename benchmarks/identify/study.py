@@ -27,7 +27,7 @@ from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import share
 from benchmarks.lib.storage import write_text
 from benchmarks.lib.tables import on_screen, write_csv
-from benchmarks.scenarios import plain
+from benchmarks.linear import nominal
 from mptc_gym import Parameters
 
 NOISE = 0.02, 0.5  # R of the logs, degC^2
@@ -82,12 +82,12 @@ def cell(plant: Plant, samples: int, seed: int) -> dict[str, Any]:
         its interval; `refused`, why, if the log could not tell.
     """
     parameters = Parameters(**plant)
-    true = plain(parameters)
-    pole = float(np.max(np.roots(true.a).real))
+    true = nominal(parameters)
+    pole = float(np.max(true.poles.real))
     truths = {
         "delay": float(plant["delay"]),
         "dead_zone": float(plant["dead_zone"]),
-        "gain": sum(true.b) / sum(true.a),
+        "gain": true.gain,
         "time_constant": -true.sampling_interval / float(np.log(pole)),
         "noise_variance": float(plant["noise_variance"]),
     }

@@ -6,22 +6,13 @@ from benchmarks.limits.bounds import (
     frontier,
     least_possible,
 )
-from benchmarks.limits.reference import (
-    Limit,
-    held,
-    minimum_variance,
-    scenario_limit,
-    steady_stretches,
-)
+from benchmarks.limits.reference import held, steady_stretches
 
 __all__ = [
     "KINDS",
     "LeastPossible",
-    "Limit",
     "frontier",
     "held",
     "least_possible",
-    "minimum_variance",
-    "scenario_limit",
     "steady_stretches",
 ]

@@ -9,7 +9,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from rich.console import Console
 from tqdm import tqdm
@@ -19,7 +18,6 @@ from benchmarks.lib import command_line
 from benchmarks.lib.statistics import bootstrap
 from benchmarks.lib.tables import on_screen
 from benchmarks.limits.bounds import CACHE, EPISODES, LeastPossible, least_possible
-from benchmarks.limits.reference import minimum_variance, scenario_limit
 from benchmarks.limits.verify import mpc_errors, verify
 from benchmarks.scenarios import SCENARIOS, scenarios_of
 from mptc_gym import PRESETS
@@ -112,18 +110,12 @@ def scenarios(cache: Path) -> pd.DataFrame:
     """Return the table of the scenarios."""
     rows = []
     for name, scenario in tqdm(SCENARIOS.items(), unit="scenario"):
-        known = least_possible(samples=scenario.samples, folder=cache, **scenario.arguments)
-        row = {"scenario": name, "with preview": f"{known.value:.4f}"}
-        if not scenario.parameters.is_disturbed:
-            limit = scenario_limit(scenario)
-            variance = minimum_variance(scenario.parameters)
-            row |= {
-                "reference": f"{limit.mae:.4f}",
-                "reference, rms": f"{np.sqrt(limit.mse):.4f}",
-                "set point held, rms": f"{np.sqrt(variance):.4f}",
-            }
+        case = {"samples": scenario.samples, "folder": cache, **scenario.arguments}
+        row = {"scenario": name}
+        for kind, title in (("preview", "with preview"), ("reference", "reference")):
+            row[title] = f"{least_possible(kind=kind, **case).value:.4f}"
         rows.append(row)
-    return pd.DataFrame(rows).fillna("")
+    return pd.DataFrame(rows)
 
 
 def bounds(cases: Mapping[str, Mapping[str, Any]], options: argparse.Namespace) -> pd.DataFrame:

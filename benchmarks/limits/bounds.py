@@ -37,11 +37,11 @@ from scipy import stats
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import CONFIDENCE
 from benchmarks.lib.storage import ROOT, seal, unseal, write_text
-from benchmarks.limits.course import Course, course
 from benchmarks.limits.news import News
 from benchmarks.limits.programme import Plan, plan
 from benchmarks.limits.reference import SMOOTH, TAIL, held, reference
 from benchmarks.limits.unknown import Unknown, unknown
+from benchmarks.linear import Course, check_linear, course
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.parameters import PlantNumbers
@@ -150,6 +150,7 @@ def least_possible(
         for the kind "reference" if a set point changes before the plant has settled.
     """
     parameters = Parameters(**arguments)
+    check_linear(parameters)
     for name, count in (("samples", samples), ("episodes", episodes)):
         if not isinstance(count, int) or count < 1:
             raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
@@ -206,6 +207,7 @@ def frontier(
         by descending travel; at the end a valve that does not move.
     """
     parameters = Parameters(**arguments)
+    check_linear(parameters)
     kind = kind or ("news" if parameters.setpoint == "random" else "preview")
     cases, idle = _draw(parameters, samples, episodes, seed)
     points = []

@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.limits.course import Course
 from benchmarks.limits.unknown import Unknown
+from benchmarks.linear import Coefficients, Course
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
@@ -76,12 +76,10 @@ class News:
         self._left = np.clip(
             (self._longest - age) / (self._longest - self._shortest + 1), 0.0, 1.0
         )
-        impulse = np.eye(1, samples)[0]
-        self._impulse = np.zeros(samples)  # response to one t/h, after as many samples
-        delayed = np.convolve(impulse, [*[0.0] * (course.delay + 1), *beta])[:samples]
-        for k in range(samples):
-            past = self._impulse[max(k - len(alpha), 0) : k][::-1]
-            self._impulse[k] = delayed[k] + alpha[: len(past)] @ past
+        at_start = Coefficients(alpha, beta, course.load[0])
+        after = at_start.impulse_response(max(samples - course.delay - 1, 0))
+        # The response to one t/h, after as many samples.
+        self._impulse = np.concatenate([np.zeros(course.delay + 1), after])[:samples]
 
     def toll(self, setpoint: Array, starts: NDArray[np.intp]) -> Array:
         """Return pi, degC times samples for each t/h, shape (samples,).
@@ -111,7 +109,7 @@ class News:
                 ages = np.arange(j + 1 - start, samples - start)
                 expected = self._expected(ages, j - start, stay, change)
                 surprise[j + 1 :, j] = guess[j + 1 :] - expected
-        tolls: Array = (self._course.response() * surprise).sum(axis=0)
+        tolls: Array = (self._course.flow_response() * surprise).sum(axis=0)
         return tolls
 
     def _expected(

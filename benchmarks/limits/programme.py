@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, sparse
 
-from benchmarks.limits.course import Course
 from benchmarks.limits.unknown import Unknown
+from benchmarks.linear import Course
 
 Array = NDArray[np.float64]
 

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.limits.course import Course
+from benchmarks.linear import Course
 from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
@@ -109,26 +109,14 @@ def noise_variance(course: Course) -> Array:
     ndarray, shape (samples,)
         At the beginning of an episode less noise has come.
     """
-    samples, order = course.alpha.shape
+    samples = len(course.load)
     R = course.numbers.noise_variance
     V = course.numbers.measurement_noise_variance
     if R == 0.0:
         return np.zeros(samples)
-    # State: the noise in y at k, k-1, ..., then xi at k, k-1, ...
-    past = len(course.c) - 1
-    order = max(order, 1)
-    size = order + past
-    Phi = np.zeros((samples, size, size))
-    Phi[:, 0, : course.alpha.shape[1]] = course.alpha
-    Phi[:, 0, order:] = course.c[1:]
-    for i in range(1, size):
-        if i != order:
-            Phi[:, i, i - 1] = 1.0
-    enters = np.zeros(size)
-    enters[0] = 1.0
-    enters[order : order + 1] = 1.0
+    Phi, enters = course.state_space(course.c)
     Q = R * np.outer(enters, enters)
-    known = np.zeros((samples, size, size))  # covariance of the state, given all readings
+    known = np.zeros_like(Phi)  # covariance of the state, given all readings
     if V > 0.0:
         P = known[0]
         for k in range(1, samples):

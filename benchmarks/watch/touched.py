@@ -12,8 +12,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.linear import check_linear, coefficients
 from mptc_gym import MiddlePointEnv
-from mptc_gym.plant import Dynamics
 from mptc_gym.ranges import Ranges
 from mptc_gym.record import Record
 
@@ -49,7 +49,7 @@ class Touched(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         plant = cast("MiddlePointEnv", env.unwrapped)
         self.parameters = plant.parameters
-        self._dynamics = Dynamics(self.parameters)
+        check_linear(self.parameters)
         self._show = show
         self.setpoint = self.load = 0.0
 
@@ -58,26 +58,24 @@ class Touched(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, info = self.env.reset(**arguments)
         parameters = self.parameters
         drawn = {name: info[name] for name in parameters.ranges}
-        numbers = replace(Ranges(parameters).given, **drawn)
-        self._factors = numbers.gain_factor, numbers.time_constant_factor
-        self._order = len(self._dynamics.coefficients(*self._factors)[0])
-        length = max(*parameters.windows, self._order)
+        self._numbers = replace(Ranges(parameters).given, **drawn)
+        self._k = 0
+        length = max(*parameters.windows, len(parameters.a) - 1)
         # What is added to y_d and to y, newest first.
         self._setpoints = deque([0.0] * length, length)
         self._outputs = deque([0.0] * length, length)
         if self._show is not None:
-            self.record = Record(numbers, parameters.sampling_interval, info["setpoint"])
+            self.record = Record(self._numbers, parameters.sampling_interval, info["setpoint"])
             self._show(self.record)
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Step the plant, and add what the hand does."""
-        alpha, _, rest = self._dynamics.coefficients(*self._factors)
+        self._k += 1
+        now = coefficients(self.parameters, self._numbers, self._k)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        if self.parameters.drifts:
-            self._factors = info["gain_factor"], info["time_constant_factor"]
-        added = sum(a * d for a, d in zip(alpha, self._outputs, strict=False))
-        self._outputs.appendleft(added + rest * self.load)
+        added = sum(a * d for a, d in zip(now.alpha.tolist(), self._outputs, strict=False))
+        self._outputs.appendleft(added + float(now.load) * self.load)
         self._setpoints.appendleft(self.setpoint)
         output, setpoint = self._outputs[0], self._setpoints[0]
         info |= {

@@ -1,0 +1,298 @@
+"""Describe the plant as a linear system: every analysis takes its coefficients from here.
+
+Between the limits of the actuator (29) the plant is
+
+    (28)  y(k) = sum_i alpha_i y(k-1-i) + sum_i beta_i u_a(k-d-1-i) + C xi(k) + A(1) w(k),
+
+w being the load. Gain and time-constant factors, and drifts, are worked into alpha and beta.
+An argument that makes more of the plant than this is refused by name; `mptc_gym.parameters`
+declares, for each argument, what it does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import signal
+
+from mptc_gym import Parameters
+from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, PlantNumbers
+from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
+
+Array = NDArray[np.float64]
+
+SETTLED = 1e-5  # share of a transient that is left where a step response ends
+LONGEST = 1_000_000  # samples; a plant that needs more has no steady state to wait for
+
+
+def check_linear(parameters: Parameters) -> None:
+    """Refuse a plant that is more than (28) and (29).
+
+    Raises
+    ------
+    ValueError
+        If an argument that is not declared as linear is not at its default; it is named.
+    """
+    for name, argument in ARGUMENTS.items():
+        value = getattr(parameters, name)
+        if not argument.linear and value != argument.default:
+            raise ValueError(
+                f"{name} must be {argument.default!r} where the plant is taken as linear, got "
+                f"{value!r}"
+            )
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """(28) with coefficients that do not change.
+
+    Attributes
+    ----------
+    a, b, c
+        Coefficients of A, B and C: `a` and `c` from z^0 on, `b` from z^-1 on.
+    delay
+        d, samples.
+    sampling_interval
+        s.
+    """
+
+    a: Sequence[float]
+    b: Sequence[float]
+    c: Sequence[float] = (1.0,)
+    delay: int = 0
+    sampling_interval: float = 8.0
+
+    @property
+    def gain(self) -> float:
+        """Steady-state gain B(1) / A(1), degC per t/h; infinite for an integrating plant."""
+        a, b = sum(self.a), sum(self.b)
+        return b / a if a else math.copysign(math.inf, b)
+
+    @property
+    def poles(self) -> NDArray[np.complex128]:
+        """Roots of A."""
+        return np.asarray(np.roots(self.a), np.complex128)
+
+    def transfer(self) -> tuple[Array, Array]:
+        """Return numerator and denominator, in powers of z^-1, from u_a to y."""
+        return np.array([*[0.0] * (self.delay + 1), *self.b]), np.array(self.a)
+
+    def response(self, flow: ArrayLike) -> Array:
+        """Return y(0), y(1), ..., degC, from rest, for u_a(0), u_a(1), ..., t/h."""
+        response: Array = signal.lfilter(*self.transfer(), np.asarray(flow, np.float64))
+        return response
+
+    def step_response(self, samples: int | None = None) -> Array:
+        """Return y(0), y(1), ... after a step of u_a from 0 to 1 t/h at k = 0, degC per t/h.
+
+        Parameters
+        ----------
+        samples
+            How many; None for as many as the response takes to settle.
+
+        Raises
+        ------
+        ValueError
+            If it never settles, or settles at 0, and `samples` is None.
+        """
+        if samples is None:
+            slowest = float(np.max(np.abs(self.poles), initial=0.0))
+            if sum(self.b) == 0.0:
+                raise ValueError(f"b must have a sum other than 0 for a gain, got {self.b}")
+            settling = math.log(SETTLED) / math.log(slowest) if 0.0 < slowest < 1.0 else 0.0
+            if slowest >= 1.0 or settling > LONGEST:
+                raise ValueError(f"a must be of a stable plant for a step test, got {self.a}")
+            # Some more for poles that are repeated, whose transients last longer.
+            samples = self.delay + len(self.b) + 2 * math.ceil(settling) + 2
+        return self.response(np.ones(samples))
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """What (28) has for one plant, for many, or at each sample of an episode.
+
+    Attributes
+    ----------
+    alpha, beta
+        Shapes (..., order of A) and (..., length of B).
+    load
+        A(1), shape (...).
+    """
+
+    alpha: Array
+    beta: Array
+    load: Array
+
+    def impulse_response(self, samples: int) -> Array:
+        """Return what 1 t/h does to the first `samples` outputs that it can show in.
+
+        Returns
+        -------
+        ndarray, shape (..., samples)
+            degC per t/h, from y(j + d + 1) on for a flow at j. The coefficients do not change.
+        """
+        response = np.zeros((*self.load.shape, samples))
+        for k in range(samples):
+            if k < self.beta.shape[-1]:
+                response[..., k] = self.beta[..., k]
+            for i in range(min(self.alpha.shape[-1], k)):
+                response[..., k] += self.alpha[..., i] * response[..., k - 1 - i]
+        return response
+
+    def state_space(self, c: Sequence[float]) -> tuple[Array, Array]:
+        """Return what noise alone does to the state y(k), y(k-1), ..., xi(k), xi(k-1), ...
+
+        Parameters
+        ----------
+        c
+            Coefficients of C, from z^0 on.
+
+        Returns
+        -------
+        F
+            Shape (..., size, size): x(k) = F x(k-1) + g xi(k).
+        g
+            Shape (size,).
+        """
+        order = max(self.alpha.shape[-1], 1)
+        size = order + len(c) - 1
+        F = np.zeros((*self.load.shape, size, size))
+        F[..., 0, : self.alpha.shape[-1]] = self.alpha
+        F[..., 0, order:] = c[1:]
+        for i in range(1, size):
+            if i != order:
+                F[..., i, i - 1] = 1.0
+        g = np.zeros(size)
+        g[0] = 1.0
+        g[order : order + 1] = 1.0
+        return F, g
+
+
+def coefficients(
+    parameters: Parameters, numbers: PlantNumbers[Any], k: int | NDArray[np.int64]
+) -> Coefficients:
+    """Return the coefficients of the step to sample k.
+
+    Parameters
+    ----------
+    parameters
+        The environment's.
+    numbers
+        The plant numbers of the episode: of one plant, or arrays for many.
+    k
+        One sample, or an array of samples for one plant.
+
+    Raises
+    ------
+    ValueError
+        If the plant is not linear between its limits; see `check_linear`.
+    """
+    check_linear(parameters)
+    dynamics = Dynamics(parameters)
+    gain, time_constant = dynamics.factors(numbers, k // DRIFT_INTERVAL * DRIFT_INTERVAL)
+    alpha, scale, load = dynamics.coefficients(gain, time_constant)
+    ones = np.ones(np.broadcast_shapes(np.shape(gain), np.shape(time_constant)))
+    return Coefficients(
+        np.stack([ones * a for a in alpha], axis=-1) if alpha else np.zeros((*ones.shape, 0)),
+        (ones * scale)[..., np.newaxis] * np.array(parameters.b),
+        ones * load,
+    )
+
+
+def nominal(parameters: Parameters) -> LinearModel:
+    """Return the model of a plant: ranges at their middle, drifts at k = 0, nothing added.
+
+    Raises
+    ------
+    ValueError
+        If the plant is not linear between its limits; see `check_linear`.
+    """
+    middle = {name: sum(parameters.range_of(name)) / 2 for name in PLANT_NUMBERS}
+    at_start = coefficients(parameters, PlantNumbers(**middle), 0)
+    return LinearModel(
+        (1.0, *(-at_start.alpha).tolist()),
+        tuple(at_start.beta.tolist()),
+        tuple(parameters.c),
+        round(middle["delay"]),
+        parameters.sampling_interval,
+    )
+
+
+@dataclass(frozen=True)
+class Course(Coefficients):
+    """What (28) and (29) are at each sample of an episode: coefficients, one row a sample.
+
+    Attributes
+    ----------
+    c
+        Coefficients of C, from z^0 on.
+    delay
+        d, samples.
+    low, high
+        The least and the greatest flow that the actuator can apply, t/h. It can apply 0, even
+        if the limits exclude it, if there is a dead zone.
+    numbers
+        The plant numbers of the episode.
+    """
+
+    c: tuple[float, ...]
+    delay: int
+    low: float
+    high: float
+    numbers: PlantNumbers[float]
+
+    @property
+    def lag(self) -> int:
+        """Samples from a flow to the first output that it can show in."""
+        shows = np.flatnonzero(self.beta.any(axis=0))
+        return self.delay + 1 + int(shows[0]) if len(shows) else len(self.beta)
+
+    def first(self, samples: int) -> Course:
+        """Return the same for the first samples."""
+        rows = {name: getattr(self, name)[:samples] for name in ("alpha", "beta", "load")}
+        return replace(self, **rows)
+
+    def flow_response(self) -> Array:
+        """Return G, shape (samples, samples): what 1 t/h at j adds to y(k) is G[k, j]."""
+        samples, order = self.alpha.shape
+        G = np.zeros((samples, samples))
+        for k in range(1, samples):
+            for i in range(min(order, k)):
+                G[k] += self.alpha[k, i] * G[k - 1 - i]
+            for i, beta in enumerate(self.beta[k]):
+                if k - self.delay - 1 - i >= 0:
+                    G[k, k - self.delay - 1 - i] += beta
+        return G
+
+
+def course(parameters: Parameters, numbers: PlantNumbers[float], samples: int) -> Course:
+    """Return the course of an episode.
+
+    Parameters
+    ----------
+    parameters
+        The environment's.
+    numbers
+        All plant numbers, as they were drawn.
+    samples
+        Length of the course.
+
+    Raises
+    ------
+    ValueError
+        If the plant is not linear between its limits; see `check_linear`.
+    """
+    rest = [0.0] if numbers.dead_zone > 0.0 else []
+    return Course(
+        **vars(coefficients(parameters, numbers, np.arange(samples))),
+        c=tuple(parameters.c),
+        delay=int(numbers.delay),
+        low=min([numbers.u_min, *rest]),
+        high=max([numbers.u_max, *rest]),
+        numbers=numbers,
+    )
