@@ -6,11 +6,16 @@ import argparse
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import Parameter
 
 from benchmarks.lib.command_line import UsageError, blame
+from benchmarks.lib.options import Repeated, options
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.parameters import slowest_pole
+
+_PRESET = f"A plant that comes with the environment: {', '.join(PRESETS)}."
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,24 @@ class Plant:
 
     name: str
     arguments: dict[str, Any]
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class PlantOptions:
+    """Which plant to run on."""
+
+    plant: Path | None = None
+    """JSON file with arguments of the environment, such as the plant.json that
+    benchmarks.identify writes."""
+    preset: Annotated[str | None, Parameter(help=_PRESET)] = None
+    set: Repeated = ()
+    """An argument of the environment, such as delay=30 or delay=[12,24] (repeatable; it
+    overrides those of --plant, and these override --preset)."""
+
+    def chosen(self) -> Plant:
+        """Return the plant that is asked for; see `chosen`."""
+        return chosen(self)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +78,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def chosen(options: argparse.Namespace) -> Plant:
+def chosen(options: argparse.Namespace | PlantOptions) -> Plant:
     """Return the plant that the options of `add_options` ask for.
 
     Raises
@@ -66,6 +89,8 @@ def chosen(options: argparse.Namespace) -> Plant:
     names: list[str] = []
     arguments: dict[str, Any] = {}
     if options.preset:
+        if options.preset not in PRESETS:
+            raise UsageError(f"--preset: no {options.preset!r}; there are {', '.join(PRESETS)}")
         names.append(options.preset)
         arguments |= PRESETS[options.preset]
     if options.plant:

@@ -1,6 +1,7 @@
 """What all commands have in common: their help."""
 
 import importlib
+import re
 from pathlib import Path
 
 import pytest
@@ -21,20 +22,21 @@ def test_help_shows_defaults_as_one_would_type_them(name, capsys):
         command = importlib.import_module(module)
     except ImportError as error:  # `.ci/versions` tests without the extras
         pytest.skip(f"it needs an extra: {error}")
-    with pytest.raises(SystemExit) as stop:
-        command.main(["--help"])
-    assert stop.value.code == 0
+    try:
+        status = command.main(["--help"])
+    except SystemExit as stop:
+        status = stop.code
+    assert status == 0
     shown = capsys.readouterr().out
     for clutter in (str(ROOT), "default: None", "default: False", "default: ["):
         assert clutter not in shown
     if "--seed " in shown:
-        assert "(default: 0)" in shown or "(default: 1)" in shown  # 0 is a default, too
+        assert re.search(r"default: [01][])]", shown)  # 0 is a default, too
 
 
 def test_help_keeps_names_whole(capsys):
     compare = pytest.importorskip("benchmarks.compare.__main__")
-    with pytest.raises(SystemExit):
-        compare.main(["--help"])
+    compare.main(["--help"])
     shown = capsys.readouterr().out
     for name in ("nn-frozen", "dead-zone-7", "square-dead-zone-7", "constant-noise"):
         assert name in shown

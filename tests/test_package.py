@@ -186,7 +186,9 @@ EXAMPLES = [
 ]
 
 
-COMPARE = {"joblib", "matplotlib", "pandas", "rich", "scipy", "tabulate", "tqdm"}  # the extra
+COMPARE = {  # the extra
+    "cyclopts", "joblib", "matplotlib", "pandas", "rich", "scipy", "tabulate", "tqdm",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=range(len(EXAMPLES)))

@@ -1,6 +1,5 @@
 """The robustness study: its plants, its cells, and what it makes of them."""
 
-import argparse
 import json
 
 import numpy as np
@@ -13,8 +12,9 @@ from benchmarks.controllers.engineered import simc_pi
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.designs import SPANS, grid, random_design
 from benchmarks.sweep import __main__ as sweep
-from benchmarks.sweep import cells, report
+from benchmarks.sweep import cells, command, report
 from benchmarks.sweep.cells import agent_cell, limit_cell
+from benchmarks.sweep.options import Options
 from mptc_gym import Parameters
 
 NOMINAL = {"delay": 18}
@@ -137,15 +137,15 @@ class TestSweep:
 
         common = {
             "plants": [{"delay": 18}], "nominal": {}, "factories": [Member("a")],
-            "options": argparse.Namespace(runs=2, samples=700), "controller": ROSTER["pi"],
+            "options": Options(runs=2, samples=700), "controller": ROSTER["pi"],
         }  # fmt: skip
         changes = [
             {}, {"plants": [{"delay": 19}]}, {"nominal": {"dead_zone": 7.0}},
             {"factories": [Member("b")]}, {"controller": ROSTER["nn"]},
-            {"options": argparse.Namespace(runs=3, samples=700)},
-            {"options": argparse.Namespace(runs=2, samples=650)},
+            {"options": Options(runs=3, samples=700)},
+            {"options": Options(runs=2, samples=650)},
         ]  # fmt: skip
-        keys = {sweep._agent_key(**{**common, **change}) for change in changes}
+        keys = {command.agent_key(**{**common, **change}) for change in changes}
         assert len(keys) == len(changes)
 
     def test_grid(self, tmp_path, monkeypatch):
@@ -166,7 +166,7 @@ class TestSweep:
     def test_a_failed_cell_is_named_and_the_others_are_kept(
         self, tmp_path, capsys, monkeypatch
     ):
-        monkeypatch.setattr(sweep, "agent_cell", _fails_on_pi)
+        monkeypatch.setattr(command, "agent_cell", _fails_on_pi)
         assert run_sweep(tmp_path, "--design", "random", "--plants", 2) == 1
         assert "pi-simc 0" in capsys.readouterr().out
         assert len(list((tmp_path / "cells").rglob("nn *.json"))) == 2

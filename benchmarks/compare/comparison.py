@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -90,7 +89,7 @@ class Comparison:
         scenarios: Sequence[Scenario],
         runs: int,
         out: Path,
-        options: argparse.Namespace,
+        options: Mapping[str, Any],
     ) -> None:
         self.runs = pd.DataFrame()
         self._scenarios = {scenario.name: scenario for scenario in scenarios}
@@ -105,7 +104,7 @@ class Comparison:
         self._clock = time.perf_counter()
         self._origin = {
             "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            "options": {name: _plain(value) for name, value in vars(options).items()},
+            "options": dict(options),
             "seeds": self._seeds,
             "scenarios": {
                 name: {"samples": each.samples, "arguments": each.arguments}
@@ -318,7 +317,3 @@ def _files_of_earlier_run(provenance: Path) -> list[str]:
         tqdm.write(f"{error}. Other files of the earlier run may stay.", file=sys.stderr)
         return []
     return files
-
-
-def _plain(value: Any) -> Any:
-    return str(value) if isinstance(value, Path) else value

@@ -2,88 +2,57 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from benchmarks.controllers.factories import load_factory, try_out
 from benchmarks.controllers.records import POLICIES, Controller, Training
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import (
-    UsageError,
-    add_fan_out,
-    fan_out,
-    known,
-    number,
-    out_folder,
-)
+from benchmarks.lib.command_line import UsageError, known, out_folder
+from benchmarks.lib.options import Count, FanOutOptions, Names, Repeated, options
+
+AgentNames = Annotated[
+    Names,
+    Parameter(help=f"Controllers to run, out of {', '.join(ROSTER)}."),
+]
 
 
-def add_options(parser: argparse.ArgumentParser, agents: Sequence[str], what: str) -> None:
-    """Add the options that say which controllers are run, and how those that learn are trained.
+@options
+@dataclass(frozen=True, kw_only=True)
+class ControllerOptions:
+    """Controllers of one's own, and how those that learn are trained."""
 
-    Parameters
-    ----------
-    parser
-        Gets them.
-    agents
-        The controllers that are run by default.
-    what
-        Is run by the fan-out, in the words of its help.
-    """
-    add = parser.add_argument
-    add(
-        "--agents",
-        nargs="*",
-        default=agents,
-        metavar="NAME",
-        help=f"which controllers to run, out of {', '.join(ROSTER)}",
-    )
-    add(
-        "--agent",
-        action="append",
-        default=[],
-        metavar="NAME=MODULE:FACTORY",
-        help="a controller of your own, beside those of --agents (may be given more than once)",
-    )
-    add(
-        "--training-steps",
-        type=number,
-        default=argparse.SUPPRESS,
-        metavar="N",
-        help="train each policy of PPO with N samples of experience (default: take those that "
-        "come with the project)",
-    )
-    add(
-        "--policies",
-        type=number,
-        default=argparse.SUPPRESS,
-        metavar="N",
-        help="how many policies of PPO to run, each from a seed of its own (default: 5)",
-    )
-    add_fan_out(parser, what)
-    add(
-        "--kept",
-        type=Path,
-        default=POLICIES,
-        metavar="FOLDER",
-        help="where policies that are trained here are kept; no code in its files is run",
-    )
+    agent: Repeated = ()
+    """A controller of your own, NAME=MODULE:FACTORY, beside those of --agents (repeatable)."""
+    training_steps: Count | None = None
+    """Train each policy of PPO with so many samples of experience (default: take those that
+    come with the project)."""
+    policies: Count | None = None
+    """How many policies of PPO to run, each from a seed of its own (default: 5)."""
+    kept: Path = POLICIES
+    """Where policies that are trained here are kept; no code in its files is run."""
+    fan_out: FanOutOptions = field(default_factory=FanOutOptions)
+    retrain: bool = False
+    """Train policies of PPO anew, which takes many minutes."""
 
+    def training(self) -> Training:
+        """Return the training that is asked for.
 
-def training(options: argparse.Namespace, *, retrain: bool = False) -> Training:
-    """Return the training that the options of `add_options` ask for.
-
-    Raises
-    ------
-    UsageError
-        If policies are to be trained and their folder cannot be written to.
-    """
-    steps, policies = (getattr(options, name, None) for name in ("training_steps", "policies"))
-    is_folder = options.kept.is_dir() or not options.kept.exists()
-    if retrain or steps or policies or not is_folder:
-        out_folder(options.kept, "--kept")
-    return Training(fan_out(options), options.kept, steps, policies, retrain)
+        Raises
+        ------
+        UsageError
+            If policies are to be trained and their folder cannot be written to.
+        """
+        is_folder = self.kept.is_dir() or not self.kept.exists()
+        if self.retrain or self.training_steps or self.policies or not is_folder:
+            out_folder(self.kept, "--kept")
+        return Training(
+            self.fan_out.open(), self.kept, self.training_steps, self.policies, self.retrain
+        )
 
 
 def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controller]:
@@ -109,8 +78,12 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
     found = {name: ROSTER[name] for name in known("--agents", names, list(ROSTER))}
     for text in own:
         name, equals, location = text.partition("=")
-        if not (name and equals) or name.lower() in {*ROSTER, *found}:
+        if not (name and equals):
             raise UsageError(f"--agent must be NEW_NAME=MODULE:FACTORY, got {text!r}")
+        if name.lower() in {*ROSTER, *found}:
+            raise UsageError(
+                f"--agent must be NEW_NAME=MODULE:FACTORY, and {name!r} is taken, got {text!r}"
+            )
         found[name] = own_controller(name, location)
     if not found:
         raise UsageError("--agents, --agent: no controller to run")

@@ -1,25 +1,136 @@
-"""What the commands share: options, how they run, and how they end."""
+"""Run the commands `python -m benchmarks.NAME`, and end them with a sentence and a status.
+
+Only the standard library is imported before `main` is called, so that Ctrl-C and a missing
+package are answered in a sentence, too.
+"""
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import math
+import os
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.console import Console
+if TYPE_CHECKING:
+    from rich.console import Console
 
-from benchmarks.lib.fan_out import BACKENDS, CellsFailedError, FanOut
-from benchmarks.lib.storage import ROOT, NotWrittenError, check_folder
+    from benchmarks.lib.fan_out import FanOut
 
 Main = Callable[[Sequence[str] | None], int]
+
+EXTRAS = {
+    **dict.fromkeys(("cyclopts", "joblib", "matplotlib", "pandas", "rich"), "compare"),
+    **dict.fromkeys(("scipy", "tabulate", "tqdm"), "compare"),
+    **dict.fromkeys(("moviepy", "pygame"), "render"),
+    **dict.fromkeys(("h5py", "minari"), "data"),
+    **dict.fromkeys(("optuna", "PIL", "stable_baselines3"), "bench"),
+    "ray": "ray",
+    "tclab": "test",
+    "torch": "torch",
+}
 
 
 class UsageError(ValueError):
     """An option that does not fit. The message names it."""
+
+
+def runner(
+    name: str,
+    *,
+    module: str = "",
+    width: int = 120,
+    interrupted: str = "what has finished is kept.",
+) -> Callable[[Sequence[str] | None], int]:
+    """Return the `main` of `python -m benchmarks.<name>`.
+
+    Parameters
+    ----------
+    name
+        Of the command.
+    module
+        Prefix of the modules that it is made of; `benchmarks.<name>.` by default. In `options`
+        there is a dataclass `Options`, whose docstring is the description in the help. In
+        `command` there is `run`, which is called with the options and a `rich` console, does
+        the work and returns the closing line. It is imported after the options were read.
+    width
+        Columns of the console where nothing says how wide it is.
+    interrupted
+        What the user is told after Ctrl-C.
+
+    Returns
+    -------
+    callable
+        It takes the command line without the program's name and returns the exit status: 0; 1
+        if tasks failed or a file could not be written; 130 if it was interrupted. An option
+        that does not fit, or a package that is missing, ends the program with status 2.
+    """
+    prefix = module or f"benchmarks.{name}."
+
+    def main(arguments: Sequence[str] | None = None) -> int:
+        os.environ["MPLBACKEND"] = "agg"  # pictures go to files, whatever the user's shell says
+        for stream in (sys.stdout, sys.stderr):
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(
+                    errors="replace"
+                )  # of "°C" on a console that has ASCII alone
+        program = f"python -m benchmarks.{name}"
+        try:
+            given = sys.argv[1:] if arguments is None else arguments
+            return _main(program, prefix, given, width)
+        except KeyboardInterrupt:
+            print(f"\nInterrupted: {interrupted}")
+            return 130
+        except MemoryError:
+            print("There is not enough memory for so many runs or samples.", file=sys.stderr)
+            return 1
+        except (UsageError, ModuleNotFoundError) as error:
+            print(f"{program}: error: {_sentence(error)}", file=sys.stderr)
+            raise SystemExit(2) from error
+
+    return main
+
+
+def _main(program: str, prefix: str, given: Sequence[str], width: int) -> int:
+    declared = importlib.import_module(f"{prefix}options").Options
+    from benchmarks.lib.options import read
+
+    options = read(declared, program, given)
+    if options is None:
+        return 0
+    run = importlib.import_module(f"{prefix}command").run
+    from rich.console import Console
+
+    from benchmarks.lib.fan_out import CellsFailedError
+    from benchmarks.lib.storage import NotWrittenError
+
+    console = Console(
+        width=None if sys.stdout.isatty() else width, highlight=False, markup=False
+    )
+    try:
+        console.print(run(options, console))
+    except (CellsFailedError, NotWrittenError) as error:
+        console.print(str(error))
+        return 1
+    return 0
+
+
+def _sentence(error: BaseException) -> str:
+    """Return the message of an error, with the extra that would have what was not found."""
+    cause: BaseException | None = error
+    while cause is not None:
+        missing = (getattr(cause, "name", None) or "").partition(".")[0]
+        if isinstance(cause, ModuleNotFoundError) and missing in EXTRAS:
+            return f'{missing} is not installed: pip install -e ".[{EXTRAS[missing]}]"'
+        cause = cause.__cause__
+    if isinstance(error, ModuleNotFoundError):
+        raise error  # a fault of ours
+    return str(error)
 
 
 class _HelpFormatter(argparse.HelpFormatter):
@@ -29,6 +140,8 @@ class _HelpFormatter(argparse.HelpFormatter):
         return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
 
     def _get_help_string(self, action: argparse.Action) -> str:
+        from benchmarks.lib.storage import ROOT
+
         text, default = action.help or "", action.default
         if default is None or default is False or default is argparse.SUPPRESS:
             return text
@@ -74,6 +187,11 @@ def command(
 
     def decorate(work: Callable[[argparse.Namespace, Console], str]) -> Main:
         def main(arguments: Sequence[str] | None = None) -> int:
+            from rich.console import Console
+
+            from benchmarks.lib.fan_out import CellsFailedError
+            from benchmarks.lib.storage import NotWrittenError
+
             parser = argparse.ArgumentParser(
                 prog=f"python -m benchmarks.{name}",
                 description=description,
@@ -116,6 +234,8 @@ def blame(option: str) -> Iterator[None]:
 
 def out_folder(folder: Path, option: str = "--out") -> Path:
     """Return the folder of an option, which is made; `UsageError` if it is not writable."""
+    from benchmarks.lib.storage import NotWrittenError, check_folder
+
     try:
         check_folder(folder)
     except NotWrittenError as error:
@@ -202,13 +322,15 @@ def add_fan_out(parser: argparse.ArgumentParser, what: str) -> None:
     )
     parser.add_argument(
         "--backend",
-        choices=BACKENDS,
-        default=BACKENDS[0],
+        choices=("loky", "ray"),
+        default="loky",
         help=f"where {what} run: loky, on this machine; ray, on a Ray cluster",
     )
 
 
 def fan_out(options: argparse.Namespace) -> FanOut:
     """Return the fan-out that the options of `add_fan_out` ask for."""
+    from benchmarks.lib.fan_out import FanOut
+
     with blame("--backend"):
         return FanOut(getattr(options, "jobs", None), options.backend)

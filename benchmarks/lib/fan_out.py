@@ -21,9 +21,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import joblib
-from tqdm import tqdm
-
 from benchmarks.lib.cluster import Cluster
 from benchmarks.lib.storage import seal, unseal, write_text
 
@@ -82,6 +79,8 @@ class FanOut:
     def __init__(self, jobs: int | None = None, backend: str = "loky") -> None:
         if backend not in BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+        import joblib  # here: it takes a while to load
+
         self.backend = backend
         self._cluster = Cluster() if backend == "ray" else None
         self._asked = jobs
@@ -122,6 +121,8 @@ class FanOut:
         CellsFailedError
             At the end, if cells raised an exception or lost their worker again and again.
         """
+        from tqdm import tqdm
+
         results = {} if folder is None else _saved(cells, folder)
         missing = {
             key: partial(_as_json, cell) for key, cell in cells.items() if key not in results
@@ -199,6 +200,8 @@ class FanOut:
 
     def _answers(self, cells: Cells, started: list[str]) -> Iterator[tuple[str, Any, str]]:
         """Run cells, yield their answers as they come, and note which were handed out."""
+        import joblib
+
         parent = os.getpid()
 
         def tasks() -> Iterator[Any]:

@@ -1,0 +1,43 @@
+"""Declare the options of `python -m benchmarks.compare`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from benchmarks.controllers.options import AgentNames, ControllerOptions
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.options import Names, Runs, options
+from benchmarks.plants import PlantOptions
+from benchmarks.scenarios import SCENARIOS, SETPOINTS
+
+COMPARED = tuple(name for name, controller in ROSTER.items() if controller.compared)
+RUNS = 100
+_CASES = (
+    f"Cases to run, out of {', '.join(SCENARIOS)}; with --presets the presets, on a plant of "
+    f"your own {', '.join(name for name, *_ in SETPOINTS)} (default: all)."
+)
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Run controllers on the same cases in the same noise, and write a report.
+
+    It has tables, data and pictures.
+    """
+
+    agents: AgentNames = COMPARED
+    controllers: ControllerOptions = field(default_factory=ControllerOptions)
+    scenarios: Annotated[Names | None, Parameter(help=_CASES)] = None
+    plant: PlantOptions = field(default_factory=PlantOptions)
+    presets: bool = False
+    """Run all presets of the environment in place of the paper's cases."""
+    runs: Runs = RUNS
+    """Runs of each controller in each case."""
+    out: Path | None = None
+    """Folder to write to (default: results/compare, and a name of its own beside that for a
+    comparison of other controllers or cases)."""

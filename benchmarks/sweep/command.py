@@ -1,0 +1,133 @@
+"""Run a sweep as its options say, and write what it finds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from datetime import datetime, timezone
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from benchmarks.controllers.factories import Factory, provenances
+from benchmarks.controllers.options import chosen
+from benchmarks.controllers.records import Controller
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.designs import Plant, grid, random_design
+from benchmarks.lib.command_line import out_folder
+from benchmarks.lib.fingerprint import fingerprint
+from benchmarks.lib.options import flat
+from benchmarks.lib.report import provenance_line, write_report
+from benchmarks.lib.storage import commit, versions, write_json
+from benchmarks.lib.tables import on_screen, write_csv
+from benchmarks.sweep.cells import agent_cell, limit_cell
+from benchmarks.sweep.options import Options
+from benchmarks.sweep.report import report, table
+
+SEED = 0  # of a plant's first run
+NOTHING = "nothing"  # the controller that sets the scale
+
+
+def run(options: Options, console: Console) -> str:
+    """Run the sweep and write what it finds."""
+    controllers = chosen(options.agents, options.controllers.agent)
+    nominal = options.plant.chosen().arguments
+    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    out = out_folder(options.out or Path(f"results/sweep-{options.design}"))
+    training = options.controllers.training()
+    known = {NOTHING: ROSTER[NOTHING], **controllers}
+    members = {
+        name: controller.members_in_service(training) for name, controller in known.items()
+    }
+    differing = (
+        grid()
+        if options.design == "grid"
+        else random_design(options.plants, options.design_seed, options.samples)
+    )
+    plants = [{**nominal, **plant} for plant in differing]
+    began = time.perf_counter()
+    results = training.fan_out.run(
+        _limit_cells(plants, options),
+        out / "cells" / _limit_key(plants, options),
+        title="limit",
+    )
+    for name, factories in members.items():
+        results |= training.fan_out.run(
+            _agent_cells(name, factories, plants, nominal, options),
+            # A folder for each, so that one more controller leaves the others' cells valid.
+            out / "cells" / agent_key(known[name], factories, plants, nominal, options),
+            title=name,
+        )
+    seconds = time.perf_counter() - began
+
+    runs = table(plants, list(controllers), results)
+    sections = report(runs, out, options.design)
+    write_csv(out / "runs.csv", runs)
+    origin = {
+        "started": started,
+        "seconds": round(seconds, 1),
+        "options": flat(options),
+        "policies": provenances(members),
+        "versions": versions(),
+        "commit": commit(),
+    }
+    write_json(out / "provenance.json", origin)
+    title = "Controllers on plants that they were not made for"
+    write_report(out, title, sections, provenance_line("sweep", origin))
+    for section in sections:
+        console.print(section.title, *section.text, sep="\n")
+        if section.table is not None:
+            console.print(on_screen(section.table))
+    return f"{len(results)} cells in {seconds:.0f} s. The report, data and maps are in {out}/"
+
+
+def _limit_cells(plants: list[Plant], options: Options) -> dict[str, Callable[[], Any]]:
+    return {
+        f"limit {i}": partial(limit_cell, plant, options.samples)
+        for i, plant in enumerate(plants)
+    }
+
+
+def _limit_key(plants: list[Plant], options: Options) -> str:
+    return fingerprint(limit_cell.__module__, plants=plants, samples=options.samples)
+
+
+def _agent_cells(
+    name: str,
+    factories: Sequence[Factory],
+    plants: list[Plant],
+    nominal: Plant,
+    options: Options,
+) -> dict[str, Callable[[], Any]]:
+    """Return a controller on every plant, by name."""
+    common = {"samples": options.samples, "runs": options.runs, "seed": SEED}
+    return {
+        # Every plant has its own member, in turn: how much they differ shows in the maps.
+        f"{name} {i}": partial(
+            agent_cell, factories[i % len(factories)], nominal, plant, **common
+        )
+        for i, plant in enumerate(plants)
+    }
+
+
+def agent_key(
+    controller: Controller,
+    factories: Sequence[Factory],
+    plants: list[Plant],
+    nominal: Plant,
+    options: Options,
+) -> str:
+    """Return a name made of everything that shapes the results of a controller."""
+    location = controller.in_service or controller.factory
+    modules = [location.partition(":")[0]] if location else []
+    return fingerprint(
+        agent_cell.__module__,
+        *modules,
+        options=[options.runs, options.samples],
+        plants=plants,
+        nominal=nominal,
+        controller=location,
+        policies=provenances({controller.name: factories}),
+    )

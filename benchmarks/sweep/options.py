@@ -1,0 +1,41 @@
+"""Declare the options of `python -m benchmarks.sweep`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from benchmarks.controllers.options import AgentNames, ControllerOptions
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.options import Runs, Seed, options
+from benchmarks.plants import PlantOptions
+
+SWEPT = tuple(name for name, controller in ROSTER.items() if controller.swept)
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Run controllers on plants that they were not made for.
+
+    The plant that they were made for is the paper's, or that of --plant, --preset or --set; the
+    others differ from it in what the design says.
+    """
+
+    design: Literal["grid", "random"] = "grid"
+    """grid: 20 delays by 10 gains; random: plants that differ in everything, half of which
+    drift."""
+    plants: Runs = 200
+    """Plants of a random design."""
+    design_seed: Seed = 0
+    """Seed that the plants of a random design are drawn with."""
+    runs: Runs = 20
+    """Runs of a controller on a plant."""
+    samples: Runs = 1200
+    """Samples of 8 s in a run."""
+    agents: AgentNames = SWEPT
+    controllers: ControllerOptions = field(default_factory=ControllerOptions)
+    plant: PlantOptions = field(default_factory=PlantOptions)
+    out: Path | None = None
+    """Folder to write to (default: results/sweep-DESIGN)."""
