@@ -1,16 +1,11 @@
 """Fan-out: nothing depends on where and when cells run, and nothing that is done is lost."""
 
 import argparse
-import importlib.util
 import json
 import os
-import secrets
 import select
-import signal
-import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from functools import partial
@@ -257,94 +252,3 @@ def until(condition, seconds=30.0):
     while not condition():
         assert time.monotonic() < end, "it took too long"
         time.sleep(0.05)
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
-def private():
-    """Return an environment that keeps Ray to those who have its token."""
-    return os.environ | {
-        "RAY_AUTH_MODE": "token",  # whatever this machine's settings are
-        "RAY_AUTH_TOKEN": secrets.token_hex(16),
-        "RAY_USAGE_STATS_ENABLED": "0",
-    }
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Ray's clusters are Linux's")
-@pytest.mark.skipif(
-    importlib.util.find_spec("ray") is None,
-    reason="Ray is not installed: it is an extra, and there are not wheels for every Python",
-)
-class TestRay:
-    """In processes of their own: Ray logs, warns and leaves threads behind."""
-
-    @pytest.fixture
-    def cluster(self):
-        """Two cores; yields the environment of its users."""
-        port = free_port()
-        environment = private() | {"RAY_ADDRESS": f"127.0.0.1:{port}"}
-        with tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True) as folder:
-            command = [
-                *(sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block"),
-                *("--port", str(port), "--num-cpus", "2"),
-                *("--temp-dir", folder, "--include-dashboard", "false"),
-                *("--object-store-memory", "100000000"),
-            ]
-            with (Path(folder) / "log").open("w") as log:
-                head = subprocess.Popen(
-                    command, env=environment, cwd=ROOT, stdout=log, stderr=log,
-                    start_new_session=True,
-                )  # fmt: skip
-            try:
-                until(lambda: "Ray runtime started" in (Path(folder) / "log").read_text())
-                yield environment
-            finally:
-                head.terminate()
-                try:
-                    head.wait(15)
-                finally:
-                    if head.poll() is None:
-                        os.killpg(head.pid, signal.SIGKILL)
-
-    def test_a_lost_worker_loses_nothing(self, cluster, tmp_path, calls):
-        done = subprocess.run(
-            [sys.executable, "-m", "tests.ray_run", str(tmp_path)],
-            env=cluster, cwd=ROOT, timeout=60, capture_output=True, text=True,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        out = json.loads((tmp_path / "out.json").read_text())
-        assert (tmp_path / "died").exists()
-        assert out["results"] == run(work(24))
-        assert list(out["results"]) == list(work(24))
-        # The cluster makes up for the worker: nothing that had finished runs again.
-        assert counted(calls) == Counter(range(24))
-        assert out["jobs"] == 2  # all the cores that there are
-        assert list(out["errors"]) == ["the fault"]
-        assert "no such plant as 1" in out["errors"]["the fault"]
-
-    def test_without_a_cluster_it_says_how_to_start_one(self):
-        program = "from benchmarks.lib.fan_out import FanOut; FanOut(2, 'ray')"
-        done = subprocess.run(
-            [sys.executable, "-c", program],
-            env=private() | {"RAY_ADDRESS": f"127.0.0.1:{free_port()}"},
-            cwd=ROOT, timeout=60, capture_output=True, text=True,
-        )  # fmt: skip
-        assert (
-            "ValueError: No Ray cluster can be reached: start one with `ray start"
-            in done.stderr
-        )
-
-    def test_a_cluster_that_is_gone_is_not_waited_for(self, tmp_path):
-        (tmp_path / "ray").mkdir()
-        (tmp_path / "ray/ray_current_cluster").write_text(f"127.0.0.1:{free_port()}")
-        environment = private() | {"RAY_TMPDIR": str(tmp_path)}
-        environment.pop("RAY_ADDRESS", None)
-        program = "from benchmarks.lib.fan_out import FanOut; FanOut(2, 'ray')"
-        done = subprocess.run(
-            [sys.executable, "-c", program],
-            env=environment, cwd=ROOT, timeout=60, capture_output=True, text=True,
-        )  # fmt: skip
-        assert "ValueError: No Ray cluster can be reached" in done.stderr

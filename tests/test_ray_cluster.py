@@ -1,10 +1,14 @@
-"""A Ray cluster of three nodes that have no checkout, and lose one of them in the middle."""
+"""A Ray cluster of three nodes that have no checkout; workers and whole nodes are lost."""
 
 import importlib.util
+import json
 import os
+import secrets
+import socket
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +20,11 @@ from benchmarks.lib.fan_out import FanOut
 from benchmarks.sweep.__main__ import main as sweep
 from benchmarks.train.__main__ import run as train
 from tests.nodes.train import TRAININGS
-from tests.test_fan_out import private, until
+from tests.test_fan_out import counted, until, work
 
 ROOT = Path(__file__).parent.parent
 NODES = ROOT / "tests" / "nodes"
+SECONDS = 300.0  # after which something hangs, on the slowest machine
 DESIGN = (
     *("--design", "random", "--plants", "8", "--runs", "2", "--samples", "1200"),
     *("--agents", "ppo"),
@@ -30,39 +35,43 @@ pytestmark = [
         not sys.platform.startswith("linux"), reason="Ray's clusters are Linux's"
     ),
     pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed"),
+    pytest.mark.xdist_group("ray"),  # one process starts one cluster for all of them
 ]
 
 
+def private():
+    """Return an environment that keeps Ray to those who have its token."""
+    return os.environ | {
+        "RAY_AUTH_MODE": "token",  # whatever this machine's settings are
+        "RAY_AUTH_TOKEN": secrets.token_hex(16),
+        "RAY_USAGE_STATS_ENABLED": "0",
+    }
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def python(*words, environment):
+    return subprocess.run(
+        [sys.executable, *words],
+        env=environment, cwd=ROOT, timeout=SECONDS, capture_output=True, text=True,
+    )  # fmt: skip
+
+
 class Cluster:
-    """Three nodes of a core each; two of them can be lost."""
+    """Three nodes of a core each; two of them can be lost. `environment` is its users'."""
 
     def __init__(self, process, log, environment):
         self._process = process
         self._log = log
-        self._environment = environment | {"RAY_ADDRESS": process.stdout.readline().strip()}
+        self.environment = environment | {"RAY_ADDRESS": process.stdout.readline().strip()}
 
     def order(self, what):
         self._process.stdin.write(f"{what}\n")
         self._process.stdin.flush()
         assert self._process.stdout.readline() == "done\n", self._log.read_text()
-
-    def run(self, *command, files, count, last):
-        """Run Python, and end a node that is at work when so many files of a kind are there."""
-        with subprocess.Popen(
-            [sys.executable, *command],
-            env=self._environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True,
-        ) as driver:  # fmt: skip
-            try:
-                until(lambda: driver.poll() is not None or len(files()) >= count, 120.0)
-                if driver.poll() is None:
-                    self.order("lose")
-                    assert not last()  # the end was not reached
-                said = driver.communicate(timeout=120)[0]
-            finally:
-                driver.kill()
-        assert driver.returncode == 0, said
-        self.order("join")  # three again
 
 
 @pytest.fixture(scope="module")
@@ -96,28 +105,68 @@ def cluster(results):
 
 def test_a_sweep_loses_a_node(cluster, results):
     there, here = results / "swept there", results / "swept here"
-    cluster.run(
-        "-m", "benchmarks.sweep", *DESIGN, "--backend", "ray", "--out", str(there),
-        files=lambda: list(there.glob("cells/*/limit *.json")), count=2,
-        last=(there / "runs.csv").exists,
-    )  # fmt: skip
+    with subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.sweep", *DESIGN, "--backend=ray", f"--out={there}"],
+        env=cluster.environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True,
+    ) as driver:  # fmt: skip
+        begun = "cells/*/limit *.json"
+        try:
+            until(lambda: driver.poll() or len(list(there.glob(begun))) > 1, SECONDS)
+            cluster.order("lose")
+            assert not (there / "runs.csv").exists()  # the end was not reached
+            said = driver.communicate(timeout=SECONDS)[0]
+        finally:
+            driver.kill()
+    assert driver.returncode == 0, said
+    cluster.order("join")  # three again
     assert sweep([*DESIGN, "--jobs", "1", "--out", str(here)]) == 0
     pd.testing.assert_frame_equal(
         pd.read_csv(there / "runs.csv"), pd.read_csv(here / "runs.csv"), check_exact=True
     )
 
 
-def test_a_training_loses_a_node(cluster, results):
+def test_trainings_give_the_networks_that_they_give_here(cluster, results):
     there, here = results / "trained there", results / "trained here"
-    cluster.run(
-        "-m", "tests.nodes.train", str(there),
-        files=lambda: list(there.glob("*/network.npz")), count=1,
-        last=lambda: len(list(there.glob("*/network.npz"))) == len(TRAININGS),
-    )  # fmt: skip
+    done = python("-m", "tests.nodes.train", str(there), environment=cluster.environment)
+    assert done.returncode == 0, done.stderr
     networks = train(TRAININGS, here, FanOut(1))
+    assert len(networks) == len(list(there.glob("*/network.npz"))) == len(TRAININGS)
     for network in networks:
         key = network.provenance["code"]
         other = PolicyNetwork.load(there / key / "network.npz")
         for layer, same in zip(network.layers, other.layers, strict=True):
             assert all(map(np.array_equal, layer, same))
         assert other.provenance["commit"] == network.provenance["commit"]
+
+
+def test_a_lost_worker_loses_nothing(cluster, tmp_path):
+    (tmp_path / "calls").mkdir()
+    done = python("-m", "tests.ray_run", str(tmp_path), environment=cluster.environment)
+    assert done.returncode == 0, done.stderr
+    out = json.loads((tmp_path / "out.json").read_text())
+    assert (tmp_path / "died").exists()
+    assert out["results"] == FanOut(1).run(work(24), progress=False)
+    assert list(out["results"]) == list(work(24))
+    # The cluster makes up for the worker: nothing that had finished runs again.
+    assert counted(tmp_path / "calls") == Counter(range(24))
+    assert out["jobs"] == 3  # all the cores that there are
+    assert list(out["errors"]) == ["the fault"]
+    assert "no such plant as 1" in out["errors"]["the fault"]
+
+
+NO_CLUSTER = "ValueError: No Ray cluster can be reached: start one with `ray start"
+CONNECT = "from benchmarks.lib.fan_out import FanOut; FanOut(2, 'ray')"
+
+
+def test_without_a_cluster_it_says_how_to_start_one():
+    nowhere = private() | {"RAY_ADDRESS": f"127.0.0.1:{free_port()}"}
+    assert NO_CLUSTER in python("-c", CONNECT, environment=nowhere).stderr
+
+
+def test_a_cluster_that_is_gone_is_not_waited_for(tmp_path):
+    (tmp_path / "ray").mkdir()
+    (tmp_path / "ray/ray_current_cluster").write_text(f"127.0.0.1:{free_port()}")
+    environment = private() | {"RAY_TMPDIR": str(tmp_path)}
+    environment.pop("RAY_ADDRESS", None)
+    assert NO_CLUSTER in python("-c", CONNECT, environment=environment).stderr

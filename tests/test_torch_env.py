@@ -159,7 +159,7 @@ def replay(recording, env, rtol=1e-9, atol=1e-9):
             assert_close(own, other, name, rtol, atol)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     arguments=valid_arguments,
     num_envs=st.integers(1, 5),

@@ -63,7 +63,7 @@ def compare(native, sync, *, steps, rng, partial_resets):
             assert_equal(*both)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     arguments=valid_arguments,
     num_envs=st.integers(1, 6),

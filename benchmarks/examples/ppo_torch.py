@@ -10,18 +10,18 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import gymnasium
 import torch
-import tyro
+from cyclopts import App, Parameter
 from torch import Tensor, nn
 from torch.distributions import Normal
 
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Settings of a training."""
 
@@ -59,6 +59,7 @@ class Arguments:
     """How often the policy is measured."""
 
 
+DEFAULTS = Arguments()
 # With delay + 2 past actions the problem is Markov while the set point holds.
 OBSERVATION: dict[str, Any] = {"action_window": 20, "output_window": 2}
 # Returns of about 1 in size: the gradient of larger ones would crowd out that of the policy.
@@ -190,12 +191,18 @@ def square_error(agent: Agent, device: str) -> float:
     return float(torch.cat(errors).mean())
 
 
-def main(words: list[str] | None = None) -> None:
-    """Train with the arguments of a command line, without the program's name."""
-    arguments = tyro.cli(Arguments, args=words, description=__doc__)
+def run(arguments: Annotated[Arguments, Parameter(name="*")] = DEFAULTS) -> None:
+    """Train on as many cores as it takes."""
     if arguments.device == "cpu":
         torch.set_num_threads(1)  # the networks are too small for more
     train(arguments)
+
+
+def main(words: list[str] | None = None) -> None:
+    """Train with the arguments of a command line, without the program's name."""
+    app = App(help=__doc__, version_flags=())
+    app.default(run)
+    app(words, result_action="return_value")
 
 
 if __name__ == "__main__":
