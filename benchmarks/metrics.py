@@ -45,8 +45,8 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     dict of ndarray, shape (runs,)
         In degC, t/h and minutes, and shares in percent:
 
-        - `mae`: mean of |e|;
-        - `ise`: integral of e^2;
+        - `mae`: mean of |e(k)| over k = 1 to N, as the rewards have it;
+        - `ise`: integral of e^2, likewise;
         - `itae`: integral of t |e|, t counted from the latest set-point change;
         - `total_variation`: of the applied input; see `travel`;
         - `overshoot`: how far the output goes beyond the new set point, as a percentage of the
@@ -61,7 +61,6 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     """
     interval = parameters.sampling_interval / 60.0  # min
     command = trajectory.command
-    error = trajectory.setpoint - trajectory.output
     drawn = {"dead_zone", "u_min", "u_max"} & set(parameters.ranges)
     inside = saturated = np.full(command.shape, np.nan)
     if not drawn:
@@ -73,8 +72,8 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     ]
     samples_itae, overshoot, settling = np.array(by_steps).T
     return {
-        "mae": np.abs(error).mean(axis=0),
-        "ise": interval * np.square(error).sum(axis=0),
+        "mae": mean_error(trajectory),
+        "ise": interval * np.square(trajectory.error).sum(axis=0),
         "itae": interval**2 * samples_itae,
         "total_variation": travel(trajectory),
         "overshoot": 100.0 * overshoot,
@@ -105,8 +104,8 @@ def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]
 
 
 def mean_error(trajectory: Trajectory) -> Array:
-    """Return the mean |e| of each run, degC, shape (runs,)."""
-    error: Array = np.abs(trajectory.setpoint - trajectory.output).mean(axis=0)
+    """Return the mean of |e(k)| over k = 1 to N of each run, degC, shape (runs,)."""
+    error: Array = np.abs(trajectory.error).mean(axis=0)
     return error
 
 

@@ -35,6 +35,8 @@ class Trajectory:
         u(k) and u_a(k), t/h.
     noise
         n(k), degC.
+    error
+        e(k + 1), degC: that of the reward of sample k. Every mean error is over k = 1 to N.
     """
 
     setpoint: NDArray[np.float64]
@@ -42,6 +44,7 @@ class Trajectory:
     command: NDArray[np.float64]
     applied: NDArray[np.float64]
     noise: NDArray[np.float64]
+    error: NDArray[np.float64]
 
 
 def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vector.VectorEnv:
@@ -97,4 +100,5 @@ def rollout(
         # A step reports the command and the applied input of the sample that it starts from.
         trajectory.command[k] = info["command"]
         trajectory.applied[k] = info["applied"]
+        trajectory.error[k] = info["error"]
     return trajectory

@@ -37,17 +37,28 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
         "setpoint": "random",
     },
 }
-"""Arguments of the environment by name: `gymnasium.make("MiddlePoint-v0", **PRESETS["noisy"])`.
+"""Arguments of the environment by name. Each preset has an id of its own, see `IDS`.
 
-| Name | What it is |
-|---|---|
-| `paper` | the paper's first case (Figs 5 and 10): dead zone 5 t/h, no noise; the default |
-| `dead-zone-7` | its second case (Figs 6 and 7): dead zone 7 t/h |
-| `noisy` | its third case (Figs 8, 9 and 11): R = 0.5 degC^2 |
-| `disturbed` | a noisy boiler and transmitter, under a load that changes and wanders |
-| `fouling` | the same, and the dynamics drift: the gain to 0.5 to 1.5 times what it was |
-| `randomised` | delay, dead zone, noise, gain and time constant drawn at each reset |
-| `hard` | everything on, and random set points |
+| Name | Id | What it is |
+|---|---|---|
+| `paper` | `MiddlePoint-v0` | the paper's first case: dead zone 5 t/h, no noise; the default |
+| `dead-zone-7` | `MiddlePointDeadZone7-v0` | its second case: dead zone 7 t/h |
+| `noisy` | `MiddlePointNoisy-v0` | its third case: R = 0.5 degC^2 |
+| `disturbed` | `MiddlePointDisturbed-v0` | a noisy boiler and transmitter; the load changes |
+| `fouling` | `MiddlePointFouling-v0` | the same, and gain and time constant drift |
+| `randomised` | `MiddlePointRandomised-v0` | a plant drawn at each reset |
+| `hard` | `MiddlePointHard-v0` | everything on, and random set points |
 
 `time_constant_drift` above 1 makes the plant slower, and `gain_drift` below 1 weaker.
 """
+
+IDS: Final[dict[str, str]] = {
+    "paper": "MiddlePoint-v0",
+    "dead-zone-7": "MiddlePointDeadZone7-v0",
+    "noisy": "MiddlePointNoisy-v0",
+    "disturbed": "MiddlePointDisturbed-v0",
+    "fouling": "MiddlePointFouling-v0",
+    "randomised": "MiddlePointRandomised-v0",
+    "hard": "MiddlePointHard-v0",
+}
+"""The id of each preset: `gymnasium.make(IDS["noisy"])`, with arguments on top if need be."""

@@ -140,8 +140,8 @@ class TestSetPointChanges:
         ("name", "mae"),
         # As a programme gave them that has nothing of this one but the solver.
         [
-            ("square", 0.9073), ("square-dead-zone-7", 0.9073), ("square-noise", 1.6027),
-            ("constant", 0.2391), ("constant-dead-zone-7", 0.2391), ("constant-noise", 1.0112),
+            ("square", 0.9115), ("square-dead-zone-7", 0.9115), ("square-noise", 1.6069),
+            ("constant", 0.2308), ("constant-dead-zone-7", 0.2308), ("constant-noise", 1.0043),
         ],
     )  # fmt: skip
     def test_the_reference_of_the_papers_cases(self, name, mae):
@@ -218,9 +218,9 @@ class TestProgramme:
     def test_a_controller_that_knows_the_future_attains_the_bound(self, period):
         # Without a dead zone, so that every flow can be applied.
         arguments = {"setpoint_period": period, "dead_zone": 0.0}
-        least = least_possible(samples=600, folder=None, **arguments)
-        plants = make_plants(1, 600, **arguments)
-        setpoint = rollout(plants, PIController(0.0, 0.0), 600, 0).setpoint[:, 0]
+        least = least_possible(samples=600, kind="preview", folder=None, **arguments)
+        plants = make_plants(1, 601, **arguments)
+        setpoint = rollout(plants, PIController(0.0, 0.0), 601, 0).setpoint[:, 0]
         found = mean_error(rollout(plants, Plan(best_plan(setpoint).flow), 600, seed=0))
         assert found[0] == pytest.approx(least.value, rel=1e-5)
         assert not beats(found * (1 + 1e-5), least)
@@ -231,13 +231,13 @@ class TestProgramme:
             "u_min": -12.0, "u_max": 6.0, "delay": 7, "gain_drift": 0.6, "dead_zone": 0.0,
             "time_constant_drift": 1.5, "drift_samples": 300, "time_constant_factor": 0.8,
         }  # fmt: skip
-        setpoint = np.repeat([3.0, -4.0, 6.0], 100)
+        setpoint = np.append(np.repeat([3.0, -4.0, 6.0], 100), 6.0)  # k = 0 to 300
         best = best_plan(setpoint, **arguments)
         assert best.flow.min() == pytest.approx(-12.0)
         plants = make_plants(1, 300, setpoint=setpoint.tolist(), **arguments)
         runs = rollout(plants, Plan(best.flow, -12.0, 6.0), 300, seed=0)
-        np.testing.assert_allclose(runs.output[:, 0], best.output, atol=1e-4)
-        assert mean_error(runs)[0] == pytest.approx(best.value / 300, rel=1e-4)
+        np.testing.assert_allclose(runs.output[:, 0], best.output[:-1], atol=1e-4)
+        assert mean_error(runs)[0] == pytest.approx(best.error[1:].mean(), rel=1e-4)
 
     def test_a_dead_zone_brings_0_within_reach(self):
         shut_out = course_of(50, u_min=3.0, u_max=9.0, dead_zone=2.0)
@@ -361,17 +361,30 @@ class TestLeastPossible:
         assert 0.0 < least.value < found["reference"].value < least.idle
         assert least.low <= least.value <= least.high
 
+    def test_by_default_it_is_what_reports_use(self):
+        # Of the kind that applies: no controller that does not count samples beats it.
+        found = [
+            least_possible(samples=samples, episodes=1, folder=None, **arguments)
+            for samples, arguments in (
+                (1200, {}), (600, {"setpoint_period": 38}), (600, {"setpoint": 5.0}),
+                (300, {"setpoint": "random"}),
+            )
+        ]  # fmt: skip
+        assert [least.kind for least in found] == ["reference", "preview", "preview", "news"]
+        assert found[0].value == pytest.approx(0.9115, abs=1e-4)
+
     @pytest.mark.parametrize("period", [20, 38, 76, 100, 160])
     @pytest.mark.parametrize("controller", [Counting, PIController])
     def test_nobody_beats_it_however_short_holds_are(self, period, controller):
-        least = least_possible(samples=600, folder=None, setpoint_period=period)
+        case = {"samples": 600, "setpoint_period": period}
+        least = least_possible(kind="preview", folder=None, **case)
         assert not beats(errors(controller, 1, 600, setpoint_period=period), least)
         assert least.value < 0.95 * least.idle
 
     def test_one_who_counts_samples_beats_the_reference_alone(self):
         found = errors(Counting, 1, 1200)[0]
-        assert least_possible(samples=1200, folder=None).value < found
-        assert found < 0.7 * least_possible(samples=1200, kind="reference").value
+        assert least_possible(samples=1200, kind="preview", folder=None).value < found
+        assert found < 0.7 * least_possible(samples=1200).value
 
     def test_the_controller_that_knows_most_attains_it_where_nothing_changes(self):
         least = least_possible(samples=600, folder=None, setpoint=5.0)
@@ -411,7 +424,7 @@ class TestLeastPossible:
             hopeless.score(1.0)
 
     def test_it_is_kept_by_all_that_shapes_it(self, tmp_path, monkeypatch):
-        ask = {"samples": 60, "folder": tmp_path, "setpoint": 5.0}
+        ask = {"samples": 60, "kind": "preview", "folder": tmp_path, "setpoint": 5.0}
         first = least_possible(**ask)
         (file,) = tmp_path.iterdir()
         with monkeypatch.context() as patch:

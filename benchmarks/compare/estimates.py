@@ -26,7 +26,6 @@ from benchmarks.scenarios import Scenario
 
 SEED = 0  # of the first run, and of the bootstraps
 EPISODES = 100  # at most, over which a bound of drawn plants is averaged
-SAME = 1e-4  # degC; where two bounds differ by less, that of every controller is shown
 TOLERANCE = 1e-4  # relative error that a bound may have
 
 
@@ -61,15 +60,7 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
         "episodes": min(runs, EPISODES),
         **scenario.arguments,
     }
-    preview = least_possible(kind="preview", **case)
-    random = scenario.parameters.setpoint == "random"
-    try:
-        least = least_possible(kind="news" if random else "reference", **case)
-    except ValueError:  # it does not settle between changes
-        least = preview
-    # What cannot be foreseen makes no difference where nothing changes.
-    if abs(least.value - preview.value) < SAME:
-        least = preview
+    least, preview = least_possible(**case), least_possible(kind="preview", **case)
     return Scale(least, preview, preview.idle_low < preview.idle_high)
 
 

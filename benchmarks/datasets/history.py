@@ -171,16 +171,14 @@ def record(plant: str, behaviour: str, episodes: int = EPISODES, seed: int = SEE
 def scale(plant: str, episodes: int = EVALUATIONS) -> Scale:
     """Return the least possible mean |e| over k = 1 to SAMPLES, and that of an idle valve."""
     arguments = arguments_of(plant)
-    bound = least_possible(samples=SAMPLES + 1, episodes=episodes, **arguments)
+    bound = least_possible(samples=SAMPLES, episodes=episodes, **arguments)
     idle = _Recorder(
         make_plants(episodes, SAMPLES, **arguments), range(bound.seed, bound.seed + episodes)
     )
-    trajectory = rollout(idle, Nothing(), SAMPLES, bound.seed)
+    rollout(idle, Nothing(), SAMPLES, bound.seed)
     idle.close()
-    # The bound begins at k = 0, where e is the set point whatever the controller does.
-    first = float(np.abs(trajectory.setpoint[0]).mean())
     return Scale(
-        ((SAMPLES + 1) * bound.value - first) / SAMPLES,
+        bound.value,
         -float(np.mean(idle.rewards)),
         bound.kind,
         range(bound.seed, bound.seed + episodes),

@@ -17,10 +17,12 @@ from benchmarks import plants
 from benchmarks.lib import command_line
 from benchmarks.lib.statistics import bootstrap
 from benchmarks.lib.tables import on_screen
-from benchmarks.limits.bounds import CACHE, EPISODES, LeastPossible, least_possible
+from benchmarks.limits import package
+from benchmarks.limits.bounds import CACHE, LeastPossible, least_possible
 from benchmarks.limits.verify import mpc_errors, verify
 from benchmarks.scenarios import SCENARIOS, scenarios_of
 from mptc_gym import PRESETS
+from mptc_gym.evaluation import EPISODES
 
 SAMPLES = 1200  # of an episode of a preset
 
@@ -42,6 +44,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--verify", action="store_true", help="run every controller against the bounds instead"
+    )
+    parser.add_argument(
+        "--package",
+        action="store_true",
+        help="write the bounds of the presets that come with the package instead",
     )
     parser.add_argument(
         "--runs",
@@ -87,6 +94,9 @@ def main(options: argparse.Namespace, console: Console) -> str:
             "--verify: goes without --mpc, --plant, --preset and --set"
         )
     command_line.out_folder(options.cache, "--cache")
+    if options.package:
+        package.write(options.cache)
+        return f"Written to {package.PLACE}"
     if options.verify:
         table, beaten = verify(options.runs, options.cache, command_line.fan_out(options))
         console.print(on_screen(table))

@@ -17,9 +17,11 @@ from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import fingerprint
-from benchmarks.limits.bounds import SEED, LeastPossible, least_possible
+from benchmarks.limits.bounds import LeastPossible, least_possible
+from benchmarks.metrics import mean_error
 from benchmarks.rollout import Agent, make_plants, rollout
 from mptc_gym import PRESETS, Parameters
+from mptc_gym.evaluation import SEED
 from mptc_gym.plant import action_from_command
 
 Array = NDArray[np.float64]
@@ -93,8 +95,7 @@ def errors(factory: Factory, runs: int, samples: int, **arguments: Any) -> Array
     agent: Agent = build(factory, Parameters(**arguments), runs, SEED)
     trajectory = rollout(plants, agent, samples, SEED)
     plants.close()
-    mean: Array = np.abs(trajectory.setpoint - trajectory.output).mean(axis=0)
-    return mean
+    return mean_error(trajectory)
 
 
 def mpc_errors(runs: int, samples: int, **arguments: Any) -> Array:

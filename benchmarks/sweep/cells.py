@@ -64,7 +64,7 @@ def agent_cell(
     steady = steady_stretches(trajectory.setpoint[:, 0])
     measures = {
         "mae": mean_error(trajectory),
-        "late": np.abs(error[samples // 2 :]).mean(axis=0),
+        "late": np.abs(trajectory.error[samples // 2 :]).mean(axis=0),
         "swing": _swing(error, steady),
         "travel": travel(trajectory),
     }

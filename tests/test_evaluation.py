@@ -1,0 +1,309 @@
+"""Tests of `mptc_gym.evaluate`, of the bounds that come with it, and of the presets' ids."""
+
+import json
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box
+
+import mptc_gym
+from agents import DirectNNController, PIController, PolicyNetwork
+from benchmarks.limits import least_possible
+from mptc_gym import IDS, PRESETS, MiddlePointEnv, evaluate
+from mptc_gym.evaluation import SEED, least_errors
+from mptc_gym.wrappers import IncrementalAction
+
+HARD = "MiddlePointHard-v0"
+
+
+def idle(observations):
+    return np.zeros((len(observations), 1), np.float32)
+
+
+def proportional(observations):
+    return np.clip(-0.3 * observations[:, 3:4], -1.0, 1.0)
+
+
+def wrapped(**arguments):
+    env = gymnasium.make(HARD, action_window=20, **arguments)
+    return IncrementalAction(env, max_move=0.2, undo_dead_zone=True)
+
+
+class TestPresets:
+    @pytest.mark.parametrize("name", PRESETS)
+    def test_each_has_an_id_of_its_own(self, name):
+        ids = [
+            gymnasium.make(IDS[name]),
+            gymnasium.make("MiddlePoint-v0", **PRESETS[name]),
+            gymnasium.make(EnvSpec.from_json(gymnasium.make(IDS[name]).spec.to_json())),
+        ]
+        batch = gymnasium.make_vec(IDS[name], num_envs=1)
+        assert {env.unwrapped.parameters for env in ids} == {batch.parameters}
+        assert {env.spec.max_episode_steps for env in ids} == {1200}
+
+    def test_arguments_go_on_top(self):
+        env = gymnasium.make(HARD, delay=18, action_window=2)
+        assert env.unwrapped.parameters.delay == 18
+        assert env.unwrapped.parameters.dead_zone == (3.0, 7.0)
+        assert gymnasium.make(HARD).unwrapped.parameters.delay == (12, 24)
+
+
+class TestEvaluate:
+    @pytest.mark.parametrize("name", ["paper", "hard"])
+    def test_it_is_a_mean_over_the_rewards_of_the_listed_seeds(self, name):
+        found = evaluate(PIController(), IDS[name], episodes=3)
+        assert list(found.seeds) == [SEED, SEED + 1, SEED + 2]
+        for i, seed in enumerate(found.seeds):
+            env, controller = gymnasium.make(IDS[name]), PIController()
+            observation, info = env.reset(seed=seed)
+            errors, flows, ended = [], [0.0], False
+            while not ended:
+                observation, _, _, ended, info = env.step(controller.act(observation))
+                errors.append(abs(info["error"]))
+                flows.append(info["applied"])
+            assert len(errors) == 1200
+            assert found.errors[i] == pytest.approx(np.mean(errors), abs=1e-12)
+            assert found.travels[i] == pytest.approx(np.abs(np.diff(flows)).sum(), abs=1e-9)
+        assert found.mean_error == pytest.approx(found.errors.mean(), abs=1e-12)
+
+    @pytest.mark.parametrize("name", IDS)
+    def test_a_valve_that_is_left_alone_scores_0_and_the_bound_1(self, name):
+        found = evaluate(idle, IDS[name], episodes=10)
+        assert found.score == pytest.approx(0.0, abs=1e-12)
+        assert found.scores == pytest.approx(np.zeros(10), abs=1e-12)
+        assert found.travel == 0.0
+        # The same line through both, at the error of a better policy.
+        better = evaluate(PIController(1.0, 0.05), IDS[name], episodes=10)
+        share = (found.mean_error - better.mean_error) / (
+            found.mean_error - found.least_possible
+        )
+        assert better.score == pytest.approx(share)
+        assert better.interval[0] <= better.score <= better.interval[1]
+        assert better.multiple == pytest.approx(better.mean_error / better.least_possible)
+
+    def test_the_interval_holds_what_more_episodes_say(self):
+        few = evaluate(PIController(1.0, 0.05), HARD, episodes=40)
+        more = evaluate(PIController(1.0, 0.05), HARD, episodes=120)
+        assert few.interval[0] < more.score < few.interval[1]
+        assert np.ptp(more.interval) < np.ptp(few.interval) < 0.5
+        alike = evaluate(PIController(1.0, 0.05), episodes=10)
+        assert np.ptp(alike.interval) == pytest.approx(0.0, abs=1e-12)
+
+    def test_one_policy_in_three_forms(self):
+        class Acts:
+            act = staticmethod(proportional)
+
+        class Predicts:
+            def predict(self, observation, state=None, episode_start=None, deterministic=False):
+                assert deterministic
+                return proportional(observation), state
+
+        class Plainly:
+            def predict(self, observation):
+                return proportional(observation)
+
+        expected = evaluate(proportional, HARD, episodes=5)
+        for policy in (Acts(), Predicts(), Plainly()):
+            np.testing.assert_array_equal(
+                evaluate(policy, HARD, episodes=5).errors, expected.errors
+            )
+
+    def test_what_a_policy_remembers_begins_anew_with_each_batch(self):
+        begun = []
+
+        class Recurrent:
+            def predict(self, observation, state=None, episode_start=None, **_):
+                if state is None:
+                    begun.append(len(observation))
+                    assert episode_start.all()
+                    state = 0
+                else:
+                    assert not episode_start.any()
+                return idle(observation), state + 1
+
+        evaluate(Recurrent(), episodes=130, max_episode_steps=4)
+        assert begun == [100, 30]
+        learning = DirectNNController(num_envs=3, seed=0)
+        first, again = (evaluate(learning, episodes=3) for _ in range(2))
+        assert again.mean_error < first.mean_error  # reset() keeps what it has learnt
+
+    def test_wrappers_are_those_of_the_spec(self):
+        by_spec = evaluate(proportional, wrapped().spec, episodes=4)
+        by_function = evaluate(proportional, wrapped, episodes=4)
+        # Without a spec, environments are stepped one by one.
+        one_by_one = evaluate(
+            proportional,
+            lambda: IncrementalAction(
+                MiddlePointEnv(**PRESETS["hard"], action_window=20),
+                max_move=0.2, undo_dead_zone=True,
+            ),
+            episodes=4,
+        )  # fmt: skip
+        assert by_spec.least_possible is not None
+        for other in (by_function, one_by_one):
+            np.testing.assert_allclose(other.errors, by_spec.errors, atol=1e-12)
+            np.testing.assert_allclose(other.travels, by_spec.travels, atol=1e-9)
+            np.testing.assert_array_equal(other.least, by_spec.least)
+        bare = evaluate(proportional, HARD, episodes=4, action_window=20)
+        assert bare.mean_error != pytest.approx(by_spec.mean_error, abs=0.1)
+
+    def test_any_other_wrapper_is_applied(self):
+        class Backwards(gymnasium.ActionWrapper):
+            def action(self, action):
+                return -action
+
+        env = lambda: Backwards(gymnasium.make(HARD))  # noqa: E731
+        turned = evaluate(proportional, env, episodes=3)
+        expected = evaluate(lambda seen: -proportional(seen), HARD, episodes=3)
+        np.testing.assert_allclose(turned.errors, expected.errors, atol=1e-12)
+
+    def test_other_episodes_and_lengths(self):
+        found = evaluate(PIController(), HARD, episodes=5, seed=3)
+        assert (found.score, found.interval, found.scores) == (None, None, None)
+        assert found.seeds == range(3, 8)
+        short = evaluate(idle, episodes=2, max_episode_steps=301)
+        # 300 samples at 5 degC but for k = 0, and at k = 300 the next half period begins.
+        assert short.mean_error == 5.0
+        assert short.score is None
+        some = evaluate(PIController(), HARD, episodes=20, seed=SEED + 100)
+        assert some.score is not None
+        assert evaluate(PIController(), HARD, episodes=121).score is None
+
+    def test_its_text_is_one_line(self):
+        found = evaluate(PIController(), HARD, episodes=4)
+        assert f"{HARD}: mean error {found.mean_error:.3f} degC" in str(found)
+        assert f"score {found.score:.3f} (95 % " in str(found)
+        assert "\n" not in str(found)
+        assert len(repr(found)) < 80
+        other = evaluate(PIController(), episodes=2, delay=[5, 9], setpoint="random")
+        assert str(other).endswith(
+            "python -m benchmarks.limits --set delay=[5,9] --set setpoint=random"
+        )
+
+    def test_it_needs_numpy_and_gymnasium_alone(self):
+        code = (
+            "import sys, mptc_gym, numpy as np\n"
+            "print(mptc_gym.evaluate(lambda seen: np.zeros((len(seen), 1)), episodes=2))\n"
+            "print({'scipy', 'torch', 'pandas', 'benchmarks', 'agents'} & set(sys.modules))"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        )
+        first, second = done.stdout.splitlines()
+        assert first.startswith("MiddlePoint-v0: mean error 5.000 degC, 5.4")
+        assert second == "set()"
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("policy", "message"),
+        [
+            (lambda seen: np.zeros(len(seen)), r"policy must return actions of shape \(4, 1\)"),
+            (lambda seen: np.zeros((1, 1)), r"policy must return actions of shape \(4, 1\)"),
+            (lambda seen: np.full((len(seen), 1), np.nan), "policy must return finite actions"),
+            (3, "policy must be a function, or an object with predict or with act, got 3"),
+        ],
+    )
+    def test_policies(self, policy, message):
+        with pytest.raises(ValueError, match=message):
+            evaluate(policy, episodes=4)
+
+    @pytest.mark.parametrize(
+        ("env", "message"),
+        [
+            ("MiddlePointEasy-v0", "env must be the id of an environment.*MiddlePointHard-v0"),
+            ("no_such_module:Plant-v0", "env must be the id of an environment"),
+            ("CartPole-v1", "env must be a MiddlePointEnv, in wrappers or not, got .*CartPole"),
+            (7, "env must be an id, an EnvSpec or a function that makes an environment, got 7"),
+            (lambda: None, "env must be a MiddlePointEnv, in wrappers or not, got None"),
+        ],
+    )
+    def test_environments(self, env, message):
+        with pytest.raises(ValueError, match=message):
+            evaluate(idle, env, episodes=2)
+
+    @pytest.mark.parametrize("episodes", [1, 0, -3, 2.5, "many"])
+    def test_too_few_episodes(self, episodes):
+        with pytest.raises(ValueError, match="episodes must be an integer from 2"):
+            evaluate(idle, episodes=episodes)
+
+    def test_arguments(self):
+        with pytest.raises(ValueError, match="delay must be"):
+            evaluate(idle, delay=-1)
+        with pytest.raises(TypeError, match="did you mean 'delay'"):
+            evaluate(idle, delai=3)
+        with pytest.raises(ValueError, match="delay must be given in the function that is env"):
+            evaluate(idle, MiddlePointEnv, delay=3)
+
+    def test_observations_that_do_not_fit(self):
+        class Trained:
+            observation_space = Box(-1.0, 1.0, (26,))
+            predict = staticmethod(idle)
+
+        with pytest.raises(
+            ValueError, match=r"shape \(26,\), as policy reads them, got \(6,\)"
+        ):
+            evaluate(Trained())
+        evaluate(Trained(), action_window=20, episodes=2)
+        network = PolicyNetwork.pretrained("nn-dpc")
+        with pytest.raises(
+            ValueError,
+            match=r"env must have the windows that policy wants, .*n_window=\d+, got",
+        ):
+            evaluate(network)
+        with pytest.raises(ValueError, match="newest error as element 3"):
+            evaluate(PIController(), setpoint_window=7)
+
+    def test_a_policy_that_was_trained_with_a_wrapper(self):
+        class Trained:
+            spec = wrapped().spec.to_json()
+            predict = staticmethod(proportional)
+
+        with pytest.raises(ValueError, match="the wrapper that policy was trained with, Incr"):
+            evaluate(Trained(), HARD, action_window=20)
+        found = evaluate(Trained(), wrapped().spec, episodes=2)
+        assert found.mean_error == evaluate(proportional, wrapped, episodes=2).mean_error
+
+    def test_episodes_that_end_apart(self):
+        class Ends(gymnasium.Wrapper):
+            def step(self, action):
+                seen, reward, _, truncated, info = self.env.step(action)
+                return seen, reward, abs(info["error"]) > 6.0, truncated, info
+
+        with pytest.raises(ValueError, match="env must end all its episodes at the same"):
+            evaluate(idle, lambda: Ends(gymnasium.make(HARD)), episodes=5)
+
+
+class TestBounds:
+    @pytest.mark.parametrize("name", PRESETS)
+    def test_they_are_those_of_the_limits(self, name):
+        plant = mptc_gym.Parameters(**PRESETS[name])
+        kept = least_errors(plant, 1200, range(SEED, SEED + 120))
+        drawn = name in ("fouling", "randomised", "hard")
+        assert len(set(kept.tolist())) == (120 if drawn else 1)
+        for i in (7, 118) if drawn else (0,):
+            least = least_possible(
+                samples=1200, episodes=1, seed=SEED + i, folder=None, **PRESETS[name]
+            )
+            assert kept[i] == pytest.approx(least.value, abs=2e-6)
+
+    def test_they_say_how_they_were_made(self):
+        path = mptc_gym.__path__[0] + "/bounds.json"
+        with open(path, encoding="utf-8") as file:  # noqa: PTH123
+            kept = json.load(file)
+        assert kept["arguments"] == PRESETS
+        assert (kept["samples"], kept["seed"], kept["episodes"]) == (1200, SEED, 120)
+        assert kept["command"] == "python -m benchmarks.limits --package"
+        assert set(kept) >= {"commit", "code", "versions", "kinds", "unit"}
+
+    def test_what_an_agent_sees_and_is_paid_changes_no_bound(self):
+        seen = evaluate(idle, episodes=2, action_window=9, reward="absolute", move_weight=0.1)
+        assert seen.least_possible == evaluate(idle, episodes=2).least_possible
+        # A case is known by its arguments, not by its name.
+        noisy = evaluate(idle, episodes=2, noise_variance=0.5)
+        assert noisy.score is not None
+        assert evaluate(idle, episodes=2, noise_variance=0.6).score is None
