@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 from gymnasium import wrappers
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
-from gymnasium.vector import SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
 from mptc_gym.checks import MOST_PLANTS, count, reject
@@ -30,7 +30,7 @@ from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalActio
 
 Values = NDArray[np.float64]  # one an episode, shape (episodes,)
 Act = Callable[[NDArray[np.float32]], Any]  # observations, shape (n, size), to actions
-Batch = Callable[[int], VectorEnv[Any, Any, Any]]  # makes n environments
+Batch = Callable[..., VectorEnv[Any, Any, Any]]  # makes n environments
 
 SEED: Final = 7_000_000
 """Of the first of the fixed episodes; episode i has the seed `SEED + i`. Train on others."""
@@ -44,6 +44,10 @@ WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_win
 _NO_MATTER: Final = *WINDOWS, "reward", "error_scale", "move_weight"
 _BATCH: Final = 100  # episodes that run side by side
 _RESAMPLES: Final = 2000  # of the bootstrap
+_NATIVE: Final[tuple[list[Any], ...]] = (
+    [],
+    [IncrementalAction],
+)  # wrappers that a batch can have
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -174,7 +178,7 @@ def evaluate(
         _check_fit(policy, single, parameters)
         name = single.spec.id if single.spec else type(single.unwrapped).__name__
         samples = (single.spec and single.spec.max_episode_steps) or SAMPLES
-        batch = _native(single, parameters, samples) or partial(_side_by_side, make)
+        batch = native_batch(single) or partial(_side_by_side, make)
     seeds = range(first, first + episodes)
     errors, travels, samples = _run(batch, partial(_episode_of, policy), seeds, samples)
     found: dict[str, Any] = {
@@ -189,7 +193,7 @@ def evaluate(
     if least is None:
         return Evaluation(**found, missing=_missing(parameters))
     rest = action_from_command(0.0, parameters.u_min, parameters.u_max)
-    batch = partial(_plants, parameters, samples, None)
+    batch = partial(MiddlePointVectorEnv, **dataclasses.asdict(parameters))
     idle, _, _ = _run(batch, lambda: lambda seen: np.full((len(seen), 1), rest), seeds, samples)
     gained, possible = idle - errors, idle - least
     return Evaluation(
@@ -277,7 +281,7 @@ def _interval(gained: Values, possible: Values) -> tuple[float, float]:
 def _maker(env: Any, arguments: dict[str, Any]) -> Callable[[], gymnasium.Env[Any, Any]]:
     """Return a function that makes one environment."""
     if isinstance(env, str | EnvSpec):
-        return partial(_make, env, arguments)
+        return partial(make_one, env, arguments)
     if not callable(env):
         reject("env", env, "an id, an EnvSpec or a function that makes an environment")
     if arguments:
@@ -286,7 +290,8 @@ def _maker(env: Any, arguments: dict[str, Any]) -> Callable[[], gymnasium.Env[An
     return make
 
 
-def _make(env: str | EnvSpec, arguments: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+def make_one(env: str | EnvSpec, arguments: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    """Make an environment from an id or a spec; ValueError if there is no such id."""
     try:
         return gymnasium.make(env, disable_env_checker=True, **arguments)
     except (gymnasium.error.UnregisteredEnv, ModuleNotFoundError) as error:
@@ -335,13 +340,18 @@ def _check_fit(policy: Any, single: gymnasium.Env[Any, Any], parameters: Paramet
 
 
 def trained_on(policy: Any) -> EnvSpec | None:
-    """Return the spec of the environment that a policy was trained on, if the policy has it."""
-    spec = getattr(policy, "spec", None)
-    if spec is None and callable(getattr(policy, "get_env", None)):
-        plants = policy.get_env()
-        with suppress(AttributeError):
-            spec = plants.get_attr("spec")[0]
-    return EnvSpec.from_json(spec) if isinstance(spec, str) else spec
+    """Return the spec of the environment that a policy was trained on, if that is known.
+
+    `mptc_gym.sb3` notes it in the observation space; models of Stable-Baselines3 that were not
+    loaded from a file still have their environments.
+    """
+    text = getattr(getattr(policy, "observation_space", None), "trained_on", None)
+    if text is not None:
+        return EnvSpec.from_json(text)
+    with suppress(AttributeError):  # no model, or no environments, or they have no spec
+        spec: EnvSpec | None = policy.get_env().get_attr("spec")[0]
+        return spec
+    return None
 
 
 def action_wrappers(spec: EnvSpec) -> list[WrapperSpec]:
@@ -350,32 +360,39 @@ def action_wrappers(spec: EnvSpec) -> list[WrapperSpec]:
     return [each for each in spec.additional_wrappers if each.name not in watching]
 
 
-def _native(
-    single: gymnasium.Env[Any, Any], parameters: Parameters, samples: int
-) -> Batch | None:
-    """Return how to make a batch that steps at once; None if a wrapper does not let it."""
+def native_batch(single: gymnasium.Env[Any, Any]) -> Batch | None:
+    """Return how to make many of an environment that step at once.
+
+    Returns
+    -------
+    callable or None
+        Called with their number, and with an autoreset mode if need be. None if there is no
+        such batch: for another environment, one without a spec, and in other wrappers than
+        `IncrementalAction`.
+    """
     chain, inner = [], single
     while isinstance(inner, gymnasium.Wrapper):
         chain.append(type(inner))
         inner = inner.env
     plain = {wrappers.OrderEnforcing, wrappers.PassiveEnvChecker, wrappers.TimeLimit}
-    if type(inner) is not MiddlePointEnv or single.spec is None:
-        return None
     others = [each for each in chain if each not in plain]
-    if not others:
-        return partial(_plants, parameters, samples, None)
-    if others != [IncrementalAction]:
+    spec = single.spec
+    if type(inner) is not MiddlePointEnv or spec is None or others not in _NATIVE:
         return None
-    wrapper = next(w for w in single.spec.additional_wrappers if w.name == "IncrementalAction")
-    return partial(_plants, parameters, samples, wrapper.kwargs)
+    limit, arguments = spec.max_episode_steps, dataclasses.asdict(inner.parameters)
+    of_wrapper = [w.kwargs for w in spec.additional_wrappers if w.name == "IncrementalAction"]
 
+    def batch(
+        n: int, autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP
+    ) -> VectorEnv[Any, Any, Any]:
+        plants: VectorEnv[Any, Any, Any] = MiddlePointVectorEnv(
+            n, max_episode_steps=limit, autoreset_mode=autoreset_mode, **arguments
+        )
+        for kwargs in of_wrapper:
+            plants = VectorIncrementalAction(plants, **(kwargs or {}))
+        return plants
 
-def _plants(
-    parameters: Parameters, samples: int, wrapper: dict[str, Any] | None, n: int
-) -> VectorEnv[Any, Any, Any]:
-    arguments = dataclasses.asdict(parameters)
-    plants = MiddlePointVectorEnv(n, max_episode_steps=samples, **arguments)
-    return plants if wrapper is None else VectorIncrementalAction(plants, **wrapper)
+    return batch
 
 
 def _side_by_side(

@@ -116,7 +116,8 @@ class TestConvergence:
 
 def trajectory(setpoint, output):
     columns = [np.array(c, dtype=float)[:, np.newaxis] for c in (setpoint, output)]
-    return Trajectory(*columns, *(np.zeros((len(setpoint), 1)) for _ in range(3)))
+    error = columns[0] - columns[1]  # as if each step led to its own sample
+    return Trajectory(*columns, *(np.zeros((len(setpoint), 1)) for _ in range(3)), error)
 
 
 class TestMeasures:

@@ -17,7 +17,7 @@ from stable_baselines3 import PPO
 from benchmarks.datasets.history import arguments_of, record
 from benchmarks.examples import offline, ppo_torch, sb3
 from benchmarks.train import defaults
-from benchmarks.train.sb3_vec_env import GymnasiumVecEnv
+from mptc_gym.sb3 import GymnasiumVecEnv
 
 ROOT = Path(__file__).parent.parent
 

@@ -12,7 +12,7 @@ from benchmarks.rollout import Trajectory
 def test_the_typical_run_is_the_median_one():
     outputs = np.array([[1.0, 9.0, 4.0, 2.0]])  # errors 4, 4, 1, 3 of set point 5
     still = np.zeros((1, 4))
-    runs = Trajectory(np.full((1, 4), 5.0), outputs, 10 * outputs, still, still)
+    runs = Trajectory(np.full((1, 4), 5.0), outputs, 10 * outputs, still, still, 5.0 - outputs)
     row = figures.summarise(runs).iloc[0]
     assert (row["setpoint"], row["output_typical"], row["command_typical"]) == (5.0, 2.0, 20.0)
     assert row["output_p10"] == pytest.approx(1 + 0.3 * (2 - 1))

@@ -61,8 +61,8 @@ def test_a_gif_shows_the_run(tmp_path, capsys):
     for k in range(SAMPLES):
         if k % 5 == 0:
             assert np.abs(shown[k // 5] - env.render()).mean() < 0.5  # it has fewer colours
-        errors.append(abs(info["error"]))
         observation, _, _, _, info = env.step(controller.act(observation))
+        errors.append(abs(info["error"]))
     assert f"mean absolute error {np.mean(errors):.3f} °C" in capsys.readouterr().out
 
 
@@ -235,7 +235,7 @@ def test_your_hands_are_on_the_valve(hands_on, quick_bound, capsys):
     assert commands[30:] == pytest.approx([-0.5] * 10, abs=1e-6)
 
     shown = capsys.readouterr().out
-    errors = [abs(sample[0] - sample[1]) for sample, _ in screen[:-1]]
+    errors = [abs(sample[0] - sample[1]) for sample, _ in screen[1:]]
     applied = [sample[3] for sample, _ in screen]
     mine = next(line for line in shown.splitlines() if line.split()[:1] == ["you"])
     assert mine.split()[1:] == [
@@ -247,8 +247,8 @@ def test_your_hands_are_on_the_valve(hands_on, quick_bound, capsys):
     observation, info = (plant := MiddlePointEnv()).reset(seed=0)
     errors = []
     for _ in range(SAMPLES):
-        errors.append(abs(info["error"]))
         observation, _, _, _, info = plant.step(controller.act(observation))
+        errors.append(abs(info["error"]))
     pi = next(line for line in shown.splitlines() if line.split()[:1] == ["PI"])
     assert pi.split()[1] == f"{np.mean(errors):.3f}"
     assert "0.123" in shown
@@ -269,7 +269,7 @@ def test_keys_move_set_point_and_load_under_any_controller(hands_on, quick_bound
     # The controller saw it: it does what it does on a plant with these set points.
     own = run_closed(MiddlePointEnv(setpoint=setpoints), PIController())
     assert [sample[1] for sample, _ in screen] == pytest.approx(own, abs=1e-5)
-    assert quick_bound[0]["setpoint"] == setpoints[:-1]
+    assert quick_bound[0]["setpoint"] == setpoints
     assert "Smith" in capsys.readouterr().out
 
 

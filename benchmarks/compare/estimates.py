@@ -21,7 +21,7 @@ from benchmarks.lib.statistics import (
     stratified,
 )
 from benchmarks.lib.tables import groups
-from benchmarks.limits import LeastPossible, frontier, least_possible
+from benchmarks.limits import LeastPossible, frontier, is_random, least_possible
 from benchmarks.scenarios import Scenario
 
 SEED = 0  # of the first run, and of the bootstraps
@@ -61,7 +61,7 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
         **scenario.arguments,
     }
     least, preview = least_possible(**case), least_possible(kind="preview", **case)
-    return Scale(least, preview, preview.idle_low < preview.idle_high)
+    return Scale(least, preview, is_random(scenario.parameters))
 
 
 def travel_frontier(scenario: Scenario) -> list[tuple[float, float]]:

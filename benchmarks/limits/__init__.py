@@ -4,6 +4,7 @@ from benchmarks.limits.bounds import (
     KINDS,
     LeastPossible,
     frontier,
+    is_random,
     least_possible,
 )
 from benchmarks.limits.reference import held, steady_stretches
@@ -13,6 +14,7 @@ __all__ = [
     "LeastPossible",
     "frontier",
     "held",
+    "is_random",
     "least_possible",
     "steady_stretches",
 ]

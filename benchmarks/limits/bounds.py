@@ -278,14 +278,23 @@ class _Idle:
         return self._actions
 
 
+def _is_drawn(parameters: Parameters) -> bool:
+    return bool(parameters.ranges) or parameters.setpoint == "random"
+
+
+def is_random(parameters: Parameters) -> bool:
+    """Whether episodes differ in their errors, be it in their noise alone."""
+    noises = "noise_variance", "measurement_noise_variance"
+    noisy = any(parameters.range_of(name)[1] > 0.0 for name in noises)
+    return _is_drawn(parameters) or noisy or parameters.is_disturbed
+
+
 def _draw(
     parameters: Parameters, samples: int, episodes: int, seed: int
 ) -> tuple[list[_Case], Array]:
     """Return episodes as the environment draws them, and mean |e| with the valve left alone."""
-    drawn = bool(parameters.ranges) or parameters.setpoint == "random"
-    noisy = parameters.range_of("noise_variance")[1] > 0.0 or parameters.is_disturbed
-    count = episodes if drawn else 1
-    runs = episodes if drawn or noisy else 1
+    count = episodes if _is_drawn(parameters) else 1
+    runs = episodes if is_random(parameters) else 1
     plants = make_plants(runs, samples + 1, **asdict(parameters))
     _, info = plants.reset(seed=seed)
     drawn_numbers = {name: np.array(info[name]) for name in parameters.ranges}

@@ -27,8 +27,8 @@ from benchmarks.metrics import mean_error
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
 from benchmarks.train.ppo_arguments import PPOArguments
-from benchmarks.train.sb3_vec_env import GymnasiumVecEnv
 from mptc_gym import Parameters
+from mptc_gym.sb3 import GymnasiumVecEnv
 from mptc_gym.wrappers.vector import IncrementalAction
 
 VALIDATION_INTERVAL = 32_768  # samples of experience

@@ -1,0 +1,354 @@
+"""Tests of `mptc_gym.sb3`: the batch against DummyVecEnv, what models keep, the callback."""
+
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import SyncVectorEnv
+from stable_baselines3 import PPO
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from mptc_gym import MiddlePointEnv, Parameters, evaluate
+from mptc_gym.evaluation import SEED
+from mptc_gym.sb3 import GymnasiumVecEnv, ScoreCallback, make_vec_env, save, spec_of
+from mptc_gym.wrappers import IncrementalAction
+from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
+from tests.test_ppo import parameters_of
+
+N = 4
+ARGUMENTS = {
+    "max_episode_steps": 30, "noise_variance": 0.5, "setpoint": "random", "setpoint_period": 20,
+}  # fmt: skip
+
+
+def make_both():
+    def make():
+        return gymnasium.make("MiddlePoint-v0", **ARGUMENTS)
+
+    envs = gymnasium.make_vec("MiddlePoint-v0", N, autoreset_mode="SameStep", **ARGUMENTS)
+    return GymnasiumVecEnv(envs), DummyVecEnv([make] * N)
+
+
+def make_both_of_episodes_that_terminate():
+    def make():
+        return gymnasium.make("CartPole-v1", max_episode_steps=15)
+
+    envs = SyncVectorEnv([make] * N, autoreset_mode="SameStep")
+    return GymnasiumVecEnv(envs), DummyVecEnv([make] * N)
+
+
+def make_both_of_two_batches():
+    calm = {**ARGUMENTS, "noise_variance": 0.0}
+    parts = [(3, ARGUMENTS), (1, calm)]
+    batches = [
+        gymnasium.make_vec("MiddlePoint-v0", count, autoreset_mode="SameStep", **arguments)
+        for count, arguments in parts
+    ]
+    single = [
+        lambda arguments=arguments: gymnasium.make("MiddlePoint-v0", **arguments)
+        for count, arguments in parts
+        for _ in range(count)
+    ]
+    return GymnasiumVecEnv(*batches), DummyVecEnv(single)
+
+
+@pytest.mark.parametrize(
+    "make", [make_both, make_both_of_two_batches, make_both_of_episodes_that_terminate]
+)
+def test_trajectories_equal_those_of_dummy_vec_env(make, rng):
+    ours, theirs = make()
+    assert ours.num_envs == theirs.num_envs
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    truncated = []
+    for seed in (3, None):
+        if seed is not None:
+            assert ours.seed(seed) == theirs.seed(seed)
+        np.testing.assert_array_equal(ours.reset(), theirs.reset())
+        for _ in range(70):
+            actions = rng.normal(0, 1, (N, 1)).astype(np.float32)
+            if ours.action_space.shape == ():
+                actions = (actions[:, 0] > 0).astype(int)
+            *arrays, infos = ours.step(actions)
+            *expected, expected_infos = theirs.step(actions)
+            for array, other in zip(arrays, expected, strict=True):
+                np.testing.assert_array_equal(array, other)
+                assert array.dtype == other.dtype
+            for info, other, done in zip(infos, expected_infos, arrays[2], strict=True):
+                assert info.get("TimeLimit.truncated", False) is other["TimeLimit.truncated"]
+                assert ("terminal_observation" in info) == done
+                if done:
+                    last = info["terminal_observation"]
+                    np.testing.assert_array_equal(last, other["terminal_observation"])
+                    truncated.append(info["TimeLimit.truncated"])
+    terminate = make is make_both_of_episodes_that_terminate
+    assert set(truncated) == ({True, False} if terminate else {True})
+
+
+def test_training_ends_in_the_same_weights():
+    trained = [
+        PPO("MlpPolicy", envs, n_steps=64, batch_size=64, n_epochs=2, seed=3, device="cpu")
+        .learn(1024)
+        for envs in make_both()
+    ]  # fmt: skip
+    assert torch.equal(*map(parameters_of, trained))
+    untrained = PPO("MlpPolicy", make_both()[0], seed=3, device="cpu")
+    assert not torch.equal(parameters_of(trained[0]), parameters_of(untrained))
+
+
+def test_infos_of_the_batch_are_at_hand():
+    ours, _ = make_both()
+    ours.reset()
+    assert ours.infos["output"].shape == (N,)
+    ours.step(np.ones((N, 1), np.float32))
+    assert list(ours.infos["command"]) == [10.0] * N
+
+
+def test_pictures_are_those_of_the_batch():
+    envs = gymnasium.make_vec(
+        "MiddlePoint-v0", 2, autoreset_mode="SameStep", render_mode="rgb_array"
+    )
+    ours = GymnasiumVecEnv(envs)
+    ours.reset()
+    np.testing.assert_array_equal(ours.get_images(), envs.render())
+    assert ours.render().shape == (2 * 540, 960, 3)
+
+
+def test_another_autoreset_mode_is_refused():
+    with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
+        GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", N))
+
+
+def test_batches_of_other_spaces_are_refused():
+    batches = [
+        gymnasium.make_vec("MiddlePoint-v0", 2, autoreset_mode="SameStep", action_window=window)
+        for window in (0, 1)
+    ]
+    with pytest.raises(ValueError, match="same spaces"):
+        GymnasiumVecEnv(*batches)
+
+
+def test_infos_and_attributes_of_two_batches():
+    ours, _ = make_both_of_two_batches()
+    ours.reset()
+    ours.step(np.ones((N, 1), np.float32))
+    assert list(ours.infos["command"]) == [10.0] * N
+    assert np.all(ours.infos["noise"][:3] != 0.0)
+    assert ours.infos["noise"][3] == 0.0
+    assert [p.noise_variance for p in ours.get_attr("parameters")] == [0.5, 0.5, 0.5, 0.0]
+
+
+def test_attributes_are_those_of_the_batch():
+    ours, _ = make_both()
+    assert ours.get_attr("render_mode") == [None] * N
+    assert [p.noise_variance for p in ours.get_attr("parameters", [0, 1])] == [0.5, 0.5]
+    assert ours.env_is_wrapped(Monitor) == [False] * N
+    with pytest.raises(NotImplementedError, match="parameters"):
+        ours.set_attr("parameters", None)
+    with pytest.raises(NotImplementedError, match="reset"):
+        ours.env_method("reset")
+    ours.set_options({"level": 3})
+    with pytest.raises(ValueError, match="options"):
+        ours.reset()
+
+
+class Shift(gymnasium.ActionWrapper, RecordConstructorArgs):
+    def __init__(self, env, by=0.1):
+        RecordConstructorArgs.__init__(self, by=by)
+        gymnasium.ActionWrapper.__init__(self, env)
+
+    def action(self, action):
+        return action + self._saved_kwargs["by"]
+
+
+VELOCITY = {"max_move": 0.3, "undo_dead_zone": True}
+TRAINING = {"action_window": 20, "setpoint": "random", "reward": "absolute"}
+
+
+def model_of(plants, **arguments):
+    return PPO("MlpPolicy", plants, n_steps=32, batch_size=32, device="cpu", **arguments)
+
+
+class TestMakeVecEnv:
+    def test_it_equals_wrapped_environments_one_by_one(self, rng):
+        ours = make_vec_env("MiddlePointHard-v0", 3, seed=5, wrapper=VELOCITY, **TRAINING)
+
+        def make():
+            return IncrementalAction(
+                gymnasium.make("MiddlePointHard-v0", **TRAINING), **VELOCITY
+            )
+
+        theirs = DummyVecEnv([make] * 3)
+        theirs.seed(5)
+        np.testing.assert_array_equal(ours.reset(), theirs.reset())
+        for _ in range(50):
+            actions = rng.uniform(-1, 1, (3, 1)).astype(np.float32)
+            for mine, other in zip(ours.step(actions)[:3], theirs.step(actions), strict=False):
+                np.testing.assert_array_equal(mine, other)
+
+    @pytest.mark.parametrize(
+        "wrapper",
+        [
+            VELOCITY, partial(IncrementalAction, **VELOCITY),
+            partial(VectorIncrementalAction, **VELOCITY),
+            lambda env: IncrementalAction(env, **VELOCITY),
+        ],
+    )  # fmt: skip
+    def test_the_spec_makes_the_same_environment(self, wrapper):
+        spec = make_vec_env("MiddlePoint-v0", 2, wrapper=wrapper, **TRAINING).spec
+        env = gymnasium.make(EnvSpec.from_json(spec.to_json()))
+        assert isinstance(env, IncrementalAction)
+        assert spec.additional_wrappers[0].kwargs == VELOCITY
+        assert env.unwrapped.parameters.action_window == 20
+
+    def test_returns_are_those_of_a_monitor(self):
+        ours = make_vec_env("MiddlePoint-v0", 2, max_episode_steps=7, noise_variance=0.5)
+        theirs = DummyVecEnv(
+            [
+                lambda: Monitor(
+                    gymnasium.make("MiddlePoint-v0", max_episode_steps=7, noise_variance=0.5)
+                )
+            ]
+            * 2
+        )
+        found = []
+        for plants in (ours, theirs):
+            plants.seed(1)
+            plants.reset()
+            steps = [plants.step(np.ones((2, 1), np.float32)) for _ in range(21)]
+            episodes = [i["episode"] for *_, infos in steps for i in infos if "episode" in i]
+            found.append([(episode["r"], episode["l"]) for episode in episodes])
+        assert len(found[0]) == 6
+        np.testing.assert_allclose(found[0], found[1], atol=2e-6)
+
+    def test_they_are_logged(self):
+        plants = make_vec_env("MiddlePoint-v0", 2, max_episode_steps=16)
+        model = model_of(plants).learn(64)
+        assert len(model.ep_info_buffer) == 4
+        assert model.ep_info_buffer[0]["r"] == pytest.approx(-0.5 * 16)
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ({"n_envs": 0}, "n_envs must be an integer from 1"),
+            ({"wrapper": 3}, "wrapper must be the arguments of IncrementalAction"),
+            ({"wrapper": Shift}, "wrapper must be IncrementalAction, got"),
+            ({"wrapper": {"max_move": 7}}, "max_move must be"),
+            ({"env": "MiddlePointEasy-v0"}, "env must be the id of an environment"),
+            ({"delay": -2}, "delay must be"),
+        ],
+    )
+    def test_what_is_refused(self, arguments, message):
+        with pytest.raises(ValueError, match=message):
+            make_vec_env(**arguments)
+
+
+class TestHowItWasTrained:
+    @pytest.mark.parametrize("by", ["its own save", "save", "before"])
+    def test_a_model_keeps_it(self, by, tmp_path):
+        model = model_of(make_vec_env("MiddlePoint-v0", 2, wrapper=VELOCITY, **TRAINING))
+        path = tmp_path / "model.zip"
+        if by == "its own save":
+            model.save(path)
+        elif by == "save":
+            save(model, path)
+        found = spec_of(model if by == "before" else path, "MiddlePointNoisy-v0", delay=12)
+        plant = gymnasium.make(found)
+        assert plant.unwrapped.parameters == Parameters(
+            noise_variance=0.5, delay=12, action_window=20
+        )
+        assert found.additional_wrappers[0].kwargs == VELOCITY
+        expected = evaluate(
+            model,
+            lambda: IncrementalAction(
+                gymnasium.make("MiddlePointNoisy-v0", delay=12, action_window=20), **VELOCITY
+            ),
+            episodes=2,
+        )
+        loaded = model if by == "before" else PPO.load(path, device="cpu")
+        np.testing.assert_array_equal(
+            evaluate(loaded, found, episodes=2).errors, expected.errors
+        )
+        with pytest.raises(ValueError, match="the wrapper that policy was trained with"):
+            evaluate(loaded, "MiddlePoint-v0", action_window=20)
+
+    def test_a_model_of_single_environments_is_saved_with_it(self, tmp_path):
+        model = model_of(Shift(gymnasium.make("MiddlePoint-v0", output_window=2), by=0.2))
+        save(model, tmp_path / "mine.zip")
+        assert [path.name for path in tmp_path.iterdir()] == ["mine.zip"]
+        found = spec_of(tmp_path / "mine.zip")
+        assert [wrapper.kwargs for wrapper in found.additional_wrappers] == [{"by": 0.2}]
+        errors = evaluate(PPO.load(tmp_path / "mine.zip", device="cpu"), found, episodes=2)
+        assert errors.mean_error == evaluate(model, found, episodes=2).mean_error
+
+    def test_without_it_nothing_is_guessed(self, tmp_path):
+        model = model_of(gymnasium.make("MiddlePoint-v0"))
+        model.save(tmp_path / "bare.zip")
+        with pytest.raises(
+            ValueError, match="policy must be one that knows how it was trained"
+        ):
+            spec_of(tmp_path / "bare.zip")
+        with pytest.raises(
+            ValueError, match="policy must be one that knows how it was trained"
+        ):
+            spec_of(PPO.load(tmp_path / "bare.zip", device="cpu"))
+        (tmp_path / "text.zip").write_text("no zip")
+        with pytest.raises(ValueError, match=r"text\.zip must be a model"):
+            spec_of(tmp_path / "text.zip")
+        with pytest.raises(ValueError, match=r"none\.zip cannot be read: No such file"):
+            spec_of(tmp_path / "none.zip")
+
+    def test_running_statistics_are_refused(self, tmp_path):
+        model = model_of(VecNormalize(make_vec_env("MiddlePoint-v0", 2)))
+        with pytest.raises(ValueError, match="trained without VecNormalize"):
+            save(model, tmp_path / "model.zip")
+        # At hand, the model is judged with them.
+        model.learn(64)
+        plain = PPO("MlpPolicy", make_vec_env("MiddlePoint-v0", 2), device="cpu")
+        plain.policy.load_state_dict(model.policy.state_dict())
+        assert not np.array_equal(
+            evaluate(model, episodes=2, dead_zone=0.0).travels,
+            evaluate(plain, episodes=2, dead_zone=0.0).travels,
+        )
+
+
+class TestScoreCallback:
+    def test_it_scores_keeps_the_best_and_tells(self, tmp_path, capsys):
+        plants = make_vec_env("MiddlePoint-v0", 2, seed=0, wrapper=VELOCITY, **TRAINING)
+        callback = ScoreCallback(
+            "MiddlePointNoisy-v0", every=128, episodes=3, path=tmp_path / "best.zip"
+        )
+        model = model_of(plants, seed=1, learning_rate=0.01)
+        model.set_logger(configure(str(tmp_path / "log"), ["csv"]))
+        model.learn(320, callback=callback)
+        model.logger.close()
+        assert [samples for samples, _ in callback.scores] == [128, 256, 320]
+        spec = spec_of(model, "MiddlePointNoisy-v0")
+        last = evaluate(model, spec, episodes=3, seed=SEED + 100)
+        assert callback.scores[-1][1].mean_error == last.mean_error
+        errors = [found.mean_error for _, found in callback.scores]
+        assert callback.best.mean_error == min(errors)
+        kept = PPO.load(tmp_path / "best.zip", device="cpu")
+        assert evaluate(
+            kept, spec_of(tmp_path / "best.zip", spec), episodes=3, seed=SEED + 100
+        ).mean_error == min(errors)
+        shown = capsys.readouterr().out.splitlines()
+        assert len(shown) == 3
+        assert shown[0].startswith("128 of 320 samples: MiddlePointNoisy-v0: mean error ")
+        assert sum(line.endswith("; best") for line in shown) >= 1
+        logged = (tmp_path / "log" / "progress.csv").read_text()
+        assert "score/mean_error" in logged
+        assert "score/score" in logged
+
+    def test_it_refuses_what_it_cannot_judge(self):
+        with pytest.raises(ValueError, match="every must be an integer from 1"):
+            ScoreCallback(every=0)
+        env = MiddlePointEnv()  # made without a spec
+        with pytest.raises(ValueError, match="policy must be one that knows how"):
+            model_of(env).learn(32, callback=ScoreCallback())
