@@ -260,7 +260,8 @@ class TestRefusals:
 
     def test_a_policy_that_was_trained_with_a_wrapper(self):
         class Trained:
-            spec = wrapped().spec.to_json()
+            observation_space = wrapped().observation_space
+            observation_space.trained_on = wrapped().spec.to_json()  # as mptc_gym.sb3 notes it
             predict = staticmethod(proportional)
 
         with pytest.raises(ValueError, match="the wrapper that policy was trained with, Incr"):

@@ -569,7 +569,7 @@ def test_command(capsys, tmp_path):
     shown = capsys.readouterr().out
     for name in (*SCENARIOS, *PRESETS):
         assert name in shown
-    assert "0.9073" in shown
+    assert "0.9114" in shown
 
 
 class TestOtherDynamics:

@@ -59,7 +59,7 @@ class TestScore:
         score = tune.score(PIController, runs=1, first_run=0)
         scenario, first = {s.name: (s, n) for s, n in tune.SCENARIOS}["learnt"]
         runs = Batch(1).run(PIController(), scenario.samples, **scenario.arguments)
-        error = np.abs(runs.setpoint - runs.output)
+        error = np.abs(runs.error)
         assert score["learnt"] == pytest.approx(error[first:].mean())
         assert score["learnt"] != pytest.approx(error.mean())
 
