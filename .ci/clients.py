@@ -182,7 +182,7 @@ def rllib() -> None:
     (line,) = lines("RLlib")
     done = run(line, "--steps", "500", "--batch", "250", folder=ROOT)
     assert done.returncode == 0, done.stderr
-    shown = [each.split() for each in done.stdout.splitlines() if "mean |e|" in each]
+    shown = [each.split() for each in done.stdout.splitlines() if "mean error" in each]
     assert [each[0] for each in shown] == ["250", "500"]
 
 

@@ -21,7 +21,8 @@ installed = distribution("mptc_gym")
 files = {file.as_posix() for file in installed.files or ()}
 info = f"mptc_gym-{installed.version}.dist-info"
 assert {file.partition("/")[0] for file in files} == {"mptc_gym", info}, sorted(files)
-assert {"mptc_gym/py.typed", f"{info}/licenses/LICENSE"} <= files, sorted(files)
+shipped = {"mptc_gym/py.typed", "mptc_gym/CHANGELOG.md", f"{info}/licenses/LICENSE"}
+assert shipped <= files, sorted(files)
 present = [name for name in ABSENT if find_spec(name)]
 assert not present, present
 
@@ -62,4 +63,6 @@ import mptc_gym  # noqa: E402 (last, since the id above must do without it)
 
 assert Path(mptc_gym.__file__).is_relative_to(sys.prefix), mptc_gym.__file__
 assert mptc_gym.__version__ == installed.version
+changelog = Path(mptc_gym.__file__).with_name("CHANGELOG.md").read_text(encoding="utf-8")
+assert f"## {installed.version}\n" in changelog
 print(f"mptc_gym {installed.version} is complete and runs, with nothing but {needed}")

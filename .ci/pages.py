@@ -28,7 +28,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         if name.startswith((".", "tests")) or not path.exists():
             continue
         if path.suffix in SHOWN or name == "LICENSE":
-            files.append(File.generated(config, name, abs_src_path=str(path)))
+            files.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
         elif path.suffix == ".py":
             code = path.read_text(encoding="utf-8")
             head = f"---\nsearch: {{exclude: true}}\nhide: [toc]\n---\n# {name}"

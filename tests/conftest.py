@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from typing import Any
 
+# Before NumPy and PyTorch are loaded: the processes of the tests share the cores already.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ["SDL_VIDEODRIVER"] = "dummy"  # windows that nobody sees
+
 import gymnasium
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-
-os.environ["SDL_VIDEODRIVER"] = "dummy"  # windows that nobody sees
 
 
 def run(

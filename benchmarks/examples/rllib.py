@@ -1,7 +1,7 @@
 """PPO of RLlib on one plant.
 
-`python -m benchmarks.examples.rllib` trains a policy for some iterations and prints its mean
-absolute error on the noise-free square wave, without exploration, after each. Nothing is kept.
+`python -m benchmarks.examples.rllib` trains a policy for some iterations and prints its score
+on the noise-free square wave, without exploration, after each. The policy is not saved.
 RLlib asks for one version of Gymnasium, and so for a virtual environment of its own:
 `pip install -e ".[bench,rllib]"`.
 """
@@ -10,48 +10,35 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
-import gymnasium
+import numpy as np
 import ray
 import torch
+from numpy.typing import NDArray
 from ray.rllib.algorithms.ppo import PPOConfig
 
-import mptc_gym  # noqa: F401 (registers the environment)
+from mptc_gym import evaluate
 
 # With delay + 2 past actions the problem is Markov while the set point holds.
 OBSERVATION: dict[str, Any] = {"action_window": 20}
 
 
-@torch.no_grad()
-def square_error(module: Any) -> float:
-    """Return the mean |e| of a module of RLlib on the noise-free square wave, degC."""
-    plant = gymnasium.make("MiddlePoint-v0", **OBSERVATION)
-    observation, info = plant.reset(seed=0)
-    total, samples, ended = 0.0, 0, False
-    while not ended:
-        total += abs(info["error"])
-        samples += 1
-        inputs = {"obs": torch.as_tensor(observation)[None]}
+def policy_of(module: Any) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    """Return a module of RLlib as a function of observations, without exploration."""
+
+    @torch.no_grad()
+    def act(observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        outputs = module.forward_inference({"obs": torch.as_tensor(observations)})
         # The mean of its distribution comes first, then the logarithm of its spread.
-        action = module.forward_inference(inputs)["action_dist_inputs"][0, :1].numpy()
-        observation, _, _, ended, info = plant.step(action)
-    return total / samples
+        return cast("NDArray[np.float32]", outputs["action_dist_inputs"][:, :1].numpy())
+
+    return act
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Train, and print how far it got.
-
-    Parameters
-    ----------
-    arguments
-        The command line without the program's name.
-
-    Returns
-    -------
-    int
-        0.
-    """
+    """Train with the options of a command line, without the program's name."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.examples.rllib",
         description=__doc__,
@@ -78,11 +65,8 @@ def main(arguments: list[str] | None = None) -> int:
     algorithm = config.build_algo()
     for iteration in range(-(-options.steps // options.batch)):
         algorithm.train()
-        error = square_error(algorithm.get_module())
-        print(
-            f"{(iteration + 1) * options.batch:9,} steps: mean |e| on the square wave "
-            f"{error:.3f} degC", flush=True,
-        )  # fmt: skip
+        found = evaluate(policy_of(algorithm.get_module()), **OBSERVATION)
+        print(f"{(iteration + 1) * options.batch:9,} steps: {found}", flush=True)
     algorithm.stop()
     ray.shutdown()
     return 0

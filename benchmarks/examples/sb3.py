@@ -1,8 +1,8 @@
 """PPO of Stable-Baselines3, all its settings at their defaults, learns to control one plant.
 
 `python benchmarks/examples/sb3.py` trains for 300,000 samples, which takes some minutes, and
-prints the mean absolute error on a square wave between +5 and -5 degC that the policy has not
-met. Doing nothing makes 5 degC, and the least that is possible is 0.91 degC.
+prints the score of the policy on a square wave between +5 and -5 degC, which it has not met:
+0 is a valve left alone, 1 the least possible error.
 
 This is one file to copy. What makes it work:
 
@@ -20,7 +20,7 @@ import gymnasium
 import torch
 from stable_baselines3 import PPO
 
-import mptc_gym  # noqa: F401 (registers MiddlePoint-v0)
+from mptc_gym import evaluate
 from mptc_gym.wrappers import IncrementalAction
 
 SET_POINTS = {"setpoint": "random", "setpoint_amplitude": 6.0}
@@ -30,18 +30,6 @@ def make_plant(**arguments: Any) -> gymnasium.Env[Any, Any]:
     """Make the plant as the policy sees it."""
     plant = gymnasium.make("MiddlePoint-v0", action_window=20, reward="absolute", **arguments)
     return IncrementalAction(plant, max_move=0.4, undo_dead_zone=True)
-
-
-def mean_error(model: PPO) -> float:
-    """Return the mean absolute error on the default square wave, degC."""
-    plant = make_plant()
-    observation, _ = plant.reset(seed=0)
-    errors, truncated = [], False
-    while not truncated:
-        action, _ = model.predict(observation, deterministic=True)
-        observation, _, _, truncated, info = plant.step(action)
-        errors.append(abs(info["error"]))
-    return float(sum(errors) / len(errors))
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -55,7 +43,7 @@ def main(arguments: list[str] | None = None) -> None:
     plant = make_plant(**SET_POINTS)
     model = PPO("MlpPolicy", plant, seed=options.seed, device="cpu")
     model.learn(options.steps)
-    print(f"mean |e| on the square wave: {mean_error(model):.2f} °C")
+    print(evaluate(model, make_plant))
 
 
 if __name__ == "__main__":
