@@ -74,8 +74,8 @@ class TestFit:
     def test_without_noise_the_coefficients_are_exact(self):
         log = recorded(dead_zone=0.0, noise=1e-8)
         model = identify(log, Options(orders=Orders(2, 2, 2), find_dead_zone=False))
-        np.testing.assert_allclose(model.a, PAPER.a, atol=2e-3)
-        np.testing.assert_allclose(model.b, PAPER.b, atol=2e-4)
+        np.testing.assert_allclose(model.plant.a, PAPER.a, atol=2e-3)
+        np.testing.assert_allclose(model.plant.b, PAPER.b, atol=2e-4)
         assert model.estimates["delay"].value == 18
 
     def test_log_without_noise_needs_no_higher_orders(self):
@@ -91,7 +91,7 @@ class TestFit:
         log, plain = good
         shifted = Log(log.flow + 480.0, log.temperature + 385.0, 8.0)
         model = identify(shifted, Options(operating_flow=480.0))
-        np.testing.assert_allclose(model.a, plain.a, rtol=1e-4)
+        np.testing.assert_allclose(model.plant.a, plain.plant.a, rtol=1e-4)
         assert model.operating_flow == 480.0
         assert model.operating_temperature == pytest.approx(385.0, abs=0.5)
         by_itself = identify(shifted, Options(find_dead_zone=False))
@@ -408,7 +408,7 @@ class TestLog:
             ("4,1.0,1.0", "line 4: the time must increase, and goes from 8 s by -4 s"),
             ("8,1.0,1.0", "line 4: the time must increase"),
             ("19,1.0,1.0", "line 4: the time steps are unequal, 11 s here where most are 8 s"),
-            ("16,1,0,1,5", "line 4: 5 fields where the heading has 3. With decimal commas"),
+            ("16,1,0,1,5", "Expected 3 fields in line 4, saw 5. With decimal commas"),
         ],
     )
     def test_bad_line_is_named(self, written, line, complaint):
@@ -469,7 +469,7 @@ class TestCommand:
             (["--u-min", "nan"], "--u-min: must be a finite number, got 'nan'"),
             (["--u-max", "full"], "--u-max: must be a finite number, got 'full'"),
             (["--operating-flow", "inf"], "--operating-flow: must be a finite number"),
-            (["--operating-flow", "1e9"], "b must have a sum other than 0"),
+            (["--operating-flow", "1e9"], "operating_flow must be near the flows of the log"),
             (["--sampling-interval", "0"], "--sampling-interval: must be a number above 0"),
         ],
     )

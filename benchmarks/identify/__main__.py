@@ -55,6 +55,13 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         help="column of the temperature",
     )
     add(
+        "--disturbance",
+        action="append",
+        default=[],
+        metavar="COLUMN",
+        help="column of a measured disturbance: it may be given more than once",
+    )
+    add(
         "--sampling-interval",
         type=command_line.positive,
         metavar="S",
@@ -134,6 +141,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
     columns = Columns(
         options.time, options.flow, options.temperature, options.sampling_interval,
         options.time_unit, options.flow_unit, options.temperature_unit,
+        tuple(options.disturbance),
     )  # fmt: skip
     try:
         log = read_log(options.log, columns, options.rows)

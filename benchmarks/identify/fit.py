@@ -1,36 +1,55 @@
-"""Fits (28) and the dead zone of (29) to a log: the search for delay, dead zone and orders."""
+"""Fits (28) and the dead zone of (29) to a log: the choice of orders, delay and dead zone."""
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
 
+from benchmarks.identify import simulation
 from benchmarks.identify.armax import Array, Orders
-from benchmarks.identify.intervals import Estimates, polynomials
-from benchmarks.identify.likelihood import MAGNITUDES, Candidate, Likelihood, Place
+from benchmarks.identify.cleaning import (
+    at_one_rate,
+    suspects,
+    without,
+    without_noise_of_held_flow,
+)
+from benchmarks.identify.likelihood import Candidate, Gap, Likelihood
 from benchmarks.identify.log import Log
-from benchmarks.identify.model import CannotTellError, Interval, Model, Options
+from benchmarks.identify.model import (
+    CannotTellError,
+    HeldOut,
+    Known,
+    Model,
+    Options,
+)
+from benchmarks.identify.noise import in_the_environment
+from benchmarks.identify.posterior import Posterior
+from benchmarks.linear import LinearModel
 
+SECOND = np.array([-0.8])  # C of a second time constant, to begin with
 FIRST_ORDERS = Orders(2, 1, 2)  # to look for the delay with, before the orders are known
-WORTH_A_FIT = 16.0  # candidates that the search leaves this far behind get no fit of their own
-MOST_FITS = 60
+OF_A, OF_B, OF_C = (1, 2, 3), (1, 2, 3, 6, 12), (0, 1, 3)
+WORTH_A_FIT = 7  # orders that are fitted, of those that come out best with a common C
+WORTH_A_TRIAL = 4  # of those, the ones that are tried on the last third
+CLOSE = 12.0  # of criteria: orders that far behind take no part
+WORSE = 1.2  # times the least share that is left open: what is more takes no part
 WEAK = 100.0  # twice the log likelihood, below which a log may be the wrong way round
 CHANCE = 0.01  # that a flow without effect is taken for one with effect
+OUTLYING = 6.0  # robust deviations of prediction errors, from which a suspect is a spike
+SLOW = 3.0  # time constants that a log should hold
 
 
 def identify(log: Log, options: Options | None = None) -> Model:
     """Fit (28), and the dead zone of (29), to a log.
 
-    The delay and the dead zone are searched: every delay, and every gap between two neighbours
-    among the magnitudes of the commands, since the likelihood is the same all over a gap.
-    For each pair that is any good, A, B and C are those of maximum likelihood.
-
-    The delay is then the one with most of the posterior within one sample, with no preference
-    beforehand, and the dead zone is the median of its posterior. Their intervals hold 95 % of
-    it; that of the dead zone takes gaps as a whole. The intervals of gain and time constant are
-    where the likelihood, at its maximum over all else, is within what chance would explain.
+    Orders of A, B and C, with and without a random walk of the base line, are fitted by maximum
+    likelihood. Those with the best information criteria are fitted again to the first two
+    thirds of the log, and simulate the last one; what is clearly worse there is left out. What
+    remains has a posterior: over orders by the criterion, over all delays and all gaps between
+    neighbours among the magnitudes of the commands, as the likelihood is the same all over a
+    gap, and over the coefficients. All intervals are its quantiles.
 
     Parameters
     ----------
@@ -47,95 +66,177 @@ def identify(log: Log, options: Options | None = None) -> Model:
         If the options do not fit to the log.
     """
     options = options or Options()
-    likelihood = Likelihood(log, options)
-    fits, criteria = _search(likelihood)
-    orders = next(iter(criteria))
-    _check_answer(likelihood, fits[0], orders, log)
-    found = Estimates(likelihood, orders, fits)
-    a, b, c, constant = polynomials(found.chosen.solution, orders)
+    log = _cleaned(without_noise_of_held_flow(at_one_rate(log)), options)
+    longest_b = options.orders.b if options.orders else max(OF_B)
+    likelihood = Likelihood(log, options, longest_b)
+    fits = _fits(likelihood)
+    _check_answer(likelihood, fits[0], log)
+    fits, held_out = _tried(likelihood, fits)
+    posterior = Posterior(likelihood, fits)
+    chosen = posterior.chosen
+    a, b, of_known, levels = likelihood.parts(chosen)
     _check_stable(a)
-    covariance = found.covariance()
     interval = log.sampling_interval
-    samples = found.time_constant()
     estimates = {
-        "delay": found.delay,
-        "dead_zone": found.dead_zone,
-        "gain": found.gain(),
-        "time_constant": Interval(
-            interval * samples.value, interval * samples.low, interval * samples.high
-        ),
-        "noise_variance": found.noise_variance(),
-        **found.coefficients(covariance),
+        "delay": posterior.delay,
+        "dead_zone": posterior.dead_zone,
+        "gain": posterior.gain,
+        "time_constant": posterior.time_constant(interval),
+        "noise_variance": posterior.noise_variance(),
+        **posterior.coefficients(),
     }
+    noise, c = in_the_environment(a, chosen)
     errors = np.full(len(likelihood.output), np.nan)
-    errors[likelihood.rows.index] = found.chosen.solution.errors
-    return Model(
-        a=a, b=b, c=c,
-        estimates=estimates,
+    errors[likelihood.rows.counted] = chosen.solution.errors
+    plant = LinearModel(a.tolist(), b.tolist(), c, chosen.place.delay, interval)
+    known = tuple(
+        Known(name, float(values[np.isfinite(values)][0]), lag, tuple(each.tolist()))
+        for (name, values), lag, each in zip(
+            log.disturbances.items(), likelihood.lags, of_known, strict=True
+        )
+    )
+    level = likelihood.level
+    if chosen.orders.walk:
+        level += _level(likelihood, chosen)
+    else:
+        level += float(levels[0]) / float(a.sum())
+    model = Model(
+        plant=plant, noise=noise, known=known,
+        estimates=estimates, possible=posterior.draws,
         u_min=likelihood.u_min, u_max=likelihood.u_max,
-        operating_flow=likelihood.operating_flow,
-        operating_temperature=likelihood.level + constant / sum(a),
-        orders=orders,
-        sampling_interval=interval,
-        criteria=criteria,
-        errors=errors,
-        covariance=covariance,
-        profile=_profile_of_delay(fits),
-        notes=_notes(found.chosen, estimates["gain"], options),
+        operating_flow=likelihood.operating_flow, operating_temperature=level,
+        orders=chosen.orders, sampling_interval=interval, errors=errors, held_out=held_out,
+        notes=list(log.notes),
     )  # fmt: skip
+    model.notes.extend(_notes(model, options, len(log.flow)))
+    return model
 
 
-def _search(likelihood: Likelihood) -> tuple[list[Candidate], dict[Orders, float]]:
-    """Return the fits that are worth a look and the criterion of all orders, the best first.
+def _cleaned(log: Log, options: Options) -> Log:
+    """Return a log without its spikes: suspects that a first model does not foresee either."""
+    found = suspects(log)
+    if not found.any():
+        return log
+    likelihood = Likelihood(without(log, found), replace(options, orders=FIRST_ORDERS))
+    fit = _first(likelihood)[0]
+    errors = likelihood.errors(fit)
+    missed = errors + np.where(found, log.temperature - likelihood.level, 0.0)
+    missed -= np.where(found, likelihood.filled, 0.0)
+    scale = 1.4826 * float(np.nanmedian(np.abs(errors[~found])))
+    return without(log, found & ~(np.abs(missed) < OUTLYING * scale))
 
-    Afterwards the likelihood looks at the delays of these fits only.
-    """
-    first = likelihood.options.orders or FIRST_ORDERS
-    _, delay, gap = likelihood.scan(first, np.zeros(0), likelihood.gaps())[0]
-    c = likelihood.fit(delay, gap, first).solution.c
-    best = likelihood.scan(first, c, likelihood.gaps())
-    criteria = _criteria(likelihood, best, c)
-    orders = next(iter(criteria))
-    c = likelihood.fit(*best[0][1:], orders, c).solution.c
-    gaps = likelihood.gaps()
-    best = likelihood.scan(orders, c, gaps)
-    if len(likelihood.magnitudes) > MAGNITUDES and likelihood.options.find_dead_zone:
-        gaps = likelihood.gaps(around=best[0][2])
-        best = likelihood.scan(orders, c, gaps)
-    # Without the longest delays, rows at the beginning and after gaps are known, too.
-    likelihood.narrow(max(delay for _, delay, _ in _near(best)))
-    fits = [
-        likelihood.fit(delay, gap, orders, c)
-        for _, delay, gap in _near(likelihood.scan(orders, c, gaps))
+
+def _first(likelihood: Likelihood) -> list[Candidate]:
+    """Return fits of the first orders without and with a walk, the better one first."""
+    options = likelihood.options
+    orders = options.orders or FIRST_ORDERS
+    place = likelihood.scan(replace(orders, c=0), np.zeros(0), likelihood.gaps())[0]
+    fit = likelihood.fit(place, orders)
+    if likelihood.known:
+        likelihood.place_known(place, orders, fit.solution.c)
+        fit = likelihood.fit(place, orders, fit.solution.c)
+    tried = [orders] if options.orders else [orders, replace(orders, walk=True)]
+    fits = []
+    for each in tried:
+        c = likelihood.fit(place, each).solution.c
+        best = likelihood.scan(each, c, likelihood.gaps())[0]
+        fits.append(likelihood.fit(best, each, c))
+    return sorted(fits, key=lambda fit: likelihood.criterion(fit.orders, fit.deviance))
+
+
+def _fits(likelihood: Likelihood) -> list[Candidate]:
+    """Return fits of all orders that are worth it, by their criterion, the best first."""
+    first = _first(likelihood)
+    if likelihood.options.orders:
+        return first
+    scanned = []
+    for base in first:
+        gaps = [base.place.gap]
+        for a in OF_A:
+            for b in OF_B:
+                orders = Orders(a, b, 2, base.orders.walk)
+                place = likelihood.scan(orders, base.solution.c, gaps)[0]
+                scanned.append(
+                    (likelihood.criterion(orders, place.deviance), orders, place, base)
+                )
+    scanned.sort(key=lambda entry: entry[0])
+    # Of each kind one at least: a common C is no measure for all.
+    kinds = [(walk, long) for walk in (False, True) for long in (False, True)]
+    chosen = scanned[:WORTH_A_FIT] + [
+        next(e for e in scanned if (e[1].walk, e[1].b > 3) == kind) for kind in kinds
     ]
-    return sorted(fits, key=lambda fit: fit.deviance), criteria
+    fits: dict[Orders, Candidate] = {}
+    for _, orders, place, base in chosen:
+        if orders not in fits:
+            fits[orders] = likelihood.best_fit(place, orders, base.solution.c)
+
+    def by_criterion() -> list[Candidate]:
+        return sorted(
+            fits.values(), key=lambda fit: likelihood.criterion(fit.orders, fit.deviance)
+        )
+
+    for fit in by_criterion()[:3]:
+        for c in OF_C:
+            orders = replace(fit.orders, c=c)
+            if orders not in fits:
+                fits[orders] = likelihood.best_fit(fit.place, orders, fit.solution.c)
+    # A second time constant of the plant that is not one of the noise has a peak of its own.
+    lags, found = [], by_criterion()
+    for b in (1, 2):
+        orders = Orders(2, b, 1)
+        place = likelihood.scan(orders, SECOND, [found[0].place.gap])[0]
+        lags.append(likelihood.fit(place, orders, SECOND))
+    return [*found, *(fit for fit in lags if fit.solution.c[0] < -0.3)]
 
 
-def _near(found: list[Place]) -> list[Place]:
-    """Return what is worth a fit of its own, out of what is sorted by its deviance."""
-    return [place for place in found if place[0] < found[0][0] + WORTH_A_FIT][:MOST_FITS]
+def _tried(likelihood: Likelihood, fits: list[Candidate]) -> tuple[list[Candidate], HeldOut]:
+    """Return the fits that simulate the last third well, and how well the best of them does."""
+    log = likelihood.log
+    cut = int(likelihood.rows.index[len(likelihood.rows.index) * 2 // 3])
+    last = np.arange(len(log.flow)) >= cut
+    flow = simulation.held(likelihood.applied(Gap(0.0, 0.0)))
+    known = [simulation.held(each) for each in likelihood.known]
+    impulse = simulation.of_impulse_response([flow, *known], likelihood.output, ~last)
+    mild = sorted(
+        fits, key=lambda fit: likelihood.criterion(fit.orders, fit.deviance, mild=True)
+    )
+    long = [fit for fit in fits if fit.orders.b > 3]
+    trial = fits[:WORTH_A_TRIAL]
+    others = dict.fromkeys([*mild[:2], *long[:1], *fits[-2:]])
+    trial += [fit for fit in others if fit not in trial]
+    likelihood.narrow(likelihood.longest_delay, cut)
+    shares = []
+    for fit in trial:
+        part = likelihood.fit(fit.place, fit.orders, fit.solution.c)
+        simulated = likelihood.simulated(part)
+        shares.append(simulation.explained(likelihood.output, simulated, last))
+    likelihood.narrow(likelihood.longest_delay)
+    # What a better simulation leaves open, and a part of the noise that no one foresees.
+    least = max(WORSE * (1.0 - max(shares)), 1.0 - max(shares) + 0.005)
+    good = [
+        (fit, share) for fit, share in zip(trial, shares, strict=True) if 1.0 - share <= least
+    ] or list(zip(trial, shares, strict=True))[:1]
+    criteria = [likelihood.criterion(fit.orders, fit.deviance, mild=True) for fit, _ in good]
+    # One of each kind: without a walk and with it, with a short B and a long one, and with a
+    # time constant of its own.
+    kinds: dict[tuple[bool, ...], Candidate] = {}
+    for (fit, _), each in zip(good, criteria, strict=True):
+        if each < min(criteria) + CLOSE:
+            kind = fit.orders.walk, fit.orders.b > 3, fit in fits[-2:], fit.orders.b > 1
+            kinds.setdefault(kind, fit)
+    near = [fit for fit in kinds.values() if fit is not good[0][0]]
+    found = simulation.explained(likelihood.output, impulse, last)
+    return [good[0][0], *near], HeldOut(float(good[0][1]), float(found))
 
 
-def _criteria(likelihood: Likelihood, best: list[Place], c: Array) -> dict[Orders, float]:
-    """Return the Bayesian information criterion of all orders, the best first.
-
-    A coefficient of B beyond the first counts twice: it is chosen, as the delay is, from
-    several places, and one before or behind the right ones gains by chance.
-    """
-    places = {(delay, gap) for _, delay, gap in best[:3]}
-    criteria = {}
-    for orders in likelihood.orders:
-        # More coefficients of B can stand for a longer delay.
-        tried = places | {(delay - 1, gap) for delay, gap in places if delay and orders.b > 1}
-        least = min(likelihood.fit(delay, gap, orders, c).deviance for delay, gap in tried)
-        counted = orders.count + orders.b - 1
-        criteria[orders] = least + counted * math.log(len(likelihood.rows))
-    return dict(sorted(criteria.items(), key=lambda entry: entry[1]))
+def _level(likelihood: Likelihood, fit: Candidate) -> float:
+    """Return the mean of what the simulation leaves, degC."""
+    return float(np.nanmean(likelihood.output - likelihood.simulated(fit)))
 
 
-def _check_answer(likelihood: Likelihood, best: Candidate, orders: Orders, log: Log) -> None:
+def _check_answer(likelihood: Likelihood, best: Candidate, log: Log) -> None:
     """Refuse a log in which the flow does nothing that can be told from noise."""
-    gained = likelihood.gained(best, orders)
+    gained = likelihood.gained(best)
     longest = likelihood.options.longest_delay
     if gained < WEAK and _gained_when_swapped(log, longest) > WEAK:
         raise CannotTellError(
@@ -145,7 +246,7 @@ def _check_answer(likelihood: Likelihood, best: Candidate, orders: Orders, log: 
         )
     # As many delays and dead zones have been tried, the best of them gains by chance.
     tried = (longest + 1) * len(likelihood.gaps())
-    least = float(stats.chi2.isf(CHANCE / tried, orders.b))
+    least = float(stats.chi2.isf(CHANCE / tried, best.orders.b))
     if gained < least:
         raise CannotTellError(
             "the temperature does not answer the flow in this log: a model without the "
@@ -159,14 +260,13 @@ def _gained_when_swapped(log: Log, longest_delay: int) -> float:
     """Return what the temperature adds to the likelihood of the flow."""
     swapped = Log(log.temperature, log.flow, log.sampling_interval)
     try:
-        likelihood = Likelihood(swapped, Options(longest_delay=longest_delay))
+        likelihood = Likelihood(swapped, Options(longest_delay, FIRST_ORDERS))
+        return likelihood.gained(_first(likelihood)[0])
     except ValueError:
         return 0.0
-    _, delay, gap = likelihood.scan(FIRST_ORDERS, np.zeros(0), likelihood.gaps())[0]
-    return likelihood.gained(likelihood.fit(delay, gap, FIRST_ORDERS), FIRST_ORDERS)
 
 
-def _check_stable(a: tuple[float, ...]) -> None:
+def _check_stable(a: Array) -> None:
     largest = float(np.max(np.abs(np.roots(a)), initial=0.0))
     if largest >= 1.0 - 1e-4:
         raise CannotTellError(
@@ -176,26 +276,34 @@ def _check_stable(a: tuple[float, ...]) -> None:
         )
 
 
-def _profile_of_delay(fits: list[Candidate]) -> dict[int, float]:
-    """Return what each delay falls short of the best by, twice the log likelihood."""
-    profile: dict[int, float] = {}
-    for fit in fits:
-        short = fit.deviance - fits[0].deviance
-        profile[fit.delay] = min(short, profile.get(fit.delay, math.inf))
-    return dict(sorted(profile.items()))
-
-
-def _notes(chosen: Candidate, gain: Interval, options: Options) -> list[str]:
+def _notes(model: Model, options: Options, samples: int) -> list[str]:
     """Return what the user should know about the fit."""
     notes = []
+    gain, constant = model.estimates["gain"], model.estimates["time_constant"]
+    walk = model.noise["disturbance_walk_variance"]
     if gain.value > 0:
         notes.append(
             "The direction is unusual for a boiler: the temperature rises with the flow. "
             "If it should not, see whether the columns are swapped."
         )
-    if chosen.delay >= options.longest_delay - 1:
+    if model.plant.delay >= options.longest_delay - 1:
         notes.append(
             f"The delay is as long as was looked for, {options.longest_delay} "
             "samples: try a longer --longest-delay, or a longer sampling interval."
+        )
+    if walk:
+        notes.append(
+            f"The base line wanders by {np.sqrt(walk):.2g} °C a sample, as a random walk: "
+            "`disturbance_walk_variance`. What the plant settles at is known less well."
+        )
+    if not np.isfinite([gain.low, gain.high, constant.high]).all():
+        notes.append(
+            "The plant may be integrating: an interval has no end, as the log does not show "
+            "where the temperature settles. Hold the flow longer."
+        )
+    elif SLOW * constant.value > samples * model.sampling_interval:
+        notes.append(
+            f"The log holds less than {SLOW:g} time constants of the plant. Its gain rests on "
+            "how the response goes on, which no one has seen."
         )
     return notes

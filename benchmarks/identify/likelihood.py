@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.lib.stride_tricks import sliding_window_view
 
-from benchmarks.identify.armax import Array, Orders, Rows, Solution
+from benchmarks.identify.armax import Array, Flags, Orders, Rows, Solution
 from benchmarks.identify.excitation import LEAST_SAMPLES, check_excitation
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError, Options
+from benchmarks.identify.simulation import held, response
 
-ALL_ORDERS = tuple(Orders(a, b, c) for a in (1, 2, 3) for b in (1, 2, 3) for c in (0, 1, 2, 3))
-MAGNITUDES = 40  # most dead zones that are tried at once
+COARSE = 40  # dead zones that are tried first
+MOST_GAPS = 250  # that are tried in all
 FINEST = 1e-6  # of the temperature's deviation, what its numbers tell
+BRIDGE = 10  # missing temperatures in a row that are filled in, for the noise to go on
+SHORTEST = 30  # rows of a stretch without a gap
+OF_KNOWN = 4  # coefficients of a known disturbance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class Gap:
-    """Two neighbours among the magnitudes of the commands, with the dead zone between them."""
+    """Neighbours among the magnitudes of the commands that are tried, and the zone between."""
 
     low: float
     high: float
@@ -33,18 +37,32 @@ class Gap:
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A delay and a place of the dead zone, with what the log says to them."""
+class Place:
+    """A delay and a place of the dead zone, with the deviance there.
 
+    The deviance is twice the negative log likelihood, but for a constant.
+    """
+
+    deviance: float
     delay: int
     gap: Gap
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Orders at a place, with the coefficients of maximum likelihood."""
+
+    orders: Orders
+    place: Place
     solution: Solution
-    deviance: float  # twice the negative log likelihood, but for a constant
+
+    @property
+    def deviance(self) -> float:
+        """Twice the negative log likelihood, but for a constant."""
+        return self.place.deviance
 
 
-Place = tuple[float, int, Gap]  # a deviance, and the delay and the gap that have it
-
-
+@dataclass
 class Likelihood:
     """A log in deviations from its operating point, and how well models explain it.
 
@@ -63,12 +81,12 @@ class Likelihood:
         Limits of the flow, t/h.
     command, output
         u(k), t/h, and y(k), degC, of the log; NaN where they are not known.
+    known
+        The known disturbances, as deviations from their first values.
+    lags
+        The delay of each of them, samples.
     magnitudes
         Of the commands, ascending, without 0, t/h.
-    orders : tuple of Orders
-        Those that are tried.
-    longest_delay : int
-        The longest that is tried, samples.
     rows : Rows
         Those that are predicted: in them all is known that (28) takes, for every delay and all
         orders that are tried.
@@ -81,39 +99,54 @@ class Likelihood:
         If the options do not fit to the log.
     """
 
-    def __init__(self, log: Log, options: Options) -> None:
-        self.options = options
+    log: Log
+    options: Options
+    longest_b: int = 1
+    lags: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        log, options = self.log, self.options
         self.operating_flow = _operating_flow(log.flow, options)
         command = log.flow - self.operating_flow
         self.u_min, self.u_max = _limits(command, options)
         self.command = np.clip(command, self.u_min, self.u_max)
         self.level = float(np.nanmean(log.temperature)) if len(log.temperature) else 0.0
         self.output = log.temperature - self.level
+        self.known = [each - each[np.isfinite(each)][0] for each in log.disturbances.values()]
+        self.lags = self.lags or [0] * len(self.known)
         # Smaller errors than this are rounding, and no reason for higher orders.
         self.resolution = FINEST**2 * float(np.nanvar(self.output)) if len(self.output) else 0.0
         check_excitation(self.command, self.output)
         magnitudes = np.unique(np.abs(self.command[np.isfinite(self.command)]))
         self.magnitudes = magnitudes[magnitudes > 0.0]
-        self.orders = (options.orders,) if options.orders else ALL_ORDERS
         self.narrow(options.longest_delay)
         if len(self.rows) < LEAST_SAMPLES:
             raise CannotTellError(
                 f"the log is too short: {len(self.output)} rows leave {len(self.rows)} without "
                 f"a gap in the {options.longest_delay} samples before them, and at least "
-                f"{LEAST_SAMPLES} are needed. A shorter --longest-delay needs less"
+                f"{LEAST_SAMPLES} are needed. A shorter --longest-delay needs less, and a "
+                "--sampling-interval as long as the gaps does not meet them"
             )
 
-    def narrow(self, longest_delay: int) -> None:
-        """Look at delays up to this one only, which may leave more rows to predict."""
+    def narrow(self, longest_delay: int, last: int | None = None) -> None:
+        """Look at delays up to this one only, which may leave more rows; and up to a row."""
         self.longest_delay = longest_delay
-        order_a = max(orders.a for orders in self.orders)
-        reach = longest_delay + max(orders.b for orders in self.orders)
-        flow, temperature = np.isfinite(self.command), np.isfinite(self.output)
-        known = _all_of_last(temperature, order_a + 1)
-        flows = _all_of_last(flow, reach)
-        known[1:] &= flows[:-1]
-        known[: max(order_a, reach)] = False
-        self.rows = Rows(known)
+        order_a = 3 if self.options.orders is None else self.options.orders.a
+        reach = longest_delay + self.longest_b
+        missing = ~np.isfinite(self.output)
+        self.filled = _interpolated(self.output)
+        bridged = missing & ~_runs(missing, BRIDGE + 1)
+        temperatures = _all_of_last(~missing | bridged, order_a + 1)
+        flows = _all_of_last(np.isfinite(self.command), reach)
+        for known in self.known:
+            flows &= _all_of_last(np.isfinite(known), reach + OF_KNOWN)
+        usable = temperatures.copy()
+        usable[1:] &= flows[:-1]
+        usable[: max(order_a, reach + (OF_KNOWN if self.known else 0))] = False
+        if last is not None:
+            usable[last:] = False
+        usable &= _runs(usable, SHORTEST)
+        self.rows = Rows(usable, _all_of_last(~missing, order_a + 1))
 
     def applied(self, gap: Gap) -> Array:
         """Return u_a for a dead zone within a gap."""
@@ -121,80 +154,183 @@ class Likelihood:
         result: Array = np.where(inside, 0.0, self.command)
         return np.where(np.isfinite(self.command), result, 0.0)  # of rows that are not used
 
-    def regressors(self, delay: int, gap: Gap, orders: Orders) -> tuple[Array, Array]:
-        """Return the target y(k), and -y(k-1) ..., u_a(k-d-1) ... and 1."""
-        rows, lags = self.rows, range(1, orders.a + 1)
-        inputs = range(delay + 1, delay + 1 + orders.b)
-        columns = (
-            -rows.lagged(self.output, lags),
-            rows.lagged(self.applied(gap), inputs),
-            np.ones((len(rows), 1)),
-        )
-        return self.output[rows.index], np.hstack(columns)
+    def fixed(self, orders: Orders, but: int = -1) -> tuple[Array, Array]:
+        """Return the target y(k), and all regressors but the flow, and but one disturbance."""
+        rows = self.rows
+        known = [
+            rows.lagged(np.nan_to_num(each), range(lag + 1, lag + 1 + OF_KNOWN))
+            for i, (each, lag) in enumerate(zip(self.known, self.lags, strict=True))
+            if i != but
+        ]
+        past = -rows.lagged(self.filled, range(1, orders.a + 1))
+        return self.filled[rows.index], np.hstack([past, *known, rows.levels(orders)])
 
-    def fit(
-        self, delay: int, gap: Gap, orders: Orders, start: Array | None = None
-    ) -> Candidate:
+    def regressors(self, place: Place, orders: Orders) -> tuple[Array, Array]:
+        """Return y(k), and -y(k-1) ..., u_a(k-d-1) ..., disturbances and levels."""
+        target, columns = self.fixed(orders)
+        lags = range(place.delay + 1, place.delay + 1 + orders.b)
+        flow = self.rows.lagged(self.applied(place.gap), lags)
+        return target, np.hstack([columns[:, : orders.a], flow, columns[:, orders.a :]])
+
+    def fit(self, place: Place, orders: Orders, start: Array | None = None) -> Candidate:
         """Return the fit of maximum likelihood."""
-        target, columns = self.regressors(delay, gap, orders)
-        solution = self.rows.solve(target, columns, orders.c, start)
-        return Candidate(delay, gap, solution, self.deviance(solution.square))
+        target, columns = self.regressors(place, orders)
+        solution = self.rows.solve(target, columns, orders.noise, start, walk=orders.walk)
+        return self._candidate(orders, place, solution)
+
+    def best_fit(self, place: Place, orders: Orders, start: Array) -> Candidate:
+        """Return the better of two fits: there may be a peak with a slow C and one without."""
+        slow = np.asarray(np.poly([0.8, 0.95][: 1 + orders.walk]), float)[1 : orders.noise + 1]
+        starts = [start, slow] if orders.a > 1 and orders.noise else [start]
+        fits = [self.fit(place, orders, each) for each in starts]
+        return min(fits, key=lambda fit: fit.deviance)
+
+    def linear(self, place: Place, orders: Orders, c: Array) -> Candidate:
+        """Return the fit with a given C."""
+        target, columns = self.regressors(place, orders)
+        white = self.rows.whitened(np.column_stack([target, columns]), c, walk=orders.walk)
+        white = white[self.rows.counts]
+        linear = np.linalg.lstsq(white[:, 1:], white[:, 0], rcond=None)[0]
+        errors = white[:, 0] - white[:, 1:] @ linear
+        return self._candidate(orders, place, Solution(linear, c, errors))
+
+    def _candidate(self, orders: Orders, place: Place, solution: Solution) -> Candidate:
+        found = Place(self.deviance(solution.square), place.delay, place.gap)
+        return Candidate(orders, found, solution)
 
     def deviance(self, square: float) -> float:
         """Return twice the negative log likelihood, but for a constant."""
         count = len(self.rows)
-        return count * math.log(max(square, count * self.resolution))
+        return count * math.log(max(square, count * self.resolution, 1e-300))
 
-    def gaps(self, around: Gap | None = None) -> list[Gap]:
-        """Return the places of the dead zone to try: all, or in detail around one of them."""
-        m = self.magnitudes
+    def criterion(self, orders: Orders, deviance: float, *, mild: bool = False) -> float:
+        """Return the Bayesian information criterion, or the milder one of Akaike.
+
+        A coefficient of B beyond the first counts twice: it is chosen, as the delay is, from
+        several places, and one before or behind the right ones gains by chance.
+        """
+        price = 2.0 if mild else math.log(len(self.rows))
+        return deviance + (orders.count + orders.b - 1) * price
+
+    def gaps(self) -> list[Gap]:
+        """Return places of the dead zone to begin with."""
         if not self.options.find_dead_zone:
             return [Gap(0.0, 0.0)]
-        edges = np.concatenate([[0.0], m])
-        if around is not None:
-            width = around.width
-            low, high = around.low - width, around.high + width
-            edges = edges[(edges >= low) & (edges <= high)]
-        if len(edges) > MAGNITUDES:
-            places = np.linspace(0, len(edges) - 1, MAGNITUDES).round().astype(int)
-            edges = edges[places]
-        return [Gap(low, high) for low, high in itertools.pairwise(edges.tolist())]
+        edges = np.concatenate([[0.0], self.magnitudes])
+        places = np.linspace(0, len(edges) - 1, min(len(edges), COARSE)).round().astype(int)
+        return [Gap(low, high) for low, high in itertools.pairwise(edges[places].tolist())]
 
-    def scan(self, orders: Orders, c: Array, gaps: list[Gap]) -> list[Place]:
+    def halves(self, gap: Gap) -> list[Gap]:
+        """Return a gap in two, if there are magnitudes in between."""
+        low, high = np.searchsorted(self.magnitudes, [gap.low, gap.high], "left")
+        low += gap.low > 0.0
+        if high <= low:
+            return [gap]
+        middle = float(self.magnitudes[(low + high) // 2])
+        if not gap.low < middle < gap.high:
+            return [gap]
+        return [Gap(gap.low, middle), Gap(middle, gap.high)]
+
+    def scan(
+        self, orders: Orders, c: Array, gaps: list[Gap], delays: range | None = None
+    ) -> list[Place]:
         """Return the deviance of every delay and gap with a given C, the best first."""
-        rows, count = self.rows, self.longest_delay + 1
-        target, columns = self.regressors(0, Gap(0.0, 0.0), Orders(orders.a, 0, orders.c))
-        basis, _ = np.linalg.qr(rows.whitened(columns, c))
-        white = rows.whitened(target[:, np.newaxis], c)[:, 0]
-        white = white - basis @ (basis.T @ white)
-        total = float(white @ white)
+        delays = delays or range(self.longest_delay + 1)
+        target, columns = self.fixed(orders)
         found = []
         for gap in gaps:
-            inputs = rows.lagged(self.applied(gap), range(1, count + orders.b))
-            inputs = rows.whitened(inputs, c)
-            inputs = inputs - basis @ (basis.T @ inputs)
-            gram, moments = inputs.T @ inputs, inputs.T @ white
-            ridge = 1e-10 * max(float(np.trace(gram)) / len(gram), 1e-300)
-            for delay in range(count):
-                span = slice(delay, delay + orders.b)
-                block = gram[span, span] + ridge * np.eye(orders.b)
-                explained = moments[span] @ np.linalg.solve(block, moments[span])
-                found.append((self.deviance(total - float(explained)), delay, gap))
-        found.sort(key=lambda entry: entry[0])
-        return found
+            deviances = self._deviances(
+                target, columns, self.applied(gap), delays, orders.b, orders, c
+            )
+            found += [
+                Place(float(deviance), delay, gap)
+                for delay, deviance in zip(delays, deviances, strict=True)
+            ]
+        return sorted(found, key=lambda place: place.deviance)
 
-    def gained(self, best: Candidate, orders: Orders) -> float:
+    def place_known(self, place: Place, orders: Orders, c: Array) -> None:
+        """Find the delay of each known disturbance, with all else as it is."""
+        lags = range(place.delay + 1, place.delay + 1 + orders.b)
+        for i, known in enumerate(self.known):
+            target, columns = self.fixed(orders, but=i)
+            columns = np.hstack([columns, self.rows.lagged(self.applied(place.gap), lags)])
+            deviances = self._deviances(
+                target, columns, np.nan_to_num(known),
+                range(self.longest_delay + 1), OF_KNOWN, orders, c,
+            )  # fmt: skip
+            self.lags[i] = int(np.argmin(deviances))
+
+    def _deviances(
+        self,
+        target: Array,
+        columns: Array,
+        signal: Array,
+        delays: range,
+        length: int,
+        orders: Orders,
+        c: Array,
+    ) -> Array:
+        """Return the deviance with `length` coefficients of a signal, for every delay."""
+        rows = self.rows
+        lags = rows.lagged(signal, range(delays[0] + 1, delays[-1] + 1 + length))
+        white = rows.whitened(np.column_stack([target, columns]), c, walk=orders.walk)
+        inputs = rows.whitened(lags, c, walk=orders.walk)[rows.counts]
+        basis, _ = np.linalg.qr(white[rows.counts, 1:])
+        left = white[rows.counts, 0]
+        left = left - basis @ (basis.T @ left)
+        inputs = inputs - basis @ (basis.T @ inputs)
+        gram, moments = inputs.T @ inputs, inputs.T @ left
+        ridge = 1e-10 * max(float(np.trace(gram)) / len(gram), 1e-300)
+        places = np.arange(len(delays))[:, np.newaxis] + np.arange(length)
+        blocks = gram[places[:, :, np.newaxis], places[:, np.newaxis, :]]
+        blocks = blocks + ridge * np.eye(length)
+        shares = sliding_window_view(moments, length)
+        solved = np.linalg.solve(blocks, shares[:, :, np.newaxis])[:, :, 0]
+        squares = float(left @ left) - np.sum(shares * solved, axis=1)
+        return np.array([self.deviance(float(square)) for square in squares])
+
+    def parts(self, fit: Candidate) -> tuple[Array, Array, Array, Array]:
+        """Return A with its 1, B, the B of each known disturbance, and the levels."""
+        a, b, linear = fit.orders.a, fit.orders.b, fit.solution.linear
+        end = a + b + OF_KNOWN * len(self.known)
+        known = linear[a + b : end].reshape(-1, OF_KNOWN)
+        return np.concatenate([[1.0], linear[:a]]), linear[a : a + b], known, linear[end:]
+
+    def errors(self, fit: Candidate) -> Array:
+        """Return the prediction errors of all rows, of the bridged ones too; NaN elsewhere."""
+        target, columns = self.regressors(fit.place, fit.orders)
+        left = target - columns @ fit.solution.linear
+        result = np.full(len(self.output), np.nan)
+        result[self.rows.index] = self.rows.whitened(left, fit.solution.c, walk=fit.orders.walk)
+        return result
+
+    def simulated(self, fit: Candidate) -> Array:
+        """Return what flow and known disturbances do to the temperature, degC."""
+        a, b, of_known, _ = self.parts(fit)
+        flow = held(np.where(np.isfinite(self.command), self.applied(fit.place.gap), np.nan))
+        total = response(a.tolist(), b.tolist(), fit.place.delay, flow)
+        for values, lag, each in zip(self.known, self.lags, of_known, strict=True):
+            total = total + response(a.tolist(), each.tolist(), lag, held(values))
+        return total
+
+    def gained(self, best: Candidate) -> float:
         """Return what the flow adds to twice the log likelihood."""
-        target, columns = self.regressors(best.delay, best.gap, orders)
-        without = np.delete(columns, np.s_[orders.a : orders.a + orders.b], axis=1)
-        none = self.rows.solve(target, without, orders.c, best.solution.c)
+        orders = best.orders
+        target, columns = self.fixed(orders)
+        none = self.rows.solve(target, columns, orders.noise, best.solution.c, walk=orders.walk)
         return self.deviance(none.square) - best.deviance
 
 
 def _operating_flow(flow: Array, options: Options) -> float:
-    if options.operating_flow is not None:
-        return options.operating_flow
     known = flow[np.isfinite(flow)]
+    if options.operating_flow is not None:
+        low, high = known.min(initial=np.inf), known.max(initial=-np.inf)
+        if not 11.0 * low - 10.0 * high <= options.operating_flow <= 11.0 * high - 10.0 * low:
+            raise ValueError(
+                f"operating_flow must be near the flows of the log, {low:g} to {high:g} t/h, "
+                f"got {options.operating_flow:g}"
+            )
+        return options.operating_flow
     if not len(known) or known.min() < 0.0 < known.max():
         return 0.0
     return float(known[0])
@@ -209,9 +345,25 @@ def _limits(command: Array, options: Options) -> tuple[float, float]:
     return low, high
 
 
-def _all_of_last(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+def _all_of_last(flags: Flags, count: int) -> Flags:
     """Return where the last `count` flags, its own included, are all true."""
     unset = np.concatenate([[0], np.cumsum(~flags)])
     ends = np.arange(1, len(flags) + 1)
-    result: NDArray[np.bool_] = unset[ends] == unset[np.maximum(ends - count, 0)]
+    result: Flags = unset[ends] == unset[np.maximum(ends - count, 0)]
     return result
+
+
+def _runs(flags: Flags, least: int) -> Flags:
+    """Return where flags are true in runs of at least this length."""
+    changes = np.flatnonzero(np.diff(flags)) + 1
+    result = np.zeros(len(flags), bool)
+    for start, stop in itertools.pairwise([0, *changes.tolist(), len(flags)]):
+        result[start:stop] = flags[start : start + 1].all() and stop - start >= least
+    return result
+
+
+def _interpolated(values: Array) -> Array:
+    known = np.flatnonzero(np.isfinite(values))
+    if not len(known):
+        return np.zeros(len(values))
+    return np.asarray(np.interp(np.arange(len(values)), known, values[known]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -16,25 +15,23 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 Array = NDArray[np.float64]
+Units = dict[str, tuple[float, float]]
 
 # By unit: factor to the units of the plant (s, t/h, degC), and what is added then.
-TIME_UNITS = {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)}
-FLOW_UNITS = {"t/h": (1.0, 0.0), "kg/s": (3.6, 0.0), "kg/h": (1e-3, 0.0), "%": (1.0, 0.0)}
-TEMPERATURE_UNITS = {
-    "degC": (1.0, 0.0),
-    "°C": (1.0, 0.0),
-    "C": (1.0, 0.0),
-    "K": (1.0, -273.15),
-    "degF": (5 / 9, -160 / 9),
-    "°F": (5 / 9, -160 / 9),
-    "F": (5 / 9, -160 / 9),
-}
+TIME_UNITS: Units = {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)}
+FLOW_UNITS: Units = dict.fromkeys(("t/h", "%"), (1.0, 0.0))
+FLOW_UNITS |= {"kg/s": (3.6, 0.0), "kg/h": (1e-3, 0.0)}
+TEMPERATURE_UNITS: Units = dict.fromkeys(("degC", "°C", "C"), (1.0, 0.0))
+TEMPERATURE_UNITS |= {"K": (1.0, -273.15)}
+TEMPERATURE_UNITS |= dict.fromkeys(("degF", "°F", "F"), (5 / 9, -160 / 9))
+
 CHUNK = 200_000  # rows that are read at once
 MOST_ROWS = 20_000  # that are kept by default, the latest
 PROGRESS_AFTER = 1.0  # s
 UNEVEN = 0.1  # of the sampling interval: what a time step may be off
 LONGEST_GAP = 2_000  # rows that a gap is filled with: beyond, what came before is forgotten
-MOST_MISSING = 0.5  # share of the rows
+LEAST_KNOWN = 0.5  # share of the flows
+LEAST_TEMPERATURES = 100
 
 
 @dataclass(frozen=True)
@@ -51,12 +48,15 @@ class Log:
         s.
     notes
         What the user should know about the log.
+    disturbances
+        Other inputs that were measured, from the times of their rows on, by their columns.
     """
 
     flow: Array
     temperature: Array
     sampling_interval: float
     notes: list[str] = field(default_factory=list)
+    disturbances: dict[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,8 @@ class Columns:
         s, in place of the times; None to read them.
     time_unit, flow_unit, temperature_unit
         None for what the heading says in brackets, and s, t/h and degC if it says nothing.
+    disturbances
+        Names of columns.
     """
 
     time: str = "time"
@@ -80,6 +82,7 @@ class Columns:
     time_unit: str | None = None
     flow_unit: str | None = None
     temperature_unit: str | None = None
+    disturbances: tuple[str, ...] = ()
 
 
 def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) -> Log:
@@ -111,20 +114,22 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) 
     clock = _Clock(columns.sampling_interval)
     read = 0
     with tqdm(unit="row", unit_scale=True, desc="reading", delay=PROGRESS_AFTER) as progress:
-        for table in layout.tables():
+        for times, table in layout.tables():
             read += len(table)
-            kept.append(clock.spread(table, first_line=read - len(table) + 2))
+            kept.append(clock.spread(times, table, first_line=read - len(table) + 2))
             while len(kept) > 1 and sum(map(len, kept)) - len(kept[0]) >= rows:
                 kept.popleft()
             progress.update(len(table))
     if clock.interval is None:
         raise ValueError(f"{path} is too short: {read} rows tell no sampling interval")
-    flow, temperature = np.concatenate(kept)[-rows:].T
     notes = list(clock.notes)
     if read > rows:
         notes.append(f"Of the {read:,} rows, the last {rows:,} are used (--rows).")
-    notes += _missing(flow, temperature)
-    return Log(_held(flow), temperature, clock.interval, notes)
+    found = dict(zip(layout.names, np.concatenate(kept)[-rows:].T, strict=True))
+    flow, temperature = (found.pop(layout.names[i]) for i in (0, 1))
+    flow, disturbances = _held(flow), {name: _held(each) for name, each in found.items()}
+    notes += _missing({"flow": flow, "temperature": temperature, **disturbances})
+    return Log(flow, temperature, clock.interval, notes, disturbances)
 
 
 class _Layout:
@@ -134,50 +139,51 @@ class _Layout:
         self.path = path
         try:
             with path.open(encoding="utf-8-sig", errors="replace") as file:
-                lines = [line for line, _ in zip(file, range(50), strict=False)]
+                heading, *lines = [line for line, _ in zip(file, range(50), strict=False)]
+        except ValueError as error:
+            raise ValueError(f"{path} is empty") from error
         except OSError as error:
             raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-        if not lines:
-            raise ValueError(f"{path} is empty")
-        self.separator = next((mark for mark in ";\t" if mark in lines[0]), ",")
-        comma = r'"-?\d+,\d+"' if self.separator == "," else r"\d,\d"
-        self.decimal = "," if any(re.search(comma, line) for line in lines[1:]) else "."
+        separator = next((mark for mark in ";\t" if mark in heading), ",")
+        comma = r'"-?\d+,\d+"' if separator == "," else r"\d,\d"
+        self._format: dict[str, Any] = {
+            "sep": separator,
+            "decimal": "," if any(re.search(comma, line) for line in lines) else ".",
+            "encoding": "utf-8-sig",
+            "encoding_errors": "replace",
+            "skipinitialspace": True,
+            "skip_blank_lines": False,
+        }
         names = [str(name) for name in self._read(nrows=0).columns]
-        for number, fields in enumerate(csv.reader(lines, delimiter=self.separator), 1):
-            if any(field.strip() for field in fields[len(names) :]):
-                raise ValueError(
-                    f"{path}, line {number}: {len(fields)} fields where the heading has "
-                    f"{len(names)}. With decimal commas, the separator must be a semicolon "
-                    "or a tab, or the numbers in quotes"
-                )
-        wanted = [columns.flow, columns.temperature]
-        units: list[tuple[dict[str, tuple[float, float]], str | None, str, str]] = [
-            (FLOW_UNITS, columns.flow_unit, "t/h", "flow"),
-            (TEMPERATURE_UNITS, columns.temperature_unit, "degC", "temperature"),
-        ]
+        wanted: list[tuple[str, Units, str | None, str, str]] = [
+            (columns.flow, FLOW_UNITS, columns.flow_unit, "t/h", "flow"),
+            (columns.temperature, TEMPERATURE_UNITS, columns.temperature_unit, "degC",
+             "temperature"),
+        ]  # fmt: skip
+        wanted += [(each, {}, None, "", "disturbance") for each in columns.disturbances]
         if columns.sampling_interval is None:
-            wanted.append(columns.time)
-            units.append((TIME_UNITS, columns.time_unit, "s", "time"))
-        found = [
-            self._find(name, names, option)
-            for name, (*_, option) in zip(wanted, units, strict=True)
-        ]
+            wanted.append((columns.time, TIME_UNITS, columns.time_unit, "s", "time"))
+        found = [self._find(name, names, option) for name, *_, option in wanted]
         if len(set(found)) < len(found):
             raise ValueError(f"each column can be one thing only, got {', '.join(found)}")
+        self._scales = {
+            name: _scale(name, units, unit, default, option)
+            for name, (_, units, unit, default, option) in zip(found, wanted, strict=True)
+        }
+        self._time = found.pop() if columns.sampling_interval is None else None
         self.names = found
-        self.scales = [_scale(name, *unit) for name, unit in zip(found, units, strict=True)]
 
     def _read(self, **options: Any) -> Any:
-        return pd.read_csv(
-            self.path,
-            sep=self.separator,
-            decimal=self.decimal,
-            encoding="utf-8-sig",
-            encoding_errors="replace",
-            skipinitialspace=True,
-            skip_blank_lines=False,
-            index_col=False,
-            **options,
+        try:
+            # Fields beyond the heading become an index, by which they are found.
+            return pd.read_csv(self.path, **{**self._format, **options})
+        except pd.errors.ParserError as error:
+            raise self._not_a_table(error) from error
+
+    def _not_a_table(self, error: Exception) -> ValueError:
+        return ValueError(
+            f"{self.path} is not a table: {str(error).strip()}. With decimal commas, "
+            "the separator must be a semicolon or a tab, or the numbers in quotes"
         )
 
     def _find(self, name: str, names: Sequence[str], option: str) -> str:
@@ -194,46 +200,44 @@ class _Layout:
             )
         return alike[0]
 
-    def tables(self) -> Iterator[Array]:
-        """Return the file piece by piece: flow, temperature and time if there is one."""
+    def tables(self) -> Iterator[tuple[Array | None, Array]]:
+        """Return the file piece by piece: times, s, and flow, temperature and disturbances."""
         line = 2
         try:
             with self._read(chunksize=CHUNK) as chunks:
                 for chunk in chunks:
-                    values = [
-                        factor * self._numbers(chunk[name], line, is_time=i == 2) + offset
-                        for i, (name, (factor, offset)) in enumerate(
-                            zip(self.names, self.scales, strict=True)
-                        )
-                    ]
+                    if not isinstance(chunk.index, pd.RangeIndex):
+                        raise self._not_a_table(ValueError("lines longer than the heading"))
+                    values = [self._numbers(chunk[name], line) for name in self.names]
+                    times = (
+                        None if self._time is None else self._numbers(chunk[self._time], line)
+                    )
                     line += len(chunk)
-                    yield np.column_stack(values)
+                    yield times, np.column_stack(values)
         except pd.errors.ParserError as error:
-            raise ValueError(f"{self.path} is not a table: {error}") from error
+            raise self._not_a_table(error) from error
 
-    def _numbers(self, column: Any, line: int, *, is_time: bool) -> Array:
-        numbers = column if pd.api.types.is_numeric_dtype(column) else None
-        if numbers is None and is_time:
-            dates = pd.to_datetime(column, errors="coerce", format="ISO8601", utc=True)
-            if dates.notna().all():
-                since = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
-                seconds: Array = since.to_numpy(dtype=np.float64)
-                return seconds
-        if numbers is None:
+    def _numbers(self, column: Any, line: int) -> Array:
+        factor, offset = self._scales[column.name]
+        is_time = column.name == self._time
+        numbers = column
+        if not pd.api.types.is_numeric_dtype(column):
+            if is_time:
+                dates = pd.to_datetime(column, errors="coerce", format="ISO8601", utc=True)
+                if dates.notna().all():
+                    since = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
+                    return np.asarray(since, np.float64)
             numbers = pd.to_numeric(column, errors="coerce")
-        values: Array = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
-        bad = np.flatnonzero(~np.isfinite(values) & column.notna().to_numpy())
-        if is_time and not len(bad):
-            bad = np.flatnonzero(np.isnan(values))
+        values = np.asarray(numbers.to_numpy(dtype=np.float64, na_value=np.nan))
+        allowed = column.isna().to_numpy() & (not is_time)
+        bad = np.flatnonzero(~np.isfinite(values) & ~allowed)
         if len(bad):
-            allowed = (
-                "a number, or a date such as 2026-01-31T12:00:00" if is_time else "a number"
-            )
+            date = ", or a date such as 2026-01-31T12:00:00" if is_time else ""
             raise ValueError(
-                f"{self.path}, line {line + bad[0]}: {column.name} must be {allowed}, got "
+                f"{self.path}, line {line + bad[0]}: {column.name} must be a number{date}, got "
                 f"{str(column.iloc[bad[0]])!r}"
             )
-        return values
+        return factor * values + offset
 
 
 class _Clock:
@@ -242,24 +246,22 @@ class _Clock:
     def __init__(self, interval: float | None) -> None:
         self.interval = interval
         self.notes: list[str] = []
-        self._last: float | None = None
+        self._last: Array = np.zeros(0)
 
-    def spread(self, table: Array, first_line: int) -> Array:
-        """Return flow and temperature, a row a sample."""
-        if table.shape[1] == 2:
+    def spread(self, times: Array | None, table: Array, first_line: int) -> Array:
+        """Return the values of a piece, a row a sample."""
+        if times is None:
             return table
-        times = table[:, 2]
-        steps = np.diff(times) if self._last is None else np.diff(times, prepend=self._last)
+        line = first_line + 1 - len(self._last)  # of the row after the first step
+        known = np.concatenate([self._last, times])
+        steps, self._last = np.diff(known), known[-1:]
         if not len(steps):
-            self._last = float(times[-1]) if len(times) else self._last
-            return table[:, :2]
-        line = first_line + (1 if self._last is None else 0)  # of the row after the first step
+            return table
         back = np.flatnonzero(steps <= 0)
         if len(back):
             raise ValueError(
                 f"line {line + back[0]}: the time must increase, and goes from "
-                f"{times[len(times) - len(steps) + back[0]] - steps[back[0]]:g} s by "
-                f"{steps[back[0]]:g} s"
+                f"{known[back[0]]:g} s by {steps[back[0]]:g} s"
             )
         if self.interval is None:
             self.interval = float(f"{np.median(steps):.6g}")
@@ -272,34 +274,26 @@ class _Clock:
                 f"here where most are {self.interval:g} s. Resample the log to equal steps, or "
                 "give --sampling-interval if the times are wrong"
             )
-        gaps = np.flatnonzero(whole > 1)
-        for gap in gaps[:3]:
+        for gap in np.flatnonzero(whole > 1):
             missing = int(whole[gap]) - 1
-            self.notes.append(
-                f"Before line {line + gap}, {missing} row{'s' * (missing > 1)} "
-                f"{'are' if missing > 1 else 'is'} missing."
-            )
-        if len(gaps) > 3:
-            self.notes.append(f"So are some before {len(gaps) - 3} more lines.")
-        self._last = float(times[-1])
-        if not len(gaps):
-            return table[:, :2]
+            rows = f"{missing} rows are" if missing > 1 else "1 row is"
+            if len(self.notes) < 3:
+                self.notes.append(f"Before line {line + gap}, {rows} missing.")
+            elif len(self.notes) == 3:
+                self.notes.append("More rows are missing later.")
         counts = np.minimum(whole, LONGEST_GAP).astype(np.intp)
-        start = np.zeros(len(times) - len(steps), np.intp)
-        places = np.cumsum(np.concatenate([start, counts]))
-        first = 0 if len(times) > len(steps) else 1  # a gap before the first row of a piece
-        result = np.full((int(places[-1]) + 1 - first, 2), np.nan)
-        result[places - first] = table[:, :2]
+        new = len(times) - len(steps)  # the first row of the file has no step before it
+        places = np.concatenate([np.zeros(new, np.intp), np.cumsum(counts) - 1 + new])
+        result = np.full((int(places[-1]) + 1, table.shape[1]), np.nan)
+        result[places] = table
         return result
 
 
 def _scale(
-    name: str,
-    units: dict[str, tuple[float, float]],
-    given: str | None,
-    default: str,
-    option: str,
+    name: str, units: Units, given: str | None, default: str, option: str
 ) -> tuple[float, float]:
+    if not units:
+        return 1.0, 0.0
     bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", name)
     unit = given or (bracket.group(1) if bracket else default)
     if unit not in units:
@@ -310,27 +304,30 @@ def _scale(
     return units[unit]
 
 
-def _missing(flow: Array, temperature: Array) -> list[str]:
-    counts = {
-        "flow": int(np.isnan(flow).sum()),
-        "temperature": int(np.isnan(temperature).sum()),
-    }
+def _missing(columns: dict[str, Array]) -> list[str]:
+    counts = {name: int(np.isnan(each).sum()) for name, each in columns.items()}
+    rows = len(columns["flow"])
     for name, count in counts.items():
-        if count > MOST_MISSING * len(flow):
-            raise ValueError(
-                f"{count} of {len(flow)} rows have no {name}: too many are missing"
-            )
+        known = rows - count
+        least = LEAST_TEMPERATURES if name == "temperature" else (1.0 - LEAST_KNOWN) * rows
+        if count and known < min(least, rows):
+            raise ValueError(f"{count} of {rows} rows have no {name}: too many are missing")
     if not any(counts.values()):
         return []
-    return [
-        f"{counts['temperature']} temperatures and {counts['flow']} flows are missing (NaN); "
-        "rows that need them are left out of the fit."
-    ]
+    said = " and ".join(f"{count} {name}s" for name, count in counts.items() if count)
+    return [f"{said} are missing (NaN); rows that need them are left out of the fit."]
 
 
 def _held(flow: Array) -> Array:
-    """Return the flow with its gaps closed where it is the same on both sides."""
+    """Return a flow with its gaps closed where it is the same on both sides.
+
+    So is that of a recorder that writes it less often than the temperature.
+    """
     series = pd.Series(flow)
     before, after = series.ffill(), series.bfill()
+    known = np.flatnonzero(series.notna())
+    steps = np.diff(known)
+    if len(steps) and np.min(steps) > 1 and np.mean(steps == steps[0]) > 0.95:
+        return np.asarray(before, np.float64)
     filled = series.where(series.notna() | (before != after), before)
     return np.asarray(filled, np.float64)

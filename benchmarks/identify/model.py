@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from benchmarks.identify.armax import Array, Orders
+from benchmarks.linear import LinearModel
 
 CONFIDENCE = 0.95  # of all intervals
 
@@ -22,7 +23,7 @@ class Options:
     longest_delay
         d up to which to look, samples.
     orders
-        Of A, B and C; None to choose them by the Bayesian information criterion.
+        Of A, B and C; None to choose them.
     find_dead_zone
         Whether the flow is the command, so that a dead zone may lie between it and the plant.
     u_min, u_max
@@ -42,11 +43,46 @@ class Options:
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate with its 95 % confidence interval."""
+    """An estimate with its 95 % interval."""
 
     value: float
     low: float
     high: float
+
+
+@dataclass(frozen=True)
+class Known:
+    """A known disturbance in a model: its part of A y is B w(k - d).
+
+    Attributes
+    ----------
+    name
+        Column of the log.
+    operating
+        What is subtracted from it.
+    delay
+        d, samples.
+    b
+        Coefficients of B, from z^-1 on.
+    """
+
+    name: str
+    operating: float
+    delay: int
+    b: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How much of the last third of a log models explain that were fitted to the rest.
+
+    Shares of the temperature's variance, in simulation: the models are given the flow and the
+    known disturbances, but no temperature. A straight line is taken from their errors, for the
+    slow disturbance that no flow explains.
+    """
+
+    model: float
+    impulse_response: float
 
 
 @dataclass(frozen=True)
@@ -55,42 +91,44 @@ class Model:
 
     Attributes
     ----------
-    a, b, c
-        The polynomials of (28), with their leading 1.
+    plant
+        The likeliest A, B, C and delay.
+    noise
+        `noise_variance`, `measurement_noise_variance` and `disturbance_walk_variance` of the
+        environment, degC^2.
+    known
+        The known disturbances.
     estimates
         With their intervals: `delay` (samples), `dead_zone` (t/h), `gain` (degC per t/h),
-        `time_constant` (s, of the slowest pole), `noise_variance` (degC^2), and the
-        coefficients `a1`, `b1`, `c1` and so on.
+        `time_constant` (s, of the slowest pole), `noise_variance` (degC^2, of the prediction
+        errors), and the coefficients `a1`, `b1` and so on.
+    possible
+        Plants drawn from what the log leaves open.
     u_min, u_max
         Limits of the flow, t/h.
     operating_flow, operating_temperature
         t/h and degC: where u and y are 0.
     orders
         Of A, B and C.
-    criteria
-        The criterion of each choice of orders that was tried, the lower the better.
     errors
         The prediction errors xi, one a row of the log, NaN where they are not known, degC.
-    covariance
-        Of the coefficients of A, B and C, in this order, without the leading 1s.
-    profile
-        Twice the log likelihood that each delay falls short of the best one.
+    held_out
+        How good simulations are.
     notes
         What the user should know about the fit.
     """
 
-    a: tuple[float, ...]
-    b: tuple[float, ...]
-    c: tuple[float, ...]
+    plant: LinearModel
+    noise: dict[str, float]
+    known: tuple[Known, ...]
     estimates: dict[str, Interval]
+    possible: list[LinearModel]
     u_min: float
     u_max: float
     operating_flow: float
     operating_temperature: float
     orders: Orders
     sampling_interval: float
-    criteria: dict[Orders, float]
     errors: Array
-    covariance: Array
-    profile: dict[int, float]
+    held_out: HeldOut
     notes: list[str] = field(default_factory=list)

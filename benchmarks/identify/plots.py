@@ -9,16 +9,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.controllers.step_test import StepTest
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import simulation, step_band
+from benchmarks.identify.tuning import Reduced
 from benchmarks.lib.drawing import COLOURS, STYLE, save
 
 Array = NDArray[np.float64]
 
 LAGS = 40  # of the autocorrelation
-DRAWS = 300  # of the step response's band
+LONGEST = 5_000  # samples of a step response that is drawn
 SHOWN = 3_000  # rows of a log: more cannot be told apart
 
 
@@ -83,11 +83,12 @@ def plot_residuals(model: Model, path: Path) -> None:
         save(figure, path)
 
 
-def plot_step(model: Model, tested: StepTest, path: Path) -> None:
-    """Draw the step response with its band, and the first-order model of the step test."""
+def plot_step(model: Model, tested: Reduced, path: Path) -> None:
+    """Draw the step response with its band, and the first-order model of it."""
     length = tested.delay + 6.0 * tested.time_constant
-    samples = int(np.ceil(length / model.sampling_interval)) + 1
-    response, low, high = step_band(model, samples, DRAWS, seed=0)
+    samples = min(int(np.ceil(length / model.sampling_interval)), LONGEST) + 1
+    response = model.plant.step_response(samples)
+    low, high = step_band(model, samples)
     times = np.arange(samples) * model.sampling_interval
     since = np.maximum(times - tested.delay + model.sampling_interval, 0.0)
     first_order = np.where(
@@ -103,7 +104,7 @@ def plot_step(model: Model, tested: StepTest, path: Path) -> None:
         axes.plot(times / 60, response, color=COLOURS[0], label="model")
         axes.plot(
             times / 60, first_order, "--", color=COLOURS[1],
-            label="first order with delay, of the step test",
+            label="first order with delay",
         )  # fmt: skip
         axes.set(xlabel="time after the step (min)", ylabel="temperature (°C per t/h)")
         axes.legend()

@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.controllers.engineered import simc_pi, smith
-from benchmarks.controllers.step_test import step_test
 from benchmarks.identify import plots
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import Interval, Model
-from benchmarks.identify.plant import explained, plant_arguments
+from benchmarks.identify.plant import plant_arguments
+from benchmarks.identify.tuning import Recommended, recommended, reduced
 from benchmarks.lib.report import Section
 from benchmarks.limits import least_possible
 from benchmarks.limits.programme import NotSolvedError
-from benchmarks.margins import Loop, Margins, margins, plot_margins
+from benchmarks.margins import Loop, Margins, plot_margins
 from benchmarks.metrics import mean_error, reversals, travel
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
@@ -31,6 +30,8 @@ UNITS = {
     "noise_variance": "°C²",
 }
 RUNS, SAMPLES, SEED = 20, 1200, 0  # of the controllers on the identified plant
+LONGEST = 6_000  # samples of a run, for which the bounds are computed
+POOR, BEHIND = 0.5, 0.1  # share that a model explains, absolutely and behind its rival's
 
 
 def report(log: Log, model: Model, out: Path) -> list[Section]:
@@ -47,43 +48,92 @@ def report(log: Log, model: Model, out: Path) -> list[Section]:
     """
     arguments = plant_arguments(model)
     parameters = Parameters(**arguments)
-    tested = step_test(parameters)
+    step = reduced(model.plant, model.sampling_interval)
     plots.plot_log(log, model, out / "log.png")
     plots.plot_residuals(model, out / "residuals.png")
-    plots.plot_step(model, tested, out / "step.png")
-    return [
-        _found(log, model),
-        _simulated(log, model),
+    plots.plot_step(model, step, out / "step.png")
+    sections = [
+        _found(model),
+        Section(
+            "The log and the model",
+            ["The model is given the flow alone, over the whole log."],
+            pictures=["log.png"],
+        ),
         _residuals(model),
         Section(
             "Step response",
             [
-                f"A step test would show a gain of {tested.gain:g} °C per t/h, a time constant "
-                f"of {tested.time_constant:g} s and a delay of {tested.delay:g} s, the sample "
-                "that any input takes to show included."
+                f"Of first order with delay, the plant would have a gain of {step.gain:g} °C "
+                f"per t/h, a time constant of {step.time_constant:g} s and a delay of "
+                f"{step.delay:g} s, the sample that any input takes to show included. These "
+                "come from the areas of the whole response."
             ],
             pictures=["step.png"],
         ),
-        _controllers(parameters, out),
-        _on_the_plant(arguments),
     ]
+    if fault(model):
+        return sections
+    tuned = recommended(model, parameters)
+    sections.append(_controllers(tuned, parameters, out))
+    if any(each.controller for each in tuned.values()):
+        sections.append(_on_the_plant(tuned, arguments))
+    return sections
 
 
-def _found(log: Log, model: Model) -> Section:
+def fault(model: Model) -> str:
+    """Return why a model should not be used; empty if it should."""
+    share, rival = model.held_out.model, model.held_out.impulse_response
+    if share < rival - BEHIND:
+        return "it explains clearly less than an impulse response does: its form does not fit"
+    if share < POOR:
+        return "it leaves more than half open: the noise hides the response, or it changes"
+    return ""
+
+
+def headline(model: Model) -> str:
+    """Return how much the model explains, and whether it should be used."""
+    share, rival = (
+        f"{100 * max(each, 0.0):.1f} %"
+        for each in (model.held_out.model, model.held_out.impulse_response)
+    )
+    known = ", ".join(each.name for each in model.known)
+    verdict = f"**The model should not be used:** {why}. Nothing is recommended." if (
+        why := fault(model)
+    ) else ""  # fmt: skip
+    return (
+        f"Fitted to the first two thirds of the log, the model explains {share} of the "
+        f"temperature's variance in the last third, by simulation from the flow"
+        f"{' and ' + known if known else ''}; a finite impulse response explains {rival}. A "
+        f"straight line, for the slow disturbance, is taken from both. {verdict}"
+    ).strip()
+
+
+def _found(model: Model) -> Section:
     text = [
+        headline(model),
+        *model.notes,
         "All numbers are deviations from the operating point: a flow of "
         f"{model.operating_flow:g} t/h, at which the temperature is "
         f"{model.operating_temperature:.4g} °C. The flow was between "
         f"{model.operating_flow + model.u_min:g} and {model.operating_flow + model.u_max:g} "
         "t/h.",
-        f"A, B and C have the orders {model.orders.a}, {model.orders.b} and {model.orders.c}. "
-        "Brackets are 95 % intervals.",
-        *log.notes,
-        *model.notes,
+        f"A, B and C have the orders {model.orders.a}, {model.orders.b} and {model.orders.c}"
+        f"{', with a random walk' if model.orders.walk else ''}. Brackets are 95 % intervals.",
+        *(
+            f"{each.name} is a known disturbance with a gain of "
+            f"{sum(each.b) / sum(model.plant.a):.4g} °C a unit and a delay of {each.delay} "
+            "samples. `plant.json` does not have it."
+            for each in model.known
+        ),
     ]
     rows = [
         (name.replace("_", " "), f"{each.value:.4g}", brackets(each), UNITS.get(name, ""))
         for name, each in model.estimates.items()
+    ]
+    rows += [
+        (name.replace("_", " "), f"{variance:.4g}", "", "°C²")
+        for name, variance in model.noise.items()
+        if variance and name != "noise_variance"
     ]
     return Section(
         "What the log shows", text, pd.DataFrame(rows, columns=["", "value", "95 %", "unit"])
@@ -93,18 +143,6 @@ def _found(log: Log, model: Model) -> Section:
 def brackets(interval: Interval) -> str:
     """Return an interval as text."""
     return f"[{interval.low:.4g}, {interval.high:.4g}]"
-
-
-def _simulated(log: Log, model: Model) -> Section:
-    share = 100 * explained(model, log)
-    return Section(
-        "The log and the model",
-        [
-            "The model is given the flow, and starts from the first temperatures; it is not "
-            f"corrected later. It explains {share:.1f} % of the temperature's variance."
-        ],
-        pictures=["log.png"],
-    )
 
 
 def _residuals(model: Model) -> Section:
@@ -127,50 +165,11 @@ def _residuals(model: Model) -> Section:
     )
 
 
-def tuned(parameters: Parameters) -> dict[str, Any]:
-    """Return the controllers that are tuned from a step test of the plant, by name."""
-    limits = {
-        "u_min": float(parameters.range_of("u_min")[0]),
-        "u_max": float(parameters.range_of("u_max")[1]),
-    }
-    return {
-        "PI, SIMC": simc_pi(parameters, **limits),
-        "Smith": smith(parameters, **limits),
-    }
-
-
-def _controllers(parameters: Parameters, out: Path) -> Section:
-    controllers = tuned(parameters)
-    plot_margins(
-        {name: Loop.of(agent, parameters) for name, agent in controllers.items()},
-        out / "margins.png",
-    )
-    rows = [
-        (name, f"{agent.kp:.4g}", f"{agent.ki:.4g}", *shown(margins(agent, parameters)))
-        for name, agent in controllers.items()
-    ]
-    columns = ["controller", "Kp (t/h per °C)", "Ki (t/h per °C and sample)", *HEADINGS]
-    return Section(
-        "Controllers tuned from the step test",
-        [
-            "u = -Kp e - Ki (sum of e). SIMC's PI has its closed-loop time constant at the "
-            "delay, the Smith predictor at half the plant's time constant. The margins are "
-            "those of the loop while no limit and no dead zone is met: by which factor the "
-            "gain may rise, and by how much phase and delay may shift, before it is unstable. "
-            "Ms is the most that the loop amplifies a disturbance; 1.4 to 2 is usual."
-        ],
-        pd.DataFrame(rows, columns=columns),
-        ["margins.png"],
-    )
-
-
 HEADINGS = ("gain margin", "phase margin (°)", "delay margin (s)", "Ms")
 
 
 def shown(found: Margins) -> tuple[str, ...]:
     """Return margins as cells of a table, under `HEADINGS`."""
-    if not found.stable:
-        return ("not stable", "", "", "")
     return (
         f"{found.gain:.2f}",
         f"{found.phase:.1f}",
@@ -179,12 +178,52 @@ def shown(found: Margins) -> tuple[str, ...]:
     )
 
 
-def _on_the_plant(arguments: dict[str, Any]) -> Section:
+def _controllers(tuned: dict[str, Recommended], parameters: Parameters, out: Path) -> Section:
+    text, rows, loops = [], [], {}
+    for name, each in tuned.items():
+        if each.controller is None or each.margins is None:
+            text.append(
+                f"{name}: not recommended. However slow it is made, Ms is above 2 with one in "
+                "twenty of the plants that the log leaves possible."
+            )
+            continue
+        if each.slowed > 1.0:
+            text.append(
+                f"{name} is de-tuned: its closed loop is {each.slowed:.2g} times slower than "
+                "by the rule, for Ms to be at most 2 with 95 % of the plants that the log "
+                "leaves possible."
+            )
+        loops[name] = Loop.of(each.controller, parameters)
+        kp, ki = f"{each.controller.kp:.4g}", f"{each.controller.ki:.4g}"
+        rows.append((name, kp, ki, *shown(each.margins), f"{each.worst:.2f}"))
+    text.append(
+        "u = -Kp e - Ki (sum of e). By rule, SIMC's PI has its closed-loop time constant at "
+        "the delay, the Smith predictor at half the plant's time constant. The margins are "
+        "those of the loop while no limit and no dead zone is met: by which factor the gain "
+        "may rise, and by how much phase and delay may shift, before it is unstable. Ms is the "
+        "most that the loop amplifies a disturbance; the last column has what 95 % of the "
+        "possible plants stay below."
+    )
+    columns = ["controller", "Kp (t/h per °C)", "Ki (t/h per °C and sample)", *HEADINGS,
+               "Ms, 95 %"]  # fmt: skip
+    if loops:
+        plot_margins(loops, out / "margins.png")
+    return Section(
+        "Recommended controllers",
+        text,
+        pd.DataFrame(rows, columns=columns) if rows else None,
+        ["margins.png"] if loops else [],
+    )
+
+
+def _on_the_plant(tuned: dict[str, Recommended], arguments: dict[str, Any]) -> Section:
     parameters = Parameters(**arguments)
-    period = parameters.setpoint_period
-    samples = max(SAMPLES, 2 * period)
+    samples = max(SAMPLES, 2 * parameters.setpoint_period)
     rows = []
+    unaware = math.nan
     try:
+        if samples > LONGEST:
+            raise NotSolvedError(f"{samples} samples are too many")
         anyone, unaware = (
             least_possible(samples=samples, kind=kind, folder=None, **arguments).value
             for kind in ("preview", "reference")
@@ -194,17 +233,18 @@ def _on_the_plant(arguments: dict[str, Any]) -> Section:
             f"is news and finds the plant settled, and {anyone:.4g} °C for a controller that "
             "knows it beforehand."
         )
-    except NotSolvedError as error:
-        unaware = math.nan
+    except (NotSolvedError, ValueError) as error:
         bound = f"The least possible mean error is not known: {error}."
-    for name, agent in tuned(parameters).items():
-        run = rollout(make_plants(RUNS, samples, **arguments), agent, samples, SEED)
+    for name, each in tuned.items():
+        if each.controller is None:
+            continue
+        plants = make_plants(RUNS, samples, **arguments)
+        run = rollout(plants, each.controller, samples, SEED)
         mean = float(mean_error(run).mean())
         moves = travel(run).mean()
         turns = reversals(run.applied, parameters.sampling_interval).mean()
-        rows.append(
-            (name, f"{mean:.4g}", f"{mean / unaware:.2f}", f"{moves:.0f}", f"{turns:.2f}")
-        )
+        of_least = f"{mean / unaware:.2f}" if unaware > 0.0 else ""
+        rows.append((name, f"{mean:.4g}", of_least, f"{moves:.0f}", f"{turns:.2f}"))
     columns = [
         "controller", "mean |e| (°C)", "of the least possible", "valve travel (t/h)",
         "reversals a minute",

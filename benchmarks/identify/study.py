@@ -17,7 +17,9 @@ import gymnasium
 import numpy as np
 import pandas as pd
 from rich.console import Console
+from scipy import signal
 
+from benchmarks.controllers.engineered import simc_pi
 from benchmarks.designs import Plant, random_design
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
@@ -33,20 +35,46 @@ from mptc_gym import Parameters
 NOISE = 0.02, 0.5  # R of the logs, degC^2
 HELD = 30, 120  # samples between two steps of the flow
 LEVELS = -10.0, 10.0  # of the flow, t/h
+LONG, SHORT = (15.0, 40.0), (5.0, 15.0)  # samples, time constants of second order
+METER = 0.1  # t/h, of the noise of a flow meter
+DRIFT = 0.05  # degC, of each step of a random walk of the base line
+KINDS = {
+    "steps": "steps of the flow",
+    "loop": "a PI loop whose set point moves",
+    "meter": f"steps, and a flow meter with noise of {METER:g} t/h",
+    "drift": f"steps, and a base line that wanders by {DRIFT:g} °C a sample",
+    "second order": "steps, and plants of second order with a long lag",
+}
 TELLING = 2.0  # t/h, dead zones that are counted
 
 
-def synthetic_plants(count: int, seed: int, samples: int) -> list[Plant]:
-    """Return plants of the random sweep that do not drift, with noise of `NOISE`."""
+def synthetic_plants(count: int, seed: int, samples: int, kind: str = "steps") -> list[Plant]:
+    """Return plants of the random sweep that do not drift, with noise of `NOISE`.
+
+    Those of the kind "second order" have two time constants, of `LONG` and `SHORT` samples.
+    """
     low, high = NOISE
-    return [
+    plants = [
         {**plant, "noise_variance": round(low + (high - low) * plant["noise_variance"], 6)}
         for plant in random_design(2 * count, seed, samples)[:count]
     ]
+    if kind != "second order":
+        return plants
+    generator = np.random.default_rng(seed)
+    for plant in plants:
+        slow, fast = generator.uniform(*LONG), generator.uniform(*SHORT)
+        gain = -0.6825 * plant.pop("gain_factor", 1.0)
+        plant.pop("time_constant_factor", None)
+        continuous = signal.zpk2ss([], [-1.0 / slow, -1.0 / fast], gain / (slow * fast))
+        sampled = signal.cont2discrete(continuous, 1.0)
+        b, a = signal.ss2tf(*sampled[:4])
+        c = [1.0, -float(np.exp(-1.0 / fast))]  # noise of first order, that of the slow pole
+        plant |= {"a": a.tolist(), "b": b[0, 1:].tolist(), "c": c}
+    return plants
 
 
-def synthetic_log(plant: Plant, samples: int, seed: int) -> Log:
-    """Return a log of a plant in the environment, excited by steps of the flow.
+def synthetic_log(plant: Plant, samples: int, seed: int, kind: str = "steps") -> Log:
+    """Return a log of a plant in the environment.
 
     Parameters
     ----------
@@ -56,23 +84,36 @@ def synthetic_log(plant: Plant, samples: int, seed: int) -> Log:
         Number of rows.
     seed
         Of the steps and of the noise.
+    kind
+        One of `KINDS`.
     """
     generator = np.random.default_rng(seed)
     levels: list[float] = []
     while len(levels) < samples:
         held = int(generator.integers(HELD[0], HELD[1], endpoint=True))
         levels += [float(generator.uniform(*LEVELS))] * held
-    env = gymnasium.make("MiddlePoint-v0", max_episode_steps=samples, **plant)
-    _, info = env.reset(seed=int(generator.integers(2**31)))
+    setpoint: dict[str, Any] = {}
+    if kind == "loop":
+        setpoint = {"setpoint": "random", "setpoint_amplitude": 5.0}
+    env = gymnasium.make("MiddlePoint-v0", max_episode_steps=samples, **plant, **setpoint)
+    observation, info = env.reset(seed=int(generator.integers(2**31)))
+    controller = simc_pi(Parameters(**plant), -10.0, 10.0)
     flow, temperature = np.empty(samples), np.empty(samples)
     for k in range(samples):
         temperature[k] = info["output"]
-        *_, info = env.step(np.array([levels[k] / 10.0], np.float32))
+        action = np.array([levels[k] / 10.0], np.float32)
+        if kind == "loop":
+            action = np.asarray(controller.act(observation), np.float32)
+        observation, *_, info = env.step(action)
         flow[k] = info["command"]
+    if kind == "meter":
+        flow += generator.normal(0.0, METER, samples)
+    if kind == "drift":
+        temperature += np.cumsum(generator.normal(0.0, DRIFT, samples))
     return Log(flow, temperature, Parameters(**plant).sampling_interval)
 
 
-def cell(plant: Plant, samples: int, seed: int) -> dict[str, Any]:
+def cell(plant: Plant, samples: int, seed: int, kind: str = "steps") -> dict[str, Any]:
     """Identify a plant from a log of it.
 
     Returns
@@ -91,7 +132,7 @@ def cell(plant: Plant, samples: int, seed: int) -> dict[str, Any]:
         "time_constant": -true.sampling_interval / float(np.log(pole)),
         "noise_variance": float(plant["noise_variance"]),
     }
-    log = synthetic_log(plant, samples, seed)
+    log = synthetic_log(plant, samples, seed, kind)
     began = time.process_time()
     try:
         model = identify(log)

@@ -29,7 +29,7 @@ from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import Model, Options
 from benchmarks.identify.plant import plant_arguments
-from benchmarks.identify.report import tuned
+from benchmarks.identify.tuning import recommended
 from mptc_gym import Parameters
 
 INTERVAL = 4.0  # s
@@ -108,7 +108,9 @@ def controllers(model: Model) -> dict[str, PIController]:
     course = PIController(
         COURSE["kp"], COURSE["ki"], anti_windup=True, u_min=-HEATER, u_max=100.0 - HEATER
     )
-    return {**tuned(parameters), "PI, course": course}
+    tuned = recommended(model, parameters)
+    found = {name: each.controller for name, each in tuned.items() if each.controller}
+    return {**found, "PI, course": course}
 
 
 def run(controller: PIController | SmithPredictor, seed: int = 1) -> NDArray[np.float64]:

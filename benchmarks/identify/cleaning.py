@@ -1,0 +1,102 @@
+"""Mends what recorders do to a log: two rates, noise on a held flow, spikes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.identify.armax import Array, Flags
+from benchmarks.identify.log import Log
+
+SPIKE = 8.0  # robust deviations that a sample must stick out from its neighbours
+MOST_SPIKES = 0.03  # share of the rows
+STEP = 8.0  # deviations of its noise, from which a change of a held flow is a step
+SHORTEST_HOLD = 5  # samples
+RATES = range(2, 61)  # rows for each temperature
+
+
+def at_one_rate(log: Log) -> Log:
+    """Return the log at the rate of its temperatures, if only every n-th row has one."""
+    known = np.flatnonzero(np.isfinite(log.temperature))
+    if len(known) < 2 or 2 * len(known) > len(log.temperature) + 1:
+        return log
+    rate = int(np.median(np.diff(known)))
+    first = int(np.bincount(known % rate).argmax()) if rate in RATES else 0
+    if rate not in RATES or np.mean(known % rate == first) < 0.95:
+        return log
+    rows = np.arange(first, len(log.flow) - rate + 1, rate)
+
+    def mean(values: Array) -> Array:
+        """Return means from each temperature to the next."""
+        means: Array = values[rows[:, np.newaxis] + np.arange(rate)].mean(axis=1)
+        return means
+
+    note = (
+        f"Only one row in {rate} has a temperature. The log is fitted at these rows, "
+        f"{rate * log.sampling_interval:g} s apart, with the mean of the flow between them."
+    )
+    return Log(
+        mean(log.flow),
+        log.temperature[rows],
+        rate * log.sampling_interval,
+        [*log.notes, note],
+        {name: mean(each) for name, each in log.disturbances.items()},
+    )
+
+
+def without_noise_of_held_flow(log: Log) -> Log:
+    """Return the log with the means of the flow while it is held, if it is held, but noisy."""
+    flow = log.flow
+    moves = np.diff(flow)
+    known = moves[np.isfinite(moves)]
+    spread = 1.4826 * float(np.median(np.abs(known))) / np.sqrt(2.0) if len(known) else 0.0
+    if spread == 0.0:  # it stands still in most samples
+        return log
+    steps = np.flatnonzero(~(np.abs(moves) < STEP * spread)) + 1
+    holds = np.split(flow, steps)
+    long = sum(len(hold) for hold in holds if len(hold) >= SHORTEST_HOLD)
+    means = np.concatenate([np.full(len(hold), hold.mean()) for hold in holds])
+    left = flow - means
+    left = left[np.isfinite(left)]
+    if len(steps) < 3 or long < 0.9 * len(flow) or len(left) < 2 or not left.any():
+        return log
+    # What a controller or a hand does is not white; what a transmitter adds is.
+    together = np.corrcoef(left[1:], left[:-1])[0, 1]
+    if abs(together) > 0.2 or np.std(left) > 0.25 * np.nanstd(flow):
+        return log
+    note = (
+        f"The flow is held for stretches and has noise of {np.std(left):.2g} t/h, which is "
+        "taken as the flow meter's: the means of the stretches are used."
+    )
+    return replace(log, flow=means, notes=[*log.notes, note])
+
+
+def suspects(log: Log) -> Flags:
+    """Return which temperatures stick out from those before and after, as spikes do."""
+    series = pd.Series(log.temperature)
+    apart = (series - series.rolling(7, center=True, min_periods=3).median()).abs()
+    known = np.sort(np.unique(log.temperature[np.isfinite(log.temperature)]))
+    finest = float(np.min(np.diff(known))) if len(known) > 1 else 0.0
+    scale = max(1.4826 * float(np.nanmedian(apart)), finest, 1e-3 * float(np.ptp(known)))
+    found = (apart > SPIKE * scale).to_numpy(dtype=bool)
+    most = int(MOST_SPIKES * len(found))
+    if found.sum() > most:
+        found &= apart.to_numpy() >= np.sort(apart.fillna(0.0).to_numpy())[-max(most, 1)]
+    return np.asarray(found, bool)
+
+
+def without(log: Log, spikes: Flags) -> Log:
+    """Return the log with these temperatures missing, and a note."""
+    if not spikes.any():
+        return log
+    count = int(spikes.sum())
+    rows = ", ".join(str(row + 1) for row in np.flatnonzero(spikes)[:5])
+    more = ", ..." if count > 5 else ""
+    note = (
+        f"{count} {'spikes' if count > 1 else 'spike'} of the temperature "
+        f"{'are' if count > 1 else 'is'} left out (samples {rows}{more})."
+    )
+    temperature = np.where(spikes, np.nan, log.temperature)
+    return replace(log, temperature=temperature, notes=[*log.notes, note])

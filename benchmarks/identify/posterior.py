@@ -1,0 +1,289 @@
+"""What a log leaves open: orders, delays, dead zones and coefficients by their probability."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from benchmarks.identify.armax import Array
+from benchmarks.identify.likelihood import MOST_GAPS, Candidate, Gap, Likelihood, Place
+from benchmarks.identify.model import CONFIDENCE, Interval
+from benchmarks.linear import LinearModel
+
+ENDS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # of the posterior, where an interval ends
+NEAR = 25.0  # of deviances: what is further off has no probability worth a mention
+AS_GOOD = 4.0  # of Akaike's criterion: orders that are no further behind count the same
+MOST_FITS = 8  # of orders, at as many delays
+PLACES, DRAWS_EACH = 60, 6  # drawn: orders with a delay and a dead zone, and coefficients
+
+
+class Entry(NamedTuple):
+    """Orders, as one of the fits that take part has them, with a C, at a place."""
+
+    number: int
+    fit: Candidate
+    place: Place
+
+
+class Posterior:
+    """The posterior of the plant, and draws from it.
+
+    Parameters
+    ----------
+    likelihood
+        Of the log.
+    fits
+        Of orders that take part, the best first.
+
+    Attributes
+    ----------
+    delay, dead_zone, gain : Interval
+        Samples, t/h and degC per t/h.
+    chosen : Candidate
+        The fit of delay and dead zone.
+    draws : list of LinearModel
+        Plants.
+    """
+
+    def __init__(self, likelihood: Likelihood, fits: list[Candidate]) -> None:
+        self._likelihood = likelihood
+        entries = self._entries(fits)
+        places = [entry.place for entry in entries]
+        # The likeliest plant is of the simplest orders that will do. What is possible gives
+        # all orders that are about as good the same weight: a second time constant may stand
+        # for a part of the delay, and a log tells little of it.
+        likeliest, weights = self._weights(entries), self._weights(entries, possible=True)
+        self.delay = _of_delay(places, likeliest, weights)
+        self.dead_zone = _of_dead_zone([place.gap for place in places], weights)
+        self.chosen = self._choose(entries, likeliest)
+        generator = np.random.default_rng(0)
+        self.draws = self._draw(entries, weights, generator)
+        value = self._linear(self.chosen, self.chosen.solution.linear).gain
+        endless = math.copysign(math.inf, value)  # where nothing settles
+        self.gain = _interval(
+            value, np.array([d.gain if sum(d.a) > 0.0 else endless for d in self.draws])
+        )
+
+    def _entries(self, fits: list[Candidate]) -> list[Entry]:
+        """Return places for all orders that are near the best."""
+        likelihood, found = self._likelihood, []
+        gaps = likelihood.gaps()
+        for i, fit in enumerate(fits):
+            places = likelihood.scan(fit.orders, fit.solution.c, gaps)
+            if i == 0:
+                gaps = self._refined(fit, places)
+                gap = likelihood.scan(
+                    fit.orders,
+                    fit.solution.c,
+                    gaps,
+                    range(fit.place.delay, fit.place.delay + 1),
+                )[0].gap
+            near = [p.delay for p in places if p.deviance < places[0].deviance + 2.0 * NEAR]
+            delays = range(min(near), max(near) + 1)
+            # Another delay may ask for another C.
+            stride = max(len(delays) // MOST_FITS, 1)
+            for delay in delays[::stride]:
+                around = range(delay, min(delay + stride, delays.stop))
+                middle = Place(0.0, around[len(around) // 2], gap)
+                refit = likelihood.fit(middle, fit.orders, fit.solution.c)
+                places = likelihood.scan(fit.orders, refit.solution.c, gaps, around)
+                found += [Entry(i, refit, place) for place in places]
+        return found
+
+    def _weights(self, entries: list[Entry], *, possible: bool = False) -> Array:
+        """Return the probabilities of places."""
+        likelihood = self._likelihood
+        deviances = np.array([entry.place.deviance for entry in entries])
+        prior = np.array([self._prior(entry.place.gap) for entry in entries])
+        member = np.array([entry.number for entry in entries])
+        weights = np.zeros(len(entries))
+        behind = np.zeros(member.max() + 1)
+        for number in range(member.max() + 1):
+            own = member == number
+            least, orders = deviances[own].min(), entries[int(np.argmax(own))].fit.orders
+            behind[number] = likelihood.criterion(orders, least, mild=possible)
+            weights[own] = np.exp((least - deviances[own]) / 2.0) * prior[own]
+            if possible:
+                weights[own] /= weights[own].sum()
+        behind = np.maximum(behind - behind.min() - AS_GOOD * possible, 0.0)
+        weights *= np.exp(-behind / 2.0)[member]
+        weights /= weights.sum()
+        return weights
+
+    def _refined(self, fit: Candidate, places: list[Place]) -> list[Gap]:
+        """Return gaps near the best, with all gaps between commands told apart there."""
+        likelihood = self._likelihood
+        near = [p.delay for p in places if p.deviance < places[0].deviance + 2.0 * NEAR]
+        delays = range(min(near), max(near) + 1)
+        best: dict[Gap, float] = {}
+        for place in places:
+            best.setdefault(place.gap, place.deviance)  # the best of a gap comes first
+        while len(best) < MOST_GAPS:
+            gaps = sorted(best)
+            limit = min(best.values()) + NEAR
+            parts = {
+                gap: likelihood.halves(gap)
+                for gap, above in zip(gaps, [*gaps[1:], gaps[-1]], strict=True)
+                if min(best[gap], best[above]) < limit
+            }
+            parts = {gap: halves for gap, halves in parts.items() if len(halves) > 1}
+            if not parts:
+                break
+            # The lower half has the same commands at rest as the whole.
+            for gap, (lower, _) in parts.items():
+                best[lower] = best.pop(gap)
+            upper = [halves[1] for halves in parts.values()]
+            for place in likelihood.scan(fit.orders, fit.solution.c, upper, delays):
+                best.setdefault(place.gap, place.deviance)
+        return sorted(gap for gap in best if best[gap] < min(best.values()) + NEAR)
+
+    def _prior(self, gap: Gap) -> float:
+        """Return the probability beforehand: a half that there is no dead zone."""
+        if not self._likelihood.options.find_dead_zone:
+            return 1.0
+        share = gap.width / float(self._likelihood.magnitudes[-1])
+        return 0.5 * share + 0.5 * (gap.low == 0.0)
+
+    def _choose(self, entries: list[Entry], weights: Array) -> Candidate:
+        """Return the fit of the likeliest orders with the delay and the dead zone."""
+        there = np.array([entry.place.delay == self.delay.value for entry in entries])
+        shares = np.bincount([entry.number for entry in entries], weights * there)
+        best = max(
+            (entry for entry, right in zip(entries, there, strict=True)
+             if right and entry.number == int(np.argmax(shares))),
+            key=lambda entry: (
+                entry.place.gap.low <= self.dead_zone.value <= entry.place.gap.high,
+                -entry.place.deviance,
+            ),
+        )  # fmt: skip
+        return self._likelihood.fit(best.place, best.fit.orders, best.fit.solution.c)
+
+    def _draw(
+        self,
+        entries: list[Entry],
+        weights: Array,
+        generator: np.random.Generator,
+    ) -> list[LinearModel]:
+        points = (np.arange(PLACES) + generator.random()) / PLACES
+        picked = np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
+        draws = []
+        for i, times in zip(*np.unique(picked, return_counts=True), strict=True):
+            _, fit, place = entries[i]
+            found = self._likelihood.linear(place, fit.orders, fit.solution.c)
+            size = len(found.solution.linear)
+            covariance = self.covariance(found)[:size, :size]
+            draws += [
+                self._linear(found, linear)
+                for linear in generator.multivariate_normal(
+                    found.solution.linear, covariance, times * DRAWS_EACH, method="eigh"
+                )
+            ]
+        return draws
+
+    def _linear(self, fit: Candidate, linear: Array) -> LinearModel:
+        a, b = fit.orders.a, fit.orders.b
+        return LinearModel(
+            [1.0, *linear[:a].tolist()],
+            linear[a : a + b].tolist(),
+            delay=fit.place.delay,
+            sampling_interval=self._likelihood.log.sampling_interval,
+        )
+
+    def covariance(self, fit: Candidate) -> Array:
+        """Return the covariance of the linear coefficients and C."""
+        target, columns = self._likelihood.regressors(fit.place, fit.orders)
+        return self._likelihood.rows.covariance(
+            target, columns, fit.solution, walk=fit.orders.walk
+        )
+
+    def time_constant(self, interval: float) -> Interval:
+        """Return the time constant of the slowest pole, s."""
+        value = self._linear(self.chosen, self.chosen.solution.linear)
+        drawn = np.array([slowest(draw.a) for draw in self.draws])
+        found = _interval(slowest(value.a), drawn)
+        return Interval(*(interval * each for each in (found.value, found.low, found.high)))
+
+    def noise_variance(self) -> Interval:
+        """Return the variance of the prediction errors, degC^2."""
+        freedom = len(self._likelihood.rows) - self.chosen.orders.count
+        low, high = stats.chi2.ppf(ENDS, freedom)
+        square = self.chosen.solution.square
+        return Interval(square / freedom, square / float(high), square / float(low))
+
+    def coefficients(self) -> dict[str, Interval]:
+        """Return A, B and C of the chosen fit with intervals, by name."""
+        fit = self.chosen
+        values = np.concatenate([fit.solution.linear, fit.solution.c])
+        spreads = stats.norm.ppf(ENDS[1]) * np.sqrt(np.diag(self.covariance(fit)))
+        a, b, all_linear = fit.orders.a, fit.orders.b, len(fit.solution.linear)
+        places = {f"a{i + 1}": i for i in range(a)} | {f"b{i + 1}": a + i for i in range(b)}
+        places |= {f"c{i + 1}": all_linear + i for i in range(fit.orders.noise)}
+        return {
+            name: Interval(*(float(values[i] + sign * spreads[i]) for sign in (0, -1, 1)))
+            for name, i in places.items()
+        }
+
+
+def slowest(a: Sequence[float]) -> float:
+    """Return the time constant that a step response ends with, samples.
+
+    It is that of the largest real pole above 0, if any: poles below 0, whose responses change
+    sign at every sample, tell how the noise is made.
+    """
+    poles = np.roots(a)
+    settling = poles[np.isreal(poles) & (poles.real > 0.0)]
+    size = float(np.max(np.abs(settling if len(settling) else poles), initial=0.0))
+    return math.inf if size >= 1.0 else -1.0 / math.log(max(size, 1e-12))
+
+
+def _interval(value: float, drawn: Array) -> Interval:
+    """Return a value with the quantiles of draws."""
+    # Without interpolation: between a number and infinity there is none.
+    low, high = np.quantile(drawn, ENDS, method="nearest")
+    return Interval(value, min(float(low), value), max(float(high), value))
+
+
+def _of_delay(places: list[Place], likeliest: Array, weights: Array) -> Interval:
+    """Return the delay that has most probability within one sample, and its interval."""
+    delays = np.array([place.delay for place in places])
+    tried = np.unique(delays)
+    shares, of_interval = (
+        np.array([each[delays == delay].sum() for delay in tried])
+        for each in (likeliest, weights)
+    )
+    near = np.abs(tried[:, np.newaxis] - tried) <= 1
+    # Of equal ones, the delay that is itself the likelier.
+    value = float(tried[np.lexsort((shares, (near @ shares).round(6)))[-1]])
+    sums = np.cumsum(of_interval)
+    low, high = (
+        float(tried[min(int(np.searchsorted(sums, share)), len(tried) - 1)]) for share in ENDS
+    )
+    return Interval(value, min(low, value), max(high, value))
+
+
+def _of_dead_zone(places: list[Gap], weights: Array) -> Interval:
+    """Return the dead zone: its posterior is spread evenly within each gap."""
+    shares: dict[Gap, float] = {}
+    for gap, weight in zip(places, weights, strict=True):
+        shares[gap] = shares.get(gap, 0.0) + float(weight)
+    gaps = sorted(shares)
+
+    def at(probability: float) -> tuple[Gap, float]:
+        below = 0.0
+        for gap in gaps:
+            if below + shares[gap] >= probability:
+                inside = gap.width * (probability - below) / shares[gap]
+                return gap, gap.low + inside
+            below += shares[gap]
+        return gaps[-1], gaps[-1].high
+
+    # The likelihood is the same all over a gap: the interval takes gaps as a whole.
+    low = at(ENDS[0])[0].low
+    high = at(ENDS[1])[0].high
+    if gaps[0].low == 0.0 and shares[gaps[0]] > 0.5:
+        return Interval(0.0, 0.0, high)  # every command has had an effect
+    return Interval(at(0.5)[1], low, high)

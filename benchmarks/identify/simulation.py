@@ -1,0 +1,78 @@
+"""How much of a log models explain by simulation, and what an impulse response explains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import signal
+
+from benchmarks.identify.armax import Array, Flags
+
+LAGS = 60  # of the impulse response, samples
+TAILS = (30.0, 60.0, 120.0, 240.0)  # time constants of what goes on after them, samples
+RIDGES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the penalty that is chosen from
+
+
+def held(values: Array) -> Array:
+    """Return values with the last known one in place of those that are not known."""
+    known = np.flatnonzero(np.isfinite(values))
+    places = np.searchsorted(known, np.arange(len(values)), "right") - 1
+    filled: Array = values[known[np.maximum(places, 0)]]
+    return filled
+
+
+def response(a: Sequence[float], b: Sequence[float], delay: int, flow: Array) -> Array:
+    """Return what a flow does to the temperature by (28), from rest at its first value."""
+    start = float(flow[0])
+    numerator = [0.0] * (delay + 1) + list(b)
+    if np.max(np.abs(np.roots(a)), initial=0.0) >= 1.0:
+        return np.full(len(flow), np.nan)
+    moved: Array = signal.lfilter(numerator, a, flow - start)
+    return moved + start * sum(b) / sum(a)
+
+
+def explained(output: Array, simulated: Array, rows: Flags) -> float:
+    """Return the share of the variance in some rows that a simulation explains.
+
+    The straight line that fits best is taken from its errors: the slow disturbance.
+    """
+    known = rows & np.isfinite(output)
+    if not known.any() or not np.isfinite(simulated[known]).all():
+        return -np.inf
+    times, error = np.flatnonzero(known), (output - simulated)[known]
+    line = np.polyval(np.polyfit(times - times[0], error, 1), times - times[0])
+    total = float(np.var(output[known] - line))
+    return 1.0 - float(np.mean((error - line) ** 2)) / total if total else -np.inf
+
+
+def of_impulse_response(inputs: list[Array], output: Array, fitted: Flags) -> Array:
+    """Return the simulation by a finite impulse response with a slow tail, deviations in degC.
+
+    It has `LAGS` coefficients and four slow exponentials for each input, and is fitted to some
+    rows by least squares with a ridge, which generalised cross-validation chooses (G. H. Golub,
+    M. Heath and G. Wahba, Technometrics 21, 1979, 215-223).
+    """
+    columns = []
+    for each in inputs:
+        moved = each - each[0]
+        columns += [np.concatenate([np.zeros(lag), moved[:-lag]]) for lag in range(1, LAGS + 1)]
+        for samples in TAILS:
+            pole = np.exp(-1.0 / samples)
+            columns.append(
+                signal.lfilter([0.0] * (LAGS + 1) + [1.0 - pole], [1.0, -pole], moved)
+            )
+    table = np.column_stack(columns)
+    known = fitted & np.isfinite(output)
+    centre, level = table[known].mean(axis=0), output[known].mean()
+    left, sizes, right = np.linalg.svd(table[known] - centre, full_matrices=False)
+    shares, target = left.T @ (output[known] - level), output[known] - level
+    least, best = np.inf, np.zeros(table.shape[1])
+    for ridge in RIDGES:
+        kept = sizes**2 / (sizes**2 + (ridge * sizes[0]) ** 2 + 1e-300)
+        error = target - left @ (kept * shares)
+        score = float(error @ error) / (1.0 - kept.sum() / len(target)) ** 2
+        if score < least:
+            least, best = score, right.T @ (kept * shares / np.maximum(sizes, 1e-300))
+    simulated: Array = (table - centre) @ best + level
+    return simulated
