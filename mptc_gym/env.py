@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mptc_gym import rendering
 from mptc_gym.checks import shortened
-from mptc_gym.parameters import Parameters, argument_signature, argument_table
+from mptc_gym.parameters import Parameters, argument_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.ranges import Ranges
 from mptc_gym.record import Record
@@ -26,8 +26,13 @@ Observation = NDArray[np.float32]
 Action = NDArray[np.float32]
 
 
+def action_space() -> Space[Action]:
+    """Return the bounds of the action, shape (1,), float32."""
+    return Box(-1.0, 1.0, (1,), np.float32)
+
+
 def observation_space(parameters: Parameters) -> Space[Observation]:
-    """Bounds of the observation, shape (observation_size,), float32.
+    """Return the bounds of the observation, shape (observation_size,), float32.
 
     They depend on the set point only if it leaves the transmitter's range, so that a policy
     trained on one set point can be run on another.
@@ -153,7 +158,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
     With a load disturbance there is also `disturbance` (w, degC), and with a drift `gain_factor`
     and `time_constant_factor`, both as they are now. The dict of `reset` also has, under its name,
-    each number that was drawn.
+    each number that was drawn; a delay is an int.
 
     ## Rendering
 
@@ -185,25 +190,12 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         "render_fps": 30,
     }
 
-    # One list of arguments, that of `Parameters`; help() and editors see it spelt out here.
-    __signature__: ClassVar[inspect.Signature] = inspect.Signature(
-        [
-            *argument_signature(),
-            inspect.Parameter(
-                "render_mode",
-                inspect.Parameter.KEYWORD_ONLY,
-                default=None,
-                annotation="str | None",
-            ),
-        ]
-    )
-
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         self.parameters = parameters = Parameters.of_environment(arguments)
         rendering.check_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         self._record: Record | None = None  # for pictures; None if there are none
-        self.action_space = Box(-1.0, 1.0, (1,), np.float32)
+        self.action_space = action_space()
         self.observation_space = observation_space(parameters)
         # What step uses, in two tuples: unpacking one costs less than as many attributes.
         self._reward_terms = (
@@ -217,15 +209,20 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             parameters.observation_size,
         )
         self._ranges = Ranges(parameters)
-        self._noise = Noise(parameters.c, parameters.range_of("noise_variance"))
-        self._transmitter = Noise([1.0], parameters.range_of("measurement_noise_variance"))
-        self._disturbance = Disturbance(parameters)
         self._setpoint = SetPoint(parameters)
+        self._others = (
+            Noise("noise", parameters),
+            Disturbance(parameters),
+            Noise("measurement_noise", parameters),
+        )
         self._has_more_info = parameters.is_disturbed or parameters.drifts
         self._streams: Streams | None = None
         self._root: np.random.Generator | None = None  # what the streams come from
         # y_d, n, w and the transmitter's noise of the samples ahead, the next one last.
         self._ahead: list[tuple[float, float, float, float]] = []
+
+    # One list of arguments, that of `Parameters`; help() and editors see it spelt out here.
+    __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -253,14 +250,10 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
             self._streams = Streams.spawn(seeds)
         parameters = self.parameters
-        numbers = self._ranges.given
-        if self._ranges.names or parameters.is_disturbed:
-            generator = self._streams.plant.next_episode()
-            numbers = self._ranges.draw_one(generator)
-            self._disturbance.reset(generator, numbers)
-        self._noise.reset(self._streams.noise, numbers.noise_variance)
-        self._transmitter.reset(self._streams.transmitter, numbers.measurement_noise_variance)
-        self._setpoint.reset(self._streams.setpoint)
+        numbers = self._ranges.draw_one(self._streams.plant)
+        setpoint = self._setpoint.reset(self._streams, numbers)
+        for signal in self._others:  # each is 0 at k = 0
+            signal.reset(self._streams, numbers)
         self._plant = Plant(parameters, numbers)
 
         # At rest u is 0, whatever action that is.
@@ -271,8 +264,6 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self._window = [0.0] * (size - actions) + [rest_action] * (actions + 1)
         self._ahead.clear()
 
-        setpoint = self._setpoint.take(1)[0]
-        self._disturbance.take(1)  # 0, that of k = 0
         error_head, output_head, action_head = parameters.heads
         self._window[0] = setpoint
         self._window[error_head] = setpoint
@@ -397,8 +388,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     def _look_ahead(self) -> None:
         if self._streams is None:
             raise ResetNeeded("call reset before step")
-        signals = self._setpoint, self._noise, self._disturbance, self._transmitter
-        self._ahead = list(zip(*(signal.take(BLOCK) for signal in signals), strict=True))[::-1]
+        signals = self._setpoint, *self._others
+        self._ahead = list(zip(*(signal.next(BLOCK) for signal in signals), strict=True))[::-1]
 
     def _add_more_info(self, info: dict[str, float], load: float) -> None:
         """Add to the info what belongs to arguments that are off by default."""

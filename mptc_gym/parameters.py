@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
 from types import MappingProxyType
@@ -436,11 +436,13 @@ def argument_table() -> str:
     return "\n".join(["| Argument | Default | Unit | Meaning |", "|---|---|---|---|", *rows])
 
 
-def argument_signature() -> list[inspect.Parameter]:
-    """Return all arguments but `render_mode` as those of a function, for help()."""
-    return [
+def spelt_out(function: Callable[..., Any]) -> inspect.Signature:
+    """Return a method's signature for help(), with each argument in place of **arguments."""
+    own = [*inspect.signature(function).parameters.values()]
+    arguments = [
         each.replace(annotation="float | Sequence[float]")
         if each.name in PLANT_NUMBERS
         else each
         for each in inspect.signature(Parameters).parameters.values()
     ]
+    return inspect.Signature([*own[1:-1], *arguments])

@@ -1,14 +1,15 @@
-"""The plant numbers of an episode: as they are given, or drawn from their ranges."""
+"""Draws the plant numbers of an episode from their ranges, or takes them as they are given."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mptc_gym.parameters import ARGUMENTS, DRAWS, PLANT_NUMBERS, Parameters, PlantNumbers
+from mptc_gym.signals import EpisodeStream
 
 Values = NDArray[np.float64]  # of shape (episodes,), or () where all episodes have the same
 
@@ -36,44 +37,45 @@ class Ranges:
 
     def __init__(self, parameters: Parameters) -> None:
         self.names = parameters.ranges
-        lows = {name: float(parameters.range_of(name)[0]) for name in PLANT_NUMBERS}
+        # The disturbance's draws follow those of the plant numbers.
+        self._draws = bool(self.names) or parameters.is_disturbed
+        lows = {name: parameters.range_of(name)[0] for name in PLANT_NUMBERS}
         self.given: PlantNumbers[float] = PlantNumbers(**lows)
         self.given_arrays: PlantNumbers[Values] = PlantNumbers(
             **{name: np.array(low) for name, low in lows.items()}
         )
         self._places = [PLANT_NUMBERS[name] for name in self.names]
-        self._lows = np.array([lows[name] for name in self.names])
-        highs = np.array([float(parameters.range_of(name)[1]) for name in self.names])
-        self._whole = np.array([ARGUMENTS[name].is_integer for name in self.names], np.bool_)
+        self._lows = np.array([lows[name] for name in self.names], float)
+        highs = np.array([parameters.range_of(name)[1] for name in self.names], float)
+        self._types = [int if ARGUMENTS[name].is_integer else float for name in self.names]
+        self._whole = np.array([each is int for each in self._types], np.bool_)
         self._widths = highs - self._lows + self._whole
 
-    def draw(
-        self, generators: Iterable[np.random.Generator], episodes: int
-    ) -> PlantNumbers[Values]:
-        """Draw for some episodes.
-
-        Parameters
-        ----------
-        generators
-            One an episode, at the start of it.
-        episodes
-            How many.
+    def draw(self, streams: Sequence[EpisodeStream]) -> PlantNumbers[Values]:
+        """Begin an episode of each stream, and draw its numbers.
 
         Returns
         -------
         PlantNumbers of ndarray
-            What is a range has the shape (episodes,), anything else the shape ().
+            What is a range has the shape (len(streams),), anything else the shape ().
         """
-        draws = np.empty((episodes, DRAWS))
-        for generator, row in zip(generators, draws, strict=True):
-            generator.random(out=row)
-        drawn = self._scaled(draws).T
-        return replace(self.given_arrays, **dict(zip(self.names, drawn, strict=True)))
+        if not self._draws:
+            return self.given_arrays
+        draws = np.empty((len(streams), DRAWS))
+        for stream, row in zip(streams, draws, strict=True):
+            stream.next_episode().random(out=row)
+        drawn = zip(self.names, self._types, self._scaled(draws).T, strict=True)
+        return replace(
+            self.given_arrays, **{name: values.astype(type_) for name, type_, values in drawn}
+        )
 
-    def draw_one(self, generator: np.random.Generator) -> PlantNumbers[float]:
-        """Draw for one episode, with its generator."""
-        drawn = self._scaled(generator.random(DRAWS)).tolist()
-        return replace(self.given, **dict(zip(self.names, drawn, strict=True)))
+    def draw_one(self, stream: EpisodeStream) -> PlantNumbers[float]:
+        """Begin an episode of a stream, and draw its numbers."""
+        if not self._draws:
+            return self.given
+        drawn = self._scaled(stream.next_episode().random(DRAWS)).tolist()
+        numbers = zip(self.names, self._types, drawn, strict=True)
+        return replace(self.given, **{name: type_(value) for name, type_, value in numbers})
 
     def _scaled(self, draws: Values) -> Values:
         """Bring draws of all plant numbers, from 0 to 1, to the ranges: shape (..., ranges)."""
@@ -87,5 +89,5 @@ def numbers_of_plant(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[floa
     """Return the numbers of the i-th of many plants."""
     arrays = numbers.chosen(tuple(PLANT_NUMBERS))
     return PlantNumbers(
-        **{name: float(array[i] if array.ndim else array) for name, array in arrays.items()}
+        **{name: (array[i] if array.ndim else array).item() for name, array in arrays.items()}
     )

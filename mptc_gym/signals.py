@@ -1,14 +1,20 @@
-"""What comes from outside during an episode: set point, noise, disturbance, and their draws.
+"""Makes what comes from outside during an episode: set point, noise and load disturbance.
 
-One plant and many side by side have classes of their own, which share how a signal goes on.
-Noise and disturbance are made a block of samples at a time: drawing many numbers in one call
-costs a small part of drawing them one by one, and gives the same numbers.
+Every signal has two verbs, here and in `mptc_gym.torch_signals`. `reset` begins an episode and
+returns the signal at k = 0, and `next` returns it at the samples that follow:
+
+- of one plant: `reset(streams, numbers)`, and `next(samples)`, a list;
+- of many plants: `reset(which, streams, numbers)`, and `next()`, an array of one sample.
+
+Both share how a signal goes on, and agree to the bit. Noise and disturbance are made a block of
+samples at a time: drawing many numbers in one call costs a small part of drawing them one by
+one, and gives the same numbers.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
@@ -16,11 +22,14 @@ from numpy.typing import NDArray
 
 from mptc_gym.parameters import Parameters, PlantNumbers
 
+Values = NDArray[np.float64]  # one a plant
+Indices = NDArray[np.intp]  # of some plants, sorted
+
 BLOCK = 600  # samples of a signal that are made together
 FOREVER = 1 << 62  # samples
-_PLANTS_AT_A_TIME = 32  # whose draws are made together: they stay in the processor's cache
+PLANTS_AT_A_TIME = 32  # whose draws are made together: they stay in the processor's cache
 LOAD_INTERVAL = 10  # samples between two changes of the load disturbance
-_LEVELS_AT_A_TIME = 60  # of the load disturbance, made together
+LEVELS_AT_A_TIME = 60  # of the load disturbance, made together
 
 
 class EpisodeStream:
@@ -34,28 +43,34 @@ class EpisodeStream:
     entropy, spawn_key, pool_size
         Of the `SeedSequence` that starts the stream. It is made with the first episode: many
         plants have streams that are never used.
+
+    Attributes
+    ----------
+    generator : numpy.random.Generator
+        That of the present episode.
     """
 
     # Without a dict each, the streams of 100,000 plants take little memory.
-    __slots__ = ("_episode", "_generator", "_origin", "_seeds")
+    __slots__ = ("_episode", "_origin", "_seeds", "generator")
+
+    generator: np.random.Generator
 
     def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
         self._seeds = entropy, spawn_key, pool_size
-        self._generator: np.random.Generator | None = None
         self._origin = 0, 0  # state and increment of the bit generator at the start
         self._episode = 0
 
     def next_episode(self) -> np.random.Generator:
         """Move to the start of the next episode and return the generator there."""
-        if self._generator is None:
+        if self._episode == 0:
             entropy, spawn_key, pool_size = self._seeds
             seeds = np.random.SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size)
-            self._generator = np.random.Generator(np.random.PCG64(seeds))
-            origin: Any = self._generator.bit_generator.state["state"]
+            self.generator = np.random.Generator(np.random.PCG64(seeds))
+            origin: Any = self.generator.bit_generator.state["state"]
             self._origin = origin["state"], origin["inc"]
         else:
             # Found through the generator, as a copy of it may have a bit generator of its own.
-            bit_generator = cast("np.random.PCG64", self._generator.bit_generator)
+            bit_generator = cast("np.random.PCG64", self.generator.bit_generator)
             state, increment = self._origin
             bit_generator.state = {
                 "bit_generator": "PCG64",
@@ -65,7 +80,7 @@ class EpisodeStream:
             }
             bit_generator.advance(self._episode << 64)
         self._episode += 1
-        return self._generator
+        return self.generator
 
 
 class Streams(NamedTuple):
@@ -74,7 +89,7 @@ class Streams(NamedTuple):
     noise: EpisodeStream
     setpoint: EpisodeStream
     plant: EpisodeStream  # first the plant numbers, then the disturbance
-    transmitter: EpisodeStream
+    measurement_noise: EpisodeStream
 
     @classmethod
     def spawn(cls, seeds: np.random.SeedSequence) -> Streams:
@@ -93,29 +108,42 @@ class Streams(NamedTuple):
 _SPAWN_KEYS: Final = tuple((place,) for place in range(len(Streams._fields)))
 
 
+def colour_of(name: str, parameters: Parameters) -> Sequence[float]:
+    """Return the coefficients of C in (28) for "noise"; "measurement_noise" is white."""
+    return parameters.c if name == "noise" else (1.0,)
+
+
+def is_silent(name: str, parameters: Parameters) -> bool:
+    """Whether "noise" or "measurement_noise" is always 0."""
+    return parameters.range_of(f"{name}_variance")[1] == 0.0
+
+
 class Noise:
-    """Coloured noise, from k = 1 on: C(z^-1) xi(k) of (28), where xi is 0 before.
+    """Coloured noise: C(z^-1) xi(k) of (28), where xi is 0 up to k = 0.
 
     Parameters
     ----------
-    c
-        Coefficients of C, from z^0 on.
-    variances
-        The lowest and the highest that xi can have, degC^2.
+    name
+        "noise" or "measurement_noise".
+    parameters
+        Uses the variance of that name, and `c`.
     """
 
-    def __init__(self, c: Sequence[float], variances: tuple[float, float]) -> None:
-        self._c = c
-        self._silent = variances[1] == 0.0
+    def __init__(self, name: str, parameters: Parameters) -> None:
+        self._name = name
+        self._c = colour_of(name, parameters)
+        self._silent = is_silent(name, parameters)
 
-    def reset(self, stream: EpisodeStream, variance: float) -> None:
+    def reset(self, streams: Streams, numbers: PlantNumbers[float]) -> float:
         """Begin an episode, with one draw a sample; without noise the stream is untouched."""
+        stream: EpisodeStream = getattr(streams, self._name)
         self._generator = None if self._silent else stream.next_episode()
-        deviation = math.sqrt(variance)
+        deviation = math.sqrt(getattr(numbers, f"{self._name}_variance"))
         self._colour = [deviation * coefficient for coefficient in self._c]
         self._past = np.zeros(len(self._c) - 1)  # draws, oldest first
+        return 0.0
 
-    def take(self, samples: int) -> list[float]:
+    def next(self, samples: int) -> list[float]:
         """Return the next values, degC."""
         if self._generator is None:
             return [0.0] * samples
@@ -130,10 +158,8 @@ class NoiseBatch:
 
     Parameters
     ----------
-    c
-        Coefficients of C, from z^0 on.
-    variances
-        The lowest and the highest that xi can have, degC^2.
+    name, parameters
+        As for `Noise`.
     num_envs
         Number of plants.
     block
@@ -142,71 +168,59 @@ class NoiseBatch:
     Attributes
     ----------
     silent : bool
-        Whether there is never any noise.
+        Whether it is always 0.
     """
 
-    def __init__(
-        self, c: Sequence[float], variances: tuple[float, float], num_envs: int, block: int
-    ) -> None:
-        low, high = variances
-        self.silent = high == 0.0
-        self._c = np.array(c)[:, np.newaxis, np.newaxis]
+    def __init__(self, name: str, parameters: Parameters, num_envs: int, block: int) -> None:
+        self._name, self._variance = name, f"{name}_variance"
+        self.silent = is_silent(name, parameters)
+        c = np.array(colour_of(name, parameters))
+        self._c = c[:, np.newaxis, np.newaxis]
         # C times the deviation of xi: [lag, plant, 0], all plants in one if they are alike.
+        low, high = parameters.range_of(self._variance)
         self._alike = low == high
         self._colour = np.repeat(math.sqrt(low) * self._c, 1 if self._alike else num_envs, 1)
-        self._silence = np.zeros(num_envs)
         self._past = np.zeros((num_envs, len(c) - 1))
         self._generators: dict[int, np.random.Generator] = {}
         # A row a sample: what all plants need at a time lies together.
         self._block = np.zeros((0 if self.silent else block, num_envs))
+        self._silence = np.zeros(num_envs)
         self._row = 0  # the next one
 
     def reset(
-        self,
-        which: NDArray[np.intp],
-        streams: Iterable[EpisodeStream],
-        variances: NDArray[np.float64],
-    ) -> None:
-        """Begin an episode of some plants.
+        self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
+    ) -> Values:
+        """Begin an episode of some plants, given by indices, with the streams of each."""
+        if not self.silent:
+            if not self._alike:
+                deviations = np.sqrt(getattr(numbers, self._variance))
+                self._colour[:, which] = deviations[:, np.newaxis] * self._c
+            self._past[which] = 0.0
+            for i, own in zip(which.tolist(), streams, strict=True):
+                self._generators[i] = getattr(own, self._name).next_episode()
+            if len(which) == len(self._past):
+                self._row = len(self._block)
+            else:
+                self._fill(which, self._row)
+        return np.zeros(len(which))
 
-        Parameters
-        ----------
-        which
-            Their indices, sorted.
-        streams
-            One for each.
-        variances
-            Of their xi, shape (len(which),), or () where it is not drawn.
-        """
-        if self.silent:
-            return
-        if not self._alike:
-            self._colour[:, which] = np.sqrt(variances)[:, np.newaxis] * self._c
-        self._past[which] = 0.0
-        for i, stream in zip(which.tolist(), streams, strict=True):
-            self._generators[i] = stream.next_episode()
-        if len(which) == len(self._past):
-            self._row = len(self._block)
-        else:
-            self._fill(which, self._row)
-
-    def next(self) -> NDArray[np.float64]:
+    def next(self) -> Values:
         """Return the next values of all plants, degC, shape (num_envs,); only to be read."""
         if self.silent:
             return self._silence
         if self._row == len(self._block):
             self._fill(np.arange(len(self._past)), 0)
             self._row = 0
-        row: NDArray[np.float64] = self._block[self._row]
+        row: Values = self._block[self._row]
         self._row += 1
         return row
 
-    def _fill(self, which: NDArray[np.intp], first_row: int) -> None:
+    def _fill(self, which: Indices, first_row: int) -> None:
         """Make the noise of some plants, from a row on to the end of the block."""
         order = len(self._c) - 1
         samples = len(self._block) - first_row
-        for start in range(0, len(which), _PLANTS_AT_A_TIME):
-            plants = which[start : start + _PLANTS_AT_A_TIME]
+        for start in range(0, len(which), PLANTS_AT_A_TIME):
+            plants = which[start : start + PLANTS_AT_A_TIME]
             draws = np.empty((len(plants), order + samples))
             draws[:, :order] = self._past[plants]
             for i, row in zip(plants.tolist(), draws[:, order:], strict=True):
@@ -219,12 +233,10 @@ class NoiseBatch:
             self._block[first_row:, columns] = _coloured(colour, draws).T
 
 
-def _coloured(
-    colour: Sequence[float] | NDArray[np.float64], draws: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _coloured(colour: Sequence[float] | Values, draws: Values) -> Values:
     """Filter draws along the last axis, of which the first len(colour) - 1 are past ones."""
     order = len(colour) - 1
-    noise: NDArray[np.float64] = colour[0] * draws[..., order:]
+    noise: Values = colour[0] * draws[..., order:]
     for lag, coefficient in enumerate(colour[1:], start=1):
         noise += coefficient * draws[..., order - lag : -lag]
     return noise
@@ -272,24 +284,25 @@ class Levels:
 
 
 class SetPoint:
-    """The set point y_d(k) from k = 0 on.
+    """The set point y_d(k).
 
     Parameters
     ----------
     parameters
-        Uses `setpoint`, `setpoint_amplitude` and `setpoint_period`.
+        Uses what `Levels` does.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._levels = Levels(parameters)
 
-    def reset(self, stream: EpisodeStream) -> None:
+    def reset(self, streams: Streams, numbers: PlantNumbers[float]) -> float:
         """Begin an episode; the stream is untouched unless levels are random."""
-        self._generator = stream.next_episode() if self._levels.random else None
+        self._generator = streams.setpoint.next_episode() if self._levels.random else None
         self._place = 0  # of the next level
         self._level, self._left = 0.0, 0  # the level now, and for how many samples more
+        return self.next(1)[0]
 
-    def take(self, samples: int) -> list[float]:
+    def next(self, samples: int) -> list[float]:
         """Return the next values of y_d, degC."""
         values: list[float] = []
         while len(values) < samples:
@@ -309,67 +322,80 @@ class SetPoint:
             self._place = (self._place + 1) % len(levels.values)
 
 
-class SetPointBatch:
-    """`SetPoint` for many plants, each to the bit what it is alone.
+class _LevelsBatch:
+    """Values of many plants, each of which is held until it changes."""
 
-    Its clock counts samples since all plants began; each plant has its own k.
+    def __init__(self, num_envs: int) -> None:
+        self._now = np.zeros(num_envs)
+        # Samples since all plants were made, and when, by that clock, each value changes.
+        self._clock = 0
+        self._changes = np.zeros(num_envs, np.int64)
+        self._next_change = 0  # the first of them
+
+    def next(self) -> Values:
+        """Return the next values of all plants, degC, shape (num_envs,); only to be read."""
+        self._clock += 1
+        if self._clock >= self._next_change:
+            self._catch_up()
+        return self._now
+
+    def _catch_up(self) -> None:
+        # More than once where a level is held for no sample, as in a period of one.
+        while self._clock >= self._next_change:
+            self._change(self._changes <= self._clock)
+            self._next_change = int(self._changes.min())
+
+    def _change(self, due: NDArray[np.bool_]) -> None:
+        """Change the values whose time has come, and say when the next changes are."""
+        raise NotImplementedError
+
+
+class SetPointBatch(_LevelsBatch):
+    """`SetPoint` for many plants, each to the bit what it is alone.
 
     Parameters
     ----------
     parameters
-        Uses `setpoint`, `setpoint_amplitude` and `setpoint_period`.
+        Uses what `Levels` does.
     num_envs
         Number of plants.
-
-    Attributes
-    ----------
-    now : ndarray, shape (num_envs,)
-        y_d of all plants, degC; only to be read.
-    next_change : int
-        When the first of them changes, by the clock; `move` does nothing before.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
+        super().__init__(num_envs)
         self._levels = Levels(parameters)
         self._values = np.array(self._levels.values)
         self._lengths = np.array(self._levels.lengths)
         self._generators: dict[int, np.random.Generator] = {}
         self._places = np.zeros(num_envs, np.intp)  # of the next level
-        self.now = np.zeros(num_envs)
-        self._changes = np.zeros(num_envs, np.int64)  # by the clock, of the next level
-        self.next_change = 0
 
     def reset(
-        self, which: NDArray[np.intp], streams: Iterable[EpisodeStream], clock: int
-    ) -> None:
-        """Begin an episode of some plants, given by indices, with a stream for each."""
+        self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
+    ) -> Values:
+        """Begin an episode of some plants, given by indices, with the streams of each."""
         if self._levels.random:
-            for i, stream in zip(which.tolist(), streams, strict=True):
-                self._generators[i] = stream.next_episode()
+            for i, own in zip(which.tolist(), streams, strict=True):
+                self._generators[i] = own.setpoint.next_episode()
         self._places[which] = 0
-        self._changes[which] = clock
-        self._next_level(which)
+        self._changes[which] = self._next_change = self._clock
+        self._catch_up()
+        return self._now[which]
 
-    def move(self, clock: int) -> None:
-        """Bring `now` to a sample of the clock, the next one or the same."""
-        while clock >= self.next_change:
-            self._next_level(np.flatnonzero(self._changes <= clock))
-
-    def _next_level(self, which: NDArray[np.intp]) -> None:
+    def _change(self, due: NDArray[np.bool_]) -> None:
+        which = np.flatnonzero(due)
         if self._levels.random:
             for i in which.tolist():
-                self.now[i], length = self._levels.draw(self._generators[i])
+                self._now[i], length = self._levels.draw(self._generators[i])
                 self._changes[i] += length
         else:
             places = self._places[which]
-            self.now[which] = self._values[places]
+            self._now[which] = self._values[places]
             self._changes[which] += self._lengths[places]
             self._places[which] = (places + 1) % len(self._values)
-        self.next_change = int(self._changes.min())
 
 
 class Disturbance:
-    """The load disturbance w(k), from k = 0 on: steps and a random walk, both from 0.
+    """The load disturbance w(k): steps and a random walk, both from 0.
 
     It changes every `LOAD_INTERVAL` samples. The walk takes a uniform step, as wide as the
     variance asks for; the sum of many is normal all the same. With a probability of
@@ -385,37 +411,29 @@ class Disturbance:
     def __init__(self, parameters: Parameters) -> None:
         self._silent = not parameters.is_disturbed
 
-    def reset(self, generator: np.random.Generator, numbers: PlantNumbers[float]) -> None:
-        """Begin an episode; draws go on from where the generator is.
-
-        Parameters
-        ----------
-        generator
-            Where the draws come from.
-        numbers
-            The plant numbers.
-        """
-        self._generator = generator
+    def reset(self, streams: Streams, numbers: PlantNumbers[float]) -> float:
+        """Begin an episode; the draws follow those of the plant numbers."""
+        if not self._silent:
+            self._generator = streams.plant.generator
         self._shape = np.array([_shape(numbers)])
         self._last = np.zeros((1, 2))
-        self._ahead = [0.0] * LOAD_INTERVAL
+        self._ahead = [0.0] * (LOAD_INTERVAL - 1)
+        return 0.0
 
-    def take(self, samples: int) -> list[float]:
+    def next(self, samples: int) -> list[float]:
         """Return the next values of w, degC."""
         if self._silent:
             return [0.0] * samples
         while len(self._ahead) < samples:
-            draws = self._generator.random((1, _LEVELS_AT_A_TIME, 3))
+            draws = self._generator.random((1, LEVELS_AT_A_TIME, 3))
             levels, self._last = _disturbance(draws, self._shape, self._last)
             self._ahead += np.repeat(levels[0], LOAD_INTERVAL).tolist()
         values, self._ahead = self._ahead[:samples], self._ahead[samples:]
         return values
 
 
-class DisturbanceBatch:
+class DisturbanceBatch(_LevelsBatch):
     """`Disturbance` for many plants, each to the bit what it is alone.
-
-    Its clock counts samples since all plants began; each plant has its own k.
 
     Parameters
     ----------
@@ -424,56 +442,46 @@ class DisturbanceBatch:
     """
 
     def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs)
         self._generators: dict[int, np.random.Generator] = {}
         self._shapes = np.zeros((num_envs, 3))
         self._last = np.zeros((num_envs, 2))
-        self._levels = np.zeros((num_envs, _LEVELS_AT_A_TIME))  # those ahead
+        self._levels = np.zeros((num_envs, LEVELS_AT_A_TIME))  # those ahead
         # Where each plant's end, when all lie in a row.
-        self._ends = np.arange(1, num_envs + 1) * _LEVELS_AT_A_TIME
+        self._ends = np.arange(1, num_envs + 1) * LEVELS_AT_A_TIME
         self._places = self._ends.copy()  # of the next level, there
-        self._now = np.zeros(num_envs)
-        self._changes = np.zeros(num_envs, np.int64)  # by the clock, of the next level
-        self._next_change = 0
 
     def reset(
-        self,
-        which: NDArray[np.intp],
-        generators: Iterable[np.random.Generator],
-        numbers: PlantNumbers[NDArray[np.float64]],
-        clock: int,
-    ) -> None:
-        """Begin an episode of some plants, with a generator and plant numbers for each."""
-        self._generators |= zip(which.tolist(), generators, strict=True)
+        self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
+    ) -> Values:
+        """Begin an episode of some plants, given by indices, with the streams of each."""
+        for i, own in zip(which.tolist(), streams, strict=True):
+            self._generators[i] = own.plant.generator
         for column, values in enumerate(_shape(numbers)):
             self._shapes[which, column] = values
-        self._last[which] = 0.0
-        self._now[which] = 0.0
+        self._last[which] = self._now[which] = 0.0
         self._places[which] = self._ends[which]
-        self._changes[which] = clock + LOAD_INTERVAL
+        self._changes[which] = self._clock + LOAD_INTERVAL
         self._next_change = int(self._changes.min())
+        return np.zeros(len(which))
 
-    def at(self, clock: int) -> NDArray[np.float64]:
-        """Return w of all plants at the next sample of the clock, degC; only to be read."""
-        if clock >= self._next_change:
-            due = self._changes <= clock
-            self._refill(np.flatnonzero(due & (self._places == self._ends)))
-            np.copyto(self._now, self._levels.take(self._places, mode="clip"), where=due)
-            self._places += due
-            self._changes += LOAD_INTERVAL * due
-            self._next_change = int(self._changes.min())
-        return self._now
+    def _change(self, due: NDArray[np.bool_]) -> None:
+        self._refill(np.flatnonzero(due & (self._places == self._ends)))
+        np.copyto(self._now, self._levels.take(self._places, mode="clip"), where=due)
+        self._places += due
+        self._changes += LOAD_INTERVAL * due
 
-    def _refill(self, which: NDArray[np.intp]) -> None:
+    def _refill(self, which: Indices) -> None:
         """Make the next levels of some plants."""
-        for start in range(0, len(which), _PLANTS_AT_A_TIME):
-            plants = which[start : start + _PLANTS_AT_A_TIME]
-            draws = np.empty((len(plants), _LEVELS_AT_A_TIME, 3))
+        for start in range(0, len(which), PLANTS_AT_A_TIME):
+            plants = which[start : start + PLANTS_AT_A_TIME]
+            draws = np.empty((len(plants), LEVELS_AT_A_TIME, 3))
             for i, row in zip(plants.tolist(), draws, strict=True):
                 self._generators[i].random(out=row)
             self._levels[plants], self._last[plants] = _disturbance(
                 draws, self._shapes[plants], self._last[plants]
             )
-        self._places[which] = self._ends[which] - _LEVELS_AT_A_TIME
+        self._places[which] = self._ends[which] - LEVELS_AT_A_TIME
 
 
 def _shape(numbers: PlantNumbers[Any]) -> tuple[Any, Any, Any]:
@@ -486,9 +494,7 @@ def _shape(numbers: PlantNumbers[Any]) -> tuple[Any, Any, Any]:
     )
 
 
-def _disturbance(
-    draws: NDArray[np.float64], shapes: NDArray[np.float64], last: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _disturbance(draws: Values, shapes: Values, last: Values) -> tuple[Values, Values]:
     """Make disturbances of uniform draws.
 
     Parameters

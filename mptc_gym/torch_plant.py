@@ -1,36 +1,23 @@
-"""Plant and actuator in PyTorch, (28) and (29): many plants, a block of samples at a time.
+"""Moves many plants in PyTorch by (28) and (29), a block of samples at a time.
 
 `PlantBatch` in `mptc_gym.plant` is the same in NumPy, a sample at a time.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from mptc_gym.parameters import Parameters, PlantNumbers
 from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
-from mptc_gym.torch_signals import Number
-
-
-def flow_command(actions: Tensor, middle: Tensor, half_range: Number) -> Tensor:
-    """Scale normalised actions to commands u, t/h: the last formula of Section 4.
-
-    Parameters
-    ----------
-    actions
-        Normalised, shape (n,).
-    middle, half_range
-        Of the limits, t/h: (U_min + U_max) / 2 and (U_max - U_min) / 2.
-    """
-    return _plus(middle, half_range, actions)
+from mptc_gym.torch_signals import Episodes, Number
 
 
 def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:
@@ -61,12 +48,22 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     return torch.addcmul(limited, limited.detach(), passes.sub_(1.0))
 
 
-def largest_dead(dead_zone: Number, like: Tensor) -> Number:
-    """Return the largest magnitude below a dead zone, as numbers of a type go."""
-    if isinstance(dead_zone, Tensor):
-        return dead_zone.nextafter(torch.full_like(dead_zone, -1.0))
-    kind = np.float32 if like.dtype == torch.float32 else np.float64
-    return float(np.nextafter(kind(dead_zone), kind(-1.0)))
+def largest_dead(numbers: Mapping[str, Any], like: Tensor) -> Number:
+    """Return the largest magnitude of a command without effect, as numbers of a type go.
+
+    In float64 it is the number before the dead zone, as commands are worked out as in NumPy. In
+    float32 each operation rounds by up to 2^-24 of what it works on, so that a command may come
+    out inside. There, commands that lie inside by no more than such errors pass, too.
+    """
+    dead_zone, u_min, u_max = (numbers[name] for name in ("dead_zone", "u_min", "u_max"))
+    edge: Number
+    if like.dtype == torch.float32:
+        edge = dead_zone - 2.0**-22 * (u_max - u_min + abs(u_max) + abs(u_min))
+    elif isinstance(dead_zone, Tensor):
+        edge = dead_zone.nextafter(torch.full_like(dead_zone, -1.0))
+    else:
+        edge = math.nextafter(dead_zone, -1.0)
+    return edge
 
 
 class TorchPlants:
@@ -80,8 +77,8 @@ class TorchPlants:
     ----------
     parameters
         Uses `a`, `b`, the delay, and what `Dynamics` does.
-    nothing
-        Zeros of the device and type to use, shape (n,).
+    episodes
+        The present ones.
 
     Attributes
     ----------
@@ -89,8 +86,8 @@ class TorchPlants:
         How many samples can be worked out at once.
     """
 
-    def __init__(self, parameters: Parameters, nothing: Tensor) -> None:
-        self._nothing = nothing
+    def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
+        self._episodes, self._zeros = episodes, episodes.zeros
         self._dynamics = Dynamics(parameters)
         self._drifts, self._scales = parameters.drifts, parameters.changes_dynamics
         self._drift_samples = parameters.drift_samples
@@ -99,31 +96,12 @@ class TorchPlants:
         self.most_samples = shortest + 1
         self._order = len(parameters.a) - 1  # of A
 
-    def rest(
-        self,
-        which: Tensor | None,
-        taken: int,
-        numbers: Mapping[str, Number],
-        starts: Tensor | int,
-        phases: Collection[int],
-    ) -> None:
-        """Bring plants to rest.
+    def reset(self, which: Tensor | None) -> None:
+        """Bring some plants to rest, or all, with the numbers of the present episodes.
 
-        Parameters
-        ----------
-        which
-            Whether each is, shape (n,), bool; None for all.
-        taken
-            How many samples of the last block have passed.
-        numbers
-            The plant numbers of all plants from now on, by name.
-        starts
-            The clock at the beginning of each plant's episode, shape (n,), or one int if it is
-            the same for all.
-        phases
-            The remainders of `starts` when divided by `DRIFT_INTERVAL`.
+        `which` says whether each is, shape (n,), bool; None for all.
         """
-        self._numbers, self._starts, self._phases = numbers, starts, phases
+        numbers, zeros = self._episodes.numbers, self._zeros
         self._now: tuple[Any, Any] | None = None  # factors, and what (28) has for them
         plants = PlantNumbers(**numbers)
         self._factors = self._dynamics.factors(plants, 0)
@@ -131,24 +109,24 @@ class TorchPlants:
             # At the beginning of drifts, and what has been added at their end.
             last = self._dynamics.factors(plants, self._drift_samples)
             self._drift = [
-                (self._nothing + begin, self._nothing + (end - begin))
+                (zeros + begin, zeros + (end - begin))
                 for begin, end in zip(self._factors, last, strict=True)
             ]
         # The flows that are still to have an effect, oldest first, for all terms of B; and the
         # outputs, also oldest first: what A needs from before the last block, and the block.
         if which is None:
             flows = self._longest + len(self._beta)
-            self._flows = deque([self._nothing] * flows, flows)
-            self._history = [self._nothing] * self._order
+            self._flows = deque([zeros] * flows, flows)
+            self._history = [zeros] * self._order
         else:
-            past = self._history[taken : taken + self._order]
-            self._history = [each.masked_fill(which, 0.0) for each in past]
+            self._history = [each.masked_fill(which, 0.0) for each in self._past()]
             self._flows.extend(torch.stack([*self._flows]).masked_fill_(which, 0.0).unbind())
-        u_min, u_max = numbers["u_min"], numbers["u_max"]
-        self._middle = self._nothing.new_zeros(()) + (u_min + u_max) / 2.0
+        self._limits = numbers["u_min"], numbers["u_max"]
+        u_min, u_max = self._limits
+        self._middle = zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
-        self._edge = largest_dead(numbers["dead_zone"], self._nothing)
-        delay, n = numbers["delay"], len(self._nothing)
+        self._edge = largest_dead(numbers, zeros)
+        delay, n = numbers["delay"], len(zeros)
         self._places = None  # of what each plant is shown, where delays differ
         if isinstance(delay, Tensor):
             columns = torch.arange(n, device=delay.device)
@@ -158,28 +136,23 @@ class TorchPlants:
 
     def apply(self, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Take a(k) of all plants, shape (n,), and return u(k) and u_a(k), t/h."""
-        command = flow_command(actions, self._middle, self._half_range)
-        numbers = self._numbers
-        applied = applied_flow(command, self._edge, numbers["u_min"], numbers["u_max"])
+        u_min, u_max = self._limits
+        # Section 4, last formula. In float64 it rounds as in NumPy, in float32 it is faster.
+        if actions.dtype == torch.float64:
+            command = actions.add(1.0).mul_(self._half_range).add_(u_min)
+        else:
+            command = _plus(self._middle, self._half_range, actions)
+        applied = applied_flow(command, self._edge, u_min, u_max)
         self._flows.append(applied.clone())  # as the caller may write in what is returned
         return command, applied
 
     def outputs(
-        self,
-        taken: int,
-        clock: int,
-        samples: int,
-        noise: Tensor | None,
-        load: Tensor | None,
+        self, samples: int, noise: Tensor | None, load: Tensor | None
     ) -> tuple[Tensor, list[tuple[Number, Number]]]:
         """Work out the next samples, once the action before them has been applied.
 
         Parameters
         ----------
-        taken
-            How many samples of the last block have passed.
-        clock
-            Of the first of the next ones.
         samples
             How many, at most `most_samples`.
         noise, load
@@ -191,10 +164,10 @@ class TorchPlants:
             y, degC, shape (samples, n); and of each sample gain and time constant, as multiples
             of those that A and B have.
         """
-        rows, told = self._history[taken : taken + self._order], []
+        rows, all_factors = self._past(), []
         response = self._response(samples)
-        for first, last in self._stretches(clock, samples):
-            factors, (alpha, scale, load_gain) = self._drifted(clock + first)
+        for first, last in self._stretches(samples):
+            factors, (alpha, scale, load_gain) = self._drifted(self._episodes.clock + first)
             forced = response[first:last]
             if noise is not None:
                 forced = _plus(noise[first:last], scale, forced)
@@ -202,10 +175,10 @@ class TorchPlants:
                 forced = forced * scale
             if load is not None:
                 forced = _plus(forced, load_gain, load[first:last])
-            told += [factors] * (last - first)
+            all_factors += [factors] * (last - first)
             rows = _follow(rows, forced.unbind(), alpha)
         self._history = rows
-        return torch.stack(rows[self._order :]), told
+        return torch.stack(rows[self._order :]), all_factors
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions."""
@@ -227,25 +200,31 @@ class TorchPlants:
             response = response.add_(earlier, alpha=coefficient)
         return response
 
-    def _stretches(self, clock: int, samples: int) -> list[tuple[int, int]]:
+    def _past(self) -> list[Tensor]:
+        """Return the outputs that A needs, oldest first."""
+        return self._history[self._episodes.taken :][: self._order]
+
+    def _stretches(self, samples: int) -> list[tuple[int, int]]:
         """Return from which to which sample the dynamics of no plant change."""
         begins = [0]
         if self._drifts:
-            begins += [
-                r for r in range(1, samples) if (clock + r) % DRIFT_INTERVAL in self._phases
-            ]
+            begins += filter(self._changes_after, range(1, samples))
         return list(zip(begins, [*begins[1:], samples], strict=True))
+
+    def _changes_after(self, samples: int) -> bool:
+        """Whether a plant's drifting dynamics change so many samples into the block."""
+        clock = self._episodes.clock + samples
+        return clock % DRIFT_INTERVAL in self._episodes.phases
 
     def _drifted(self, clock: int) -> tuple[Any, Any]:
         """Return gain and time constant at a sample, and what (28) has for them."""
-        if self._now is None or (self._drifts and clock % DRIFT_INTERVAL in self._phases):
+        if self._now is None or (
+            self._drifts and clock % DRIFT_INTERVAL in self._episodes.phases
+        ):
             factors: tuple[Any, ...] = self._factors
             if self._drifts:
-                slow = clock - self._starts
-                slow = slow - slow % DRIFT_INTERVAL
-                if isinstance(slow, Tensor):
-                    slow = slow.to(self._nothing.dtype)
-                share = self._dynamics.share(slow)
+                age = self._episodes.age(clock)
+                share = self._dynamics.share(age - age % DRIFT_INTERVAL)
                 factors = tuple(_plus(first, share, more) for first, more in self._drift)
             gain, time_constant = factors
             self._now = factors, self._dynamics.coefficients(gain, time_constant)

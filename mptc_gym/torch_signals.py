@@ -1,138 +1,227 @@
-"""What comes from outside in PyTorch: drawn from one generator, or handed in.
+"""Makes what comes from outside in PyTorch: drawn from one generator, or handed in.
 
-All of it is made for a block of samples at a time, without a loop over plants.
+The signals have the two verbs of those in `mptc_gym.signals`, for many plants and a block of
+samples at a time, without a loop over plants. `reset(which)` begins an episode of some plants,
+or of all where `which` is None, and returns the signal at k = 0, shape (n,). `next(samples)`
+returns it at the samples that follow, degC, shape (samples, n). What is left of a block when an
+episode begins is dropped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
+from typing import Any, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from mptc_gym.signals import FOREVER, LOAD_INTERVAL, Levels
+from mptc_gym.checks import reject
+from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, Parameters
+from mptc_gym.plant import DRIFT_INTERVAL
+from mptc_gym.signals import LOAD_INTERVAL, Levels, colour_of, is_silent
 
 LONGEST = 64  # samples of a block
+SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
 Number = float | Tensor  # the same for all plants, or one for each, shape (n,)
 
 
-def at_least(number: Number, least: float) -> Number:
-    """Return a number, or the limit where it is below."""
-    return number.clamp(min=least) if isinstance(number, Tensor) else max(number, least)
+def replaced(old: Tensor, which: Tensor | None, new: Tensor) -> Tensor:
+    """Return the new values of some plants and the old ones of the others; None for all."""
+    return new if which is None else torch.where(which, new, old)
 
 
-class Draws:
-    """Random numbers of one generator, of a type and on a device.
+def as_tensor(values: Any, like: Tensor) -> Tensor | None:
+    """Return real numbers as a tensor of a type and device, None if they are not."""
+    if "complex" in str(getattr(values, "dtype", "")):  # PyTorch would drop a part of them
+        return None
+    try:
+        return torch.as_tensor(values, dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return None
+
+
+class Episodes:
+    """What signals and plants know of the present episodes, and where random numbers are from.
 
     Parameters
     ----------
-    generator
-        Where they come from; on the device.
-    nothing
-        Zeros of that type and device, shape (n,).
+    parameters
+        Uses the plant numbers.
+    zeros
+        Zeros of the device and type to use, shape (n,).
+
+    Attributes
+    ----------
+    zeros : Tensor
+        Those.
+    generator : torch.Generator
+        Where all draws come from.
+    numbers : dict
+        The plant numbers of all plants, by name.
+    clock : int
+        Samples since the plants were made, at the first sample of the next block.
+    taken : int
+        How many samples of the last block have passed.
+    starts : Tensor
+        The clock when each plant's episode began, shape (n,).
+    phases : set of int
+        Their remainders when divided by `DRIFT_INTERVAL`, if anything changes as slowly.
     """
 
-    def __init__(self, generator: torch.Generator, nothing: Tensor) -> None:
-        self.generator, self.nothing = generator, nothing
+    def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
+        self.zeros, self.generator = zeros, torch.Generator(zeros.device)
+        self._ranges = {name: parameters.range_of(name) for name in parameters.ranges}
+        self._changes = parameters.drifts or parameters.is_disturbed
+        # If one limit is drawn, both are tensors: PyTorch clamps between two numbers or between
+        # two tensors.
+        limits = {"u_min", "u_max"}
+        tensors = {*self._ranges} | (limits if limits & {*self._ranges} else set())
+        self.numbers: dict[str, Number] = {}
+        for name in PLANT_NUMBERS:
+            low = float(parameters.range_of(name)[0])
+            self.numbers[name] = zeros + low if name in tensors else low
+        self.clock = self.taken = 0
+        self.starts = torch.zeros_like(zeros, dtype=torch.int64)
+        self._rows = torch.arange(LONGEST, device=zeros.device)[:, None]
 
-    def normal(self, out: Tensor, deviation: Number) -> Tensor:
-        """Fill a tensor, shape (samples, n), with normal numbers around 0, and return it."""
-        if isinstance(deviation, float):
-            return out.normal_(0.0, deviation, generator=self.generator)
-        return out.normal_(generator=self.generator).mul_(deviation)
+    def reset(
+        self,
+        which: Tensor | None,
+        starts: NDArray[np.int64],
+        clock: int,
+        handed: Mapping[str, Handed],
+    ) -> dict[str, Tensor]:
+        """Begin an episode of some plants, and return the numbers that are drawn or handed in.
+
+        `starts` is the clock when each plant's episode began, with these episodes.
+        """
+        first = {}
+        for name, (low, high) in self._ranges.items():
+            whole = ARGUMENTS[name].is_integer
+            values = (
+                handed[name].reset(which) if name in handed else self.within(low, high, whole)
+            )
+            self.numbers[name] = replaced(self.zeros + self.numbers[name], which, values)
+            first[name] = values.to(torch.int64) if whole else values
+        begun = self.zeros.new_full((), clock, dtype=torch.int64)
+        self.starts = replaced(self.starts, which, begun.expand(len(starts)))
+        self._first = int(starts[0]) if (starts == starts[0]).all() else None
+        self.phases = {*np.unique(starts % DRIFT_INTERVAL).tolist()} if self._changes else set()
+        return first
+
+    def ages(self, samples: int) -> Tensor:
+        """Return k at each sample of the next block, shape (samples, n), or (samples, 1)."""
+        starts = self.starts[:1] if self._first is not None else self.starts
+        return self._rows[:samples] + (self.clock - starts)
+
+    def age(self, clock: int) -> int | Tensor:
+        """Return k at a sample of the clock, shape (n,), or one for all."""
+        if self._first is not None:
+            return clock - self._first
+        return (clock - self.starts).to(self.zeros.dtype)
 
     def within_one(self, rows: int) -> Tensor:
         """Draw numbers from -1 to 1, the latter excluded, shape (rows, n)."""
-        drawn = self.nothing.new_empty(rows, len(self.nothing))
+        drawn = self.zeros.new_empty(rows, len(self.zeros))
         return drawn.uniform_(-1.0, 1.0, generator=self.generator)
 
-    def within(self, low: float, high: float, *, whole: bool) -> Tensor:
+    def within(self, low: float, high: float, whole: bool) -> Tensor:
         """Draw numbers between two, or whole numbers, both ends included; shape (n,)."""
-        drawn = torch.empty_like(self.nothing)
+        drawn = torch.empty_like(self.zeros)
         drawn.uniform_(low, high + whole, generator=self.generator)
         return (drawn.floor() if whole else drawn).clamp(max=high)
 
 
+class Signal(Protocol):
+    """What all of them can do; see the beginning of this file."""
+
+    def reset(self, which: Tensor | None) -> Tensor:
+        """Begin an episode of some plants."""
+
+    def next(self, samples: int) -> Tensor:
+        """Return the next samples."""
+
+
 class Noise:
-    """Coloured noise, from k = 1 on: C(z^-1) xi(k) of (28), where xi is 0 before.
+    """Coloured noise: C(z^-1) xi(k) of (28), where xi is 0 up to k = 0.
 
     Parameters
     ----------
-    c
-        Coefficients of C, from z^0 on.
-    draws
-        Where xi comes from.
+    name, parameters
+        As for `mptc_gym.signals.Noise`.
+    episodes
+        The present ones.
     """
 
-    def __init__(self, c: Sequence[float], draws: Draws) -> None:
-        self._c, self._draws = tuple(c), draws
+    def __init__(self, name: str, parameters: Parameters, episodes: Episodes) -> None:
+        self._variance, self._c = f"{name}_variance", tuple(colour_of(name, parameters))
+        self._episodes = episodes
 
-    def rest(self, which: Tensor | None, taken: int, variance: Number) -> None:
-        """Begin an episode of some plants, or of all, after so many of the last samples.
-
-        The variance, degC^2, is that of all plants from now on.
-        """
-        order = len(self._c) - 1
-        self._deviation = variance**0.5
+    def reset(self, which: Tensor | None) -> Tensor:
+        """Begin an episode of some plants."""
+        zeros = self._episodes.zeros
+        self._deviation = self._episodes.numbers[self._variance] ** 0.5
         if which is None:
-            self._xi = self._draws.nothing.expand(order, -1)
+            self._xi = zeros.expand(len(self._c) - 1, -1)
         else:
-            self._xi = self._xi[taken : taken + order].masked_fill(which, 0.0)
+            self._xi = self._past().masked_fill(which, 0.0)
+        return zeros
 
-    def take(self, samples: int, taken: int) -> Tensor:
-        """Make the next samples, after so many of the last ones; degC, shape (samples, n)."""
-        order = len(self._c) - 1
-        past = self._xi[taken : taken + order]
+    def next(self, samples: int) -> Tensor:
+        """Draw the next samples."""
+        order, past = len(self._c) - 1, self._past()
         self._xi = past.new_empty(order + samples, past.shape[1])
         self._xi[:order] = past
-        noise = self._draws.normal(self._xi[order:], self._deviation)
+        drawn, generator = self._xi[order:], self._episodes.generator
+        if isinstance(self._deviation, float):
+            noise = drawn.normal_(0.0, self._deviation, generator=generator)
+        else:
+            noise = drawn.normal_(generator=generator).mul_(self._deviation)
         for lag, coefficient in enumerate(self._c[1:], start=1):
             noise = noise.add(self._xi[order - lag : order - lag + samples], alpha=coefficient)
         return noise
 
+    def _past(self) -> Tensor:
+        return self._xi[self._episodes.taken :][: len(self._c) - 1]
 
-class Held:
+
+class RandomSetPoint:
     """A set point that holds each random level for a random number of samples.
 
     Parameters
     ----------
     levels
         How large they are, and how long they hold.
-    draws
-        Where they come from.
+    episodes
+        The present ones.
     """
 
-    def __init__(self, levels: Levels, draws: Draws) -> None:
-        self._levels, self._draws = levels, draws
-        self._rows = torch.arange(LONGEST, dtype=draws.nothing.dtype).to(draws.nothing.device)
+    def __init__(self, levels: Levels, episodes: Episodes) -> None:
+        self._levels, self._episodes = levels, episodes
+        zeros = episodes.zeros
+        self._rows = torch.arange(LONGEST, dtype=zeros.dtype).to(zeros.device)
         # The present level, and in how many samples it changes: whole numbers of type float,
         # with which a processor is quickest. Then each change to come, in how many samples it
         # is, and what the level and the next change are from there.
-        self._level = self._left = draws.nothing
+        self._level = self._left = zeros
         self._ahead: list[tuple[Tensor, Tensor, Tensor]] = []
         self._horizon = self._passed = 0  # samples that it is known for, and that are over
 
-    def rest(self, which: Tensor | None, taken: int) -> Tensor:
-        """Begin an episode of some plants, or of all, after so many of the last samples.
-
-        Returns
-        -------
-        Tensor
-            The levels that all plants have then, shape (n,).
-        """
-        self._catch_up(taken)
+    def reset(self, which: Tensor | None) -> Tensor:
+        """Begin an episode of some plants."""
+        self._catch_up()
         level, hold = self._following()
-        if which is not None:
-            level = torch.where(which, level, self._level)
-            hold = torch.where(which, hold, self._left)
-        self._level, self._left = level, hold
-        return level
+        self._level = replaced(self._level, which, level)
+        self._left = replaced(self._left, which, hold)
+        return self._level
 
-    def take(self, samples: int, taken: int) -> Tensor:
-        """Make the next samples, after so many of the last ones; shape (samples, n)."""
-        shortest = self._levels.shortest
+    def next(self, samples: int) -> Tensor:
+        """Draw the next samples, if they are not known yet."""
+        shortest, taken = self._levels.shortest, self._episodes.taken
         if self._passed + taken + samples > self._horizon:
-            self._catch_up(taken)
+            self._catch_up()
             self._horizon, left = max(samples, shortest), self._left
             for _ in range(1 + (self._horizon - 1) // shortest):
                 level, hold = self._following()
@@ -150,12 +239,12 @@ class Held:
     def _following(self) -> tuple[Tensor, Tensor]:
         """Draw levels, and for how many samples they hold, each of shape (n,)."""
         levels = self._levels
-        level = self._draws.within_one(1)[0] * levels.amplitude
-        return level, self._draws.within(levels.shortest, levels.longest, whole=True)
+        level = self._episodes.within_one(1)[0] * levels.amplitude
+        return level, self._episodes.within(levels.shortest, levels.longest, whole=True)
 
-    def _catch_up(self, taken: int) -> None:
-        """Bring level and next change to where so many more samples have been taken."""
-        passed = self._level.new_full((), self._passed + taken)
+    def _catch_up(self) -> None:
+        """Bring level and next change to the sample that was taken last."""
+        passed = self._level.new_full((), self._passed + self._episodes.taken)
         for change, level, next_change in self._ahead:
             reached = _reached(passed, change)
             self._level = torch.lerp(self._level, level, reached)
@@ -164,51 +253,67 @@ class Held:
         self._ahead, self._horizon, self._passed = [], 0, 0
 
 
-class Load:
-    """Load disturbances, as of `Disturbance` in `mptc_gym.signals`: steps and a walk.
+class RepeatedSetPoint:
+    """A set point that is not random.
 
     Parameters
     ----------
-    numbers
-        The plant numbers by name, those of the moment when a load changes.
-    draws
-        Where all is drawn from.
+    levels
+        What is repeated.
+    episodes
+        The present ones.
     """
 
-    def __init__(self, numbers: Mapping[str, Number], draws: Draws) -> None:
-        self._numbers, self._draws = numbers, draws
+    def __init__(self, levels: Levels, episodes: Episodes) -> None:
+        self._episodes = episodes
+        self._values = episodes.zeros.new_tensor(levels.values)
+        self._ends = torch.tensor(levels.lengths, device=self._values.device).cumsum(0)
+        self._period = sum(levels.lengths)
 
-    def rest(
-        self, which: Tensor | None, taken: int, starts: Tensor, phases: Collection[int]
-    ) -> None:
-        """Begin an episode of some plants, or of all, after so many of the last samples.
+    def reset(self, which: Tensor | None) -> Tensor:
+        """Begin an episode of some plants."""
+        return self._values[0].expand(len(self._episodes.zeros))
 
-        `starts`, shape (n,), are the clock at the beginning of each plant's episode, and
-        `phases` their remainders when divided by `LOAD_INTERVAL`.
-        """
-        self._starts, self._phases = starts, phases
-        nothing = self._draws.nothing
+    def next(self, samples: int) -> Tensor:
+        """Return the next samples."""
+        ages, n = self._episodes.ages(samples), len(self._episodes.zeros)
+        if len(self._values) == 1:
+            return self._values.expand(samples, n)
+        places = torch.bucketize(ages % self._period, self._ends, right=True)
+        return self._values[places].expand(samples, n)
+
+
+class Disturbance:
+    """The load disturbance of `mptc_gym.signals.Disturbance`: steps and a walk.
+
+    Parameters
+    ----------
+    episodes
+        The present ones; a load changes by their plant numbers of that moment.
+    """
+
+    def __init__(self, episodes: Episodes) -> None:
+        self._episodes = episodes
+
+    def reset(self, which: Tensor | None) -> Tensor:
+        """Begin an episode of some plants."""
+        zeros = self._episodes.zeros
         # Steps and walk of the sample before the last block, and of those in it.
         if which is None:
-            self._parts = [(nothing, nothing)]
+            self._parts = [(zeros, zeros)]
         else:
-            # None have been made where loads are handed in.
-            step, walk = self._parts[min(taken, len(self._parts) - 1)]
+            step, walk = self._parts[self._episodes.taken]
             self._parts = [(step.masked_fill(which, 0.0), walk.masked_fill(which, 0.0))]
+        return zeros
 
-    def take(self, samples: int, taken: int, clock: int) -> Tensor:
-        """Make the samples from one of the clock on, after so many of the last ones.
-
-        Returns
-        -------
-        Tensor
-            w, degC, shape (samples, n).
-        """
-        self._parts = [self._parts[taken]]
+    def next(self, samples: int) -> Tensor:
+        """Draw the next samples."""
+        clock, phases = self._episodes.clock, self._episodes.phases
+        self._parts = [self._parts[self._episodes.taken]]
         total = torch.add(*self._parts[0])
         rows = []
         for now in range(clock, clock + samples):
-            if now % LOAD_INTERVAL in self._phases:
+            if now % LOAD_INTERVAL in phases:
                 self._parts.append(self._changed(now))
                 total = torch.add(*self._parts[-1])
             else:
@@ -218,18 +323,20 @@ class Load:
 
     def _changed(self, clock: int) -> tuple[Tensor, Tensor]:
         """Return steps and walk once those have changed whose turn it is."""
-        numbers, (step, walk) = self._numbers, self._parts[-1]
-        drawn = self._draws.within_one(2)
-        interval = at_least(numbers["disturbance_interval"], LOAD_INTERVAL)
+        numbers, (step, walk) = self._episodes.numbers, self._parts[-1]
+        drawn = self._episodes.within_one(2)
+        interval = numbers["disturbance_interval"]
+        if isinstance(interval, Tensor):
+            interval = interval.clamp(min=LOAD_INTERVAL)
         # It jumps if this is within +-1, and is then uniform there.
-        place = drawn[0] * (interval / LOAD_INTERVAL)
+        place = drawn[0] * (max(interval, LOAD_INTERVAL) / LOAD_INTERVAL)
         jumps = _reached(place.new_ones(()), place.abs())
         level = place * numbers["disturbance_amplitude"]
         # Uniform within +-h, a step of the walk has the variance h^2 / 3.
         width = (3.0 * LOAD_INTERVAL * numbers["disturbance_walk_variance"]) ** 0.5
         moved = walk + drawn[1] * width
-        if len(self._phases) > 1:
-            turn = ((clock - self._starts) % LOAD_INTERVAL == 0).to(place.dtype)
+        if len(self._episodes.phases) > 1:
+            turn = ((clock - self._episodes.starts) % LOAD_INTERVAL == 0).to(place.dtype)
             moved, jumps = torch.lerp(walk, moved, turn), jumps.mul_(turn)
         return torch.lerp(step, level, jumps), moved
 
@@ -241,71 +348,98 @@ def _reached(now: Tensor, change: Tensor) -> Tensor:
     return past.ge_(past.new_zeros(()))
 
 
-class Repeated:
-    """A set point that is not random, as a function of k.
+class Handed:
+    """A signal that is handed in instead of being drawn; or a plant number, by `reset` alone.
 
     Parameters
     ----------
-    levels
-        What is repeated.
-    nothing
-        Zeros of the type and device, shape (n,).
+    values
+        Shape (episodes, samples, n). After the last episode comes the first one again, and
+        after the last sample the last value is held.
+    episodes
+        The present ones.
     """
 
-    def __init__(self, levels: Levels, nothing: Tensor) -> None:
-        lengths = torch.tensor(levels.lengths, device=nothing.device)
-        self.values = nothing.new_tensor(levels.values)
-        self._ends = lengths.cumsum(0)
-        self._period = sum(levels.lengths)
+    def __init__(self, values: Tensor, episodes: Episodes) -> None:
+        self._values, self._episodes = values, episodes
+        self._episode = torch.zeros_like(episodes.starts) - 1  # of each plant, from 0 on
 
-    def at(self, ages: Tensor) -> Tensor:
-        """Return the levels at some k."""
-        if len(self.values) == 1:
-            return self.values.expand(ages.shape)
-        return self.values[torch.bucketize(ages % self._period, self._ends, right=True)]
+    def reset(self, which: Tensor | None) -> Tensor:
+        """Begin the next episode of some plants."""
+        self._episode = self._episode + (1 if which is None else which)
+        return self._at(torch.zeros_like(self._episode)[None])[0]
+
+    def next(self, samples: int) -> Tensor:
+        """Return the next samples."""
+        return self._at(self._episodes.ages(samples))
+
+    def _at(self, ages: Tensor) -> Tensor:
+        count, length, _ = self._values.shape
+        rows = self._episode % count * length + ages.clamp(max=length - 1)
+        return self._values.flatten(0, 1).gather(0, rows)
 
 
-class Given:
-    """Signals and plant numbers that are handed in instead of being drawn.
+def drawn_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal]:
+    """Return the signals of an environment by name, but for noise that is always 0."""
+    levels = Levels(parameters)
+    setpoint = RandomSetPoint if levels.random else RepeatedSetPoint
+    signals: dict[str, Signal] = {"setpoint": setpoint(levels, episodes)}
+    if parameters.is_disturbed:
+        signals["disturbance"] = Disturbance(episodes)
+    for name in ("noise", "measurement_noise"):
+        if not is_silent(name, parameters):
+            signals[name] = Noise(name, parameters, episodes)
+    return signals
 
-    Parameters
-    ----------
-    tensors
-        Signals, shape (episodes, samples, n), and numbers, shape (episodes, n), by name. After
-        the last episode comes the first one again.
-    nothing
-        Zeros of the type and device, shape (n,).
 
-    Attributes
-    ----------
-    last : int
-        The last sample that all signals have.
+def handed_signals(
+    signals: Any, parameters: Parameters, episodes: Episodes
+) -> tuple[dict[str, Handed], int | None]:
+    """Check signals and plant numbers that are handed in.
+
+    Returns
+    -------
+    dict, int or None
+        Them, and the last sample that all signals have, None if there are none.
     """
+    n, ranges = len(episodes.zeros), parameters.ranges
+    names = {*SIGNALS, *ranges}
+    if not parameters.is_disturbed:
+        names.remove("disturbance")
+    if not isinstance(signals, Mapping) or not signals or not names >= {*signals}:
+        given = [*signals] if isinstance(signals, Mapping) else signals
+        reject("options['signals']", given, f"a dict with some of {sorted(names)}")
+    handed, lengths = {}, []
+    for name, given in signals.items():
+        path = f"options['signals'][{name!r}]"
+        values = as_tensor(given, episodes.zeros)
+        if values is None:
+            reject(path, given, "numbers")
+        shape = (n,) if name in ranges else ("samples", n)
+        if values.ndim == len(shape):
+            values = values[None]
+        if values.ndim != len(shape) + 1 or values.shape[-1] != n or not values.numel():
+            shown = str(shape).replace("'", "")
+            raise ValueError(
+                f"{path} must have the shape {shown}, or one more dimension before, of "
+                f"episodes, got {tuple(values.shape)}"
+            )
+        if not values.isfinite().all():
+            raise ValueError(f"{path} must be finite")
+        if name in ranges:
+            _check_range(path, given, values, parameters.range_of(name), name)
+            values = values[:, None]
+        else:
+            lengths.append(values.shape[1])
+        handed[name] = Handed(values, episodes)
+    return handed, min(lengths) - 1 if lengths else None
 
-    def __init__(self, tensors: Mapping[str, Tensor], nothing: Tensor) -> None:
-        self._tensors = tensors
-        self._episodes = nothing.to(torch.int64) - 1  # of each plant, from 0 on
-        lengths = (each.shape[1] for each in tensors.values() if each.ndim == 3)
-        self.last = min(lengths, default=FOREVER) - 1
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._tensors
-
-    def rest(self, which: Tensor | None) -> None:
-        """Begin the next episode of some plants, or of all."""
-        self._episodes = self._episodes + (1 if which is None else which)
-
-    def number(self, name: str) -> Tensor:
-        """Return a plant number of the present episodes, shape (n,)."""
-        numbers = self._tensors[name]
-        return numbers.gather(0, (self._episodes % len(numbers))[None])[0]
-
-    def at(self, name: str, ages: Tensor) -> Tensor:
-        """Return a signal of the present episodes at some k, shape (samples, n) as theirs is.
-
-        Beyond the end the last value is held.
-        """
-        signals = self._tensors[name]
-        length = signals.shape[1]
-        rows = self._episodes % len(signals) * length + ages.clamp(max=length - 1)
-        return signals.flatten(0, 1).gather(0, rows)
+def _check_range(
+    path: str, given: Any, values: Tensor, ends: tuple[float, float], name: str
+) -> None:
+    """Refuse plant numbers that could not have been drawn."""
+    low, high = values.new_tensor(ends)
+    whole = not ARGUMENTS[name].is_integer or bool((values == values.round()).all())
+    if not (whole and bool(((low <= values) & (values <= high)).all())):
+        reject(path, given, f"within its range, {list(ends)}")

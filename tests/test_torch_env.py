@@ -18,6 +18,7 @@ from hypothesis import strategies as st  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters  # noqa: E402
+from mptc_gym.signals import Streams  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv  # noqa: E402
 from tests.arguments import valid_arguments  # noqa: E402
 
@@ -33,24 +34,18 @@ class Recording:
     def __init__(self, envs):
         self.envs, self.calls = envs, []
         self.episodes = [[] for _ in range(envs.num_envs)]
-        self._reading = self._ended = np.zeros(envs.num_envs)
-        transmitters = envs._transmitter
-        following = transmitters.next
-
-        def spied():
-            self._reading = following()
-            return self._reading
-
-        transmitters.next = spied
+        self._ended = np.zeros(envs.num_envs)
 
     def reset(self, **given):
         returned = self.envs.reset(**given)
+        if "seed" in given:
+            seeds = self.envs.np_random_seed
+            self._readings = [Streams.of_seed(seed).measurement_noise for seed in seeds]
         mask = (given.get("options") or {}).get("reset_mask")
         self._begin(np.ones(self.envs.num_envs, bool) if mask is None else mask, returned[1])
         self.calls.append(("reset", mask, returned))
 
     def step(self, actions):
-        self._reading = np.zeros(self.envs.num_envs)
         returned = self.envs.step(actions)
         infos = returned[-1]
         restarted = infos.get("_final_info", self._ended if self._next_step else None)
@@ -74,7 +69,11 @@ class Recording:
         for name in ("noise", "setpoint", "disturbance"):
             if name in infos:
                 episode[name].append(infos[name][i])
-        episode["measurement_noise"].append(self._reading[i])
+        # The one signal that no info shows.
+        name = "measurement_noise_variance"
+        variance = episode.get(name, self.envs.parameters.range_of(name)[0])
+        draw = self._readings[i].generator.standard_normal()
+        episode["measurement_noise"].append(variance**0.5 * draw)
 
     def _begin(self, mask, infos):
         for i in np.flatnonzero(mask):
@@ -82,6 +81,7 @@ class Recording:
             episode = {name: [infos[name][i]] for name in names if name in infos}
             ranges = {name: infos[name][i] for name in self.envs.parameters.ranges}
             self.episodes[i].append({**episode, "measurement_noise": [0.0], **ranges})
+            self._readings[i].next_episode()
 
     def signals(self):
         """Return what is to be handed in to meet the same."""
@@ -558,6 +558,10 @@ class Waiting(TorchDispatchMode):
 
     REFUSED = ("_local_scalar_dense", "nonzero", "is_nonzero", "masked_select", "equal")
 
+    def __init__(self):
+        super().__init__()
+        self.on_host = []  # tensors that would not be on the device
+
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = func._schema.name.partition("::")[2]
         assert name not in self.REFUSED, name
@@ -566,8 +570,10 @@ class Waiting(TorchDispatchMode):
             assert not any(each is not None and each.dtype == torch.bool for each in indices), (
                 f"{name} by a mask"
             )
-        if name in ("_to_copy", "copy_", "lift_fresh"):
-            assert name != "lift_fresh", "a tensor of Python numbers is copied to the device"
+        if name == "lift_fresh":
+            self.on_host.append(args[0])
+        elif any(each is other for each in args for other in self.on_host):
+            assert (name, args[2:]) == ("copy_", (True,)), f"{name} waits for a copy"
         return func(*args, **(kwargs or {}))
 
 
@@ -580,7 +586,7 @@ def test_a_step_never_waits_for_the_device(mode, differentiable):
     }  # fmt: skip
     for plant in (arguments, {"max_episode_steps": 30, "autoreset_mode": mode}):
         env = make(3, **plant)
-        env._waits = False  # as on any device but the CPU
+        env.checks_actions = False  # as on any device but the CPU
         env.reset(seed=0)
         env.step(torch.zeros(3, 1, dtype=torch.float64))
         env.reset(options={"reset_mask": torch.tensor([True, False, False])})

@@ -80,8 +80,8 @@ def test_it_equals_one_environment_after_the_other(
     if seed is None:
         seed = rng.integers(0, 2**40, num_envs).tolist()
     with (  # so small that many blocks are made and the window is moved back often
-        patch.multiple("mptc_gym.vector_env", BLOCK=7, _STEPS_PER_SHIFT=3),
-        patch.multiple("mptc_gym.signals", _PLANTS_AT_A_TIME=2),
+        patch.multiple("mptc_gym.vector_env", BLOCK=7, STEPS_PER_SHIFT=3),
+        patch.multiple("mptc_gym.signals", PLANTS_AT_A_TIME=2),
     ):
         native, sync = make_both(num_envs, mode, limit, **arguments)
         assert_equal(native.reset(seed=seed), sync.reset(seed=seed))
@@ -145,7 +145,7 @@ def test_a_wide_range_of_delays_costs_little_more_than_one_delay():
 
 def test_many_plants_share_a_bounded_memory_for_noise(rng):
     def made(num_bytes):
-        with patch.multiple("mptc_gym.vector_env", _NOISE_BYTES=num_bytes):
+        with patch.multiple("mptc_gym.vector_env", NOISE_BYTES=num_bytes):
             return MiddlePointVectorEnv(
                 50, noise_variance=1.0, measurement_noise_variance=1.0, max_episode_steps=900
             )
