@@ -129,14 +129,7 @@ def _residuals(model: Model) -> Section:
 
 def tuned(parameters: Parameters) -> dict[str, Any]:
     """Return the controllers that are tuned from a step test of the plant, by name."""
-    limits = {
-        "u_min": float(parameters.range_of("u_min")[0]),
-        "u_max": float(parameters.range_of("u_max")[1]),
-    }
-    return {
-        "PI, SIMC": simc_pi(parameters, **limits),
-        "Smith": smith(parameters, **limits),
-    }
+    return {"PI, SIMC": simc_pi(parameters), "Smith": smith(parameters)}
 
 
 def _controllers(parameters: Parameters, out: Path) -> Section:
