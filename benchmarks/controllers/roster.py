@@ -57,7 +57,7 @@ ROSTER: dict[str, RosterEntry] = {
         RosterEntry(
             "pi",
             "PI",
-            alone(engineered.paper_pi),
+            alone(engineered.paper_pi, code="agents.pi"),
             Cost("gains of the paper", "2", "not stated"),
             told=False,
             tuning=Tuning({"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}),

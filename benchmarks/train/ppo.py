@@ -87,7 +87,7 @@ class Policy:
     @property
     def curve(self) -> list[dict[str, float]]:
         """The learning curve, a row a point."""
-        return cast("list[dict[str, float]]", self.network.provenance["curve"])
+        return cast("list[dict[str, float]]", self.network.provenance.get("curve", []))
 
 
 def members(
