@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+# The windows of an observation that default indices are for: the paper's six inputs.
+PAPER_WINDOWS: Final[Mapping[str, int]] = {"setpoint_window": 3, "error_window": 3}
 Values = NDArray[np.float64] | np.float64  # one value a loop: shape (), or (batch,)
 MOST = 1_000_000  # nodes, loops, elements or samples: beyond it, a number is a mistake
 

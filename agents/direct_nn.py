@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from agents.controller import (
     MOST,
+    PAPER_WINDOWS,
     Controller,
     Values,
     check_count,
@@ -118,6 +119,8 @@ class DirectNNController(Controller):
     ValueError
         If an argument is out of range; the message names it.
     """
+
+    observation = PAPER_WINDOWS  # that the default indices are for
 
     def __init__(
         self,

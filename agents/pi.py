@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import (
+    PAPER_WINDOWS,
     Controller,
     Values,
     check_batch,
@@ -47,6 +48,8 @@ class PIController(Controller):
     ValueError
         If an argument is out of range; the message names it.
     """
+
+    observation = PAPER_WINDOWS  # that the default indices are for
 
     def __init__(
         self,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import (
+    PAPER_WINDOWS,
     Controller,
     Values,
     check_batch,
@@ -107,6 +108,8 @@ class SelfTuningController(Controller):
     ValueError
         If an argument is out of range; the message names it.
     """
+
+    observation = PAPER_WINDOWS  # that the default indices are for
 
     # What a batch remembers: responses without delay, of unit gain, and the same prefiltered,
     # (loops, time, responses); the flow within the limits, t/h, (loops, time).

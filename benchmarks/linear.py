@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import signal
 
 from mptc_gym import Parameters
 from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, PlantNumbers
@@ -84,6 +83,8 @@ class LinearModel:
 
     def response(self, flow: ArrayLike) -> Array:
         """Return y(0), y(1), ..., degC, from rest, for u_a(0), u_a(1), ..., t/h."""
+        from scipy import signal  # here: it takes long to import
+
         response: Array = signal.lfilter(*self.transfer(), np.asarray(flow, np.float64))
         return response
 

@@ -17,7 +17,7 @@ from benchmarks.limits.news import News
 from benchmarks.limits.programme import plan
 from benchmarks.limits.reference import TAIL, reference
 from benchmarks.limits.unknown import noise_variance, unknown
-from benchmarks.limits.verify import Counting, beats, errors
+from benchmarks.limits.verify import beats, controllers, errors
 from benchmarks.linear import course
 from benchmarks.metrics import mean_error
 from benchmarks.rollout import make_plants, rollout
@@ -27,6 +27,7 @@ from mptc_gym.plant import action_from_command
 from mptc_gym.ranges import Ranges
 
 CALM = Parameters()
+MPC, COUNTING = (controllers()[name] for name in ("mpc", "counting"))
 
 
 def run_mpc(runs, samples, seed=0, **arguments):
@@ -337,7 +338,7 @@ class TestNews:
             kind: least_possible(samples=900, kind=kind, episodes=25, folder=None, **arguments)
             for kind in ("preview", "news", "reference")
         }
-        found = errors(PredictiveController, 10, 600, **arguments)
+        found = errors(MPC, 10, 600, **arguments)
         assert not beats(found, kinds["news"])
         assert kinds["preview"].value < 0.5 * kinds["news"].value
         assert kinds["news"].value < kinds["reference"].value
@@ -374,21 +375,21 @@ class TestLeastPossible:
         assert found[0].value == pytest.approx(0.9115, abs=1e-4)
 
     @pytest.mark.parametrize("period", [20, 38, 76, 100, 160])
-    @pytest.mark.parametrize("controller", [Counting, PIController])
+    @pytest.mark.parametrize("controller", ["counting", "pi"])
     def test_nobody_beats_it_however_short_holds_are(self, period, controller):
         case = {"samples": 600, "setpoint_period": period}
         least = least_possible(kind="preview", folder=None, **case)
-        assert not beats(errors(controller, 1, 600, setpoint_period=period), least)
+        assert not beats(errors(controllers()[controller], 1, **case), least)
         assert least.value < 0.95 * least.idle
 
     def test_one_who_counts_samples_beats_the_reference_alone(self):
-        found = errors(Counting, 1, 1200)[0]
+        found = errors(COUNTING, 1, 1200)[0]
         assert least_possible(samples=1200, kind="preview", folder=None).value < found
         assert found < 0.7 * least_possible(samples=1200).value
 
     def test_the_controller_that_knows_most_attains_it_where_nothing_changes(self):
         least = least_possible(samples=600, folder=None, setpoint=5.0)
-        found = errors(PredictiveController, 1, 600, setpoint=5.0)
+        found = errors(MPC, 1, 600, setpoint=5.0)
         assert found[0] == pytest.approx(least.value, rel=0.01)
         assert beats(found, replace(least, value=1.03 * least.value, episodes=()))
         assert not beats(found, least)
@@ -397,7 +398,7 @@ class TestLeastPossible:
         self,
     ):
         least = least_possible(samples=1200, kind="reference", **PRESETS["disturbed"])
-        found = errors(PredictiveController, 40, 1200, **PRESETS["disturbed"])
+        found = errors(MPC, 40, 1200, **PRESETS["disturbed"])
         assert 1.0 < found.mean() / least.value < 1.1
 
     def test_drawn_episodes_are_those_of_the_environment(self):
@@ -405,7 +406,7 @@ class TestLeastPossible:
         arguments = {"delay": [5, 30], "gain_factor": [0.8, 1.4], "setpoint": 4.0}
         arguments["dead_zone"] = 0.0
         least = least_possible(samples=400, episodes=8, folder=None, **arguments)
-        found = errors(PredictiveController, 8, 400, **arguments)
+        found = errors(MPC, 8, 400, **arguments)
         assert np.all(found > np.array(least.episodes) * (1 - 1e-6))
         np.testing.assert_allclose(found, least.episodes, rtol=0.02)
 

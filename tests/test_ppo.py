@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from agents import PolicyNetwork
-from benchmarks.controllers.records import Training
+from benchmarks.controllers.pretrained import Trained, ppo_policies
 from benchmarks.lib.fan_out import CellsFailedError, FanOut
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.train import kept, ppo, ppo_arguments, ppo_training
+from benchmarks.train.ppo import PolicyRequest
 from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
 from tests.small_training import SMALL
@@ -134,10 +135,9 @@ class TestPPO:
         arguments = replace(SMALL, steps=256, **ppo.RANDOMISED)
         train(tmp_path, arguments)
         kept = ppo.Policy(arguments, tmp_path / "policy.npz")
-        assert kept.observation == arguments.observation
-        assert kept.observation["action_window"] == 39
+        assert kept.network.observation["action_window"] == 39
         size = Parameters(**arguments.training).observation_size
-        assert kept().act(np.zeros((5, size), np.float32)).shape == (5, 1)
+        assert kept.network.act(np.zeros((5, size), np.float32)).shape == (5, 1)
         assert ppo.policy_key(arguments) != ppo.policy_key(replace(SMALL, steps=256))
 
     def test_set_points_of_validation_are_met_nowhere_else(self):
@@ -260,26 +260,27 @@ class TestMembers:
         policy = ppo.Policy(SMALL, tmp_path / "policy.npz")
         observation = np.random.default_rng(0).normal(size=policy.network.n_obs)
         for given, edge in ((7.0, 0.7), (5.0, 0.5), ([3.0, 7.0], 0.5)):
-            controller = policy(Parameters(dead_zone=given))
+            controller = Trained(policy.network)(Parameters(dead_zone=given), 1, 0)
             # At its first move the policy is just beyond the edge of the dead zone.
             position = (abs(controller.act(observation)[0]) - edge) / (1.0 - edge)
             assert 0.0 < position < 0.2
         assert policy.network.increments.dead_zone == 5.0  # is not changed by it
 
     def members(self, folder, jobs, *, retrain=False):
-        return ppo.members(Training(FanOut(jobs), folder, members=2, retrain=retrain), SMALL)
+        return ppo.members(
+            PolicyRequest(FanOut(jobs), folder, policies=2, retrain=retrain), SMALL
+        )
 
     def test_side_by_side_is_one_after_the_other(self, tmp_path, monkeypatch):
         monkeypatch.undo()  # other processes would not know of it
         ones = self.members(tmp_path / "one", jobs=1)
         twos = self.members(tmp_path / "two", jobs=2)
-        first, second, third, fourth = (weights(policy()) for policy in (*ones, *twos))
+        first, second, third, fourth = (weights(policy.network) for policy in (*ones, *twos))
         assert np.array_equal(first, third)
         assert np.array_equal(second, fourth)
         assert not np.array_equal(first, second)
-        assert [policy.provenance["arguments"]["seed"] for policy in ones] == [0, 1]
+        assert [each.network.provenance["arguments"]["seed"] for each in ones] == [0, 1]
         assert [policy.curve[-1]["steps"] for policy in ones] == [1024, 1024]
-        assert "0.001024 M a policy" in ones[0].account.samples
 
     def test_only_what_is_missing_is_trained(self, tmp_path):
         files = [policy.file for policy in self.members(tmp_path, jobs=1)]
@@ -307,9 +308,10 @@ class TestMembers:
 
     def test_a_policy_goes_along_to_where_its_file_is_not(self, tmp_path):
         network = train(tmp_path)
-        packed = pickle.dumps(ppo.Policy(SMALL, tmp_path / "policy.npz"))
+        packed = pickle.dumps(Trained(network))
         (tmp_path / "policy.npz").unlink()
-        assert np.array_equal(weights(pickle.loads(packed)()), weights(network))
+        made = pickle.loads(packed)(Parameters(), 1, 0)
+        assert np.array_equal(weights(made), weights(network))
 
     def test_published_policies_are_taken_if_they_were_trained_like_this(
         self, tmp_path, monkeypatch
@@ -320,7 +322,7 @@ class TestMembers:
         shipped = self.members(tmp_path / "none", jobs=1)
         assert [policy.file.name for policy in shipped] == ["ppo-0.npz", "ppo-1.npz"]
         for one, other in zip(trained, shipped, strict=True):
-            assert np.array_equal(weights(one()), weights(other()))
+            assert np.array_equal(weights(one.network), weights(other.network))
         # Those that were trained here come first, and others are trained where asked for.
         files = {
             policy.file.parent.parent for policy in self.members(tmp_path / "kept", jobs=1)
@@ -328,10 +330,17 @@ class TestMembers:
         assert files == {tmp_path / "kept"}
         anew = self.members(tmp_path / "anew", jobs=1, retrain=True)
         assert anew[0].file.parent.parent == tmp_path / "anew"
-        other = ppo.members(Training(FanOut(1), tmp_path / "o", steps=256, members=1), SMALL)
+        other = ppo.members(
+            PolicyRequest(FanOut(1), tmp_path / "o", steps=256, policies=1), SMALL
+        )
         assert other[0].file.parent.parent == tmp_path / "o"
 
     def test_the_policies_of_the_project_are_those_of_the_defaults(self):
-        for policy in ppo.members(Training()):
+        for policy in ppo.members(PolicyRequest()):
             assert policy.file.parent.name == "pretrained"
             assert policy.curve[-1]["steps"] >= policy.arguments.steps
+        factories = ppo_policies(PolicyRequest())
+        assert [each.provenance["arguments"]["seed"] for each in factories] == [
+            *range(10_000, 10_005)
+        ]
+        assert {each.cost.samples for each in factories} == {"1.2 M a policy"}

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from benchmarks import designs
-from benchmarks.controllers import commissioned
 from benchmarks.controllers.engineered import simc_pi
+from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.designs import SPANS, grid, random_design
 from benchmarks.sweep import __main__ as sweep
@@ -21,7 +21,7 @@ NOMINAL = {"delay": 18}
 
 
 def run_cell(agent, plant, *numbers):
-    (factory,) = ROSTER[agent].members_in_service()
+    (factory,) = ROSTER[agent].members()
     return agent_cell(factory, {}, plant, *numbers)
 
 
@@ -76,8 +76,8 @@ class TestCells:
         assert limit_cell({"gain_drift": 0.5}, 1200)["mae"] > 1.4 * nominal
 
     def test_a_frozen_network_does_not_learn_and_starts_from_what_was_learnt(self):
-        learning = commissioned.learning_network(3, 0)
-        frozen = commissioned.frozen_network(3, 0)
+        learning = ROSTER["nn"].members()[0].in_service({}, 3, 0)
+        frozen = ROSTER["nn-frozen"].members()[0]({}, 3, 0)
         np.testing.assert_array_equal(learning.weights.W, frozen.weights.W)
         before = frozen.weights.W.copy()
         for each in (learning, frozen):
@@ -131,17 +131,13 @@ class TestSweep:
         pd.testing.assert_frame_equal(ours, theirs)
 
     def test_everything_that_shapes_a_cell_is_in_the_key(self):
-        class Member:
-            def __init__(self, provenance):
-                self.provenance = provenance
-
         common = {
-            "plants": [{"delay": 18}], "nominal": {}, "factories": [Member("a")],
-            "options": Options(runs=2, samples=700), "controller": ROSTER["pi"],
+            "plants": [{"delay": 18}], "nominal": {}, "factories": [Factory(simc_pi)],
+            "options": Options(runs=2, samples=700), "name": "pi",
         }  # fmt: skip
         changes = [
             {}, {"plants": [{"delay": 19}]}, {"nominal": {"dead_zone": 7.0}},
-            {"factories": [Member("b")]}, {"controller": ROSTER["nn"]},
+            {"factories": [Factory(simc_pi, provenance={"file": "b"})]}, {"name": "nn"},
             {"options": Options(runs=3, samples=700)},
             {"options": Options(runs=2, samples=650)},
         ]  # fmt: skip
@@ -173,7 +169,7 @@ class TestSweep:
 
 
 def _fails_on_pi(factory, *arguments, **others):
-    if factory is simc_pi:
+    if factory.make is simc_pi:
         raise RuntimeError("no luck")
     return agent_cell(factory, *arguments, **others)
 

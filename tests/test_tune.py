@@ -41,6 +41,12 @@ def run_tune(out, controller="pi", trials=6, jobs=1):
     return command.main([controller, *options])
 
 
+def made(name, **gains):
+    """Return the factory of a controller, with these gains."""
+    (factory,) = ROSTER[name].members()
+    return replace(factory, make=partial(factory.make, **gains))
+
+
 class TestScore:
     def test_scenarios_and_seeds_are_met_by_no_comparison(self):
         compared = [scenario.parameters for scenario in scenarios.SCENARIOS.values()]
@@ -48,7 +54,7 @@ class TestScore:
         assert comparison.SEED + 100_000 < tune.FIRST_RUN < tune.FINAL_FIRST_RUN
 
     def test_an_idle_controller_pays_for_not_settling(self):
-        score = tune.score(partial(PIController, kp=0.0, ki=0.0), runs=2, first_run=0)
+        score = tune.score(made("pi", kp=0.0, ki=0.0), runs=2, first_run=0)
         assert score["constant"] == pytest.approx(4.8)  # all of the set point, all the time
         assert score["learnt"] == pytest.approx(5.2)
         assert score["not converged"] == 1.0
@@ -56,7 +62,7 @@ class TestScore:
         assert score["objective"] == pytest.approx(np.mean(medians) + 5.0)
 
     def test_what_comes_before_the_first_sample_does_not_count(self):
-        score = tune.score(PIController, runs=1, first_run=0)
+        score = tune.score(made("pi"), runs=1, first_run=0)
         scenario, first = {s.name: (s, n) for s, n in tune.SCENARIOS}["learnt"]
         runs = Batch(1).run(PIController(), scenario.samples, **scenario.arguments)
         error = np.abs(runs.error)
@@ -64,13 +70,13 @@ class TestScore:
         assert score["learnt"] != pytest.approx(error.mean())
 
     def test_the_defaults_converge(self):
-        score = tune.score(DirectNNController, runs=20, first_run=0)
+        score = tune.score(made("nn"), runs=20, first_run=0)
         assert score["not converged"] == 0.0
         assert score["objective"] < 1.5
 
     def test_the_first_run_is_honoured(self):
         first, again, other = (
-            tune.score(DirectNNController, runs=2, first_run=run) for run in (0, 0, 7)
+            tune.score(made("nn"), runs=2, first_run=run) for run in (0, 0, 7)
         )
         assert first == again
         assert first["noise"] != other["noise"]
@@ -97,7 +103,7 @@ class TestSearch:
         for _, best in report.iterrows():
             gains = {name: float(f"{best[name]:.3g}") for name in ("kp", "ki")}
             assert (best["kp"], best["ki"]) == tuple(gains.values())
-            again = tune.score(partial(PIController, **gains), 3, tune.FINAL_FIRST_RUN)
+            again = tune.score(made("pi", **gains), 3, tune.FINAL_FIRST_RUN)
             assert best["objective"] == again["objective"]
             assert best["objective"] != best["in the search"]
 

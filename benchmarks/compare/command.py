@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from benchmarks.compare.comparison import Comparison
 from benchmarks.compare.options import COMPARED, RUNS, Options
-from benchmarks.controllers.factories import build, load_factory, observation
 from benchmarks.controllers.options import chosen
-from benchmarks.controllers.records import Controller
+from benchmarks.controllers.records import Factory
 from benchmarks.lib import command_line
 from benchmarks.lib.options import flat
 from benchmarks.lib.tables import on_screen
 from benchmarks.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
-from mptc_gym import Parameters
 
 OUT = Path("results/compare")
 LONGEST = 60  # characters of a folder's name
@@ -38,8 +36,9 @@ def run(options: Options, console: Console) -> str:
     if not names:
         raise command_line.UsageError("--scenarios: none to run")
     training = options.controllers.training()
+    members = {name: entry.members(training) for name, entry in controllers.items()}
     if plant.arguments:
-        _try_out(controllers.values(), [scenarios[name] for name in names])
+        _try_out(members, [scenarios[name] for name in names])
     out = options.out or _folder(
         [*controllers] if (*controllers,) != COMPARED else [],
         names if names != [*scenarios] else [],
@@ -50,8 +49,8 @@ def run(options: Options, console: Console) -> str:
     recorded = {**flat(options), "agents": list(controllers)}
     comparison = Comparison([scenarios[name] for name in names], options.runs, out, recorded)
     try:
-        for controller in controllers.values():
-            comparison.run(controller, training)
+        for name, entry in controllers.items():
+            comparison.run(entry, members[name])
     except BaseException:  # Ctrl-C, too
         comparison.finish(complete=False)
         raise
@@ -64,14 +63,11 @@ def run(options: Options, console: Console) -> str:
     return f"The report, tables, data and plots are in {out}/"
 
 
-def _try_out(controllers: Iterable[Controller], scenarios: Sequence[Scenario]) -> None:
+def _try_out(members: Mapping[str, list[Factory]], scenarios: Sequence[Scenario]) -> None:
     """Make each controller once, as not every one can be set up for every plant."""
-    for controller, scenario in itertools.product(controllers, scenarios):
-        if controller.factory:
-            factory = load_factory(controller.factory)
-            arguments = {**scenario.arguments, **observation(factory)}
-            with command_line.blame(f"{controller.name} on {scenario.title}"):
-                build(factory, Parameters(**arguments), num_envs=1, seed=0)
+    for name, scenario in itertools.product(members, scenarios):
+        with command_line.blame(f"{name} on {scenario.title}"):
+            members[name][0](scenario.arguments, 1, 0)
 
 
 def _folder(*differences: list[str]) -> Path:

@@ -22,8 +22,7 @@ from benchmarks.compare.estimates import (
     travel_frontier,
     verdict,
 )
-from benchmarks.controllers.factories import Factory, build, curve, observation, provenances
-from benchmarks.controllers.records import Account, Controller, Training
+from benchmarks.controllers.records import Factory, RosterEntry, provenances
 from benchmarks.controllers.roster import label
 from benchmarks.lib.report import Section, provenance_line, write_report
 from benchmarks.lib.storage import commit, read_object, versions, write_json
@@ -31,7 +30,6 @@ from benchmarks.lib.tables import write_csv
 from benchmarks.metrics import join, mean_error, measure
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import Scenario
-from mptc_gym import Parameters
 
 TWICE = "square"  # every controller runs this scenario a second time, with what it has learnt
 
@@ -62,7 +60,7 @@ RESPONSES_CAPTION = (
     "A line is the median over all runs at each sample, a band the 10th to 90th percentile. "
     "The grey band is the dead zone."
 )
-ACCOUNTS_TEXT = (
+COSTS_TEXT = (
     "First and second run: mean error on the square wave, the second time with what was learnt "
     "the first time. Most controllers learn nothing in a run, and do the same twice. Training: "
     "of one policy, the median. Runs: all scenarios, including what is measured."
@@ -95,7 +93,7 @@ class Comparison:
         self._scenarios = {scenario.name: scenario for scenario in scenarios}
         self._seeds = list(range(SEED, SEED + runs))
         self._out = out
-        self._controllers: list[Controller] = []
+        self._entries: list[RosterEntry] = []
         self._members: dict[str, list[Factory]] = {}
         self._responses: dict[str, pd.DataFrame] = {}
         self._again: dict[str, float] = {}  # mean |e| in a second run of TWICE
@@ -114,43 +112,39 @@ class Comparison:
             "commit": commit(),
         }
 
-    def run(self, controller: Controller, training: Training) -> None:
+    def run(self, entry: RosterEntry, members: list[Factory]) -> None:
         """Run all members of a controller on every scenario."""
-        members = controller.members(training)
-        self._controllers.append(controller)
-        self._members[controller.name] = members
+        self._entries.append(entry)
+        self._members[entry.name] = members
         began = time.perf_counter()
-        for scenario in tqdm(self._scenarios.values(), desc=controller.name, unit="scenario"):
+        for scenario in tqdm(self._scenarios.values(), desc=entry.name, unit="scenario"):
             trajectories = []
             for number, member in enumerate(members):
                 trajectory, again = self._roll_out(scenario, member)
                 trajectories.append(trajectory)
                 measures = pd.DataFrame(measure(trajectory, scenario.parameters))
                 measures.insert(0, "scenario", scenario.name)
-                measures.insert(1, "agent", controller.name)
+                measures.insert(1, "agent", entry.name)
                 measures.insert(2, "policy", number)
                 measures.insert(3, "seed", self._seeds)
                 self.runs = pd.concat([self.runs, measures], ignore_index=True)
                 if again is not None:
                     error = float(mean_error(again).mean()) / len(members)
-                    self._again[controller.name] = self._again.get(controller.name, 0.0) + error
-            responses = tables.summarise_responses(
-                join(trajectories), scenario, controller.name
-            )
+                    self._again[entry.name] = self._again.get(entry.name, 0.0) + error
+            responses = tables.summarise_responses(join(trajectories), scenario, entry.name)
             self._responses[scenario.name] = pd.concat(
                 [self._responses.get(scenario.name), responses], ignore_index=True
             )
             self._write_runs(complete=False)
-        self._seconds[controller.name] = time.perf_counter() - began
+        self._seconds[entry.name] = time.perf_counter() - began
 
     def _roll_out(
         self, scenario: Scenario, factory: Factory
     ) -> tuple[Trajectory, Trajectory | None]:
         """Run one member; and once more with what it has learnt, if that is of interest."""
-        arguments = {**scenario.arguments, **observation(factory)}
         runs = len(self._seeds)
-        controller = build(factory, Parameters(**arguments), runs, SEED)
-        plants = make_plants(runs, scenario.samples, **arguments)
+        controller = factory(scenario.arguments, runs, SEED)
+        plants = make_plants(runs, scenario.samples, **factory.arguments(scenario.arguments))
         first = rollout(plants, controller, scenario.samples, SEED)
         again = None
         if scenario.name == TWICE:
@@ -190,16 +184,16 @@ class Comparison:
         return sections
 
     def _drawn(self) -> list[str]:
-        drawn = [controller.name for controller in self._controllers if controller.drawn]
-        return drawn or [controller.name for controller in self._controllers]
+        drawn = [entry.name for entry in self._entries if entry.drawn]
+        return drawn or [entry.name for entry in self._entries]
 
     def _curves(self) -> pd.DataFrame:
         """Return the learning curves of all members that have one."""
         curves = [
-            pd.DataFrame(learnt).assign(agent=name, policy=number)
+            pd.DataFrame(member.curve).assign(agent=name, policy=number)
             for name, members in self._members.items()
             for number, member in enumerate(members)
-            if (learnt := curve(member)) is not None
+            if member.curve
         ]
         return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
 
@@ -227,7 +221,7 @@ class Comparison:
                 tables.score_table(scores(runs, scales)),
             ),
             Section("Error against valve travel", [TRAVEL_CAPTION], pictures=["travel.png"]),
-            Section("What each controller costs", [ACCOUNTS_TEXT], self._accounts()),
+            Section("What each controller costs", [COSTS_TEXT], self._costs()),
             Section("Every run", [RUNS_CAPTION], pictures=["runs.png"]),
             Section(
                 "Other measures: median (10th to 90th percentile)",
@@ -258,21 +252,21 @@ class Comparison:
             sections.insert(3, Section(title, text, tables.paired_table(estimates)))
         return sections
 
-    def _accounts(self) -> pd.DataFrame:
+    def _costs(self) -> pd.DataFrame:
         rows = []
-        for controller in self._controllers:
-            name, members = controller.name, self._members[controller.name]
-            account: Account = getattr(members[0], "account", controller.account)
+        for entry in self._entries:
+            name, members = entry.name, self._members[entry.name]
+            cost = members[0].cost or entry.cost
             cases = self.runs[(self.runs["agent"] == name) & (self.runs["scenario"] == TWICE)]
-            curves = [learnt for member in members if (learnt := curve(member))]
-            seconds = pd.Series([learnt[-1]["seconds"] for learnt in curves]).median()
+            curves = [member.curve for member in members if member.curve]
+            seconds = pd.Series([curve[-1]["seconds"] for curve in curves]).median()
             first, second = cases["mae"].mean(), self._again.get(name, float("nan"))
             rows.append(
                 {
-                    "agent": controller.label,
-                    "prior knowledge": account.prior_knowledge,
-                    "parameters": account.parameters,
-                    "samples before": account.samples,
+                    "agent": entry.label,
+                    "prior knowledge": cost.prior_knowledge,
+                    "parameters": cost.parameters,
+                    "samples before": cost.samples,
                     "training (s)": "" if pd.isna(seconds) else f"{seconds:.0f}",
                     "runs (s)": f"{self._seconds.get(name, 0.0):.1f}",
                     "first run": "" if pd.isna(first) else f"{first:.3f}",

@@ -1,4 +1,4 @@
-"""Controllers as an engineer would set them up, from a step test of the plant."""
+"""Make controllers as an engineer would set them up for a plant, and the paper's network."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from agents import DirectNNController, PIController, SelfTuningController, SmithPredictor
 from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.mpc import PredictiveController
+from benchmarks.controllers.records import Factory
 from benchmarks.controllers.step_test import step_test
 from benchmarks.linear import nominal
 from mptc_gym import Parameters
+from mptc_gym.plant import action_from_command
 
 
 class Nothing:
-    """Leaves the valve where it is.
+    """Leaves the valve at 0 t/h.
 
     Parameters
     ----------
@@ -26,7 +28,7 @@ class Nothing:
     """
 
     def __init__(self, u_min: float = -10.0, u_max: float = 10.0) -> None:
-        self._action = np.float32(-(u_max + u_min) / (u_max - u_min))
+        self._action = np.float32(action_from_command(0.0, u_min, u_max))
 
     def reset(self) -> None:
         """Do nothing."""
@@ -36,52 +38,70 @@ class Nothing:
         return np.full((len(observation), 1), self._action, np.float32)
 
 
-def direct_nn(
-    parameters: Parameters, num_envs: int, seed: int, u_min: float, u_max: float, **gains: Any
-) -> DirectNNController:
+def limits(plant: Parameters) -> dict[str, Any]:
+    """Return the limits of the flow, the widest if they are drawn."""
+    return {"u_min": plant.range_of("u_min")[0], "u_max": plant.range_of("u_max")[1]}
+
+
+def data_sheet(plant: Parameters) -> dict[str, Any]:
+    """Return what the actuator's data sheet says, the middle of a dead zone that is drawn."""
+    return {**limits(plant), "dead_zone": sum(plant.range_of("dead_zone")) / 2}
+
+
+def nothing(plant: Parameters, runs: int, seed: int) -> Nothing:
+    """Return what leaves the valve alone."""
+    return Nothing(**limits(plant))
+
+
+def direct_nn(plant: Parameters, runs: int, seed: int, **gains: Any) -> DirectNNController:
     """Return the paper's network, which is told the direction of the plant's response."""
-    direction = 1 if nominal(parameters).gain > 0.0 else -1
+    direction = 1 if nominal(plant).gain > 0.0 else -1
     return DirectNNController(
-        num_envs=num_envs, seed=seed, u_min=u_min, u_max=u_max, direction=direction, **gains
+        num_envs=runs, seed=seed, direction=direction, **limits(plant), **gains
     )
 
 
-def simc_pi(parameters: Parameters, u_min: float, u_max: float) -> PIController:
-    """Return a PI controller tuned by rule, from a step test of the plant alone."""
-    return PIController.simc(**asdict(step_test(parameters)), u_min=u_min, u_max=u_max)
+def frozen_nn(plant: Parameters, runs: int, seed: int) -> DirectNNController:
+    """Return the paper's network once it has learnt, on the plant that it is made for."""
+    controller = Factory(direct_nn, learns=True).in_service(asdict(plant), runs, seed)
+    assert isinstance(controller, DirectNNController)
+    controller.learning = False
+    return controller
 
 
-def searched_pi(u_min: float, u_max: float) -> PIController:
+def paper_pi(plant: Parameters, runs: int, seed: int, **gains: Any) -> PIController:
+    """Return the paper's PI controller, with its own gains or others."""
+    return PIController(**gains, **limits(plant))
+
+
+def searched_pi(plant: Parameters, runs: int, seed: int) -> PIController:
     """Return the paper's PI controller with the gains of `python -m benchmarks.tune pi`."""
-    return PIController(SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"], u_min=u_min, u_max=u_max)
+    return paper_pi(plant, runs, seed, **SEARCHED_GAINS)
 
 
-def smith(parameters: Parameters, u_min: float, u_max: float) -> SmithPredictor:
+def simc_pi(plant: Parameters, runs: int = 1, seed: int = 0) -> PIController:
+    """Return a PI controller tuned by rule, from a step test of the plant alone."""
+    return PIController.simc(**asdict(step_test(plant)), **limits(plant))
+
+
+def smith(plant: Parameters, runs: int = 1, seed: int = 0) -> SmithPredictor:
     """Return a Smith predictor whose model comes from a step test of the plant.
 
-    Its closed loop has half the plant's time constant. It knows what the actuator's data sheet
-    says: the limits and the dead zone, the middle of it if it is a range.
+    Its closed loop has half the plant's time constant. It knows the actuator's data sheet.
     """
-    tested = step_test(parameters)
+    tested = step_test(plant)
     return SmithPredictor(
         **asdict(tested),
         closed_loop_time_constant=float(f"{tested.time_constant / 2:.2g}"),
-        dead_zone=sum(parameters.range_of("dead_zone")) / 2,
-        u_min=u_min,
-        u_max=u_max,
+        **data_sheet(plant),
     )
 
 
-def self_tuning(parameters: Parameters, u_min: float, u_max: float) -> SelfTuningController:
+def self_tuning(plant: Parameters, runs: int, seed: int) -> SelfTuningController:
     """Return a self-tuning controller that starts from what a step test shows."""
-    return SelfTuningController(
-        **asdict(step_test(parameters)),
-        dead_zone=sum(parameters.range_of("dead_zone")) / 2,
-        u_min=u_min,
-        u_max=u_max,
-    )
+    return SelfTuningController(**asdict(step_test(plant)), **data_sheet(plant))
 
 
-def mpc(parameters: Parameters, num_envs: int, seed: int = 0) -> PredictiveController:
+def mpc(plant: Parameters, runs: int, seed: int) -> PredictiveController:
     """Return the predictive controller, which knows everything except the future."""
-    return PredictiveController(parameters, num_envs, seed)
+    return PredictiveController(plant, runs, seed)

@@ -9,11 +9,12 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from benchmarks.controllers.factories import load_factory, try_out
-from benchmarks.controllers.records import POLICIES, Controller, Training
+from benchmarks.controllers.own import own_entry
+from benchmarks.controllers.records import RosterEntry
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import UsageError, known, out_folder
 from benchmarks.lib.options import Count, FanOutOptions, Names, Repeated, options
+from benchmarks.train.ppo import KEPT, PolicyRequest
 
 AgentNames = Annotated[
     Names,
@@ -33,14 +34,14 @@ class ControllerOptions:
     come with the project)."""
     policies: Count | None = None
     """How many policies of PPO to run, each from a seed of its own (default: 5)."""
-    kept: Path = POLICIES
+    kept: Path = KEPT
     """Where policies that are trained here are kept; no code in its files is run."""
     fan_out: FanOutOptions = field(default_factory=FanOutOptions)
     retrain: bool = False
     """Train policies of PPO anew, which takes many minutes."""
 
-    def training(self) -> Training:
-        """Return the training that is asked for.
+    def training(self) -> PolicyRequest:
+        """Return which trained policies are asked for.
 
         Raises
         ------
@@ -50,12 +51,12 @@ class ControllerOptions:
         is_folder = self.kept.is_dir() or not self.kept.exists()
         if self.retrain or self.training_steps or self.policies or not is_folder:
             out_folder(self.kept, "--kept")
-        return Training(
+        return PolicyRequest(
             self.fan_out.open(), self.kept, self.training_steps, self.policies, self.retrain
         )
 
 
-def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controller]:
+def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEntry]:
     """Return the controllers that options ask for.
 
     Parameters
@@ -67,7 +68,7 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
 
     Returns
     -------
-    dict of Controller
+    dict of RosterEntry
         By name, those of the roster first.
 
     Raises
@@ -90,8 +91,8 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
     return found
 
 
-def own_controller(name: str, location: str) -> Controller:
-    """Return a record for a user's own controller, which has been tried out.
+def own_controller(name: str, location: str) -> RosterEntry:
+    """Return an entry for a user's own controller, which has been tried out.
 
     Raises
     ------
@@ -99,7 +100,6 @@ def own_controller(name: str, location: str) -> Controller:
         If there is no such factory, or if what it makes is no controller.
     """
     try:
-        try_out(load_factory(location))
+        return own_entry(name, location)
     except ValueError as error:
         raise UsageError(f"--agent: {error}") from error
-    return Controller(name, name, location, drawn=True)

@@ -1,46 +1,89 @@
-"""Networks that are trained and come with the project."""
+"""Make controllers of trained networks, and of PPO's policies."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
-from typing import Any
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from agents import PolicyNetwork
+from benchmarks.controllers.engineered import limits
+from benchmarks.controllers.records import Cost, Factory, Members
+from benchmarks.train import ppo
+from benchmarks.train.ppo_arguments import RANDOMISED, PPOArguments
+from mptc_gym import Parameters
 
 
 @dataclass(frozen=True)
-class Pretrained:
-    """Makes controllers of a network that comes with the project.
+class Trained:
+    """Makes controllers of a trained network, which is told the actuator's limits.
 
     Attributes
     ----------
-    name
-        As `PolicyNetwork.pretrained` takes it.
+    network
+        It goes along to machines where its file is not.
     """
 
-    name: str
+    network: PolicyNetwork
 
-    @property
-    def observation(self) -> dict[str, int]:
-        """Arguments of the environment that give the network its observation."""
-        return dict(_loaded(self.name).observation)
+    def __call__(self, plant: Parameters, runs: int, seed: int) -> PolicyNetwork:
+        """Return a controller; in velocity form it is told the dead zone, if it is a number.
 
-    @property
-    def provenance(self) -> dict[str, Any]:
-        """Where it comes from, without its learning curve."""
-        kept = _loaded(self.name).provenance
-        return {"file": f"{self.name}.npz"} | {k: v for k, v in kept.items() if k != "curve"}
+        Raises
+        ------
+        ValueError
+            If the dead zone that it is to undo leaves no flow on one side.
+        """
+        network = copy.deepcopy(self.network)
+        known = limits(plant)
+        network.u_min, network.u_max = known["u_min"], known["u_max"]
+        zone = plant.dead_zone
+        if network.increments and not isinstance(zone, Sequence):
+            if zone >= min(-network.u_min, network.u_max):
+                raise ValueError(
+                    f"dead_zone must be inside u_min = {plant.u_min} and u_max = {plant.u_max} "
+                    f"for a policy that undoes it, got {zone}"
+                )
+            network.increments = replace(network.increments, dead_zone=zone)
+        return network
 
-    def __call__(self, u_min: float, u_max: float) -> PolicyNetwork:
-        """Return a controller."""
-        return PolicyNetwork.pretrained(self.name, u_min=u_min, u_max=u_max)
+
+def network(name: str) -> Members:
+    """Return the members of a network that comes with the project, such as "nn-dpc"."""
+
+    def members(_: ppo.PolicyRequest) -> list[Factory]:
+        return [_factory(PolicyNetwork.pretrained(name), f"{name}.npz")]
+
+    return members
 
 
-@cache
-def _loaded(name: str) -> PolicyNetwork:
-    return PolicyNetwork.pretrained(name)
+def ppo_policies(request: ppo.PolicyRequest) -> list[Factory]:
+    """Return PPO's policies for the paper's plant; those that are missing are trained."""
+    return [_policy(each) for each in ppo.members(request)]
 
 
-nn_dpc = Pretrained("nn-dpc")
-nn_adaptive = Pretrained("nn-adaptive")
+def randomised_policies(request: ppo.PolicyRequest) -> list[Factory]:
+    """Return PPO's policies for many plants."""
+    arguments = replace(PPOArguments(), **RANDOMISED)
+    return [_policy(each) for each in ppo.members(request, arguments)]
+
+
+def tuned_policy(*, final: bool, member: int, **gains: float) -> Factory:
+    """Return a policy of PPO that was trained with other settings, for a search."""
+    return _policy(ppo.tuned(final=final, member=member, **gains))
+
+
+def _policy(policy: ppo.Policy) -> Factory:
+    weights = sum(W.size + b.size for W, b in policy.network.layers)
+    cost = Cost(
+        "dead zone; delay, by the past actions it sees",
+        f"{weights:,} weights a policy",
+        f"{policy.arguments.steps / 1e6:g} M a policy",
+    )
+    made = _factory(policy.network, policy.file.name)
+    return replace(made, curve=policy.curve, cost=cost)
+
+
+def _factory(network: PolicyNetwork, file: str) -> Factory:
+    about = {name: value for name, value in network.provenance.items() if name != "curve"}
+    return Factory(Trained(network), network.observation, provenance={"file": file, **about})

@@ -1,20 +1,22 @@
-"""What is known of a controller, and how it is trained: the records that the roster holds."""
+"""Declare what the roster holds: factories of controllers, and what commands know of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import cast
+from typing import Any
 
-from benchmarks.controllers.factories import Factory, load, load_factory
-from benchmarks.lib.fan_out import FanOut
+from agents.controller import PAPER_WINDOWS
+from benchmarks.rollout import Agent, make_plants, rollout
+from benchmarks.train.ppo import PolicyRequest
+from mptc_gym import Parameters
 
-POLICIES = Path("results/policies")  # where trained policies are kept
+LEARNING = 1200  # samples of the square wave with which a network is commissioned
+COMMISSIONING_SEED = 3_000_000  # of plants and noise then
 
 
 @dataclass(frozen=True)
-class Account:
+class Cost:
     """What a controller costs before it runs.
 
     Attributes
@@ -30,6 +32,74 @@ class Account:
     prior_knowledge: str = ""
     parameters: str = ""
     samples: str = ""
+
+
+@dataclass(frozen=True)
+class Factory:
+    """Makes controllers: all that a command may ask of a controller before it runs.
+
+    Attributes
+    ----------
+    make
+        Called with the plant that the controllers are made for (`Parameters`), how many runs
+        there are, and a seed: run i is to use `seed + i`. A search adds gains by name.
+    observation
+        The windows of the environment that the controllers want.
+    learns
+        Whether they go on learning from run to run.
+    code
+        The module whose code shapes them, if it is not that of `make`.
+    provenance
+        Where a trained policy comes from, in a form for JSON; empty if nothing was trained.
+    curve
+        Its learning curve, a row an evaluation.
+    cost
+        What it costs, where that is not known before the training.
+    """
+
+    make: Callable[..., Agent]
+    observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
+    learns: bool = False
+    code: str = ""
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    curve: Sequence[Mapping[str, float]] = ()
+    cost: Cost | None = None
+
+    @property
+    def module(self) -> str:
+        """The module whose code shapes the controllers."""
+        return self.code or self.make.__module__
+
+    def arguments(self, plant: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a plant's arguments of the environment, with the windows that are wanted."""
+        return {**plant, **self.observation}
+
+    def __call__(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
+        """Return a controller of `runs` plants, made for a plant given by its arguments."""
+        return self.make(Parameters(**self.arguments(plant)), runs, seed)
+
+    def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
+        """Return a controller as it comes to plants that it was not made for.
+
+        One that learns has learnt before, on the plant that it is made for.
+        """
+        controller = self(plant, runs, seed)
+        if self.learns:
+            plants = make_plants(
+                runs, LEARNING, **{**self.arguments(plant), "setpoint": "square"}
+            )
+            rollout(plants, controller, LEARNING, COMMISSIONING_SEED)
+            plants.close()
+        return controller
+
+
+Members = Callable[[PolicyRequest], Sequence[Factory]]
+
+
+def alone(make: Callable[..., Agent], **more: Any) -> Members:
+    """Return the members of a controller that is not trained: one factory, as `Factory`."""
+    factory = Factory(make, **more)
+    return lambda request: [factory]
 
 
 @dataclass(frozen=True)
@@ -50,10 +120,10 @@ class Tuning:
     members
         How many controllers are made of the same gains, in the search and at last. Their
         objectives are averaged.
-    make
-        "module:function", called with the gains, `final` (whether they are judged for the last
-        time) and `member` (the number of the controller); returns a factory. By default the
-        controller's own factory gets the gains as arguments.
+    train
+        Called with the gains, `final` (whether they are judged for the last time) and `member`
+        (the number of the controller); returns a factory. None: the controller's own factory
+        makes it with these gains.
     """
 
     space: Mapping[str, tuple[float, float]]
@@ -62,36 +132,11 @@ class Tuning:
     finalists: int = 10
     penalty: float = 5.0
     members: tuple[int, int] = (1, 1)
-    make: str = ""
+    train: Callable[..., Factory] | None = None
 
 
 @dataclass(frozen=True)
-class Training:
-    """How controllers that need training are to be had.
-
-    Attributes
-    ----------
-    fan_out
-        Runs the trainings.
-    folder
-        Where trained policies are kept.
-    steps
-        Samples of experience; None for as many as the training has by default.
-    members
-        How many policies, which differ in their seeds; None for the default.
-    retrain
-        Whether to train even where a finished policy is at hand.
-    """
-
-    fan_out: FanOut = field(default_factory=lambda: FanOut(1))
-    folder: Path = POLICIES
-    steps: int | None = None
-    members: int | None = None
-    retrain: bool = False
-
-
-@dataclass(frozen=True)
-class Controller:
+class RosterEntry:
     """A controller and all that any command has to know of it.
 
     Attributes
@@ -100,17 +145,16 @@ class Controller:
         In options and files.
     label
         In tables and plots.
-    factory
-        "module:factory"; see `load_factory`. Empty if `trained` is given.
-    trained
-        "module:function", called with a `Training`; returns factories, one for each policy.
-        They may have attributes `provenance`, a dict for JSON, and `curve`, the learning curve
-        as a list of rows.
-    in_service
-        "module:factory" of the controller as `sweep` meets it, if it is another one: one that
-        has learnt on the plant that it was made for.
-    account
+    made_by
+        Returns its factories: one, or several for policies that were trained apart. Called
+        with a request, which controllers that are not trained ignore.
+    cost
         What it costs before it runs.
+    told
+        Whether it is set up for the plant that it is told. Otherwise it is made for the paper's
+        plant, and is told no more than the actuator.
+    trained
+        Whether `made_by` may have to train.
     tuning
         How its gains are searched, if they are.
     compared, swept
@@ -121,23 +165,24 @@ class Controller:
 
     name: str
     label: str
-    factory: str = ""
-    trained: str = ""
-    in_service: str = ""
-    account: Account = Account()
+    made_by: Members
+    cost: Cost = Cost()
+    told: bool = True
+    trained: bool = False
     tuning: Tuning | None = None
     compared: bool = True
     swept: bool = False
     drawn: bool = False
 
-    def members(self, training: Training | None = None) -> list[Factory]:
+    def members(self, request: PolicyRequest | None = None) -> list[Factory]:
         """Return the factories of its members: one, or several that were trained apart."""
-        if self.trained:
-            return cast("list[Factory]", load(self.trained)(training or Training()))
-        return [load_factory(self.factory)]
+        return list(self.made_by(request or PolicyRequest()))
 
-    def members_in_service(self, training: Training | None = None) -> list[Factory]:
-        """Return its members as they come to plants that they were not made for."""
-        if self.in_service:
-            return [load_factory(self.in_service)]
-        return self.members(training)
+
+def provenances(members: Mapping[str, Sequence[Factory]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the provenance of every trained policy, by the name of its controller."""
+    found = {
+        name: [dict(each.provenance) for each in factories if each.provenance]
+        for name, factories in members.items()
+    }
+    return {name: each for name, each in found.items() if each}

@@ -1,34 +1,33 @@
-"""The roster: one record for each controller, with all that any command has to know of it.
+"""The roster: one entry for each controller, with all that any command has to know of it.
 
 A controller is added here and nowhere else. `compare`, `sweep`, `tune`, `train` and `watch`
-know it then. A user's own controllers (`--agent NAME=MODULE:FACTORY`) become such records, too.
+know it then. A user's own controllers (`--agent NAME=MODULE:FACTORY`) become such entries, too.
 """
 
 from __future__ import annotations
 
-from benchmarks.controllers.records import Account, Controller, Tuning
+from benchmarks.controllers import engineered, pretrained
+from benchmarks.controllers.records import Cost, RosterEntry, Tuning, alone
 
 _STEP_TEST = "gain, time constant, delay"
+_SEARCH = "566 M (search)"
 
-ROSTER: dict[str, Controller] = {
-    controller.name: controller
-    for controller in (
-        Controller(
+ROSTER: dict[str, RosterEntry] = {
+    entry.name: entry
+    for entry in (
+        RosterEntry(
             "nothing",
             "no control",
-            "benchmarks.controllers.engineered:Nothing",
-            account=Account("nothing", "0", "none"),
+            alone(engineered.nothing, observation={}),
+            Cost("nothing", "0", "none"),
             compared=False,
         ),
-        Controller(
+        RosterEntry(
             "nn",
             "NN",
-            "benchmarks.controllers.engineered:direct_nn",
-            in_service="benchmarks.controllers.commissioned:learning_network",
-            account=Account(
-                "direction; gains searched on the paper's plant",
-                "25 weights, 6 gains",
-                "566 M (search)",
+            alone(engineered.direct_nn, learns=True),
+            Cost(
+                "direction; gains searched on the paper's plant", "25 weights, 6 gains", _SEARCH
             ),
             tuning=Tuning(
                 {
@@ -43,72 +42,75 @@ ROSTER: dict[str, Controller] = {
             swept=True,
             drawn=True,
         ),
-        Controller(
+        RosterEntry(
             "nn-frozen",
             "NN, frozen",
-            "benchmarks.controllers.commissioned:frozen_network",
-            account=Account(
+            alone(engineered.frozen_nn),
+            Cost(
                 "direction; gains searched on the paper's plant",
                 "25 weights, 6 gains",
-                "566 M (search), 1,200 a network",
+                f"{_SEARCH}, 1,200 a network",
             ),
             compared=False,
             swept=True,
         ),
-        Controller(
+        RosterEntry(
             "pi",
             "PI",
-            "agents:PIController",
-            account=Account("gains of the paper", "2", "not stated"),
+            alone(engineered.paper_pi, code="agents.pi"),
+            Cost("gains of the paper", "2", "not stated"),
+            told=False,
             tuning=Tuning({"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}),
             swept=True,
             drawn=True,
         ),
-        Controller(
+        RosterEntry(
             "pi-simc",
             "PI, SIMC",
-            "benchmarks.controllers.engineered:simc_pi",
-            account=Account(_STEP_TEST, "2", "one step test"),
+            alone(engineered.simc_pi),
+            Cost(_STEP_TEST, "2", "one step test"),
             swept=True,
         ),
-        Controller(
+        RosterEntry(
             "pi-searched",
             "PI, searched",
-            "benchmarks.controllers.engineered:searched_pi",
-            account=Account("gains searched on the paper's plant", "2", "566 M (search)"),
+            alone(engineered.searched_pi),
+            Cost("gains searched on the paper's plant", "2", _SEARCH),
+            told=False,
         ),
-        Controller(
+        RosterEntry(
             "smith",
             "Smith",
-            "benchmarks.controllers.engineered:smith",
-            account=Account(
+            alone(engineered.smith),
+            Cost(
                 f"{_STEP_TEST}, dead zone, limits", "2 gains, 5 of the model", "one step test"
             ),
             swept=True,
             drawn=True,
         ),
-        Controller(
+        RosterEntry(
             "self-tuning",
             "self-tuning",
-            "benchmarks.controllers.engineered:self_tuning",
-            account=Account(
+            alone(engineered.self_tuning),
+            Cost(
                 f"{_STEP_TEST}, dead zone, limits; delay range",
                 "a bank of models, 30 settings",
                 "one step test",
             ),
             swept=True,
         ),
-        Controller(
+        RosterEntry(
             "mpc",
             "MPC",
-            "benchmarks.controllers.engineered:mpc",
-            account=Account("everything but the future", "all of the plant's", "none"),
+            alone(engineered.mpc),
+            Cost("everything but the future", "all of the plant's", "none"),
         ),
-        Controller(
+        RosterEntry(
             "ppo",
             "PPO",
-            trained="benchmarks.train.ppo:members",
-            account=Account("dead zone; delay, by the past actions it sees"),
+            pretrained.ppo_policies,
+            told=False,
+            trained=True,
             tuning=Tuning(
                 {
                     "learning_rate": (7e-4, 2e-3),
@@ -123,32 +125,34 @@ ROSTER: dict[str, Controller] = {
                 # errors count.
                 penalty=0.0,
                 members=(2, 4),
-                make="benchmarks.train.ppo:tuned",
+                train=pretrained.tuned_policy,
             ),
             swept=True,
             drawn=True,
         ),
-        Controller(
+        RosterEntry(
             "ppo-randomised",
             "PPO, randomised",
-            trained="benchmarks.train.ppo:randomised_members",
-            account=Account("dead zone; delay range, by the past actions it sees"),
+            pretrained.randomised_policies,
+            told=False,
+            trained=True,
             compared=False,
-            swept=False,
         ),
-        Controller(
+        RosterEntry(
             "nn-dpc",
             "NN, trained through the plant",
-            "benchmarks.controllers.pretrained:nn_dpc",
-            account=Account("the paper's plant: its equations, ranges of dead zone and noise"),
+            pretrained.network("nn-dpc"),
+            Cost("the paper's plant: its equations, ranges of dead zone and noise"),
+            told=False,
             swept=True,
             drawn=True,
         ),
-        Controller(
+        RosterEntry(
             "nn-adaptive",
             "NN, trained on many plants",
-            "benchmarks.controllers.pretrained:nn_adaptive",
-            account=Account("the class of plants: equations, and ranges of their numbers"),
+            pretrained.network("nn-adaptive"),
+            Cost("the class of plants: equations, and ranges of their numbers"),
+            told=False,
             swept=True,
             drawn=True,
         ),

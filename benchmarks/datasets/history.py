@@ -13,7 +13,6 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from benchmarks.controllers.engineered import Nothing
-from benchmarks.controllers.factories import build
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.limits import least_possible
 from benchmarks.rollout import make_plants, rollout
@@ -157,9 +156,8 @@ def record(plant: str, behaviour: str, episodes: int = EPISODES, seed: int = SEE
         which = slice(j, episodes, len(names))
         own = seeds[which]
         plants = _Recorder(make_plants(len(own), SAMPLES, **arguments), own)
-        controller = build(
-            ROSTER[name].members_in_service()[0], Parameters(**arguments), len(own), seed
-        )
+        (factory,) = ROSTER[name].members()
+        controller = factory.in_service(arguments, len(own), seed)
         rollout(plants, controller, SAMPLES, seed)
         plants.close()
         history.observations[which] = np.stack(plants.observations, axis=1)

@@ -14,12 +14,13 @@ from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks import plants
+from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import command_line
 from benchmarks.lib.statistics import bootstrap
 from benchmarks.lib.tables import on_screen
 from benchmarks.limits import package
 from benchmarks.limits.bounds import CACHE, LeastPossible, least_possible
-from benchmarks.limits.verify import mpc_errors, verify
+from benchmarks.limits.verify import errors, verify
 from benchmarks.scenarios import SCENARIOS, scenarios_of
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import EPISODES
@@ -147,7 +148,8 @@ def bounds(cases: Mapping[str, Mapping[str, Any]], options: argparse.Namespace) 
             "reference": _shown(found["reference"]) if "reference" in found else "",
         }
         if options.mpc:
-            error = bootstrap(mpc_errors(options.mpc, SAMPLES, **arguments), 0)
+            (mpc,) = ROSTER["mpc"].members()
+            error = bootstrap(errors(mpc, options.mpc, SAMPLES, **arguments), 0)
             row["MPC"] = _cell(error.value, error.low, error.high)
         rows.append(row)
     return pd.DataFrame(rows)

@@ -12,14 +12,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.controllers.factories import Factory, build, load_factory, observation
-from benchmarks.controllers.mpc import PredictiveController
+from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.limits.bounds import LeastPossible, least_possible
+from benchmarks.linear import nominal
 from benchmarks.metrics import mean_error
-from benchmarks.rollout import Agent, make_plants, rollout
+from benchmarks.rollout import make_plants, rollout
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.evaluation import SEED
 from mptc_gym.plant import action_from_command
@@ -48,14 +48,14 @@ CASES: dict[str, dict[str, Any]] = {
 class Counting:
     """Counts samples: it knows when the square wave changes, and changes the flow before.
 
-    The flow is that which holds the set point of `lead` samples later. So it is a controller
+    The flow is that which holds the set point of d + 10 samples later. So it is a controller
     with preview, though nobody shows it the future.
     """
 
-    def __init__(self, parameters: Parameters, num_envs: int, lead: int | None = None) -> None:
-        self._p = parameters
-        self._runs = num_envs
-        self._lead = parameters.range_of("delay")[0] + 10 if lead is None else lead
+    def __init__(self, plant: Parameters, runs: int, seed: int = 0) -> None:
+        self._p = plant
+        self._runs = runs
+        self._lead = plant.range_of("delay")[0] + 10
         self.reset()
 
     def reset(self) -> None:
@@ -73,34 +73,23 @@ class Counting:
             level = np.full(self._runs, p.setpoint_amplitude * (1.0 if first_half else -1.0))
         self._k += 1
         u_min, u_max = (float(np.mean(p.range_of(name))) for name in ("u_min", "u_max"))
-        command = level * sum(p.a) / sum(p.b)
+        command = level / nominal(p).gain
         action: Array = action_from_command(command, u_min, u_max)[:, np.newaxis]
         return action
 
 
 def controllers() -> dict[str, Factory]:
     """Return factories by name: of the roster, but what has to be trained, and one more."""
-    known = {
-        name: load_factory(controller.factory)
-        for name, controller in ROSTER.items()
-        if controller.factory
-    }
-    return {**known, "counting": Counting}
+    known = {name: entry.members()[0] for name, entry in ROSTER.items() if not entry.trained}
+    return {**known, "counting": Factory(Counting)}
 
 
 def errors(factory: Factory, runs: int, samples: int, **arguments: Any) -> Array:
     """Return mean |e| of runs with seeds from `SEED` on, degC, shape (runs,)."""
-    arguments = {**arguments, **observation(factory)}
-    plants = make_plants(runs, samples, **arguments)
-    agent: Agent = build(factory, Parameters(**arguments), runs, SEED)
-    trajectory = rollout(plants, agent, samples, SEED)
+    plants = make_plants(runs, samples, **factory.arguments(arguments))
+    trajectory = rollout(plants, factory(arguments, runs, SEED), samples, SEED)
     plants.close()
     return mean_error(trajectory)
-
-
-def mpc_errors(runs: int, samples: int, **arguments: Any) -> Array:
-    """Return mean |e| of runs of the predictive controller, degC, shape (runs,)."""
-    return errors(PredictiveController, runs, samples, **arguments)
 
 
 def beats(found: Array, least: LeastPossible) -> bool:
@@ -147,7 +136,7 @@ def verify(
     for case in cases:
         cells[f"bound, {case}"] = partial(_bound, case, runs)
         cells |= {f"{name}, {case}": partial(_errors, name, case, runs) for name in factories}
-    sources = [factory.__module__ for factory in factories.values()]
+    sources = [factory.module for factory in factories.values()]
     kept = folder / f"verify-{fingerprint('benchmarks.limits.verify', *sources, runs=runs)}"
     results = fan_out.run(cells, kept, title="verify")
     rows, beaten = [], []

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.controllers.factories import Factory, build, observation
+from benchmarks.controllers.records import Factory
 from benchmarks.designs import Plant
 from benchmarks.limits import least_possible, steady_stretches
 from benchmarks.metrics import mean_error, travel
 from benchmarks.rollout import make_plants, rollout
-from mptc_gym import Parameters
 
 SETPOINT: Plant = {"setpoint": "square", "setpoint_period": 600}
 
@@ -56,9 +55,8 @@ def agent_cell(
         standard deviation of the error on the steady stretches, all in degC; and `travel`, the
         total variation of the applied flow, t/h.
     """
-    windows = observation(factory)
-    controller = build(factory, Parameters(**{**nominal, **SETPOINT, **windows}), runs, seed)
-    plants = make_plants(runs, samples, **{**plant, **SETPOINT, **windows})
+    controller = factory.in_service({**nominal, **SETPOINT}, runs, seed)
+    plants = make_plants(runs, samples, **factory.arguments({**plant, **SETPOINT}))
     trajectory = rollout(plants, controller, samples, seed)
     error = trajectory.setpoint - trajectory.output
     steady = steady_stretches(trajectory.setpoint[:, 0])

@@ -11,9 +11,8 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks.controllers.factories import Factory, provenances
 from benchmarks.controllers.options import chosen
-from benchmarks.controllers.records import Controller
+from benchmarks.controllers.records import Factory, provenances
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.designs import Plant, grid, random_design
 from benchmarks.lib.command_line import out_folder
@@ -38,9 +37,7 @@ def run(options: Options, console: Console) -> str:
     out = out_folder(options.out or Path(f"results/sweep-{options.design}"))
     training = options.controllers.training()
     known = {NOTHING: ROSTER[NOTHING], **controllers}
-    members = {
-        name: controller.members_in_service(training) for name, controller in known.items()
-    }
+    members = {name: entry.members(training) for name, entry in known.items()}
     differing = (
         grid()
         if options.design == "grid"
@@ -57,7 +54,7 @@ def run(options: Options, console: Console) -> str:
         results |= training.fan_out.run(
             _agent_cells(name, factories, plants, nominal, options),
             # A folder for each, so that one more controller leaves the others' cells valid.
-            out / "cells" / agent_key(known[name], factories, plants, nominal, options),
+            out / "cells" / agent_key(name, factories, plants, nominal, options),
             title=name,
         )
     seconds = time.perf_counter() - began
@@ -113,21 +110,19 @@ def _agent_cells(
 
 
 def agent_key(
-    controller: Controller,
+    name: str,
     factories: Sequence[Factory],
     plants: list[Plant],
     nominal: Plant,
     options: Options,
 ) -> str:
     """Return a name made of everything that shapes the results of a controller."""
-    location = controller.in_service or controller.factory
-    modules = [location.partition(":")[0]] if location else []
     return fingerprint(
         agent_cell.__module__,
-        *modules,
+        factories[0].module,
         options=[options.runs, options.samples],
         plants=plants,
         nominal=nominal,
-        controller=location,
-        policies=provenances({controller.name: factories}),
+        controller=name,
+        policies=provenances({name: factories}),
     )

@@ -21,7 +21,6 @@ from rich.console import Console
 
 from agents import PolicyNetwork
 from agents.policy_network import PRETRAINED
-from benchmarks.controllers import records
 from benchmarks.lib import command_line, drawing
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import commit
@@ -91,7 +90,7 @@ def _train_ppo(options: argparse.Namespace, console: Console) -> str:
     if options.prices:
         raise command_line.UsageError("--prices: PPO's training has no price of valve travel")
     out = command_line.out_folder(options.out)
-    asked = records.Training(
+    asked = ppo.PolicyRequest(
         command_line.fan_out(options),
         out,
         getattr(options, "steps", None),

@@ -7,7 +7,6 @@ only.
 
 from __future__ import annotations
 
-import copy
 import json
 import shutil
 import tempfile
@@ -17,22 +16,47 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from agents import Increments, PolicyNetwork
+from agents import PolicyNetwork
 from agents.policy_network import PRETRAINED
-from benchmarks.controllers.records import Account, Training
+from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import replacing
 from benchmarks.train import kept
-from benchmarks.train.ppo_arguments import RANDOMISED, PPOArguments
-from mptc_gym import Parameters
+from benchmarks.train.ppo_arguments import PPOArguments
 
+KEPT = Path("results/policies")
 POLICIES = 5  # are trained and compared, from seeds in sequence
 TUNING_SEED, FINAL_SEED = 1000, 2000  # of policies in a search, others than a comparison uses
 
 
 @dataclass(frozen=True)
+class PolicyRequest:
+    """Which trained policies are wanted, and how those that are missing are to be trained.
+
+    Attributes
+    ----------
+    fan_out
+        Runs the trainings.
+    folder
+        Where trained policies are kept.
+    steps
+        Samples of experience; None for as many as the training has by default.
+    policies
+        How many policies, which differ in their seeds; None for the default.
+    retrain
+        Whether to train even where a finished policy is at hand.
+    """
+
+    fan_out: FanOut = field(default_factory=lambda: FanOut(1))
+    folder: Path = KEPT
+    steps: int | None = None
+    policies: int | None = None
+    retrain: bool = False
+
+
+@dataclass(frozen=True)
 class Policy:
-    """Makes controllers of one trained policy, which a file keeps.
+    """A trained policy, which a file keeps.
 
     Attributes
     ----------
@@ -41,7 +65,7 @@ class Policy:
     file
         Where it is.
     network
-        What the file holds. It goes along to machines where the file is not.
+        What the file holds.
 
     Raises
     ------
@@ -61,41 +85,13 @@ class Policy:
         object.__setattr__(self, "network", network)
 
     @property
-    def observation(self) -> dict[str, Any]:
-        """Arguments of the environment that give the policy its observation."""
-        return self.arguments.observation
-
-    @property
-    def account(self) -> Account:
-        """What it costs before it runs."""
-        weights = sum(W.size + b.size for W, b in self.network.layers)
-        return Account(
-            "dead zone; delay, by the past actions it sees",
-            f"{weights:,} weights a policy",
-            f"{self.arguments.steps / 1e6:g} M a policy",
-        )
-
-    @property
     def curve(self) -> list[dict[str, float]]:
         """The learning curve, a row a point."""
-        return cast("list[dict[str, float]]", self.network.provenance["curve"])
-
-    @property
-    def provenance(self) -> dict[str, Any]:
-        """Where it comes from."""
-        kept = self.network.provenance
-        return {"file": self.file.name, **{k: v for k, v in kept.items() if k != "curve"}}
-
-    def __call__(self, parameters: Parameters | None = None) -> PolicyNetwork:
-        """Return a controller; it is told the plant's dead zone, if that is a number."""
-        network = copy.deepcopy(self.network)
-        if parameters is not None and not isinstance(parameters.dead_zone, Sequence):
-            network.increments = Increments(self.arguments.max_move, parameters.dead_zone)
-        return network
+        return cast("list[dict[str, float]]", self.network.provenance.get("curve", []))
 
 
 def members(
-    training: Training, arguments: PPOArguments | None = None, *, shipped: bool = True
+    request: PolicyRequest, arguments: PPOArguments | None = None, *, shipped: bool = True
 ) -> list[Policy]:
     """Return policies that differ in their seeds, and train those that are missing.
 
@@ -103,7 +99,7 @@ def members(
 
     Parameters
     ----------
-    training
+    request
         Where they are kept, how many there are, and what trains them.
     arguments
         How to train the first; the seeds of the others follow.
@@ -111,20 +107,20 @@ def members(
         Whether those that come with the project will do.
     """
     arguments = arguments or PPOArguments()
-    if training.steps is not None:
-        arguments = replace(arguments, steps=training.steps)
-    seeds = range(arguments.seed, arguments.seed + (training.members or POLICIES))
+    if request.steps is not None:
+        arguments = replace(arguments, steps=request.steps)
+    seeds = range(arguments.seed, arguments.seed + (request.policies or POLICIES))
     wanted = [replace(arguments, seed=seed) for seed in seeds]
     files: dict[Path, PPOArguments] = {}
     missing = {}
     for each in wanted:
-        own = training.folder / policy_key(each) / "policy.npz"
-        if shipped and not (training.retrain or own.exists()) and _comes(each):
+        own = request.folder / policy_key(each) / "policy.npz"
+        if shipped and not (request.retrain or own.exists()) and _comes(each):
             files[pretrained(each)] = each
         else:
             files[own] = each
             missing[own] = partial(train, each)
-    kept.train(missing, training.fan_out, retrain=training.retrain)
+    kept.train(missing, request.fan_out, retrain=request.retrain)
     return [Policy(each, file) for file, each in files.items()]
 
 
@@ -133,11 +129,6 @@ def train(arguments: PPOArguments) -> PolicyNetwork:
     from benchmarks.train import ppo_training  # here: torch takes seconds to load
 
     return ppo_training.train(arguments)
-
-
-def randomised_members(training: Training) -> list[Policy]:
-    """Return policies for many plants, as `members` does."""
-    return members(training, replace(PPOArguments(), **RANDOMISED))
 
 
 def tuned(*, final: bool, member: int, **gains: Any) -> Policy:

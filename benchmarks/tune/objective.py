@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.controllers.factories import Factory, build, observation
-from benchmarks.controllers.records import Tuning
+from benchmarks.controllers.records import Factory, Tuning
 from benchmarks.metrics import mean_error, settled, split
 from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import Scenario
-from mptc_gym import Parameters
 
 # Neighbours of the paper's cases, each with its first sample that counts: three that begin with
 # an untrained controller, and two that show what comes after learning.
@@ -60,7 +58,7 @@ def score(
     Parameters
     ----------
     factory
-        Makes the controller; called by `benchmarks.controllers.factories.build`.
+        Makes the controller.
     runs
         Of each scenario.
     first_run
@@ -80,9 +78,9 @@ def score(
     medians: dict[str, float] = {}
     for i, (scenario, first_sample) in enumerate(SCENARIOS):
         seed = first_run + i * 100_000
-        environment = {**(plant or {}), **scenario.arguments, **observation(factory)}
-        controller = build(factory, Parameters(**environment), runs, seed)
-        plants = make_plants(runs, scenario.samples, **environment)
+        arguments = {**(plant or {}), **scenario.arguments}
+        controller = factory(arguments, runs, seed)
+        plants = make_plants(runs, scenario.samples, **factory.arguments(arguments))
         trajectory = rollout(plants, controller, scenario.samples, seed)
         _, counted = split(trajectory, first_sample)
         medians[scenario.name] = float(np.median(mean_error(counted)))

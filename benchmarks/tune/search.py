@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,7 @@ import pandas as pd
 from optuna.distributions import BaseDistribution, FloatDistribution
 from tqdm import tqdm
 
-from benchmarks.controllers.factories import load, load_factory
-from benchmarks.controllers.records import Controller, Tuning
+from benchmarks.controllers.records import RosterEntry, Tuning
 from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import code, fingerprint
@@ -31,7 +31,7 @@ DIGITS = 3  # significant, of the gains that are proposed
 
 
 def _score(
-    controller: Controller,
+    controller: RosterEntry,
     gains: dict[str, float],
     runs: int,
     first_run: int,
@@ -41,14 +41,15 @@ def _score(
     member: int,
 ) -> dict[str, float]:
     tuning = tuning_of(controller)
-    if tuning.make:
-        factory = load(tuning.make)(**gains, final=final, member=member)
+    if tuning.train is None:
+        (factory,) = controller.members()
+        factory = replace(factory, make=partial(factory.make, **gains))
     else:
-        factory = partial(load_factory(controller.factory), **gains)
+        factory = tuning.train(**gains, final=final, member=member)
     return score(factory, runs, first_run, tuning.penalty, plant)
 
 
-def tuning_of(controller: Controller) -> Tuning:
+def tuning_of(controller: RosterEntry) -> Tuning:
     """Return how a controller's gains are searched; ValueError if they are not."""
     if controller.tuning is None:
         tuned = ", ".join(name for name, each in ROSTER.items() if each.tuning)
@@ -82,7 +83,7 @@ class Search:
 
     def __init__(
         self,
-        controller: Controller,
+        controller: RosterEntry,
         runs: int,
         folder: Path,
         fan_out: FanOut,
@@ -125,10 +126,11 @@ class Search:
 
     def _code(self) -> str:
         """Return a hash of the code that makes and judges the controller."""
-        maker = load(self._tuning.make or self._controller.factory)
+        train = self._tuning.train
+        maker = train.__module__ if train else self._controller.members()[0].module
         judges = ("benchmarks.metrics", "benchmarks.rollout")
         objective = code("benchmarks.tune.objective")  # and not all that it imports
-        return fingerprint(maker.__module__, *judges, objective=objective)
+        return fingerprint(maker, *judges, objective=objective)
 
     def _earlier(self) -> list[dict[str, float]]:
         """Return the trials that are kept, if they are of this search."""

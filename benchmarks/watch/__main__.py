@@ -18,9 +18,8 @@ from PIL import Image
 from rich.console import Console
 
 from benchmarks import plants
-from benchmarks.controllers.factories import Factory, build, observation
 from benchmarks.controllers.options import own_controller
-from benchmarks.controllers.records import Controller, Training
+from benchmarks.controllers.records import Factory, RosterEntry
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import command_line
 from benchmarks.lib.storage import replacing
@@ -28,6 +27,7 @@ from benchmarks.lib.tables import on_screen
 from benchmarks.metrics import mean_error
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import SCENARIOS, SETPOINTS, Scenario, scenarios_of
+from benchmarks.train.ppo import PolicyRequest
 from benchmarks.watch import rivals
 from benchmarks.watch.hands import HELP, Closed, Hands
 from mptc_gym import MiddlePointEnv, Parameters, drawing
@@ -113,7 +113,7 @@ def main(options: argparse.Namespace, console: Console) -> str:
         raise command_line.UsageError(
             f"--agent {YOU}: needs a screen to open a window on, and no --video"
         )
-    factory = controller.members(Training(members=1))[0] if controller else None
+    factory = controller.members(PolicyRequest(policies=1))[0] if controller else None
 
     if film is None and not has_screen:
         film = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.mp4"
@@ -168,7 +168,7 @@ def in_window(
     Closed
         If the window is closed before the end.
     """
-    arguments = {**scenario.arguments, **(observation(factory) if factory else {})}
+    arguments = factory.arguments(scenario.arguments) if factory else scenario.arguments
     parameters = Parameters(**arguments)
     hands = Hands(parameters.range_of("u_min")[0], parameters.range_of("u_max")[1], speed)
 
@@ -187,7 +187,7 @@ def in_window(
         if (hands.setpoint, hands.load) != (touched.setpoint, touched.load):
             moves[k] = touched.setpoint, touched.load = hands.setpoint, hands.load
 
-    controller = build(factory, parameters, 1, seed) if factory else hands
+    controller = factory(arguments, 1, seed) if factory else hands
     pygame.display.init()
     pygame.key.set_repeat(300, 60)  # ms
     try:
@@ -205,11 +205,11 @@ def in_film(
     Its pictures are those of every n-th sample, such that there are no more of them a second
     than its kind of film allows.
     """
-    arguments = {**scenario.arguments, **observation(factory)}
+    arguments = factory.arguments(scenario.arguments)
     plants = make_plants(1, scenario.samples, render_mode="rgb_array", **arguments)
     film = FILMS[path.suffix]
     every = math.ceil(speed / film.fps)
-    controller = build(factory, Parameters(**arguments), 1, seed)
+    controller = factory(arguments, 1, seed)
     with replacing(path) as partial, film.open(partial, speed / every) as put:
 
         def draw(k: int) -> None:
@@ -251,7 +251,7 @@ def _gif(path: Path, fps: float) -> Iterator[Put]:
 FILMS: dict[str, Film] = {".mp4": Film(_mp4, 30), ".gif": Film(_gif, 10)}
 
 
-def _controller(agent: str) -> Controller:
+def _controller(agent: str) -> RosterEntry:
     if ":" in agent:
         return own_controller(agent, agent)
     if agent not in ROSTER:

@@ -9,14 +9,12 @@ from typing import Any, cast
 import gymnasium
 import pandas as pd
 
-from benchmarks.controllers.factories import build, observation
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.limits import least_possible
 from benchmarks.metrics import mean_error, travel
 from benchmarks.rollout import Trajectory, rollout
 from benchmarks.scenarios import Scenario
 from benchmarks.watch.touched import Touched
-from mptc_gym import Parameters
 from mptc_gym.record import Record
 
 Moves = dict[int, tuple[float, float]]  # k: what is added to set point and load from k + 1 on
@@ -46,8 +44,8 @@ def touched_one(plants: gymnasium.vector.SyncVectorEnv) -> Touched:
 
 def replay(name: str, moves: Moves, scenario: Scenario, seed: int) -> Trajectory:
     """Run a controller of the roster, with the noise and the moves of another's run."""
-    factory = ROSTER[name].members()[0]
-    arguments = {**scenario.arguments, **observation(factory)}
+    (factory,) = ROSTER[name].members()
+    arguments = factory.arguments(scenario.arguments)
     plants = touched_plants(scenario.samples, arguments)
     touched = touched_one(plants)
 
@@ -56,8 +54,7 @@ def replay(name: str, moves: Moves, scenario: Scenario, seed: int) -> Trajectory
             touched.setpoint, touched.load = moves[k]
 
     try:
-        controller = build(factory, Parameters(**arguments), 1, seed)
-        return rollout(plants, controller, scenario.samples, seed, move)
+        return rollout(plants, factory(arguments, 1, seed), scenario.samples, seed, move)
     finally:
         plants.close()
 
