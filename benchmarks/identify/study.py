@@ -97,7 +97,7 @@ def synthetic_log(plant: Plant, samples: int, seed: int, kind: str = "steps") ->
         setpoint = {"setpoint": "random", "setpoint_amplitude": 5.0}
     env = gymnasium.make("MiddlePoint-v0", max_episode_steps=samples, **plant, **setpoint)
     observation, info = env.reset(seed=int(generator.integers(2**31)))
-    controller = simc_pi(Parameters(**plant), -10.0, 10.0)
+    controller = simc_pi(Parameters(**plant))
     flow, temperature = np.empty(samples), np.empty(samples)
     for k in range(samples):
         temperature[k] = info["output"]
