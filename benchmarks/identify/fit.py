@@ -114,18 +114,18 @@ def identify(log: Log, options: Options | None = None) -> Model:
 
 
 def _cleaned(log: Log, options: Options) -> Log:
-    """Return a log without its spikes: suspects that a first model does not foresee either."""
+    """Return a log without its spikes: suspects that no answer to the flow explains."""
     found = suspects(log)
     if not found.any():
         return log
-    flexible = replace(options, orders=options.orders or TO_FORESEE)
-    likelihood = Likelihood(without(log, found), flexible, flexible.orders.b)
-    fit = _first(likelihood)[0]
-    errors = likelihood.errors(fit)
-    missed = errors + np.where(found, log.temperature - likelihood.level, 0.0)
-    missed -= np.where(found, likelihood.filled, 0.0)
-    scale = 1.4826 * float(np.nanmedian(np.abs(errors[~found])))
-    return without(log, found & ~(np.abs(missed) < OUTLYING * scale))
+    orders = options.orders or TO_FORESEE
+    likelihood = Likelihood(log, replace(options, orders=orders), orders.b)
+    errors = np.nan_to_num(likelihood.errors(_first(likelihood)[0]))
+    scale = 1.4826 * float(np.median(np.abs(errors[likelihood.rows.index])))
+    # The second sample of a spike may follow from the first one.
+    runs = np.cumsum(np.diff(found, prepend=False))
+    outlying = np.unique(runs[found & (np.abs(errors) > OUTLYING * scale)])
+    return without(log, found & np.isin(runs, outlying))
 
 
 def _first(likelihood: Likelihood) -> list[Candidate]:
