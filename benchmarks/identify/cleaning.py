@@ -80,11 +80,11 @@ def suspects(log: Log) -> Flags:
     known = np.sort(np.unique(log.temperature[np.isfinite(log.temperature)]))
     finest = float(np.min(np.diff(known))) if len(known) > 1 else 0.0
     scale = max(1.4826 * float(np.nanmedian(apart)), finest, 1e-3 * float(np.ptp(known)))
-    found = (apart > SPIKE * scale).to_numpy(dtype=bool)
+    found = np.array(apart > SPIKE * scale, bool)
     most = int(MOST_SPIKES * len(found))
     if found.sum() > most:
         found &= apart.to_numpy() >= np.sort(apart.fillna(0.0).to_numpy())[-max(most, 1)]
-    return np.asarray(found, bool)
+    return found
 
 
 def without(log: Log, spikes: Flags) -> Log:

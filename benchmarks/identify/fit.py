@@ -30,6 +30,7 @@ from benchmarks.linear import LinearModel
 
 SECOND = np.array([-0.8])  # C of a second time constant, to begin with
 FIRST_ORDERS = Orders(2, 1, 2)  # to look for the delay with, before the orders are known
+TO_FORESEE = Orders(2, 6, 2)  # so that a fast response is not taken for a spike
 OF_A, OF_B, OF_C = (1, 2, 3), (1, 2, 3, 6, 12), (0, 1, 3)
 WORTH_A_FIT = 7  # orders that are fitted, of those that come out best with a common C
 WORTH_A_TRIAL = 4  # of those, the ones that are tried on the last third
@@ -113,17 +114,18 @@ def identify(log: Log, options: Options | None = None) -> Model:
 
 
 def _cleaned(log: Log, options: Options) -> Log:
-    """Return a log without its spikes: suspects that a first model does not foresee either."""
+    """Return a log without its spikes: suspects that no answer to the flow explains."""
     found = suspects(log)
     if not found.any():
         return log
-    likelihood = Likelihood(without(log, found), replace(options, orders=FIRST_ORDERS))
-    fit = _first(likelihood)[0]
-    errors = likelihood.errors(fit)
-    missed = errors + np.where(found, log.temperature - likelihood.level, 0.0)
-    missed -= np.where(found, likelihood.filled, 0.0)
-    scale = 1.4826 * float(np.nanmedian(np.abs(errors[~found])))
-    return without(log, found & ~(np.abs(missed) < OUTLYING * scale))
+    orders = options.orders or TO_FORESEE
+    likelihood = Likelihood(log, replace(options, orders=orders), orders.b)
+    errors = np.nan_to_num(likelihood.errors(_first(likelihood)[0]))
+    scale = 1.4826 * float(np.median(np.abs(errors[likelihood.rows.index])))
+    # The second sample of a spike may follow from the first one.
+    runs = np.cumsum(np.diff(found, prepend=False))
+    outlying = np.unique(runs[found & (np.abs(errors) > OUTLYING * scale)])
+    return without(log, found & np.isin(runs, outlying))
 
 
 def _first(likelihood: Likelihood) -> list[Candidate]:
@@ -186,7 +188,7 @@ def _fits(likelihood: Likelihood) -> list[Candidate]:
         orders = Orders(2, b, 1)
         place = likelihood.scan(orders, SECOND, [found[0].place.gap])[0]
         lags.append(likelihood.fit(place, orders, SECOND))
-    return [*found, *(fit for fit in lags if fit.solution.c[0] < -0.3)]
+    return [*found, *(fit for fit in lags if fit.has_own_lag)]
 
 
 def _tried(likelihood: Likelihood, fits: list[Candidate]) -> tuple[list[Candidate], HeldOut]:
@@ -196,13 +198,13 @@ def _tried(likelihood: Likelihood, fits: list[Candidate]) -> tuple[list[Candidat
     last = np.arange(len(log.flow)) >= cut
     flow = simulation.held(likelihood.applied(Gap(0.0, 0.0)))
     known = [simulation.held(each) for each in likelihood.known]
-    impulse = simulation.of_impulse_response([flow, *known], likelihood.output, ~last)
+    impulse, _ = simulation.of_impulse_response([flow, *known], likelihood.output, ~last)
     mild = sorted(
         fits, key=lambda fit: likelihood.criterion(fit.orders, fit.deviance, mild=True)
     )
     long = [fit for fit in fits if fit.orders.b > 3]
     trial = fits[:WORTH_A_TRIAL]
-    others = dict.fromkeys([*mild[:2], *long[:1], *fits[-2:]])
+    others = dict.fromkeys([*mild[:2], *long[:1], *(fit for fit in fits if fit.has_own_lag)])
     trial += [fit for fit in others if fit not in trial]
     likelihood.narrow(likelihood.longest_delay, cut)
     shares = []
@@ -214,15 +216,17 @@ def _tried(likelihood: Likelihood, fits: list[Candidate]) -> tuple[list[Candidat
     # What a better simulation leaves open, and a part of the noise that no one foresees.
     least = max(WORSE * (1.0 - max(shares)), 1.0 - max(shares) + 0.005)
     good = [
-        (fit, share) for fit, share in zip(trial, shares, strict=True) if 1.0 - share <= least
+        (fit, share)
+        for fit, share in zip(trial, shares, strict=True)
+        if 1.0 - share <= least * (1.3 if fit.has_own_lag else 1.0)
     ] or list(zip(trial, shares, strict=True))[:1]
     criteria = [likelihood.criterion(fit.orders, fit.deviance, mild=True) for fit, _ in good]
     # One of each kind: without a walk and with it, with a short B and a long one, and with a
     # time constant of its own.
     kinds: dict[tuple[bool, ...], Candidate] = {}
     for (fit, _), each in zip(good, criteria, strict=True):
-        if each < min(criteria) + CLOSE:
-            kind = fit.orders.walk, fit.orders.b > 3, fit in fits[-2:], fit.orders.b > 1
+        if each < min(criteria) + CLOSE and not fit.walks_nowhere:
+            kind = fit.orders.walk, fit.orders.b > 3, fit.has_own_lag, fit.orders.b > 1
             kinds.setdefault(kind, fit)
     near = [fit for fit in kinds.values() if fit is not good[0][0]]
     found = simulation.explained(likelihood.output, impulse, last)

@@ -20,6 +20,8 @@ MOST_GAPS = 250  # that are tried in all
 FINEST = 1e-6  # of the temperature's deviation, what its numbers tell
 BRIDGE = 10  # missing temperatures in a row that are filled in, for the noise to go on
 SHORTEST = 30  # rows of a stretch without a gap
+OWN_LAG = -0.3  # the C of first order, below which it cancels a time constant
+STILL = 0.99  # the root of C', above which it cancels the random walk
 OF_KNOWN = 4  # coefficients of a known disturbance
 
 
@@ -55,6 +57,18 @@ class Candidate:
     orders: Orders
     place: Place
     solution: Solution
+
+    @property
+    def has_own_lag(self) -> bool:
+        """Whether the plant has a second time constant that is not one of the noise."""
+        c = self.solution.c
+        return self.orders == Orders(2, self.orders.b, 1) and float(c[0]) < OWN_LAG
+
+    @property
+    def walks_nowhere(self) -> bool:
+        """Whether the random walk is one of (nearly) no variance."""
+        roots = np.roots([1.0, *self.solution.c])
+        return self.orders.walk and bool(np.max(roots.real, initial=0.0) > STILL)
 
     @property
     def deviance(self) -> float:

@@ -16,7 +16,7 @@ from benchmarks.linear import LinearModel
 
 ENDS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # of the posterior, where an interval ends
 NEAR = 25.0  # of deviances: what is further off has no probability worth a mention
-AS_GOOD = 4.0  # of Akaike's criterion: orders that are no further behind count the same
+AS_GOOD = 8.0  # of Akaike's criterion: orders that are no further behind count the same
 MOST_FITS = 8  # of orders, at as many delays
 PLACES, DRAWS_EACH = 60, 6  # drawn: orders with a delay and a dead zone, and coefficients
 
@@ -90,6 +90,8 @@ class Posterior:
                 around = range(delay, min(delay + stride, delays.stop))
                 middle = Place(0.0, around[len(around) // 2], gap)
                 refit = likelihood.fit(middle, fit.orders, fit.solution.c)
+                if fit.has_own_lag and not refit.has_own_lag:
+                    continue
                 places = likelihood.scan(fit.orders, refit.solution.c, gaps, around)
                 found += [Entry(i, refit, place) for place in places]
         return found

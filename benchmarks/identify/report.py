@@ -220,21 +220,7 @@ def _on_the_plant(tuned: dict[str, Recommended], arguments: dict[str, Any]) -> S
     parameters = Parameters(**arguments)
     samples = max(SAMPLES, 2 * parameters.setpoint_period)
     rows = []
-    unaware = math.nan
-    try:
-        if samples > LONGEST:
-            raise NotSolvedError(f"{samples} samples are too many")
-        anyone, unaware = (
-            least_possible(samples=samples, kind=kind, folder=None, **arguments).value
-            for kind in ("preview", "reference")
-        )
-        bound = (
-            f"The least possible mean error is {unaware:.4g} °C if a change of the set point "
-            f"is news and finds the plant settled, and {anyone:.4g} °C for a controller that "
-            "knows it beforehand."
-        )
-    except (NotSolvedError, ValueError) as error:
-        bound = f"The least possible mean error is not known: {error}."
+    unaware, bound = _bounds(arguments, samples)
     for name, each in tuned.items():
         if each.controller is None:
             continue
@@ -257,4 +243,26 @@ def _on_the_plant(tuned: dict[str, Recommended], arguments: dict[str, Any]) -> S
             "benchmarks.compare --plant plant.json`."
         ],
         pd.DataFrame(rows, columns=columns),
+    )
+
+
+def _bounds(arguments: dict[str, Any], samples: int) -> tuple[float, str]:
+    """Return the least possible mean error, degC, NaN if it is not known, and a sentence."""
+    if samples > LONGEST:
+        return (
+            math.nan,
+            f"The least possible mean error is not known: {samples} samples are many.",
+        )
+    try:
+        found = least_possible(samples=samples, kind="preview", folder=None, **arguments)
+    except NotSolvedError as error:
+        return math.nan, f"The least possible mean error is not known: {error}."
+    anyone = f"{found.value:.4g} °C for a controller that knows the set point beforehand"
+    try:
+        unaware = least_possible(samples=samples, kind="reference", folder=None, **arguments)
+    except (NotSolvedError, ValueError):  # it does not settle before the set point changes
+        return found.value, f"The least possible mean error is {anyone}."
+    return unaware.value, (
+        f"The least possible mean error is {unaware.value:.4g} °C if a change of the set point "
+        f"is news and finds the plant settled, and {anyone}."
     )

@@ -46,8 +46,10 @@ def explained(output: Array, simulated: Array, rows: Flags) -> float:
     return 1.0 - float(np.mean((error - line) ** 2)) / total if total else -np.inf
 
 
-def of_impulse_response(inputs: list[Array], output: Array, fitted: Flags) -> Array:
-    """Return the simulation by a finite impulse response with a slow tail, deviations in degC.
+def of_impulse_response(
+    inputs: list[Array], output: Array, fitted: Flags
+) -> tuple[Array, float]:
+    """Return the simulation by a finite impulse response with a slow tail, degC, and its gain.
 
     It has `LAGS` coefficients and four slow exponentials for each input, and is fitted to some
     rows by least squares with a ridge, which generalised cross-validation chooses (G. H. Golub,
@@ -74,5 +76,5 @@ def of_impulse_response(inputs: list[Array], output: Array, fitted: Flags) -> Ar
         score = float(error @ error) / (1.0 - kept.sum() / len(target)) ** 2
         if score < least:
             least, best = score, right.T @ (kept * shares / np.maximum(sizes, 1e-300))
-    simulated: Array = (table - centre) @ best + level
-    return simulated
+    gain = float(best[: LAGS + len(TAILS)].sum())  # of the first input
+    return (table - centre) @ best + level, gain
