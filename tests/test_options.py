@@ -205,7 +205,7 @@ class TestRanges:
             assert ranges <= set(info)
             drawn = {name: info[name] for name in ranges}
             assert type(drawn["delay"]) is int
-            numbers = {**EVERYTHING, **drawn, "delay": int(drawn["delay"])}
+            numbers = {**EVERYTHING, **drawn}
             ours = run(drawn_plant, actions, seed)
             theirs = run(MiddlePointEnv(**numbers), actions, seed)
             assert set(ours) == set(theirs)
