@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import Parameter
-
 from benchmarks.lib.command_line import UsageError, blame
-from benchmarks.lib.options import Repeated, options
+from benchmarks.lib.options import Repeated, choice, options
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.parameters import slowest_pole
-
-_PRESET = f"A plant that comes with the environment: {', '.join(PRESETS)}."
 
 
 @dataclass(frozen=True)
@@ -42,81 +37,50 @@ class PlantOptions:
     plant: Path | None = None
     """JSON file with arguments of the environment, such as the plant.json that
     benchmarks.identify writes."""
-    preset: Annotated[str | None, Parameter(help=_PRESET)] = None
+    preset: Annotated[
+        str | None, choice(PRESETS, "A plant that comes with the environment")
+    ] = None
     set: Repeated = ()
     """An argument of the environment, such as delay=30 or delay=[12,24] (repeatable; it
     overrides those of --plant, and these override --preset)."""
 
     def chosen(self) -> Plant:
-        """Return the plant that is asked for; see `chosen`."""
-        return chosen(self)
+        """Return the plant that is asked for.
 
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which plant to run on."""
-    add = parser.add_argument
-    add(
-        "--plant",
-        type=Path,
-        metavar="FILE",
-        help="JSON file with arguments of the environment, such as the plant.json that "
-        "benchmarks.identify writes",
-    )
-    add(
-        "--preset",
-        choices=PRESETS,
-        metavar="NAME",
-        help=f"a plant that comes with the environment: {', '.join(PRESETS)}",
-    )
-    add(
-        "--set",
-        action="append",
-        default=[],
-        metavar="ARGUMENT=VALUE",
-        help="an argument of the environment, such as delay=30 or delay=[12,24] (may be given "
-        "more than once; it overrides those of --plant, and these override --preset)",
-    )
-
-
-def chosen(options: argparse.Namespace | PlantOptions) -> Plant:
-    """Return the plant that the options of `add_options` ask for.
-
-    Raises
-    ------
-    UsageError
-        If the file, an argument or a value does not fit.
-    """
-    names: list[str] = []
-    arguments: dict[str, Any] = {}
-    if options.preset:
-        if options.preset not in PRESETS:
-            raise UsageError(f"--preset: no {options.preset!r}; there are {', '.join(PRESETS)}")
-        names.append(options.preset)
-        arguments |= PRESETS[options.preset]
-    if options.plant:
-        names.append(options.plant.stem)
-        with blame("--plant"):
-            arguments |= read_plant(options.plant)
-    for text in options.set:
-        name, equals, value = text.partition("=")
-        if not (name and equals):
-            raise UsageError(f"--set must be ARGUMENT=VALUE, got {text!r}")
-        names.append(text)
+        Raises
+        ------
+        UsageError
+            If the file, an argument or a value does not fit.
+        """
+        names: list[str] = []
+        arguments: dict[str, Any] = {}
+        if self.preset:
+            names.append(self.preset)
+            arguments |= PRESETS[self.preset]
+        if self.plant:
+            names.append(self.plant.stem)
+            with blame("--plant"):
+                arguments |= read_plant(self.plant)
+        for text in self.set:
+            name, equals, value = text.partition("=")
+            if not (name and equals):
+                raise UsageError(f"--set must be ARGUMENT=VALUE, got {text!r}")
+            names.append(text)
+            try:
+                arguments[name] = json.loads(value)
+            except ValueError:
+                arguments[name] = value  # such as random
+        given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
         try:
-            arguments[name] = json.loads(value)
-        except ValueError:
-            arguments[name] = value  # such as random
-    given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(options, name)]
-    try:
-        parameters = Parameters.of_environment(arguments)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{', '.join(given)}: {error}") from error
-    if abs(slowest_pole(parameters.a) or 0.0) > 1.0:
-        raise UsageError(
-            f"{', '.join(given)}: a must not have a root beyond the unit circle, as nothing "
-            f"holds such a plant, got {list(parameters.a)}"
-        )
-    return Plant(", ".join(names) or "the paper's plant", arguments)
+            parameters = Parameters.of_environment(arguments)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"{', '.join(given)}: {error}") from error
+        if abs(slowest_pole(parameters.a) or 0.0) > 1.0:
+            raise UsageError(
+                f"{', '.join(given)}: a must not have a root beyond the unit circle, as "
+                f"nothing holds such a plant, got {list(parameters.a)}"
+            )
+        return Plant(", ".join(names) or "the paper's plant", arguments)
 
 
 def read_plant(path: str | Path) -> dict[str, Any]:

@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 
 from agents import DirectNNController
-from benchmarks.claims import __main__ as claims
+from benchmarks.claims import command as claims
 from benchmarks.claims import examinations, verdicts
+from benchmarks.claims.__main__ import main
 from benchmarks.claims.runs import Batch, converged_at, fail_node
 from benchmarks.claims.verdicts import Entry, Finding, Verdict, verdict
 from benchmarks.lib.statistics import Estimate
@@ -186,7 +187,7 @@ class TestPlants:
 
 
 def run_claims(out, *options):
-    return claims.main([*map(str, options), "--runs", "8", "--out", str(out)])
+    return main([*map(str, options), "--runs", "8", "--out", str(out)])
 
 
 QUICK = ("direction", "convergence", "figures")

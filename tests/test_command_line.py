@@ -1,42 +1,173 @@
-"""What all commands have in common: their help."""
+"""What all commands have in common: their help, and how they end."""
 
 import importlib
+import os
 import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
+pytest.importorskip("cyclopts", reason="the commands need the extra compare")
+
+from benchmarks.lib import command_line
+from benchmarks.lib.options import read
+
 ROOT = Path(__file__).parent.parent
-COMMANDS = (
-    *("compare", "limits", "claims", "figures", "sweep", "identify", "identify.study"),
-    *("train", "train.defaults", "tune", "watch", "datasets", "identify.tclab_twin"),
+COMMANDS = sorted(
+    ".".join(path.parent.relative_to(ROOT).parts[1:])
+    for path in (ROOT / "benchmarks").glob("*/**/__main__.py")
 )
+HEAVY = {
+    "joblib", "matplotlib", "optuna", "pandas", "pygame", "ray", "scipy", "stable_baselines3",
+    "tclab", "torch",
+}  # fmt: skip
+
+
+WITHOUT = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == {package!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Missing())
+from benchmarks.{command}.__main__ import main
+main({given})
+"""
+
+
+def run_without(package, command, given, folder=ROOT):
+    return subprocess.run(
+        [sys.executable, "-c", WITHOUT.format(package=package, command=command, given=given)],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(folder)])},
+        capture_output=True,
+        text=True,
+    )
+
+
+def main_of(name):
+    return importlib.import_module(f"benchmarks.{name}.__main__").main
+
+
+def test_all_commands_are_found():
+    assert {"compare", "train.defaults", "identify.study"} <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_shows_defaults_as_one_would_type_them(name, capsys):
-    module = f"benchmarks.{name}"
-    if (ROOT / module.replace(".", "/")).is_dir():
-        module += ".__main__"
-    try:
-        command = importlib.import_module(module)
-    except ImportError as error:  # `.ci/versions` tests without the extras
-        pytest.skip(f"it needs an extra: {error}")
-    try:
-        status = command.main(["--help"])
-    except SystemExit as stop:
-        status = stop.code
-    assert status == 0
-    shown = capsys.readouterr().out
+def test_help_is_printed_alone_and_imports_nothing_heavy(name):
+    program = (
+        f"import sys; from benchmarks.{name}.__main__ import main; status = main(['--help']); "
+        "print(*{name.partition('.')[0] for name in sys.modules}, file=sys.stderr); "
+        "sys.exit(status)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith(f"Usage: python -m benchmarks.{name}")
+    assert not HEAVY & set(done.stderr.split())
     for clutter in (str(ROOT), "default: None", "default: False", "default: ["):
-        assert clutter not in shown
-    if "--seed " in shown:
-        assert re.search(r"default: [01][])]", shown)  # 0 is a default, too
+        assert clutter not in done.stdout
+    if "--seed " in done.stdout:
+        assert re.search(r"default: [01]\]", done.stdout)  # 0 is a default, too
 
 
 def test_help_keeps_names_whole(capsys):
-    compare = pytest.importorskip("benchmarks.compare.__main__")
-    compare.main(["--help"])
+    assert main_of("compare")(["--help"]) == 0
     shown = capsys.readouterr().out
     for name in ("nn-frozen", "dead-zone-7", "square-dead-zone-7", "constant-noise"):
         assert name in shown
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_unknown_option_is_named_in_one_line(name, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main_of(name)(["--nonsense"])
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"python -m benchmarks.{name}: error: ")
+    assert "--nonsense" in line or "requires an argument" in line
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "extra"),
+    [
+        ("claims", "cyclopts", "compare"), ("compare", "pandas", "compare"),
+        ("datasets", "minari", "data"),
+        ("watch", "pygame", "render"), ("train", "torch", "torch"), ("tune", "optuna", "bench"),
+        ("identify.tclab_twin", "tclab", "test"), ("speed", "torch", "torch"),
+    ],
+)  # fmt: skip
+def test_a_missing_package_is_named_with_its_extra(name, package, extra):
+    positional = {"train": ["nn-dpc"], "tune": ["pi"]}
+    done = run_without(package, name, positional.get(name, []))
+    assert done.returncode == 2
+    assert f'{package} is not installed: pip install -e ".[{extra}]"' in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_controller_that_lacks_a_package_names_its_extra(tmp_path):
+    (tmp_path / "mine.py").write_text("import torch\n")
+    done = run_without("torch", "compare", ["--agent", "mine=mine:Mine"], tmp_path)
+    assert done.returncode == 2
+    assert 'pip install -e ".[torch]"' in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT to another process")
+@pytest.mark.parametrize("wait", [0.02, 0.2])
+def test_an_interruption_while_it_imports_shows_no_traceback(wait):
+    # A marker says that the interpreter is up: what comes before cannot be caught.
+    program = (
+        "import sys; from benchmarks.compare.__main__ import main; print('up', flush=True); "
+        "sys.exit(main(['--runs', '1']))"
+    )
+    run = subprocess.Popen(
+        [sys.executable, "-c", program], cwd=ROOT, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert run.stdout.readline() == "up\n"
+    time.sleep(wait)
+    run.send_signal(signal.SIGINT)
+    out, err = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert "Interrupted" in out
+    assert "Traceback" not in err
+
+
+class TestReading:
+    def read(self, *given):
+        options = importlib.import_module("benchmarks.compare.options").Options
+        return read(options, "program", given)
+
+    def test_names_with_spaces_or_commas(self):
+        assert self.read("--agents", "nn", "pi", "--runs", "3").agents == ("nn", "pi")
+        assert self.read("--agents", "nn,pi").agents == ("nn,pi",)
+        assert self.read("--agents").agents == ()
+
+    def test_the_last_of_equal_options_counts_unless_it_may_be_repeated(self):
+        options = self.read(
+            "--agents", "nn", "pi", "--agents", "mpc", "--runs", "3", "--runs", "4",
+            "--set", "delay=3", "--set", "a=[1,-0.5]",
+        )  # fmt: skip
+        assert (options.agents, options.runs) == (("mpc",), 4)
+        assert options.plant.set == ("delay=3", "a=[1,-0.5]")
+
+    @pytest.mark.parametrize(
+        ("given", "complaint"),
+        [
+            (["--runs", "2.5"], "--runs: must be an integer of at least 1, got '2.5'"),
+            (["--runs", "99999999999"], "--runs: must be at most 100,000, got '99999999999'"),
+            (["--preset", "harder"], "--preset: no 'harder'; there are paper, dead-zone-7"),
+            (["--backend", "cloud"], "--backend"),
+            (["--out"], "--out requires an argument"),
+            (["stray"], "stray"),
+        ],
+    )  # fmt: skip
+    def test_what_does_not_fit_is_named(self, given, complaint):
+        with pytest.raises(command_line.UsageError, match=re.escape(complaint)):
+            self.read(*given)

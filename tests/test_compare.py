@@ -17,8 +17,8 @@ import pandas as pd
 import pytest
 
 from agents import DirectNNController, PIController
-from benchmarks.compare import __main__ as compare
 from benchmarks.compare import comparison
+from benchmarks.compare.__main__ import main
 from benchmarks.compare.estimates import beaten, estimate, scale_of, verdict
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage, tables
@@ -339,7 +339,7 @@ class TestStorage:
 
 def run_compare(out, *options):
     policies = out.parent / "policies"
-    return compare.main(["--out", str(out), "--kept", str(policies), *map(str, options)])
+    return main(["--out", str(out), "--kept", str(policies), *map(str, options)])
 
 
 class TestCompare:
@@ -699,7 +699,7 @@ class TestOtherPlants:
     def test_a_part_goes_to_a_folder_of_its_own(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         options = ["--agents", "pi", "--scenarios", "constant", "--runs", "1"]
-        assert compare.main([*options, "--set", "delay=30"]) == 0
+        assert main([*options, "--set", "delay=30"]) == 0
         (folder,) = (tmp_path / "results").iterdir()
         assert folder.name == "compare-pi-constant-delay-30-1-runs"
 

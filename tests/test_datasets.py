@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from agents import PIController
-from benchmarks.datasets import __main__ as datasets
+from benchmarks.datasets import command as datasets
 from benchmarks.datasets import history
+from benchmarks.datasets.__main__ import main
 from mptc_gym import PRESETS
 from mptc_gym.plant import action_from_command
 
@@ -30,7 +31,7 @@ def minari(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("name", ["middlepoint/paper/pi-v0", "middlepoint/fouling/mixed-v0"])
 def test_the_recorded_actions_give_the_recorded_observations(name, minari, tmp_path, capsys):
-    assert datasets.main([name, "--episodes", "5"]) == 0
+    assert main([name, "--episodes", "5"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["middlepoint"]  # nothing is left over
     assert name in capsys.readouterr().out
     dataset = minari.load_dataset(name)
@@ -112,7 +113,7 @@ def test_the_scale_is_of_the_episodes_it_names():
 
 def test_the_metadata_scores_a_learner(minari):
     name = "middlepoint/paper/smith-v0"
-    datasets.main([name, "--episodes", "2"])
+    main([name, "--episodes", "2"])
     dataset = minari.load_dataset(name)
     about = dataset.storage.metadata
     assert about["least_possible_error"] == 0.5
@@ -128,14 +129,14 @@ def test_the_metadata_scores_a_learner(minari):
 def test_writing_again_replaces_and_a_failure_changes_nothing(minari, monkeypatch, tmp_path):
     name = "middlepoint/paper/pi-v0"
     for episodes in ("2", "3"):
-        assert datasets.main([name, "--episodes", episodes]) == 0
+        assert main([name, "--episodes", episodes]) == 0
     assert minari.load_dataset(name).total_episodes == 3
 
     def fail(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(minari, "create_dataset_from_buffers", fail)
-    assert datasets.main([name, "--episodes", "2"]) == 130
+    assert main([name, "--episodes", "2"]) == 130
     assert minari.load_dataset(name).total_episodes == 3
     assert [path.name for path in tmp_path.iterdir()] == ["middlepoint"]
 
@@ -150,7 +151,7 @@ def test_without_minari_it_says_what_to_install(monkeypatch, capsys):
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(SystemExit):
-        datasets.main(["middlepoint/paper/pi-v0"])
+        main(["middlepoint/paper/pi-v0"])
     assert 'pip install -e ".[data]"' in capsys.readouterr().err
 
 
@@ -163,7 +164,7 @@ def test_without_minari_it_says_what_to_install(monkeypatch, capsys):
 )
 def test_bad_options_are_named(arguments, named, minari, capsys):
     with pytest.raises(SystemExit):
-        datasets.main(arguments)
+        main(arguments)
     assert named in capsys.readouterr().err
 
 
@@ -171,7 +172,7 @@ def test_a_place_that_cannot_be_written_to_is_named(minari, tmp_path, monkeypatc
     (tmp_path / "file").touch()
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "file"))
     with pytest.raises(SystemExit):
-        datasets.main(["middlepoint/paper/pi-v0", "--episodes", "1"])
+        main(["middlepoint/paper/pi-v0", "--episodes", "1"])
     assert "MINARI_DATASETS_PATH: " in capsys.readouterr().err
 
 

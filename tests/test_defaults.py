@@ -12,7 +12,8 @@ from stable_baselines3 import PPO
 
 from agents import PIController
 from benchmarks.rollout import make_plants
-from benchmarks.train import defaults
+from benchmarks.train.defaults import command as defaults
+from benchmarks.train.defaults.__main__ import main
 
 ROOT = Path(__file__).parent.parent
 
@@ -32,9 +33,9 @@ def weights(model):
 
 def test_curves_are_shown_kept_and_drawn(tmp_path, capsys):
     command = ["--steps", "64", "--interval", "32", "--out", str(tmp_path)]
-    assert defaults.main([*command, "--seed", "3", "--seeds", "2"]) == 0
+    assert main([*command, "--seed", "3", "--seeds", "2"]) == 0
     assert capsys.readouterr().out.count("mae") == 4
-    assert defaults.main([*command, "--seed", "4", "--seeds", "1", "--case", "ppo"]) == 0
+    assert main([*command, "--seed", "4", "--seeds", "1", "--case", "ppo"]) == 0
     curves = pd.read_csv(tmp_path / "sb3_defaults.csv")
     seeds = curves.groupby("case")["seed"].apply(list).to_dict()
     assert seeds == {"ppo": [4, 4], "ppo-velocity": [3, 3, 4, 4]}
@@ -42,7 +43,7 @@ def test_curves_are_shown_kept_and_drawn(tmp_path, capsys):
     picture = tmp_path / "sb3_defaults.png"
     assert picture.stat().st_size > 10_000
     picture.unlink()
-    defaults.main([*command, "--plot"])
+    main([*command, "--plot"])
     assert picture.exists()
     pd.testing.assert_frame_equal(curves, pd.read_csv(tmp_path / "sb3_defaults.csv"))
 
@@ -58,9 +59,9 @@ def test_an_interrupted_study_goes_on(tmp_path, monkeypatch, capsys):
 
     with monkeypatch.context() as patch:
         patch.setattr(defaults, "train", interrupted)
-        assert defaults.main(command) == 130
+        assert main(command) == 130
     capsys.readouterr()
-    assert defaults.main(command) == 0
+    assert main(command) == 0
     shown = capsys.readouterr().out
     assert shown.count("seed 0") == 0
     assert shown.count("seed 1") == 2
@@ -68,7 +69,7 @@ def test_an_interrupted_study_goes_on(tmp_path, monkeypatch, capsys):
 
 
 def test_sac_learns_from_it_too(capsys):
-    defaults.main(["--case", "sac", "--seeds", "1", "--steps", "110", "--interval", "55"])
+    main(["--case", "sac", "--seeds", "1", "--steps", "110", "--interval", "55"])
     assert [line.split()[5] for line in capsys.readouterr().out.splitlines()[:2]] == [
         "55",
         "110",
@@ -77,7 +78,7 @@ def test_sac_learns_from_it_too(capsys):
 
 def test_nothing_is_drawn_from_nowhere(capsys):
     with pytest.raises(SystemExit):
-        defaults.main(["--plot"])
+        main(["--plot"])
     assert "--plot needs --out" in capsys.readouterr().err
 
 
@@ -88,14 +89,14 @@ def test_a_folder_without_curves_or_no_folder_is_named(tmp_path, capsys):
         (["--out", str(tmp_path / "file")], "cannot be written to: it is no folder"),
     ):
         with pytest.raises(SystemExit):
-            defaults.main(arguments)
+            main(arguments)
         assert f"--out: {tmp_path}" in (shown := capsys.readouterr().err)
         assert complaint in shown
 
 
 def test_a_training_too_short_for_a_test_says_so(tmp_path, capsys):
     arguments = ["--seeds", "1", "--steps", "64", "--interval", "5000", "--out", str(tmp_path)]
-    assert defaults.main(arguments) == 0
+    assert main(arguments) == 0
     assert "Nothing was kept" in capsys.readouterr().out
 
 

@@ -19,7 +19,7 @@ from stable_baselines3 import PPO
 import mptc_gym.sb3
 from benchmarks.datasets.history import arguments_of, record
 from benchmarks.examples import offline, ppo_torch, sb3
-from benchmarks.train import defaults
+from benchmarks.train.defaults import command as defaults
 
 ROOT = Path(__file__).parent.parent
 

@@ -5,7 +5,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.figures import __main__ as figures
+from benchmarks.figures import command as figures
+from benchmarks.figures.__main__ import main
 from benchmarks.rollout import Trajectory
 
 
@@ -21,7 +22,7 @@ def test_the_typical_run_is_the_median_one():
 
 def test_every_figure_is_drawn(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(figures, "SAMPLES", 120)
-    assert figures.main(["--runs", "3", "--out", str(tmp_path)]) == 0
+    assert main(["--runs", "3", "--out", str(tmp_path)]) == 0
     names = [f"figure_{n:02d}.png" for n in range(5, 13)]
     assert sorted(path.name for path in tmp_path.glob("*.png")) == [*names, "figures.png"]
     for name in (*names, "figures.png"):
@@ -57,7 +58,7 @@ def test_interrupted(tmp_path, monkeypatch, capsys):
         return whole(trajectory)
 
     monkeypatch.setattr(figures, "summarise", stop_at_the_third)
-    assert figures.main(["--runs", "2", "--out", str(tmp_path)]) == 130
+    assert main(["--runs", "2", "--out", str(tmp_path)]) == 130
     assert "Interrupted" in capsys.readouterr().out
     kept = {path.name for path in tmp_path.iterdir()}
     pictures = {f"figure_{n:02d}.png" for n in (5, 6, 7)}

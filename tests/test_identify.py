@@ -22,7 +22,7 @@ from benchmarks.identify.log import Columns, Log, read_log
 from benchmarks.identify.model import CannotTellError, HeldOut, Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges, simulation
 from benchmarks.identify.report import fault, headline
-from benchmarks.identify.study import (
+from benchmarks.identify.study.command import (
     KINDS,
     beside_rivals,
     cell,

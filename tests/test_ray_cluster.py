@@ -18,7 +18,7 @@ import pytest
 from agents import PolicyNetwork
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.sweep.__main__ import main as sweep
-from benchmarks.train.__main__ import run as train
+from benchmarks.train.command import run as train
 from tests.nodes.train import TRAININGS
 from tests.test_fan_out import counted, until, work
 

@@ -2,7 +2,8 @@
 
 import pytest
 
-from benchmarks import speed
+from benchmarks.speed import command as speed
+from benchmarks.speed.__main__ import main
 
 
 def test_ratios_compare_rounds_with_each_other(monkeypatch):
@@ -26,7 +27,7 @@ def test_it_runs(monkeypatch, capsys):
     }  # fmt: skip
     for name, value in small.items():
         monkeypatch.setattr(speed, name, value)
-    speed.main(["--rounds", "1"])
+    main(["--rounds", "1"])
     shown = capsys.readouterr().out
     for words in (
         "n = 3",
@@ -46,14 +47,14 @@ def test_it_runs(monkeypatch, capsys):
 @pytest.mark.parametrize("rounds", ["0", "many"])
 def test_bad_rounds_are_named(rounds, capsys):
     with pytest.raises(SystemExit):
-        speed.main(["--rounds", rounds])
+        main(["--rounds", rounds])
     assert "--rounds" in capsys.readouterr().err
 
 
 def test_a_device_can_be_measured_alone(monkeypatch, capsys):
     monkeypatch.setattr(speed, "DEVICE_BATCHES", (2, 3))
     monkeypatch.setattr(speed, "DEVICE_STEPS", 5)
-    speed.main(["--rounds", "1", "--device", "cpu"])
+    main(["--rounds", "1", "--device", "cpu"])
     shown = capsys.readouterr().out
     assert "on cpu" in shown
     assert "hard" in shown

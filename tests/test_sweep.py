@@ -11,8 +11,8 @@ from benchmarks.controllers.engineered import simc_pi
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.designs import SPANS, grid, random_design
-from benchmarks.sweep import __main__ as sweep
 from benchmarks.sweep import cells, command, report
+from benchmarks.sweep.__main__ import main
 from benchmarks.sweep.cells import agent_cell, limit_cell
 from benchmarks.sweep.options import Options
 from mptc_gym import Parameters
@@ -98,7 +98,7 @@ class TestCells:
 
 def run_sweep(out, *options):
     arguments = ["--agents", "nn", "nn-frozen", "pi-simc", "--runs", "2", "--samples", "700"]
-    return sweep.main([*arguments, "--jobs", "1", "--out", str(out), *map(str, options)])
+    return main([*arguments, "--jobs", "1", "--out", str(out), *map(str, options)])
 
 
 class TestSweep:
@@ -156,7 +156,7 @@ class TestSweep:
 
     def test_unknown_controller(self, tmp_path, capsys):
         with pytest.raises(SystemExit):
-            sweep.main(["--agents", "nobody", "--out", str(tmp_path)])
+            main(["--agents", "nobody", "--out", str(tmp_path)])
         assert "no 'nobody'; there are nothing, nn" in capsys.readouterr().err
 
     def test_a_failed_cell_is_named_and_the_others_are_kept(

@@ -14,8 +14,8 @@ from agents import PolicyNetwork  # noqa: E402
 from benchmarks.designs import SPANS  # noqa: E402
 from benchmarks.lib.fan_out import FanOut  # noqa: E402
 from benchmarks.rollout import make_plants, rollout  # noqa: E402
-from benchmarks.train import __main__ as command  # noqa: E402
-from benchmarks.train import through_plant  # noqa: E402
+from benchmarks.train import command, through_plant  # noqa: E402
+from benchmarks.train.__main__ import main  # noqa: E402
 from benchmarks.train.through_plant import (  # noqa: E402
     TRAININGS,
     Draw,
@@ -245,7 +245,7 @@ class TestCommand:
 
     def test_it_trains_and_validation_chooses(self, tmp_path, capsys):
         arguments = ["nn-dpc", "--networks", "2", "--out", str(tmp_path), "--jobs", "1"]
-        assert command.main(arguments) == 0
+        assert main(arguments) == 0
         networks = [PolicyNetwork.load(path) for path in tmp_path.glob("*/network.npz")]
         assert len(networks) == 2
         best = min(networks, key=lambda network: network.provenance["validation"]["score"])
@@ -256,27 +256,27 @@ class TestCommand:
 
     def test_prices_are_drawn(self, tmp_path):
         arguments = ["nn-dpc", "--networks", "1", "--prices", "0", "0.1", "--jobs", "1"]
-        assert command.main([*arguments, "--steps", "2", "--out", str(tmp_path)]) == 0
+        assert main([*arguments, "--steps", "2", "--out", str(tmp_path)]) == 0
         table = pd.read_csv(tmp_path / "nn-dpc-prices.csv")
         assert list(table["price"]) == [0.0, 0.1]
         assert (tmp_path / "nn-dpc-prices.png").stat().st_size > 1000
 
     def test_policies_of_ppo_are_listed_by_their_seeds(self, tmp_path, capsys):
         arguments = ["ppo", "--networks", "2", "--steps", "8", "--jobs", "1"]
-        assert command.main([*arguments, "--out", str(tmp_path)]) == 0
+        assert main([*arguments, "--out", str(tmp_path)]) == 0
         seeds = {"10000", "10001"}
         assert seeds <= set(capsys.readouterr().out.split())
         assert {file.stem for file in tmp_path.glob("*.npz")} == {f"ppo-{s}" for s in seeds}
 
     def test_a_price_given_twice_is_trained_once(self, tmp_path):
         arguments = ["nn-dpc", "--networks", "1", "--prices", "0.1", "0.1", "--jobs", "1"]
-        assert command.main([*arguments, "--steps", "1", "--out", str(tmp_path)]) == 0
+        assert main([*arguments, "--steps", "1", "--out", str(tmp_path)]) == 0
         assert len(pd.read_csv(tmp_path / "nn-dpc-prices.csv")) == 1
 
     @pytest.mark.parametrize("prices", [["-1"], ["nan"], ["cheap"], ["0.1", "--keep"]])
     def test_bad_prices_are_named(self, prices, capsys):
         with pytest.raises(SystemExit):
-            command.main(["nn-dpc", "--prices", *prices])
+            main(["nn-dpc", "--prices", *prices])
         shown = capsys.readouterr().err
         assert re.search(
             "--prices: (must be a number of at least 0|goes without --keep)", shown

@@ -19,9 +19,11 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import fingerprint, storage
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.train import ppo, ppo_training
-from benchmarks.tune import __main__ as command
+from benchmarks.tune import command as command
 from benchmarks.tune import objective
 from benchmarks.tune import search as tune
+from benchmarks.tune.__main__ import main
+from benchmarks.tune.options import TUNED
 from tests.small_training import SMALL
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -30,7 +32,7 @@ optuna.logging.set_verbosity(optuna.logging.WARNING)
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Few runs for the finalists, and a sampler that learns soon."""
-    for name in command.TUNED:
+    for name in TUNED:
         tuning = replace(ROSTER[name].tuning, finalists=2, startup=4)
         monkeypatch.setitem(ROSTER, name, replace(ROSTER[name], tuning=tuning))
     monkeypatch.setattr(tune, "FINAL_RUNS", 3)
@@ -38,7 +40,7 @@ def small(monkeypatch):
 
 def run_tune(out, controller="pi", trials=6, jobs=1):
     options = ["--trials", str(trials), "--runs", "2", "--out", str(out), "--jobs", str(jobs)]
-    return command.main([controller, *options])
+    return main([controller, *options])
 
 
 def made(name, **gains):
@@ -154,7 +156,7 @@ class TestSearch:
     def test_another_search_is_not_continued(self, tmp_path, capsys):
         run_tune(tmp_path)
         with pytest.raises(SystemExit):
-            command.main(["pi", "--trials", "6", "--runs", "3", "--out", str(tmp_path)])
+            main(["pi", "--trials", "6", "--runs", "3", "--out", str(tmp_path)])
         assert "other runs" in capsys.readouterr().err
         assert len(pd.read_csv(tmp_path / "pi.csv")) == 6
 

@@ -13,8 +13,9 @@ from scipy import signal
 
 from agents import PIController
 from benchmarks.train import ppo
-from benchmarks.watch import __main__ as watch
+from benchmarks.watch import command as watch
 from benchmarks.watch import rivals
+from benchmarks.watch.__main__ import main
 from mptc_gym import PRESETS, MiddlePointEnv, Parameters, drawing
 from mptc_gym.plant import Plant
 from mptc_gym.ranges import Ranges
@@ -42,7 +43,7 @@ def pictures(path):
 def test_a_gif_shows_the_run(tmp_path, capsys):
     path = tmp_path / "new" / "film.gif"
     arguments = ["--agent", "pi", "--scenario", "square-noise", "--seed", "7", "--speed", "50"]
-    assert watch.main([*arguments, "--video", str(path)]) == 0
+    assert main([*arguments, "--video", str(path)]) == 0
     assert [each.name for each in path.parent.iterdir()] == ["film.gif"]
     assert path.stat().st_size < 200_000
     with Image.open(path) as film:
@@ -71,16 +72,14 @@ def test_a_gif_shows_the_run(tmp_path, capsys):
 )
 def test_an_mp4_has_the_speed_asked_for(speed, pictures, fps, tmp_path):
     path = tmp_path / "film.mp4"
-    assert watch.main(["--speed", str(speed), "--video", str(path)]) == 0
+    assert main(["--speed", str(speed), "--video", str(path)]) == 0
     with VideoFileClip(str(path)) as clip:
         assert clip.size == list(drawing.SIZE)
         assert (round(clip.duration * clip.fps), clip.fps) == (pictures, fps)
 
 
 def test_where_there_is_no_screen_it_says_so_and_writes_a_film(tmp_path, capsys):
-    assert (
-        watch.main(["--agent", "smith", "--scenario", "constant"]) == 0
-    )  # of the driver "dummy"
+    assert main(["--agent", "smith", "--scenario", "constant"]) == 0  # of the driver "dummy"
     assert (tmp_path / "results" / "watch" / "smith-constant.mp4").is_file()
     assert "There is no screen" in capsys.readouterr().out
 
@@ -102,7 +101,7 @@ def screen(monkeypatch):
 
 def test_a_window_shows_the_run(screen, tmp_path):
     arguments = ["--agent", "pi", "--scenario", "constant-noise", "--seed", "3"]
-    assert watch.main([*arguments, "--speed", "500"]) == 0
+    assert main([*arguments, "--speed", "500"]) == 0
     noise = {"noise_variance": 0.5, "setpoint": 5.0}
     # The first 18 outputs are those of noise alone.
     outputs = run(MiddlePointEnv(**noise), np.zeros(18), seed=3)["output"]
@@ -122,7 +121,7 @@ def test_closing_the_window_ends_it(screen, monkeypatch):
             pygame.event.post(pygame.event.Event(pygame.QUIT))
 
     monkeypatch.setattr(drawing, "show", closed_at_the_fifth)
-    assert watch.main(["--speed", "500"]) == 0
+    assert main(["--speed", "500"]) == 0
     assert len(screen) == 5
     assert not pygame.display.get_init()
 
@@ -133,21 +132,21 @@ def test_interrupted(tmp_path, monkeypatch, capsys):
 
     (tmp_path / "film.gif").write_bytes(b"earlier")
     monkeypatch.setattr(watch, "rollout", stop)
-    assert watch.main(["--video", "film.gif"]) == 130
+    assert main(["--video", "film.gif"]) == 130
     assert "Interrupted" in capsys.readouterr().out
     assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"earlier"]
 
 
 def test_a_controller_of_one_s_own(capsys):
-    assert watch.main(["--agent", "agents:PIController", "--video", "film.gif"]) == 0
+    assert main(["--agent", "agents:PIController", "--video", "film.gif"]) == 0
     own = capsys.readouterr().out
-    assert watch.main(["--agent", "pi", "--video", "other.gif"]) == 0
+    assert main(["--agent", "pi", "--video", "other.gif"]) == 0
     assert own.split("error ")[1][:5] == capsys.readouterr().out.split("error ")[1][:5]
 
 
 def test_a_policy(monkeypatch, capsys):
     monkeypatch.setattr(ppo, "PPOArguments", lambda: SMALL)
-    assert watch.main(["--agent", "ppo", "--video", "film.gif"]) == 0
+    assert main(["--agent", "ppo", "--video", "film.gif"]) == 0
     assert "PPO on square wave" in capsys.readouterr().out
 
 
@@ -164,7 +163,7 @@ def test_a_policy(monkeypatch, capsys):
 )
 def test_bad_options_are_named(option, value, named, capsys):
     with pytest.raises(SystemExit):
-        watch.main([option, value])
+        main([option, value])
     shown = capsys.readouterr().err
     assert option in shown
     assert named in shown
@@ -225,7 +224,7 @@ def test_your_hands_are_on_the_valve(hands_on, quick_bound, capsys):
             30: lambda: press(pygame.K_DOWN),
         }
     )
-    assert watch.main(["--agent", "you", "--speed", "1000"]) == 0
+    assert main(["--agent", "you", "--speed", "1000"]) == 0
     commands = [sample[2] for sample, _ in screen[1:]]
     assert commands[:3] == [0.0] * 3
     assert commands[3:10] == pytest.approx([6.0] * 7, abs=1e-6)
@@ -263,7 +262,7 @@ def test_keys_move_set_point_and_load_under_any_controller(hands_on, quick_bound
             12: lambda: press(pygame.K_PAGEDOWN),
         }
     )
-    assert watch.main(["--agent", "pi", "--scenario", "constant", "--speed", "1000"]) == 0
+    assert main(["--agent", "pi", "--scenario", "constant", "--speed", "1000"]) == 0
     setpoints = [sample[0] for sample, _ in screen]
     assert setpoints == [5.0] * 6 + [7.0] * 7 + [6.0] * (SAMPLES - 12)
     # The controller saw it: it does what it does on a plant with these set points.
@@ -285,7 +284,7 @@ def run_closed(env, controller):
 def test_a_load_step_shows_as_in_the_plant_s_equation(hands_on, quick_bound, capsys):
     screen = hands_on({4: lambda: [press(pygame.K_l), press(pygame.K_l), press(pygame.K_k)]})
     arguments = ["--agent", "nothing", "--scenario", "constant-noise"]
-    assert watch.main([*arguments, "--speed", "1000"]) == 0
+    assert main([*arguments, "--speed", "1000"]) == 0
     untouched = run(MiddlePointEnv(noise_variance=0.5), np.zeros(SAMPLES))["output"]
     added = np.array([sample[1] for sample, _ in screen]) - untouched
     a = [1.0, -0.45181, -0.47546]  # (28): w adds A(1) w to the right-hand side
@@ -312,7 +311,7 @@ def test_speed_pause_and_escape(hands_on, monkeypatch):
             press(pygame.K_SPACE)
 
     monkeypatch.setattr(pygame.time, "wait", wait)
-    assert watch.main(["--agent", "you", "--speed", "400"]) == 0
+    assert main(["--agent", "you", "--speed", "400"]) == 0
     assert [fps for _, fps in screen[3:7]] == [800.0, 800.0, 400.0, 400.0]
     assert len(waited) == 5  # it stood still, and went on
     assert len(screen) == 10
@@ -360,5 +359,5 @@ def test_a_load_by_hand_is_a_load_of_the_plant_while_it_drifts():
 def test_your_hands_need_a_window(capsys):
     for more in ([], ["--video", "film.gif"]):
         with pytest.raises(SystemExit):
-            watch.main(["--agent", "you", *more])
+            main(["--agent", "you", *more])
         assert "--agent you: needs a screen" in capsys.readouterr().err

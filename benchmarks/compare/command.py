@@ -22,7 +22,7 @@ OUT = Path("results/compare")
 LONGEST = 60  # characters of a folder's name
 
 
-def run(options: Options, console: Console) -> str:
+def execute(options: Options, console: Console) -> str:
     """Run the comparison and write what it finds."""
     controllers = chosen(options.agents, options.controllers.agent)
     plant = options.plant.chosen()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks.controllers.engineered import Nothing
 from benchmarks.controllers.roster import ROSTER
+from benchmarks.datasets.options import EPISODES, SAMPLES
 from benchmarks.limits import least_possible
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import PRESETS, Parameters
@@ -24,8 +25,6 @@ BEHAVIOURS = {
     "smith": ("smith",),
     "mixed": ("pi", "pi-simc", "smith", "nn"),  # episode i is of the i-th of them, and so on
 }
-SAMPLES = 1200  # of an episode
-EPISODES = 100  # of a data set
 SEED = 9_000_000  # of the first episode; no comparison and no bound uses these
 EVALUATIONS = 50  # episodes to judge learners on; others than those of the data
 

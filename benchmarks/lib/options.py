@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ def _typed(default: object) -> str | None:
         default = " ".join(map(str, default))
     elif isinstance(default, Path) and default.is_relative_to(ROOT):
         default = default.relative_to(ROOT)
-    return None if default in (None, False, "") else str(default)
+    return None if default is None or default is False or default == "" else str(default)
 
 
 def flat(group: Any) -> dict[str, Any]:
@@ -48,17 +48,34 @@ def _latest(_type: object, tokens: Sequence[Token]) -> tuple[str, ...]:
     """Return the values of an option that is given more than once: those of the last time."""
     texts: list[str] = []
     for token in tokens:
-        texts = [*texts, token.value] if token.index else [token.value]
+        begins = token.keyword is not None and token.index == 0
+        texts = [token.value] if begins else [*texts, token.value]
     return tuple(text for text in texts if text)
 
 
 def reads(
-    kind: Callable[[str], Any], what: str, least: float, most: float = math.inf
+    kind: Callable[[str], Any],
+    what: str,
+    least: float,
+    most: float = math.inf,
+    *,
+    many: int = 0,
 ) -> Parameter:
-    """Return how to read a number: `kind` makes it of its text, `what` names it in messages."""
+    """Return how to read a number, or several.
 
-    def convert(_type: object, tokens: Sequence[Token]) -> Any:
-        text = tokens[0].value
+    Parameters
+    ----------
+    kind
+        Makes a number of a text.
+    what
+        Names what it must be in messages.
+    least, most
+        Its limits.
+    many
+        How many numbers there are, -1 for any number from 1 on; 0 for a single one.
+    """
+
+    def convert(text: str) -> Any:
         try:
             value = kind(text)
         except ValueError:
@@ -69,7 +86,25 @@ def reads(
             raise ValueError(f"must be at most {most:,}, got {text!r}")
         return value
 
-    return Parameter(converter=convert, n_tokens=1)
+    if not many:
+        return Parameter(converter=lambda _, tokens: convert(tokens[0].value), n_tokens=1)
+    return Parameter(
+        converter=lambda _, tokens: tuple(map(convert, _latest(_, tokens))),
+        n_tokens=many,
+        consume_multiple=1 if many < 0 else None,
+    )
+
+
+def choice(names: Collection[str], text: str) -> Parameter:
+    """Return how to read one of the names that a help text lists."""
+
+    def convert(_type: object, tokens: Sequence[Token]) -> str:
+        text = tokens[0].value
+        if text not in names:
+            raise ValueError(f"no {text!r}; there are {', '.join(names)}")
+        return text
+
+    return Parameter(converter=convert, n_tokens=1, help=f"{text}: {', '.join(names)}.")
 
 
 Count = Annotated[int, reads(int, "an integer of at least 1", 1, 1_000_000_000)]
@@ -77,7 +112,10 @@ Runs = Annotated[int, reads(int, "an integer of at least 1", 1, 100_000)]
 Seed = Annotated[int, reads(int, "an integer of at least 0", 0, 2**63)]
 Finite = Annotated[float, reads(float, "a finite number", -math.inf)]
 Positive = Annotated[float, reads(float, "a number above 0", math.nextafter(0.0, 1.0))]
-Price = Annotated[float, reads(float, "a number of at least 0", 0.0)]
+Prices = Annotated[tuple[float, ...], reads(float, "a number of at least 0", 0.0, many=-1)]
+Orders = Annotated[
+    tuple[int, int, int], reads(int, "an integer of at least 0", 0, 1000, many=3)
+]
 Names = Annotated[tuple[str, ...], Parameter(converter=_latest, consume_multiple=True)]
 Repeated = tuple[str, ...]
 Folder = Annotated[Path, Parameter(help="Folder to write to.")]
@@ -126,9 +164,10 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
     UsageError
         If an option is unknown, or its value does not fit.
     """
+    paragraphs = (inspect.getdoc(declared) or "").split("\n\n")
     app = App(
         name=program,
-        help=inspect.getdoc(declared),
+        help="\n\n".join(" ".join(each.split()) for each in paragraphs),
         help_format="plaintext",
         help_formatter=_Help(),
         version_flags=[],
@@ -147,5 +186,7 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
     try:
         found = app(list(given), exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        raise UsageError(" ".join(str(error).split())) from error
+        name = error.argument.name if error.argument else ""
+        text = " ".join(str(error).split()).removeprefix("Invalid value for ")
+        raise UsageError(text if name in text else f"{name}: {text}") from error
     return found if isinstance(found, declared) else None

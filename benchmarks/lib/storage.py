@@ -15,8 +15,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import mptc_gym
-
 PACKAGES = ("gymnasium", "numpy", "stable_baselines3", "torch")
 ROOT = Path(__file__).parent.parent.parent  # the checkout
 WAITS = (0.01, 0.05, 0.2, 0.5)  # s until a file is put in place once more
@@ -135,6 +133,8 @@ def _checksum(value: Any) -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of those packages that shape a result."""
+    import mptc_gym  # here, as gymnasium and NumPy take their time to load
+
     found = {"python": platform.python_version(), "mptc_gym": mptc_gym.__version__}
     for package in PACKAGES:
         with suppress(metadata.PackageNotFoundError):

@@ -29,7 +29,7 @@ SEED = 0  # of a plant's first run
 NOTHING = "nothing"  # the controller that sets the scale
 
 
-def run(options: Options, console: Console) -> str:
+def execute(options: Options, console: Console) -> str:
     """Run the sweep and write what it finds."""
     controllers = chosen(options.agents, options.controllers.agent)
     nominal = options.plant.chosen().arguments

@@ -23,7 +23,6 @@ from benchmarks.lib.storage import seal, unseal, write_text
 from benchmarks.lib.tables import write_csv
 from benchmarks.tune.objective import SCENARIOS, score
 
-RUNS = 100  # of each scenario in a trial, each with noise and initial weights of its own
 SEED = 1  # of the search
 FIRST_RUN = 3_000_000  # runs have seeds from here on, which no comparison uses
 FINAL_RUNS, FINAL_FIRST_RUN = 1000, 4_000_000  # for the best, judged again

@@ -7,9 +7,7 @@ regularised impulse response get the same logs.
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -27,7 +25,8 @@ from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError
 from benchmarks.identify.simulation import explained, of_impulse_response
-from benchmarks.lib import command_line
+from benchmarks.identify.study.options import Options
+from benchmarks.lib.command_line import out_folder
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import share
 from benchmarks.lib.storage import write_text
@@ -188,31 +187,9 @@ def narmax(log: Log) -> tuple[float, float, float]:
     return float(codes[flows].min() - 2001), gain, share_of_last
 
 
-def _add_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    count = command_line.number
-    add("--logs", type=count, default=60, metavar="N", help="logs a kind, each of its plant")
-    add("--samples", type=count, default=1200, metavar="N", help="rows of a log")
-    add(
-        "--seed",
-        type=command_line.seed,
-        default=1,
-        metavar="N",
-        help="seed that plants, steps of the flow and noise are drawn with",
-    )
-    command_line.add_fan_out(parser, "identifications")
-    command_line.add_out(parser, "results/identify-study")
-
-
-@command_line.command(
-    "identify.study",
-    "Identify known plants from synthetic logs, and count how often that is right.",
-    _add_options,
-    interrupted="what has finished is kept, and the next call goes on.",
-)
-def main(options: argparse.Namespace, console: Console) -> str:
+def execute(options: Options, console: Console) -> str:
     """Run the study and print its tables."""
-    out = command_line.out_folder(options.out)
+    out = out_folder(options.out)
     cells: dict[str, Callable[[], Any]] = {}
     plants: list[tuple[str, Plant]] = []
     for kind in KINDS:
@@ -222,9 +199,13 @@ def main(options: argparse.Namespace, console: Console) -> str:
             seed = options.seed * 1_000_000 + i
             cells[f"{kind} {i}"] = partial(cell, plant, options.samples, seed, kind)
             plants.append((kind, plant))
-    key = fingerprint("benchmarks.identify.study", samples=options.samples, seed=options.seed,
-                      logs=options.logs)  # fmt: skip
-    results = command_line.fan_out(options).run(cells, out / "cells" / key, title="logs")
+    key = fingerprint(
+        "benchmarks.identify.study.command",
+        samples=options.samples,
+        seed=options.seed,
+        logs=options.logs,
+    )
+    results = options.fan_out.open().run(cells, out / "cells" / key, title="logs")
     found = list(results.values())
     by_kind = {
         kind: [each for (own, _), each in zip(plants, found, strict=True) if own == kind]
@@ -332,7 +313,3 @@ def _row(kind: str, plant: Plant, found: dict[str, Any]) -> dict[str, Any]:
     for rival, value in zip(RIVALS, found["explained"], strict=True):
         row[f"explained, {rival}"] = float(f"{value:.4g}")
     return row
-
-
-if __name__ == "__main__":
-    sys.exit(main(None))

@@ -6,7 +6,6 @@ gymnax are measured where they are installed.
 
 from __future__ import annotations
 
-import argparse
 import copy
 import importlib.util
 import os
@@ -28,13 +27,12 @@ from torch import nn
 from tqdm import tqdm
 
 from agents import DirectNNController
-from benchmarks.lib import command_line
 from benchmarks.lib.tables import on_screen
 from benchmarks.rollout import make_plants, rollout
+from benchmarks.speed.options import Options
 from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
-ROUNDS = 15
 SINGLE_STEPS = 20_000
 FRAMES = 400  # with a chart that is full for half of them
 EPISODE = 1200
@@ -82,17 +80,7 @@ class Case:
     steps: int
 
 
-def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--rounds", type=command_line.number, default=ROUNDS, help="measurements of each"
-    )
-    parser.add_argument(
-        "--device", help="measure the environment in PyTorch there (cuda), and nothing else"
-    )
-
-
-@command_line.command("speed", __doc__, _add_options, width=130, interrupted="nothing is kept.")
-def main(options: argparse.Namespace, console: Console) -> str:
+def execute(options: Options, console: Console) -> str:
     """Measure and print."""
     rounds = options.rounds
     torch.set_num_threads(1)  # one core, as for the others
@@ -388,7 +376,3 @@ def _spread(values: np.ndarray[Any, np.dtype[np.float64]]) -> str:
 
 def _import(module: str) -> None:
     subprocess.run([sys.executable, "-c", f"import {module}"], check=True)
-
-
-if __name__ == "__main__":
-    sys.exit(main(None))

@@ -13,22 +13,21 @@ percent, stands for the flow. The page
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import random
-import sys
-from collections.abc import Sequence
 
 import numpy as np
 import tclab  # type: ignore[import-untyped, unused-ignore]
 from numpy.typing import NDArray
+from rich.console import Console
 
 from agents import PIController, SmithPredictor
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import Model, Options
 from benchmarks.identify.plant import plant_arguments
+from benchmarks.identify.tclab_twin import options
 from benchmarks.identify.tuning import recommended
 from mptc_gym import Parameters
 
@@ -127,25 +126,18 @@ def run(controller: PIController | SmithPredictor, seed: int = 1) -> NDArray[np.
     return np.array(rows)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def execute(_options: options.Options, console: Console) -> str:
     """Print what was identified, and what the controllers make of the twin."""
-    argparse.ArgumentParser(
-        prog="python -m benchmarks.identify.tclab_twin",
-        description="Identify TCLab's digital twin, a simulated heater, from steps of its "
-        "power, and compare controllers on it.",
-    ).parse_args([] if arguments is None else arguments)
     log = experiment()
     model = model_of(log)
     for name in ("delay", "gain", "time_constant"):
         found = model.estimates[name]
-        print(f"{name:14s} {found.value:8.3g}   95 %: {found.low:.3g} to {found.high:.3g}")
-    print("controller      mean |e| (°C)   heater travel (%)")
+        span = f"95 %: {found.low:.3g} to {found.high:.3g}"
+        console.print(f"{name:14s} {found.value:8.3g}   {span}")
+    console.print("controller      mean |e| (°C)   heater travel (%)")
     for name, controller in controllers(model).items():
         setpoint, temperature, heater = run(controller).T
         error = np.abs(setpoint - temperature).mean()
         travel = np.abs(np.diff(heater, prepend=0.0)).sum()
-        print(f"{name:14s} {error:13.3f} {travel:19.0f}")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+        console.print(f"{name:14s} {error:13.3f} {travel:19.0f}")
+    return "The flow stands for the power of heater 1, in percent."

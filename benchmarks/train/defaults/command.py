@@ -8,8 +8,6 @@ folder holds are not trained again.
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,11 +27,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from agents import PIController
-from benchmarks.lib import command_line
+from benchmarks.lib.command_line import UsageError, out_folder
 from benchmarks.lib.drawing import STYLE, colours, save
 from benchmarks.lib.tables import write_csv
 from benchmarks.metrics import METRICS, mean_error
 from benchmarks.rollout import Agent, make_plants, rollout
+from benchmarks.train.defaults.options import Options
 from mptc_gym import Parameters
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
@@ -222,29 +221,14 @@ def plot(curves: pd.DataFrame, path: Path) -> None:
         save(figure, path)
 
 
-def _add_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--case", choices=CASES, default="ppo-velocity", help="what learns, and on which plant")
-    count = command_line.number
-    add("--steps", type=count, default=300_000, metavar="N", help="samples of each training")
-    add("--seed", type=command_line.seed, default=0, metavar="N", help="the first seed")
-    add("--seeds", type=count, default=3, metavar="N", help="how many seeds to train with")
-    add("--interval", type=count, default=20_000, metavar="N", help="samples between tests")
-    add("--out", type=Path, metavar="FOLDER", help=f"where {NAME}.csv and {NAME}.png are kept")
-    add("--plot", action="store_true", help="train nothing, only draw what --out holds")
-
-
-@command_line.command("train.defaults", __doc__, _add_options)
-def main(options: argparse.Namespace, _console: Console) -> str:
+def execute(options: Options, _console: Console) -> str:
     """Train, and print how far it got."""
     if options.plot and not options.out:
-        raise command_line.UsageError("--plot needs --out")
+        raise UsageError("--plot needs --out")
     torch.set_num_threads(1)  # the networks are too small for more
-    table = command_line.out_folder(options.out) / f"{NAME}.csv" if options.out else None
+    table = out_folder(options.out) / f"{NAME}.csv" if options.out else None
     if options.plot and table and not table.exists():
-        raise command_line.UsageError(
-            f"--out: {table} is missing, so that --plot has nothing to draw"
-        )
+        raise UsageError(f"--out: {table} is missing, so that --plot has nothing to draw")
     if not options.plot:
         for seed in range(options.seed, options.seed + options.seeds):
             if not (table and is_done(options.case, options.steps, seed, table)):
@@ -255,7 +239,3 @@ def main(options: argparse.Namespace, _console: Console) -> str:
         return "Nothing was kept: no test came before the end, see --interval and --steps."
     plot(pd.read_csv(table), table.with_suffix(".png"))
     return f"Written to {options.out}"
-
-
-if __name__ == "__main__":
-    sys.exit(main(None))

@@ -1,0 +1,53 @@
+"""Test claims as the options say, and write the verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+from rich.console import Console
+from tqdm import tqdm
+
+from benchmarks.claims import verdicts
+from benchmarks.claims.claims import CLAIMS
+from benchmarks.claims.options import Options
+from benchmarks.claims.plots import PLOTS
+from benchmarks.claims.runs import Batch
+from benchmarks.lib.command_line import known, out_folder
+from benchmarks.lib.storage import write_text
+from benchmarks.lib.tables import on_screen, write_csv
+
+SEED = 0  # run i starts from the weights, and meets the noise, of seed SEED + i
+
+
+def execute(options: Options, console: Console) -> str:
+    """Examine the claims and write the verdicts."""
+    chosen = known("CLAIM", options.claims or list(CLAIMS), list(CLAIMS))
+    called = f"python -m benchmarks.claims --runs {options.runs}"
+    out_folder(options.out)
+    batch = Batch(options.runs, SEED)
+    entries: list[verdicts.Entry] = []
+    try:
+        with tqdm(chosen, unit="claim") as bar:
+            for name in bar:
+                bar.set_description(name)
+                results = CLAIMS[name].examine(batch)
+                entries.append(CLAIMS[name].entry(results))
+                write(options.out, entries, results.tables, called)
+    finally:
+        if entries:
+            overview = verdicts.overview(entries)
+            console.print(on_screen(overview[["claim", "verdict"]]))
+    return f"All numbers are in {options.out}/claims.md and claims.csv"
+
+
+def write(
+    out: Path, entries: Sequence[verdicts.Entry], tables: dict[str, pd.DataFrame], called: str
+) -> None:
+    """Write the verdicts so far, and the tables and pictures of the latest claim."""
+    write_csv(out / "claims.csv", verdicts.table(entries))
+    write_text(out / "claims.md", verdicts.markdown(entries, called))
+    for name, table in tables.items():
+        write_csv(out / f"{name}.csv", table)
+        PLOTS[name](table, out / f"{name}.png")

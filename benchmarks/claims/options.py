@@ -1,0 +1,23 @@
+"""Declare the options of `python -m benchmarks.claims`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from benchmarks.lib.options import Folder, Names, Runs, options
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Test the paper's claims, each on a thousand runs.
+
+    The verdicts go to claims.md and all numbers to claims.csv; what is drawn lies beside them.
+    """
+
+    claims: Names = field(default=(), kw_only=False)
+    """Claims to test (default: all)."""
+    runs: Runs = 1000
+    """Runs of each case."""
+    out: Folder = Path("results/claims")

@@ -1,0 +1,174 @@
+"""Write data sets as the options say, and list them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pandas as pd
+from rich.console import Console
+
+import mptc_gym
+from benchmarks.datasets.history import (
+    BEHAVIOURS,
+    PLANTS,
+    History,
+    Scale,
+    arguments_of,
+    record,
+    scale,
+)
+from benchmarks.datasets.options import SAMPLES, Options
+from benchmarks.lib.command_line import UsageError, known, out_folder
+from benchmarks.lib.tables import on_screen
+
+IDS = {
+    f"middlepoint/{plant}/{behaviour}-v0": (plant, behaviour)
+    for plant in PLANTS
+    for behaviour in BEHAVIOURS
+}
+VARIABLE = "MINARI_DATASETS_PATH"
+DESCRIPTION = (
+    "Middle-point temperature of a once-through boiler, preset {plant!r}, random set points, "
+    "under {controllers}. The reward of a step is -|error| in degC. On the episodes of the "
+    "seeds `evaluation_seeds`, `least_possible_error` is the least possible mean |error| and "
+    "`idle_error` that of a valve that is left alone."
+)
+
+
+def execute(options: Options, console: Console) -> str:
+    """Write data sets and list them."""
+    ids = known("ID", options.ids or list(IDS), list(IDS))
+    import minari  # the first thing that needs it, which not everyone has
+
+    try:
+        root = minari.storage.get_dataset_path()
+    except OSError as error:
+        raise UsageError(
+            f"{VARIABLE}: {error.filename} cannot be written to: {error.strerror}"
+        ) from error
+    out_folder(root, VARIABLE)
+    for name in ids:
+        needed = len(BEHAVIOURS[IDS[name][1]])  # one for each controller
+        if options.episodes < needed:
+            raise UsageError(
+                f"--episodes: episodes must be at least {needed} for {name}, "
+                f"got {options.episodes}"
+            )
+    rows = []
+    for name in ids:
+        plant, behaviour = IDS[name]
+        history = record(plant, behaviour, options.episodes)
+        judged_by = scale(plant)
+        write(name, history, judged_by)
+        rows.append(
+            {
+                "data set": name,
+                "transitions": f"{history.rewards.size:,}",
+                "mean |e| (°C)": f"{history.error:.3f}",
+                "least possible": f"{judged_by.least:.3f}",
+                "idle": f"{judged_by.idle:.3f}",
+                "sha256": history.sha256[:16],
+            }
+        )
+        console.print(f"{name} is written")
+    console.print(on_screen(pd.DataFrame(rows)))
+    return f"The data sets are in {root}"
+
+
+def write(name: str, history: History, judged_by: Scale) -> None:
+    """Write a data set, whole or not at all, in place of one that has its name.
+
+    Parameters
+    ----------
+    name
+        Its id, `namespace/name-v0`.
+    history
+        Its episodes.
+    judged_by
+        Goes into its metadata.
+    """
+    from minari.storage import get_dataset_path
+
+    root, place = get_dataset_path(), get_dataset_path(name)
+    # Minari does not list what is in a hidden folder.
+    with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as partial:
+        _create(Path(partial), name, history, judged_by)
+        if place.exists():
+            shutil.rmtree(place)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        (Path(partial) / name).replace(place)
+
+
+def _create(root: Path, name: str, history: History, judged_by: Scale) -> None:
+    """Make a data set in a folder of its own."""
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    arguments = arguments_of(history.plant)
+    env = gymnasium.make("MiddlePoint-v0", max_episode_steps=SAMPLES, **arguments)
+    ended = [False] * (SAMPLES - 1) + [True]
+    episodes = [
+        EpisodeBuffer(
+            seed=seed,
+            observations=observations,
+            actions=actions,
+            rewards=rewards,
+            terminations=[False] * SAMPLES,
+            truncations=ended,
+            infos={},
+        )
+        for seed, observations, actions, rewards in zip(
+            history.seeds, history.observations, history.actions, history.rewards, strict=True
+        )
+    ]
+    controllers = ", ".join(dict.fromkeys(history.controllers))
+    with _datasets_at(root), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of what it is not told: an address
+        dataset = minari.create_dataset_from_buffers(
+            name,
+            episodes,
+            env=env,
+            eval_env=env,
+            algorithm_name=controllers,
+            author="The mptc_gym developers",
+            description=DESCRIPTION.format(plant=history.plant, controllers=controllers),
+            ref_min_score=-judged_by.idle * SAMPLES,
+            ref_max_score=-judged_by.least * SAMPLES,
+            num_episodes_average_score=len(judged_by.seeds),
+            data_format="hdf5",
+        )
+    env.close()
+    about: dict[str, Any] = {
+        "sha256": history.sha256,
+        "behaviour_error": history.error,
+        "least_possible_error": judged_by.least,
+        "least_possible_kind": judged_by.kind,
+        "idle_error": judged_by.idle,
+        "evaluation_seeds": list(judged_by.seeds),
+        "mptc_gym_version": mptc_gym.__version__,
+    }
+    dataset.storage.update_metadata(about)
+    dataset.storage.update_episode_metadata(
+        [{"controller": controller} for controller in history.controllers]
+    )
+
+
+@contextmanager
+def _datasets_at(root: Path) -> Iterator[None]:
+    """Have Minari keep data sets in a folder; it takes none as an argument."""
+    kept = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = str(root)
+    try:
+        yield
+    finally:
+        del os.environ[VARIABLE]
+        if kept is not None:
+            os.environ[VARIABLE] = kept

@@ -1,0 +1,23 @@
+"""Declare the options of `python -m benchmarks.figures`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.lib.options import Folder, Runs, options
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Draw counterparts of the paper's Figs 5 to 12.
+
+    Each case is run a thousand times, with other initial weights and noise each time. A strong
+    line shows a typical run, the one with the median of the mean errors, before the 10th to
+    90th percentile of all runs. What is drawn is in CSV files.
+    """
+
+    runs: Runs = 1000
+    """Runs of each case."""
+    out: Folder = Path("results/figures")

@@ -1,0 +1,69 @@
+"""Identify a plant as the options say, and write what was found."""
+
+from __future__ import annotations
+
+import time
+from datetime import datetime, timezone
+
+from rich.console import Console
+
+from benchmarks.identify.armax import Orders
+from benchmarks.identify.fit import identify
+from benchmarks.identify.log import (
+    Columns,
+    read_log,
+)
+from benchmarks.identify.model import Options as Settings
+from benchmarks.identify.options import Options
+from benchmarks.identify.plant import plant_arguments, plant_ranges
+from benchmarks.identify.report import report
+from benchmarks.lib.command_line import UsageError, out_folder
+from benchmarks.lib.report import provenance_line, write_report
+from benchmarks.lib.storage import commit, versions, write_json
+from benchmarks.lib.tables import on_screen
+
+
+def execute(options: Options, console: Console) -> str:
+    """Identify a plant and write what was found."""
+    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    began = time.process_time()
+    out = out_folder(options.out)
+    if options.orders and min(options.orders[:2]) < 1:
+        raise UsageError(
+            f"--orders: A and B must have at least 1 coefficient, got {options.orders[:2]}"
+        )
+    columns = Columns(
+        options.time, options.flow, options.temperature, options.sampling_interval,
+        options.time_unit, options.flow_unit, options.temperature_unit,
+        options.disturbance,
+    )  # fmt: skip
+    try:
+        log = read_log(options.log, columns, options.rows)
+        model = identify(
+            log,
+            Settings(
+                longest_delay=options.longest_delay,
+                orders=Orders(*options.orders) if options.orders else None,
+                find_dead_zone=not options.applied,
+                u_min=options.u_min,
+                u_max=options.u_max,
+                operating_flow=options.operating_flow,
+            ),
+        )
+        plant, ranges = plant_arguments(model), plant_ranges(model)
+        sections = report(log, model, out)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    write_json(out / "plant.json", plant)
+    write_json(out / "ranges.json", ranges)
+    origin = {"started": started, "commit": commit(), "versions": versions()}
+    write_report(out, f"The plant of {options.log.name}", sections,
+                 provenance_line("identify", origin))  # fmt: skip
+    for section in sections:
+        console.print(section.title, *section.text, sep="\n")
+        if section.table is not None:
+            console.print(on_screen(section.table))
+    seconds = time.process_time() - began
+    return (
+        f"{seconds:.1f} s of processor time. The plant, the ranges and the report are in {out}/"
+    )

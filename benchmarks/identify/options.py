@@ -1,0 +1,72 @@
+"""Declare the options of `python -m benchmarks.identify`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from benchmarks.lib.options import (
+    Count,
+    Finite,
+    Folder,
+    Orders,
+    Positive,
+    Repeated,
+    choice,
+    options,
+)
+
+
+def _unit(what: str, units: str) -> Parameter:
+    names = units.split()
+    return choice(names, f"Unit of the {what} (default: that in the heading, else {names[0]})")
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Fit the plant's equations to a recorded log, and tune controllers for it.
+
+    The log is a table with a heading; a row holds the temperature at its time and the flow that
+    is commanded from that time on.
+    """
+
+    log: Path = field(kw_only=False)
+    """The log, a CSV file."""
+    out: Folder = Path("results/identify")
+    time: str = "time"
+    """Column of the times: numbers, or dates as ISO 8601."""
+    flow: str = "flow"
+    """Column of the flow."""
+    temperature: str = "temperature"
+    """Column of the temperature."""
+    disturbance: Repeated = ()
+    """Column of a measured disturbance (repeatable)."""
+    sampling_interval: Positive | None = None
+    """s from one row to the next; the column of the times is not read then."""
+    time_unit: Annotated[str | None, _unit("time", "s ms min h")] = None
+    flow_unit: Annotated[str | None, _unit("flow", "t/h kg/s kg/h %")] = None
+    temperature_unit: Annotated[str | None, _unit("temperature", "degC °C C K degF °F F")] = (
+        None
+    )
+    rows: Count = 20_000
+    """Of a longer log, the last rows are fitted, so many."""
+    longest_delay: Count = 60
+    """Longest delay to look for, samples."""
+    orders: Orders | None = None
+    """How many coefficients the polynomials A, B and C have, without the leading 1 of A and C
+    (default: chosen by a criterion)."""
+    applied: bool = False
+    """The flow was measured behind the actuator, so that no dead zone is looked for."""
+    u_min: Finite | None = None
+    """Least flow that the actuator can apply, t/h from the operating point (default: the log's
+    least)."""
+    u_max: Finite | None = None
+    """Largest flow that the actuator can apply, t/h from the operating point (default: the
+    log's largest)."""
+    operating_flow: Finite | None = None
+    """Flow of the operating point, t/h (default: 0 if the log has flows of both signs, else its
+    first flow)."""

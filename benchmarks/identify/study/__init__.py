@@ -1,0 +1,1 @@
+"""How often is the identification right? `python -m benchmarks.identify.study`."""

@@ -1,0 +1,12 @@
+"""Identify known plants from synthetic logs: `python -m benchmarks.identify.study`."""
+
+import sys
+
+from benchmarks.lib.command_line import runner
+
+main = runner(
+    "identify.study", interrupted="what has finished is kept, and the next call goes on."
+)
+
+if __name__ == "__main__":
+    sys.exit(main(None))

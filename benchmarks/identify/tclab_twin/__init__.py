@@ -1,0 +1,1 @@
+"""Does it work on a plant of others? `python -m benchmarks.identify.tclab_twin`."""

@@ -1,0 +1,10 @@
+"""Measure the speed of the environments: `python -m benchmarks.speed --help`."""
+
+import sys
+
+from benchmarks.lib.command_line import runner
+
+main = runner("speed", width=130, interrupted="nothing is kept.")
+
+if __name__ == "__main__":
+    sys.exit(main(None))

@@ -1,0 +1,1 @@
+"""How far do default settings get? `python -m benchmarks.train.defaults`."""

@@ -1,0 +1,37 @@
+"""Declare the options of `python -m benchmarks.tune`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.options import Count, FanOutOptions, Folder, Runs, choice, options
+from benchmarks.plants import PlantOptions
+
+TUNED = {name: each.tuning for name, each in ROSTER.items() if each.tuning}
+_TRIALS = ", ".join(f"{tuning.trials} for {name}" for name, tuning in TUNED.items())
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Search a controller's gains with Optuna.
+
+    All are judged on the same set points and seeds, which no comparison uses. NN and PI have
+    the same number of trials; PPO has fewer, as each is a training. The search is saved after
+    every trial; the same command continues it, to the same end.
+    """
+
+    controller: Annotated[str, choice(TUNED, "Whose gains to search")] = field(kw_only=False)
+    trials: Annotated[
+        Count | None, Parameter(help=f"How many sets of gains to try (default: {_TRIALS}).")
+    ] = None
+    runs: Runs = 100
+    """Runs of each case in a trial."""
+    plant: PlantOptions = field(default_factory=PlantOptions)
+    out: Folder = Path("results/tune")
+    fan_out: FanOutOptions = field(default_factory=FanOutOptions)

@@ -1,0 +1,230 @@
+"""Run a controller as the options say, and show it."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import pygame
+from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
+from PIL import Image
+from rich.console import Console
+
+from benchmarks.controllers.options import own_controller
+from benchmarks.controllers.records import Factory, RosterEntry
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.command_line import UsageError
+from benchmarks.lib.storage import replacing
+from benchmarks.lib.tables import on_screen
+from benchmarks.metrics import mean_error
+from benchmarks.rollout import Trajectory, make_plants, rollout
+from benchmarks.scenarios import SCENARIOS, Scenario, scenarios_of
+from benchmarks.train.ppo import PolicyRequest
+from benchmarks.watch import rivals
+from benchmarks.watch.hands import HELP, Closed, Hands
+from benchmarks.watch.options import YOU, Options
+from mptc_gym import Parameters, drawing
+from mptc_gym.drawing import SIZE
+from mptc_gym.record import Record
+from mptc_gym.rendering import Frame
+
+COLOURS = 48  # of a GIF: the lines', the areas' and what lies between them
+OUT = Path("results/watch")
+Put = Callable[[Frame], object]  # takes the pictures of a film, one after the other
+
+
+@dataclass(frozen=True)
+class Film:
+    """A kind of film.
+
+    Attributes
+    ----------
+    open
+        Opens a file, for a number of pictures a second.
+    fps
+        How many of them a second there are at most.
+    """
+
+    open: Callable[[Path, float], AbstractContextManager[Put]]
+    fps: int
+
+
+def execute(options: Options, console: Console) -> str:
+    """Run a controller on a scenario and show it."""
+    film: Path | None = options.video
+    if film and film.suffix not in FILMS:
+        raise UsageError(f"--video: must end in {' or '.join(FILMS)}, got {film}")
+    controller = None if options.agent == YOU else _controller(options.agent)
+    plant = options.plant.chosen()
+    scenarios = scenarios_of(plant.name, plant.arguments) if plant.arguments else SCENARIOS
+    if options.scenario not in scenarios:
+        known = ", ".join(scenarios)
+        raise UsageError(
+            f"--scenario: no {options.scenario!r} on this plant; there are {known}"
+        )
+    scenario = scenarios[options.scenario]
+    has_screen = film is None and _has_screen()
+    if controller is None and not has_screen:
+        raise UsageError(f"--agent {YOU}: needs a screen to open a window on, and no --video")
+    factory = controller.members(PolicyRequest(policies=1))[0] if controller else None
+
+    if film is None and not has_screen:
+        film = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.mp4"
+        console.print(f"There is no screen to open a window on: writing a film, {film}")
+    label = controller.label if controller else YOU
+    if film is not None:
+        assert factory is not None
+        trajectory = in_film(factory, scenario, options.seed, options.speed, film)
+        return f"{_closing(label, scenario, trajectory)}\nThe film is {film}"
+    console.print(HELP)
+    try:
+        trajectory, moves = in_window(factory, scenario, options.seed, options.speed)
+    except Closed:
+        return "The window was closed."
+    if controller is None or moves:
+        console.print("The same for the controllers ...")
+        table = rivals.table(label, trajectory, moves, scenario, options.seed)
+        console.print(on_screen(table))
+    return _closing(label, scenario, trajectory)
+
+
+def _closing(label: str, scenario: Scenario, trajectory: Trajectory) -> str:
+    error = mean_error(trajectory)[0]
+    return f"{label} on {scenario.title}: mean absolute error {error:.3f} °C"
+
+
+def in_window(
+    factory: Factory | None, scenario: Scenario, seed: int, speed: int
+) -> tuple[Trajectory, rivals.Moves]:
+    """Run a controller, or the one who watches, and show it in a window.
+
+    Parameters
+    ----------
+    factory
+        Makes the controller; None for the one who watches.
+    scenario
+        What it runs on.
+    seed
+        Of the plant and of the controller.
+    speed
+        Samples a second at the start, if so many can be drawn.
+
+    Returns
+    -------
+    Trajectory
+        Of the one run.
+    Moves
+        What was done to set point and load.
+
+    Raises
+    ------
+    Closed
+        If the window is closed before the end.
+    """
+    arguments = factory.arguments(scenario.arguments) if factory else scenario.arguments
+    parameters = Parameters(**arguments)
+    hands = Hands(parameters.range_of("u_min")[0], parameters.range_of("u_max")[1], speed)
+
+    def show(record: Record) -> None:
+        drawing.show(record, hands.speed)
+
+    plants = rivals.touched_plants(scenario.samples, arguments, show)
+    touched = rivals.touched_one(plants)
+    moves: rivals.Moves = {}
+
+    def attend(k: int) -> None:
+        hands.take(pygame.event.get(), touched.record)
+        while hands.paused:
+            pygame.time.wait(20)
+            hands.take(pygame.event.get(), touched.record)
+        if (hands.setpoint, hands.load) != (touched.setpoint, touched.load):
+            moves[k] = touched.setpoint, touched.load = hands.setpoint, hands.load
+
+    controller = factory(arguments, 1, seed) if factory else hands
+    pygame.display.init()
+    pygame.key.set_repeat(300, 60)  # ms
+    try:
+        return rollout(plants, controller, scenario.samples, seed, attend), moves
+    finally:
+        plants.close()
+        drawing.close_window()
+
+
+def in_film(
+    factory: Factory, scenario: Scenario, seed: int, speed: int, path: Path
+) -> Trajectory:
+    """Run a controller and write what a window would show, as `in_window`, to a file.
+
+    Its pictures are those of every n-th sample, such that there are no more of them a second
+    than its kind of film allows.
+    """
+    arguments = factory.arguments(scenario.arguments)
+    plants = make_plants(1, scenario.samples, render_mode="rgb_array", **arguments)
+    film = FILMS[path.suffix]
+    every = math.ceil(speed / film.fps)
+    controller = factory(arguments, 1, seed)
+    with replacing(path) as partial, film.open(partial, speed / every) as put:
+
+        def draw(k: int) -> None:
+            if k % every == 0:
+                put(cast("tuple[Frame, ...]", plants.render())[0])
+
+        trajectory = rollout(plants, controller, scenario.samples, seed, draw)
+    plants.close()
+    return trajectory
+
+
+@contextmanager
+def _mp4(path: Path, fps: float) -> Iterator[Put]:
+    writer = FFMPEG_VideoWriter(str(path), SIZE, fps)
+    try:
+        yield writer.write_frame
+    finally:
+        writer.close()
+
+
+@contextmanager
+def _gif(path: Path, fps: float) -> Iterator[Put]:
+    kept: list[bytes] = []  # compressed: in memory a minute of them takes a gigabyte
+
+    def put(frame: Frame) -> None:
+        kept.append(zlib.compress(frame.tobytes(), 1))
+
+    yield put
+    pictures = (Image.frombytes("RGB", SIZE, zlib.decompress(data)) for data in kept)
+    # One palette for all, of the last picture, which has something of everything in it.
+    last = Image.frombytes("RGB", SIZE, zlib.decompress(kept[-1]))
+    palette = last.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
+    first, *others = (
+        picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
+    )
+    first.save(path, save_all=True, append_images=others, duration=1000 / fps, loop=0)
+
+
+FILMS: dict[str, Film] = {".mp4": Film(_mp4, 30), ".gif": Film(_gif, 10)}
+
+
+def _controller(agent: str) -> RosterEntry:
+    if ":" in agent:
+        return own_controller(agent, agent)
+    if agent not in ROSTER:
+        raise UsageError(
+            f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, {YOU}, and MODULE:FACTORY "
+            "of your own"
+        )
+    return ROSTER[agent]
+
+
+def _has_screen() -> bool:
+    try:
+        pygame.display.init()
+    except pygame.error:
+        return False
+    driver = pygame.display.get_driver()
+    pygame.display.quit()
+    return driver not in ("dummy", "offscreen")

@@ -1,0 +1,40 @@
+"""Declare the options of `python -m benchmarks.watch`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.options import Count, Seed, options
+from benchmarks.plants import PlantOptions
+from benchmarks.scenarios import SCENARIOS, SETPOINTS
+from mptc_gym import MiddlePointEnv
+
+YOU = "you"  # the agent that is no controller
+_AGENTS = (
+    f"Who controls: {', '.join(ROSTER)}, {YOU}, or MODULE:FACTORY for a controller of your own."
+)
+_CASES = (
+    f"Case to run: {', '.join(SCENARIOS)}; on a plant of your own "
+    f"{', '.join(name for name, *_ in SETPOINTS)}, or run if it has a set point of its own."
+)
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Watch a controller at work, in a window or in a film, or take its place."""
+
+    agent: Annotated[str, Parameter(help=_AGENTS)] = "nn"
+    scenario: Annotated[str, Parameter(help=_CASES)] = "square"
+    plant: PlantOptions = field(default_factory=PlantOptions)
+    seed: Seed = 0
+    """Seed of noise and initial weights."""
+    speed: Count = MiddlePointEnv.metadata["render_fps"]
+    """Samples a second."""
+    video: Path | None = None
+    """Write a film to this file, .mp4 or .gif, in place of a window."""
