@@ -23,7 +23,7 @@ from mptc_gym.checks import MOST_PLANTS, count, reject
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
-from mptc_gym.presets import IDS, PRESETS
+from mptc_gym.presets import IDS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
@@ -225,28 +225,21 @@ def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values |
         None if the package does not have it. Where noise and load alone are drawn, it is the
         same for all episodes, and there for any seeds.
     """
-    kept = _kept()
-    name = next((each for each, case in _cases().items() if case == _case(parameters)), None)
-    if name is None or samples != kept["samples"]:
+    least = next((each for case, each in _kept() if case == _case(parameters)), None)
+    if least is None or samples != SAMPLES:
         return None
-    least = np.array(kept["least"][name])
     if len(least) == 1:
         return np.repeat(least, len(seeds))
-    which = slice(seeds.start - kept["seed"], seeds.stop - kept["seed"])
-    return least[which] if which.start >= 0 and which.stop <= len(least) else None
+    first, beyond = seeds.start - SEED, seeds.stop - SEED
+    return least[first:beyond] if first >= 0 and beyond <= len(least) else None
 
 
 @cache
-def _kept() -> dict[str, Any]:
-    """Return the bounds that `python -m benchmarks.limits --package` has written."""
+def _kept() -> list[tuple[Parameters, Values]]:
+    """Return the bounds that `python -m benchmarks.limits --package` has written, by case."""
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
-    kept: dict[str, Any] = json.loads(text)
-    return kept
-
-
-@cache
-def _cases() -> dict[str, Parameters]:
-    return {name: _case(Parameters(**arguments)) for name, arguments in PRESETS.items()}
+    cases = json.loads(text)["cases"].values()
+    return [(_case(Parameters(**case["arguments"])), np.array(case["least"])) for case in cases]
 
 
 def _case(parameters: Parameters) -> Parameters:

@@ -3,6 +3,7 @@
 import _pyio
 import errno
 import io
+import itertools
 import json
 import math
 import os
@@ -28,7 +29,8 @@ from benchmarks.metrics import METRICS, measure
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import SCENARIOS
 from benchmarks.train import ppo, ppo_training
-from mptc_gym import Parameters
+from mptc_gym import IDS, PRESETS, Parameters, evaluate
+from mptc_gym.evaluation import SEED
 from tests.small_training import SMALL
 
 ROOT = Path(__file__).parent.parent
@@ -396,12 +398,28 @@ class TestCompare:
             tmp_path / "two/runs.csv"
         ).read_text()
 
+    def test_a_row_of_the_presets_is_what_evaluate_says(self, tmp_path):
+        run_compare(tmp_path, "--presets", "--agents", *FIXED, "--runs", 2)
+        runs = pd.read_csv(tmp_path / "runs.csv").set_index(["agent", "scenario"])
+        estimates = pd.read_csv(tmp_path / "estimates.csv").set_index(["agent", "scenario"])
+        for agent, preset in itertools.product(FIXED, PRESETS):
+            factory = ROSTER[agent].members()[0]
+            controller = factory(PRESETS[preset], 2, SEED)
+            found = evaluate(controller, IDS[preset], episodes=2, **factory.observation)
+            row = runs.loc[agent, preset]
+            assert list(row["seed"]) == list(found.seeds)
+            np.testing.assert_allclose(row["mae"], found.errors, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(row["total_variation"], found.travels, atol=1e-9)
+            against = estimates.loc[agent, preset]
+            assert against["limit"] == pytest.approx(found.least_possible, abs=1e-12)
+            assert against["ratio"] == pytest.approx(found.multiple, abs=1e-12)
+
     def test_the_second_run_goes_on_with_what_was_learnt(self, tmp_path):
         run_compare(tmp_path, "--agents", "nn", "--scenarios", "square", "--runs", 3)
-        network, plants = DirectNNController(num_envs=3), make_plants(3, 1200)
+        network, plants = DirectNNController(num_envs=3, seed=SEED), make_plants(3, 1200)
         while_learning, after = (
             np.abs(run.error).mean()
-            for run in (rollout(plants, network, 1200, seed=0) for _ in range(2))
+            for run in (rollout(plants, network, 1200, seed=SEED) for _ in range(2))
         )
         assert after < 0.95 * while_learning
         row = f"{while_learning:.3f} | {after:.3f} |"

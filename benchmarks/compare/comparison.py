@@ -14,7 +14,6 @@ from tqdm import tqdm
 
 from benchmarks.compare import plots, tables
 from benchmarks.compare.estimates import (
-    SEED,
     Scale,
     estimate,
     scale_of,
@@ -30,6 +29,7 @@ from benchmarks.lib.tables import write_csv
 from benchmarks.metrics import join, mean_error, measure
 from benchmarks.rollout import Trajectory, make_plants, rollout
 from benchmarks.scenarios import Scenario
+from mptc_gym.evaluation import SEED
 
 TWICE = "square"  # every controller runs this scenario a second time, with what it has learnt
 
@@ -75,7 +75,7 @@ class Comparison:
     scenarios
         What to run them on.
     runs
-        How many runs of each.
+        How many runs of each: the episodes of `mptc_gym.evaluate`, from the first on.
     out
         Folder to write to.
     options

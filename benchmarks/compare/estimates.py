@@ -23,9 +23,9 @@ from benchmarks.lib.statistics import (
 from benchmarks.lib.tables import groups
 from benchmarks.limits import LeastPossible, frontier, is_random, least_possible
 from benchmarks.scenarios import Scenario
+from mptc_gym.evaluation import EPISODES
 
-SEED = 0  # of the first run, and of the bootstraps
-EPISODES = 100  # at most, over which a bound of drawn plants is averaged
+BOOTSTRAP = 0  # seed of the bootstraps
 TOLERANCE = 1e-4  # relative error that a bound may have
 
 
@@ -56,7 +56,6 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
     """
     case: dict[str, Any] = {
         "samples": scenario.samples,
-        "seed": SEED,
         "episodes": min(runs, EPISODES),
         **scenario.arguments,
     }
@@ -112,7 +111,7 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) ->
         }
         base = errors[reference].mean(axis=0) if reference in errors else None
         for agent, values in errors.items():
-            mean = bootstrap(values, SEED)
+            mean = bootstrap(values, BOOTSTRAP)
             if scale.drawn and values.size == 1:
                 mean = replace(mean, low=-math.inf, high=math.inf)
             row: dict[str, Any] = {
@@ -123,12 +122,12 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) ->
                 **_ends("mean", mean),
             }
             row["student_high"] = _student_high(values.mean(axis=0), drawn=scale.drawn)
-            iqm = bootstrap(values, SEED, interquartile_mean)
+            iqm = bootstrap(values, BOOTSTRAP, interquartile_mean)
             row |= _ends("interquartile_mean", iqm)
             row |= {f"ratio{end}": row[f"mean{end}"] / limit for end in ("", "_low", "_high")}
             if base is not None and agent != reference:
-                row |= _ends("difference", bootstrap(values - base, SEED))
-                row |= _ends("improvement", improvement(values, base, SEED))
+                row |= _ends("difference", bootstrap(values - base, BOOTSTRAP))
+                row |= _ends("improvement", improvement(values, base, BOOTSTRAP))
             rows.append(row)
     return pd.DataFrame(rows)
 
@@ -153,7 +152,7 @@ def scores(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
             errors = group.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
             tables.append(scales[scenario].least.score(errors))
             means[scenario] = float(tables[-1].mean())
-        found = stratified(tables, SEED, interquartile_mean)
+        found = stratified(tables, BOOTSTRAP, interquartile_mean)
         rows.append({"agent": agent, **_ends("score", found), **means})
     return pd.DataFrame(rows)
 

@@ -51,7 +51,7 @@ class PredictiveController:
     def __init__(self, parameters: Parameters, num_envs: int, seed: int = 0) -> None:
         self._p = parameters
         self._num_envs = num_envs
-        self._numbers = numbers = _numbers(parameters, num_envs, seed)
+        self._numbers = numbers = drawn_numbers(parameters, num_envs, seed)
         self._delay = numbers.delay.astype(np.intp)
         self._u_min, self._u_max = numbers.u_min, numbers.u_max
         self._dead_zone = numbers.dead_zone
@@ -226,7 +226,7 @@ class _Load:
         )
 
 
-def _numbers(parameters: Parameters, num_envs: int, seed: int) -> PlantNumbers[Array]:
+def drawn_numbers(parameters: Parameters, num_envs: int, seed: int) -> PlantNumbers[Array]:
     """Return the plant numbers of each loop, as the environment draws them."""
     numbers = Ranges(parameters).given_arrays.chosen(tuple(PLANT_NUMBERS))
     if parameters.ranges:

@@ -20,7 +20,6 @@ from benchmarks.datasets.history import (
     BEHAVIOURS,
     PLANTS,
     History,
-    Scale,
     arguments_of,
     record,
     scale,
@@ -28,6 +27,7 @@ from benchmarks.datasets.history import (
 from benchmarks.datasets.options import SAMPLES, Options
 from benchmarks.lib.command_line import UsageError, known, out_folder
 from benchmarks.lib.tables import on_screen
+from mptc_gym import Evaluation
 
 IDS = {
     f"middlepoint/{plant}/{behaviour}-v0": (plant, behaviour)
@@ -39,7 +39,9 @@ DESCRIPTION = (
     "Middle-point temperature of a once-through boiler, preset {plant!r}, random set points, "
     "under {controllers}. The reward of a step is -|error| in degC. On the episodes of the "
     "seeds `evaluation_seeds`, `least_possible_error` is the least possible mean |error| and "
-    "`idle_error` that of a valve that is left alone."
+    "`idle_error` that of an idle valve; `least_possible_errors` and `idle_errors` "
+    "are those of each episode. `mptc_gym.evaluate(policy, dataset.env_spec, episodes=50)` "
+    "scores a policy on them."
 )
 
 
@@ -73,8 +75,8 @@ def execute(options: Options, console: Console) -> str:
                 "data set": name,
                 "transitions": f"{history.rewards.size:,}",
                 "mean |e| (°C)": f"{history.error:.3f}",
-                "least possible": f"{judged_by.least:.3f}",
-                "idle": f"{judged_by.idle:.3f}",
+                "least possible": f"{judged_by.least_possible:.3f}",
+                "idle": f"{judged_by.mean_error:.3f}",
                 "sha256": history.sha256[:16],
             }
         )
@@ -83,7 +85,7 @@ def execute(options: Options, console: Console) -> str:
     return f"The data sets are in {root}"
 
 
-def write(name: str, history: History, judged_by: Scale) -> None:
+def write(name: str, history: History, judged_by: Evaluation) -> None:
     """Write a data set, whole or not at all, in place of one that has its name.
 
     Parameters
@@ -107,11 +109,12 @@ def write(name: str, history: History, judged_by: Scale) -> None:
         (Path(partial) / name).replace(place)
 
 
-def _create(root: Path, name: str, history: History, judged_by: Scale) -> None:
+def _create(root: Path, name: str, history: History, judged_by: Evaluation) -> None:
     """Make a data set in a folder of its own."""
     import minari
     from minari.data_collector import EpisodeBuffer
 
+    assert judged_by.least is not None
     arguments = arguments_of(history.plant)
     env = gymnasium.make("MiddlePoint-v0", max_episode_steps=SAMPLES, **arguments)
     ended = [False] * (SAMPLES - 1) + [True]
@@ -140,8 +143,8 @@ def _create(root: Path, name: str, history: History, judged_by: Scale) -> None:
             algorithm_name=controllers,
             author="The mptc_gym developers",
             description=DESCRIPTION.format(plant=history.plant, controllers=controllers),
-            ref_min_score=-judged_by.idle * SAMPLES,
-            ref_max_score=-judged_by.least * SAMPLES,
+            ref_min_score=-judged_by.mean_error * SAMPLES,
+            ref_max_score=-float(judged_by.least.mean()) * SAMPLES,
             num_episodes_average_score=len(judged_by.seeds),
             data_format="hdf5",
         )
@@ -149,9 +152,10 @@ def _create(root: Path, name: str, history: History, judged_by: Scale) -> None:
     about: dict[str, Any] = {
         "sha256": history.sha256,
         "behaviour_error": history.error,
-        "least_possible_error": judged_by.least,
-        "least_possible_kind": judged_by.kind,
-        "idle_error": judged_by.idle,
+        "least_possible_error": judged_by.least_possible,
+        "least_possible_errors": judged_by.least.tolist(),
+        "idle_error": judged_by.mean_error,
+        "idle_errors": judged_by.errors.tolist(),
         "evaluation_seeds": list(judged_by.seeds),
         "mptc_gym_version": mptc_gym.__version__,
     }

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from benchmarks.controllers.engineered import Nothing
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.datasets.options import EPISODES, SAMPLES
-from benchmarks.limits import least_possible
 from benchmarks.rollout import make_plants, rollout
-from mptc_gym import PRESETS, Parameters
+from mptc_gym import PRESETS, Evaluation, Parameters, evaluate
 
 PLANTS = ("paper", "disturbed", "fouling")  # presets
 BEHAVIOURS = {
@@ -80,32 +79,6 @@ class History:
         return digest.hexdigest()
 
 
-@dataclass(frozen=True)
-class Scale:
-    """What offline learners are judged by, on episodes of their own.
-
-    Attributes
-    ----------
-    least
-        The least possible mean |e| of these episodes, degC.
-    idle
-        Theirs with the valve left alone, degC.
-    kind
-        Of the bound; see `benchmarks.limits.least_possible`.
-    seeds
-        Of the episodes.
-    """
-
-    least: float
-    idle: float
-    kind: str
-    seeds: range
-
-    def score(self, error: float) -> float:
-        """Return 1 for the least possible mean |e| and 0 for that of an idle valve."""
-        return (self.idle - error) / (self.idle - self.least)
-
-
 def arguments_of(plant: str) -> dict[str, Any]:
     """Return the arguments of the environment that a plant's data sets come from."""
     return {**PRESETS[plant], **ARGUMENTS}
@@ -165,21 +138,13 @@ def record(plant: str, behaviour: str, episodes: int = EPISODES, seed: int = SEE
     return history
 
 
-def scale(plant: str, episodes: int = EVALUATIONS) -> Scale:
-    """Return the least possible mean |e| over k = 1 to SAMPLES, and that of an idle valve."""
-    arguments = arguments_of(plant)
-    bound = least_possible(samples=SAMPLES, episodes=episodes, **arguments)
-    idle = _Recorder(
-        make_plants(episodes, SAMPLES, **arguments), range(bound.seed, bound.seed + episodes)
-    )
-    rollout(idle, Nothing(), SAMPLES, bound.seed)
-    idle.close()
-    return Scale(
-        bound.value,
-        -float(np.mean(idle.rewards)),
-        bound.kind,
-        range(bound.seed, bound.seed + episodes),
-    )
+def scale(plant: str, episodes: int = EVALUATIONS) -> Evaluation:
+    """Return what offline learners are judged by: an idle valve on fixed episodes.
+
+    Its `mean_error` scores 0 and its `least_possible` scores 1, as by `mptc_gym.evaluate` of
+    any policy on the same environment.
+    """
+    return evaluate(Nothing(), episodes=episodes, **arguments_of(plant))
 
 
 class _Recorder(VectorWrapper):

@@ -13,13 +13,12 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-import mptc_gym  # noqa: F401 (registers the environment)
+import mptc_gym
 
 LAST_ACTION = 6  # its place in an observation: after three set points and three errors
 
@@ -167,29 +166,15 @@ def _descend(optimizer: torch.optim.Optimizer, loss: Any) -> None:
     optimizer.step()
 
 
-@torch.no_grad()
-def mean_error(actor: Actor, spec: Any, seeds: list[int]) -> float:
-    """Return the mean |e| of an actor over k = 1 to the end of each episode, degC.
+def policy_of(actor: Actor) -> Any:
+    """Return an actor as a function of observations, for `mptc_gym.evaluate`."""
 
-    Parameters
-    ----------
-    actor
-        Acts on observations.
-    spec
-        Of the environment that the data come from.
-    seeds
-        One for each episode.
-    """
-    plants = gymnasium.make_vec(
-        spec.id, len(seeds), max_episode_steps=spec.max_episode_steps, **spec.kwargs
-    )
-    observations, _ = plants.reset(seed=seeds)  # type: ignore[arg-type]
-    errors = 0.0
-    for _ in range(spec.max_episode_steps):
-        actions = actor.act(torch.as_tensor(observations)).numpy()
-        observations, _, _, _, infos = plants.step(actions)
-        errors += float(np.abs(infos["error"]).mean())
-    return errors / int(spec.max_episode_steps)
+    @torch.no_grad()
+    def policy(observations: np.ndarray) -> np.ndarray:
+        actions: np.ndarray = actor.act(torch.as_tensor(observations)).numpy()
+        return actions
+
+    return policy
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -220,15 +205,12 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"least possible {least:.3f}, idle {idle:.3f}")
     for name, alpha in (("behaviour cloning", 0.0), ("TD3+BC", Arguments.alpha)):
         settings = Arguments(steps=options.steps, alpha=alpha)
-        errors = [
-            mean_error(
-                learn(data, high, settings, seed), dataset.env_spec, about["evaluation_seeds"]
+        for seed in range(options.seeds):
+            policy = policy_of(learn(data, high, settings, seed))
+            found = mptc_gym.evaluate(
+                policy, dataset.env_spec, episodes=len(about["evaluation_seeds"])
             )
-            for seed in range(options.seeds)
-        ]
-        scores = [(idle - error) / (idle - least) for error in errors]
-        each = ", ".join(f"{error:.3f}" for error in errors)
-        print(f"{name}: mean |e| {each} degC; mean score {np.mean(scores):.2f}", flush=True)
+            print(f"{name}, seed {seed}: {found}", flush=True)
     return 0
 
 
