@@ -163,11 +163,12 @@ class TestProgramme:
         # the half periods at -17, and a plain step of it is a plan, and so no better.
         plant = {"a": [1, 0.0875, 0.0495, -0.0053], "b": [-8.6, 96.0, -26.3], "delay": 18}
         limits = {"dead_zone": 0, "u_min": 0, "u_max": 0.386, "setpoint_amplitude": 17}
-        found = least_possible(samples=1200, folder=None, **plant, **limits)
-        u = np.where(np.arange(1200) % 600 < 281, 17.0 * sum(plant["a"]) / sum(plant["b"]), 0.0)
+        found = least_possible(samples=1200, kind="preview", folder=None, **plant, **limits)
+        k = np.arange(1201)
+        u = np.where(k % 600 < 281, 17.0 * sum(plant["a"]) / sum(plant["b"]), 0.0)
         y = signal.lfilter([0.0] * 19 + plant["b"], plant["a"], u)
-        setpoint = np.where(np.arange(1200) % 600 < 300, 17.0, -17.0)
-        assert 8.5 < found.value <= np.abs(setpoint - y).mean() < 9.5
+        setpoint = np.where(k % 600 < 300, 17.0, -17.0)
+        assert 8.5 < found.value <= np.abs(setpoint - y)[1:].mean() < 9.5
 
     def test_what_cannot_be_solved_is_said(self, monkeypatch):
         hopeless = ("highs-ds", {"presolve": False, "maxiter": 1})
@@ -580,4 +581,4 @@ class TestOtherDynamics:
         plants = make_plants(1, 600, **arguments)
         controller = PredictiveController(Parameters(**arguments), 1)
         error = mean_error(rollout(plants, controller, 600, seed=0))[0]
-        assert 1.0 <= error / least < 1.02
+        assert 0.9999 <= error / least < 1.02  # bounds are rounded
