@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 Plant = dict[str, Any]  # arguments of the environment
 
@@ -45,6 +44,8 @@ def random_design(count: int, seed: int, samples: int) -> list[Plant]:
     samples
         How long they drift.
     """
+    from scipy.stats import qmc  # here: it takes long to import
+
     drawn = qmc.LatinHypercube(len(SPANS) + 2, rng=np.random.default_rng(seed)).random(count)
     drifting = ("gain_factor", "time_constant_factor")
     spans = np.array([*SPANS.values(), *(SPANS[name] for name in drifting)])

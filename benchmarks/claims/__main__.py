@@ -2,9 +2,9 @@
 
 import sys
 
-from benchmarks.lib.command_line import runner
+from benchmarks.lib.commands import command
 
-main = runner("claims", interrupted="the claims that are done are kept.")
+main = command("claims", interrupted="the claims that are done are kept.")
 
 if __name__ == "__main__":
     sys.exit(main(None))

@@ -2,9 +2,9 @@
 
 import sys
 
-from benchmarks.lib.command_line import runner
+from benchmarks.lib.commands import command
 
-main = runner("compare", width=190)
+main = command("compare", width=190)
 
 if __name__ == "__main__":
     sys.exit(main(None))

@@ -2,9 +2,9 @@
 
 import sys
 
-from benchmarks.lib.command_line import runner
+from benchmarks.lib.commands import command
 
-main = runner("identify", interrupted="nothing is written.")
+main = command("identify", interrupted="nothing is written.")
 
 if __name__ == "__main__":
     sys.exit(main(None))

@@ -2,9 +2,9 @@
 
 import sys
 
-from benchmarks.lib.command_line import runner
+from benchmarks.lib.commands import command
 
-main = runner("limits", width=150, interrupted="bounds that are known are kept.")
+main = command("limits", width=150, interrupted="bounds that are known are kept.")
 
 if __name__ == "__main__":
     sys.exit(main(None))

@@ -2,9 +2,9 @@
 
 import sys
 
-from benchmarks.lib.command_line import runner
+from benchmarks.lib.commands import command
 
-main = runner("speed", width=130, interrupted="nothing is kept.")
+main = command("speed", width=130, interrupted="nothing is kept.")
 
 if __name__ == "__main__":
     sys.exit(main(None))

@@ -2,9 +2,9 @@
 
 import sys
 
-from benchmarks.lib.command_line import runner
+from benchmarks.lib.commands import command
 
-main = runner(
+main = command(
     "sweep", width=150, interrupted="what has finished is kept, and the next call goes on."
 )
 

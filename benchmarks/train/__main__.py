@@ -2,9 +2,9 @@
 
 import sys
 
-from benchmarks.lib.command_line import runner
+from benchmarks.lib.commands import command
 
-main = runner("train", interrupted="the same command trains what is missing.")
+main = command("train", interrupted="the same command trains what is missing.")
 
 if __name__ == "__main__":
     sys.exit(main(None))

@@ -2,9 +2,9 @@
 
 import sys
 
-from benchmarks.lib.command_line import runner
+from benchmarks.lib.commands import command
 
-main = runner("tune", interrupted="the same command goes on from here.")
+main = command("tune", interrupted="the same command goes on from here.")
 
 if __name__ == "__main__":
     sys.exit(main(None))

@@ -2,9 +2,9 @@
 
 import sys
 
-from benchmarks.lib.command_line import runner
+from benchmarks.lib.commands import command
 
-main = runner("identify.tclab_twin", interrupted="nothing is kept.")
+main = command("identify.tclab_twin", interrupted="nothing is kept.")
 
 if __name__ == "__main__":
     sys.exit(main(None))
