@@ -188,6 +188,7 @@ def _fits(likelihood: Likelihood) -> list[Candidate]:
         orders = Orders(2, b, 1)
         place = likelihood.scan(orders, SECOND, [found[0].place.gap])[0]
         lags.append(likelihood.fit(place, orders, SECOND))
+    found = [fit for fit in found if not fit.walks_nowhere] or found
     return [*found, *(fit for fit in lags if fit.has_own_lag)]
 
 
@@ -218,14 +219,14 @@ def _tried(likelihood: Likelihood, fits: list[Candidate]) -> tuple[list[Candidat
     good = [
         (fit, share)
         for fit, share in zip(trial, shares, strict=True)
-        if 1.0 - share <= least * (1.3 if fit.has_own_lag else 1.0)
+        if 1.0 - share <= least * (2.0 if fit.has_own_lag else 1.0)
     ] or list(zip(trial, shares, strict=True))[:1]
     criteria = [likelihood.criterion(fit.orders, fit.deviance, mild=True) for fit, _ in good]
     # One of each kind: without a walk and with it, with a short B and a long one, and with a
     # time constant of its own.
     kinds: dict[tuple[bool, ...], Candidate] = {}
     for (fit, _), each in zip(good, criteria, strict=True):
-        if each < min(criteria) + CLOSE and not fit.walks_nowhere:
+        if each < min(criteria) + CLOSE:
             kind = fit.orders.walk, fit.orders.b > 3, fit.has_own_lag, fit.orders.b > 1
             kinds.setdefault(kind, fit)
     near = [fit for fit in kinds.values() if fit is not good[0][0]]

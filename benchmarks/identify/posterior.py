@@ -91,7 +91,7 @@ class Posterior:
                 middle = Place(0.0, around[len(around) // 2], gap)
                 refit = likelihood.fit(middle, fit.orders, fit.solution.c)
                 if fit.has_own_lag and not refit.has_own_lag:
-                    continue
+                    refit = fit
                 places = likelihood.scan(fit.orders, refit.solution.c, gaps, around)
                 found += [Entry(i, refit, place) for place in places]
         return found
@@ -106,9 +106,12 @@ class Posterior:
         behind = np.zeros(member.max() + 1)
         for number in range(member.max() + 1):
             own = member == number
-            least, orders = deviances[own].min(), entries[int(np.argmax(own))].fit.orders
-            behind[number] = likelihood.criterion(orders, least, mild=possible)
-            weights[own] = np.exp((least - deviances[own]) / 2.0) * prior[own]
+            least, fit = deviances[own].min(), entries[int(np.argmax(own))].fit
+            behind[number] = likelihood.criterion(fit.orders, least, mild=possible)
+            # How a response with a lag sets in is a matter of few samples, and of chance: the
+            # likelihood of delays is trusted half as far.
+            trust = 0.5 if possible and fit.has_own_lag else 1.0
+            weights[own] = np.exp(trust * (least - deviances[own]) / 2.0) * prior[own]
             if possible:
                 weights[own] /= weights[own].sum()
         behind = np.maximum(behind - behind.min() - AS_GOOD * possible, 0.0)

@@ -261,7 +261,8 @@ QUESTIONS: dict[str, tuple[str, Question]] = {
 def table(by_kind: dict[str, list[dict[str, Any]]]) -> pd.DataFrame:
     """Return how often estimates are right and intervals cover, by the kind of log.
 
-    Dead zones are counted from `TELLING` on.
+    Dead zones are counted from `TELLING` on. A log that is refused is a wrong estimate, and
+    has no interval.
     """
     rows = []
     for question, (name, right) in QUESTIONS.items():
@@ -270,7 +271,8 @@ def table(by_kind: dict[str, list[dict[str, Any]]]) -> pd.DataFrame:
             flags = [
                 not each["refused"] and right(each)
                 for each in found
-                if each["refused"] or name != "dead_zone" or each[name][0] >= TELLING
+                if (each["refused"] and "covers" not in question)
+                or (not each["refused"] and (name != "dead_zone" or each[name][0] >= TELLING))
             ]
             counted = share(np.array(flags, dtype=np.bool_))
             low, high = 100 * counted.low, 100 * counted.high
