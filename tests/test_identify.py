@@ -683,7 +683,7 @@ class TestStudy:
         found = {"steps": [right, wrong, {"refused": "no", "seconds": 0.1}]}
         shares = [each.split(" [")[0] for each in table(found)["steps"]]
         # Of the dead zones, one is too small to count. One log is refused.
-        assert shares == [*["33 %"] * 4, *["50 %"] * 3, "100 %", "1"]
+        assert shares == [*["33 %"] * 3, *["50 %"] * 4, "100 %", "1"]
         beside = beside_rivals(found)
         assert list(beside["gain within 10 %"]) == ["50 %", "0 %", "50 %"]
         assert list(beside["delay within one sample"]) == ["50 %", "50 %", ""]

@@ -216,7 +216,7 @@ def execute(options: Options, console: Console) -> str:
     seconds = np.array([each["seconds"] for each in found])
     closing = (
         f"{options.logs} logs a kind of {options.samples} samples, seed {options.seed}. Those "
-        "that are refused count as not covered. Processor time of a log: median "
+        "that are refused are wrong estimates. Processor time of a log: median "
         f"{np.median(seconds):.1f} s, longest {seconds.max():.1f} s."
     )
     tables = [table(by_kind), beside_rivals(by_kind)]
