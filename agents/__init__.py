@@ -2,6 +2,9 @@
 
 from agents.controller import Controller
 from agents.direct_nn import DirectNNController, Weights
+from agents.neural_law import LawNetwork
+from agents.neural_self_tuning import NeuralSelfTuningController
+from agents.neural_smith import NeuralSmithPredictor
 from agents.pi import PIController
 from agents.policy_network import Increments, PolicyNetwork
 from agents.self_tuning import SelfTuningController
@@ -11,6 +14,9 @@ __all__ = [
     "Controller",
     "DirectNNController",
     "Increments",
+    "LawNetwork",
+    "NeuralSelfTuningController",
+    "NeuralSmithPredictor",
     "PIController",
     "PolicyNetwork",
     "SelfTuningController",

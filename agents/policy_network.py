@@ -180,22 +180,6 @@ class PolicyNetwork(Controller):
         self._position: Values | None = None  # of the valve, in velocity form
 
     @classmethod
-    def pretrained(
-        cls, name: str, *, u_min: float = -10.0, u_max: float = 10.0
-    ) -> PolicyNetwork:
-        """Return a network that comes with the project, such as "nn-dpc" or "nn-adaptive".
-
-        Raises
-        ------
-        ValueError
-            If there is none of this name.
-        """
-        names = sorted(path.stem for path in PRETRAINED.glob("*.npz"))
-        if not isinstance(name, str) or name not in names:
-            raise ValueError(f"name must be one of {', '.join(names)}, got {name!r}")
-        return cls.load(PRETRAINED / f"{name}.npz", u_min=u_min, u_max=u_max)
-
-    @classmethod
     def load(
         cls, path: str | PathLike[str], *, u_min: float = -10.0, u_max: float = 10.0
     ) -> PolicyNetwork:

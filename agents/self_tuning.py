@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,27 +22,49 @@ Array = NDArray[np.float64]
 
 # Time constants in the bank, as multiples of the step test's.
 TIME_CONSTANTS = (0.5, 0.7, 1.0, 1.4, 2.0)
-# How sure the step test is, in standard deviations: of the gain, as a share of it; of the
-# delay, samples; of the time constant's logarithm; of the dead zone, as a share of the larger
-# limit. And the noise that is expected (degC), worth so many samples of it.
-GAIN_SPREAD, DELAY_SPREAD, TIME_CONSTANT_SPREAD, ZONE_SPREAD = 0.5, 8.0, 0.5, 0.2
-NOISE, NOISE_SAMPLES = 0.5, 30.0
+ZONE_SPREAD = 0.2  # how sure the told dead zone is: a share of the larger limit
+NOISE_SAMPLES = 30.0  # that the expected noise is worth
 GAINS = (0.3, 3.0)  # estimates stay between these multiples of the step test's gain
 # The prefilter (1 - 0.92 z^-1) / (1 - 0.6 z^-1) of what is compared: its zero makes the noise
 # white, its pole takes out what is too quick for models of first order.
 PREFILTER_ZERO, PREFILTER_POLE = 0.92, 0.6
 LEAST_NOISE = 0.02  # degC; smaller errors tell no model from another
-CAUTION = 0.5  # factor of the log-likelihood, as the errors are not quite white
 EXCITED = 0.05  # of half the range: the flow has to have moved by it to be learnt from
 MEMORY = 20  # samples before the longest delay, in which it has to have moved
 DELAY_STEP = 2  # samples between two delays of the bank
-INTERVAL = 10  # samples between two designs
-BLEND = 0.5  # share of a design that is taken over
 BIAS_RATE = 0.005  # a sample, of the offset's estimate
 DISTURBANCE_POLE = 0.5  # of the filter of the disturbance
 CLEARANCE = 0.2  # t/h that a command passes a dead zone by
 MOST_DELAY = 10_000  # samples: beyond it, the bank would be too large for any computer
 _ROOM = 64  # samples until the histories are moved back
+
+
+@dataclass(frozen=True)
+class Learning:
+    """How fast evidence becomes control, and how sure the step test is.
+
+    Attributes
+    ----------
+    interval
+        Samples between two designs.
+    share
+        Of a design that is taken over.
+    caution
+        Factor of the log-likelihood, as the errors are not quite white.
+    noise
+        That is expected, degC.
+    gain_spread, delay_spread, time_constant_spread
+        Standard deviations of the step test: of the gain, as a share of it; of the delay,
+        samples; of the time constant's logarithm.
+    """
+
+    interval: int = 10
+    share: float = 0.5
+    caution: float = 0.5
+    noise: float = 0.5
+    gain_spread: float = 0.5
+    delay_spread: float = 8.0
+    time_constant_spread: float = 0.5
 
 
 class SelfTuningController(Controller):
@@ -110,15 +133,16 @@ class SelfTuningController(Controller):
     """
 
     observation = PAPER_WINDOWS  # that the default indices are for
+    _learning = Learning()
 
     # What a batch remembers: responses without delay, of unit gain, and the same prefiltered,
     # (loops, time, responses); the flow within the limits, t/h, (loops, time).
     _units: Array
     _filtered: Array
     _flows: Array
-    # The last output, its offset and the disturbance that is foreseen, degC, (loops,), and the
-    # last prefiltered outputs, (loops, INTERVAL).
-    _output: Array
+    # The last outputs, newest first, (loops, 3), their offset and the disturbance that is
+    # foreseen, (loops,), and the last prefiltered outputs, (loops, interval); all in degC.
+    _outputs: Array
     _bias: Array
     _disturbance: Array
     _filtered_outputs: Array
@@ -131,6 +155,7 @@ class SelfTuningController(Controller):
     # The design: probabilities and, times these, gains of the models, (loops, models).
     _weights: Array
     _gains: Array
+    _gain_variance: Array  # of all gains, as a share of the square of their mean, (loops,)
 
     def __init__(
         self,
@@ -188,13 +213,13 @@ class SelfTuningController(Controller):
         told_delay = check_number("delay", delay, 0) / self._interval - 1.0
         told_zone = check_number("dead_zone", dead_zone, 0)
         limit = max(abs(self.u_min), abs(self.u_max))
-        off_delay = (self._delays - told_delay) / DELAY_SPREAD
-        off_constant = np.log(constants / samples) / TIME_CONSTANT_SPREAD
+        off_delay = (self._delays - told_delay) / self._learning.delay_spread
+        off_constant = np.log(constants / samples) / self._learning.time_constant_spread
         off_zone = (self._dead_zones - told_zone) / (ZONE_SPREAD * limit)
         off = np.square(off_delay)[:, np.newaxis] + np.square(off_constant) + off_zone**2
         self._prior = -0.5 * off.ravel()  # log-probability, but for a constant
         self._excited = EXCITED * (self.u_max - self.u_min) / 2.0
-        self._history = longest + max(MEMORY, INTERVAL)
+        self._history = longest + max(MEMORY, self._learning.interval) + 2
         self._loops = 0  # not known before the first observation
 
     @property
@@ -229,17 +254,23 @@ class SelfTuningController(Controller):
         filtered = (
             PREFILTER_POLE * self._filtered_outputs[:, -1]
             + output
-            - PREFILTER_ZERO * self._output
+            - PREFILTER_ZERO * self._outputs[:, 0]
         )
-        self._output = output
+        self._outputs = np.column_stack([output, self._outputs[:, :-1]])
         self._filtered_outputs[:, :-1] = self._filtered_outputs[:, 1:].copy()
         self._filtered_outputs[:, -1] = filtered
         self._samples += 1
-        if self._samples % INTERVAL == 0:
+        if self._samples % self._learning.interval == 0:
             self._learn()
-            self._design(BLEND)
+            self._design(self._learning.share)
 
-        delayed = self._units[:, self._now - self._delays].reshape(self._loops, -1)
+        command = self._beyond_the_dead_zone(self._law(setpoint))
+        self._apply(command)
+        return command if observation.ndim == 2 else command[0]
+
+    def _law(self, setpoint: Array) -> Array:
+        """Return the command that is wanted, t/h."""
+        output, delayed = self._outputs[:, 0], self._delayed(0)
         off = output - _dot(self._gains, delayed)
         self._bias = self._bias + BIAS_RATE * (off - self._bias)
         fading = self._trust * (output - self._bias) - _dot(self._faded, delayed)
@@ -248,9 +279,11 @@ class SelfTuningController(Controller):
         foreseen = _dot(self._sums, response) + self._bias + self._disturbance
         command: Array = _dot(self._shares, response)
         command += self._feedback * (setpoint - foreseen)
-        command = self._beyond_the_dead_zone(command)
-        self._apply(command)
-        return command if observation.ndim == 2 else command[0]
+        return command
+
+    def _delayed(self, ago: int) -> Array:
+        """Return what each model of gain 1 made of the output some samples ago."""
+        return self._units[:, self._now - self._delays - ago].reshape(self._loops, -1)
 
     def _start(self, loops: int) -> None:
         """Bring everything to rest, and the models to what the step test has shown."""
@@ -262,54 +295,60 @@ class SelfTuningController(Controller):
         shape = loops, history + _ROOM, len(self._poles)
         self._units, self._filtered = np.zeros(shape), np.zeros(shape)
         self._flows = np.zeros(shape[:2])
-        self._output, self._bias = np.zeros(loops), np.zeros(loops)
+        self._outputs, self._bias = np.zeros((loops, 3)), np.zeros(loops)
         self._disturbance = np.zeros(loops)
-        self._filtered_outputs = np.zeros((loops, INTERVAL))
+        self._filtered_outputs = np.zeros((loops, self._learning.interval))
         self._information, self._products = np.zeros((loops, models)), np.zeros((loops, models))
         self._energy, self._seen = np.zeros((loops, 1)), np.zeros((loops, 1))
-        self._variance = np.full((loops, 1), NOISE**2)
+        self._variance = np.full((loops, 1), self._learning.noise**2)
         self._weights, self._gains = np.zeros((loops, models)), np.zeros((loops, models))
         self._design(1.0)
 
     def _learn(self) -> None:
         """Add the last samples to the sums, of those loops whose flow has moved."""
+        interval = self._learning.interval
         flows = self._flows[:, self._now - self._history : self._now]
         moved = flows.max(1) - flows.min(1) > self._excited
         gate = moved.astype(float)[:, np.newaxis]
-        kept = 1.0 - gate * (1.0 - self._forgetting**INTERVAL)
+        kept = 1.0 - gate * (1.0 - self._forgetting**interval)
         outputs = self._filtered_outputs * gate
         information = self._by_model(self._information)
         products = self._by_model(self._products)
         self._information *= kept
         self._products *= kept
         longest, shortest = int(self._delays[0]), int(self._delays[-1])
-        oldest = self._now - longest - INTERVAL + 1
+        oldest = self._now - longest - interval + 1
         filtered = self._filtered[:, oldest : self._now - shortest + 1]
         squares = np.square(filtered) * gate[:, :, np.newaxis]
-        for i in range(INTERVAL):
+        for i in range(interval):
             delayed = slice(i, i + longest - shortest + 1, DELAY_STEP)
             products += filtered[:, delayed] * outputs[:, i, np.newaxis, np.newaxis]
             information += squares[:, delayed]
         self._energy *= kept
         self._energy += np.square(outputs).sum(1, keepdims=True)
         self._seen *= kept
-        self._seen += INTERVAL * gate
+        self._seen += interval * gate
 
     def _design(self, share: float) -> None:
         """Weigh the models by what was seen, and take over a share of what they ask for."""
-        prior = self._variance / (GAIN_SPREAD * self.gain) ** 2
+        prior = self._variance / (self._learning.gain_spread * self.gain) ** 2
         information = self._information + prior
         products = self._products + prior * self.gain
         gains = products / information
         errors = self._energy + prior * self.gain**2 - products * gains  # sums of squares
-        weights = self._prior - (0.5 * CAUTION) * errors / self._variance
+        weights = self._prior - (0.5 * self._learning.caution) * errors / self._variance
         weights -= weights.max(1, keepdims=True)
         np.exp(weights, out=weights)
         weights /= weights.sum(1, keepdims=True)
         least = np.maximum(errors.min(1, keepdims=True), LEAST_NOISE**2 * self._seen)
-        self._variance = (least + NOISE_SAMPLES * NOISE**2) / (self._seen + NOISE_SAMPLES)
+        self._variance = (least + NOISE_SAMPLES * self._learning.noise**2) / (
+            self._seen + NOISE_SAMPLES
+        )
 
         gains = np.clip(gains / self.gain, *GAINS) * self.gain  # the direction stays
+        spread = np.square(gains) + self._variance / information
+        mean = (weights * gains).sum(1)
+        self._gain_variance = (weights * spread).sum(1) / np.square(mean) - 1.0
         self._weights += share * (weights - self._weights)
         self._gains += share * (weights * gains - self._gains)
 

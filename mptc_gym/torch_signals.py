@@ -328,8 +328,10 @@ class Disturbance:
         interval = numbers["disturbance_interval"]
         if isinstance(interval, Tensor):
             interval = interval.clamp(min=LOAD_INTERVAL)
+        else:
+            interval = max(interval, LOAD_INTERVAL)
         # It jumps if this is within +-1, and is then uniform there.
-        place = drawn[0] * (max(interval, LOAD_INTERVAL) / LOAD_INTERVAL)
+        place = drawn[0] * (interval / LOAD_INTERVAL)
         jumps = _reached(place.new_ones(()), place.abs())
         level = place * numbers["disturbance_amplitude"]
         # Uniform within +-h, a step of the walk has the variance h^2 / 3.

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from agents import (
     Controller,
     DirectNNController,
+    NeuralSelfTuningController,
+    NeuralSmithPredictor,
     PIController,
     PolicyNetwork,
     SelfTuningController,
@@ -18,6 +20,7 @@ from agents import (
     Weights,
 )
 from agents.controller import action_from_command
+from agents.policy_network import PRETRAINED
 from benchmarks.rollout import make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.parameters import PlantNumbers
@@ -124,6 +127,8 @@ MAKERS = {
     "NN": DirectNNController,
     "Smith": partial(SmithPredictor, **PLANT, closed_loop_time_constant=80.0),
     "self-tuning": partial(SelfTuningController, **PLANT),
+    "NN, told": partial(NeuralSmithPredictor, **PLANT),
+    "NN, self-tuning": partial(NeuralSelfTuningController, **PLANT),
 }
 
 
@@ -518,7 +523,7 @@ def test_what_is_no_observation_is_refused_by_name(observation):
 
 def test_bad_limits_are_not_taken_for_a_damaged_file():
     with pytest.raises(ValueError, match=r"^u_min must be below u_max"):
-        PolicyNetwork.pretrained("nn-dpc", u_min=3.0, u_max=1.0)
+        PolicyNetwork.load(PRETRAINED / "ppo-10000.npz", u_min=3.0, u_max=1.0)
 
 
 def test_damaged_weights_are_refused_by_path(tmp_path):

@@ -104,7 +104,7 @@ def test_an_unknown_option_is_named_in_one_line(name, capsys):
     ],
 )  # fmt: skip
 def test_a_missing_package_is_named_with_its_extra(name, package, extra):
-    positional = {"train": ["nn-dpc"], "tune": ["pi"]}
+    positional = {"train": ["nn-smith"], "tune": ["pi"]}
     done = run_without(package, name, positional.get(name, []))
     assert done.returncode == 2
     assert f'{package} is not installed: pip install -e ".[{extra}]"' in done.stderr

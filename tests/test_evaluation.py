@@ -12,6 +12,7 @@ from gymnasium.spaces import Box
 
 import mptc_gym
 from agents import DirectNNController, PIController, PolicyNetwork
+from agents.policy_network import PRETRAINED
 from benchmarks.limits import least_possible
 from benchmarks.limits.package import CASES
 from mptc_gym import IDS, PRESETS, MiddlePointEnv, evaluate
@@ -250,7 +251,7 @@ class TestRefusals:
         ):
             evaluate(Trained())
         evaluate(Trained(), action_window=20, episodes=2)
-        network = PolicyNetwork.pretrained("nn-dpc")
+        network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
         with pytest.raises(
             ValueError,
             match=r"env must have the windows that policy wants, .*n_window=\d+, got",

@@ -253,10 +253,6 @@ class TestFile:
         with pytest.raises(FileNotFoundError):
             PolicyNetwork.load(tmp_path / "policy.npz")
 
-    def test_an_unknown_name(self):
-        with pytest.raises(ValueError, match="name must be one of"):
-            PolicyNetwork.pretrained("../pretrained/nn-dpc")
-
 
 @pytest.mark.parametrize(
     ("arguments", "message"),

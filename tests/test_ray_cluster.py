@@ -15,10 +15,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from agents import PolicyNetwork
+from agents import LawNetwork
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.sweep.__main__ import main as sweep
-from benchmarks.train.command import run as train
+from benchmarks.train.command import trained
 from tests.nodes.train import TRAININGS
 from tests.test_fan_out import counted, until, work
 
@@ -130,12 +130,12 @@ def test_trainings_give_the_networks_that_they_give_here(cluster, results):
     there, here = results / "trained there", results / "trained here"
     done = python("-m", "tests.nodes.train", str(there), environment=cluster.environment)
     assert done.returncode == 0, done.stderr
-    networks = train(TRAININGS, here, FanOut(1))
+    networks = trained(TRAININGS, here, FanOut(1))
     assert len(networks) == len(list(there.glob("*/network.npz"))) == len(TRAININGS)
     for network in networks:
         key = network.provenance["code"]
-        other = PolicyNetwork.load(there / key / "network.npz")
-        for layer, same in zip(network.layers, other.layers, strict=True):
+        other = LawNetwork.load(there / key / "network.npz")
+        for layer, same in zip(network.choosing, other.choosing, strict=True):
             assert all(map(np.array_equal, layer, same))
         assert other.provenance["commit"] == network.provenance["commit"]
 

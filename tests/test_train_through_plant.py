@@ -1,292 +1,246 @@
 """Training through the plant: what is drawn, differentiated, kept and chosen."""
 
 import json
-import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
-import pandas as pd
 import pytest
 
 torch = pytest.importorskip("torch")
 
-from agents import PolicyNetwork  # noqa: E402
-from benchmarks.designs import SPANS  # noqa: E402
+from agents import LawNetwork, NeuralSmithPredictor  # noqa: E402
+from agents.neural_law import PRETRAINED  # noqa: E402
+from benchmarks.examples import through_plant as example  # noqa: E402
 from benchmarks.lib.fan_out import FanOut  # noqa: E402
 from benchmarks.rollout import make_plants, rollout  # noqa: E402
+from benchmarks.train import __main__ as program  # noqa: E402
 from benchmarks.train import command, through_plant  # noqa: E402
-from benchmarks.train.__main__ import main  # noqa: E402
 from benchmarks.train.through_plant import (  # noqa: E402
-    TRAININGS,
     Draw,
-    Network,
-    Trainer,
-    act,
+    Net,
+    Training,
+    environment,
     loss_of,
     run,
+    train,
     training_key,
+    validate,
 )
+from mptc_gym import Parameters  # noqa: E402
 
-SMALL = replace(
-    TRAININGS["nn-dpc"], steps=6, batch=4, samples=60, window=20, hidden=4, validate_every=2
-)
-MANY = replace(SMALL, plants="many")
+SMALL = Training(steps=4, plants=4, samples=60, choosing=4, adding=3)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     monkeypatch.setattr(through_plant, "VALIDATION_PLANTS", 4)
     monkeypatch.setattr(through_plant, "VALIDATION_SAMPLES", 40)
-
-
-def train(training, folder, *, retrain=False):
-    return command.run([training], folder, FanOut(1), retrain=retrain)[0]
+    monkeypatch.setattr(through_plant, "SAVED_EVERY", 2)
 
 
 def weights(network):
-    return np.concatenate([W.ravel() for W, _ in network.layers])
+    return np.concatenate([W.ravel() for W, _ in (*network.choosing, *network.adding)])
 
 
-class TestNetwork:
-    @pytest.mark.parametrize("training", [SMALL, MANY])
-    def test_in_numpy_it_is_what_it_was_in_torch(self, training):
-        torch.manual_seed(0)
-        network = Network(training)
+def lively(training, seed=0):
+    """Return a network whose outputs matter."""
+    torch.manual_seed(seed)
+    net = Net(training)
+    with torch.no_grad():
+        for part in (net.choosing, net.adding):
+            part[-1].weight.mul_(10.0)
+    return net
+
+
+class TestLaw:
+    @pytest.mark.parametrize("first", [True, False])
+    def test_what_is_trained_is_what_runs(self, first):
+        # The same plant, set point and network, in PyTorch with its gradient and in NumPy.
+        net, n, samples = lively(SMALL), 1, 150
+        numbers = Draw(SMALL, n, samples, 3).plants()
+        for name in numbers:
+            if name.endswith(("_variance", "_amplitude")):
+                numbers[name] = torch.zeros(n)
+            if name.endswith("_drift"):
+                numbers[name] = torch.ones(n)
+        numbers["setpoint"] = torch.where(torch.arange(samples + 1) < 70, 3.0, -4.0)[:, None]
+        told = Draw(SMALL, n, samples, 4).told(numbers, exact=True)
+        told["first"] = torch.tensor([first])
+        told["uncertainty"] = torch.tensor([0.1])
         with torch.no_grad():
-            network.layers[-1].weight.mul_(20.0)
-        observations = torch.rand(50, 41) * 2.0 - 1.0
-        observations[:, :21] *= 6.0
-        expected = act(network.weights(), observations).detach().clamp(-1.0, 1.0).numpy()
-        assert np.ptp(expected) > 1.0
-        assert network.export().act(observations.numpy()) == pytest.approx(expected, abs=1e-6)
+            errors, _ = run(environment(n, samples), net, numbers, told, samples, 0)
+        of = {name: values.item() for name, values in numbers.items() if values.ndim == 1}
+        pole = 1.0 - through_plant.RATE / of["time_constant_factor"]
+        alpha, scale, _ = through_plant.DYNAMICS.coefficients(
+            of["gain_factor"], of["time_constant_factor"]
+        )
+        a, b = [1.0, *(-x for x in alpha)], [scale * x for x in Parameters().b]
+        controller = NeuralSmithPredictor(
+            gain=sum(b) / sum(a),
+            time_constant=-8.0 / np.log(pole),
+            delay=8.0 * (of["delay"] + 1.0),
+            dead_zone=of["dead_zone"],
+            coefficients=None if first else (a, b),
+            uncertainty=0.1,
+            u_min=of["u_min"],
+            u_max=of["u_max"],
+            network=net.export(),
+        )
+        plant = {"a": a, "b": b, "setpoint": [3.0] * 70 + [-4.0]}
+        plant |= {name: of[name] for name in ("dead_zone", "u_min", "u_max")}
+        plants = make_plants(1, samples + 1, **plant, delay=int(of["delay"]))
+        trajectory = rollout(plants, controller, samples + 1, seed=0)
+        error = (trajectory.setpoint - trajectory.output)[1:]
+        reach = abs(controller.u_max - controller.u_min) / 2.0 * abs(sum(b) / sum(a))
+        assert np.ptp(error) > 3.0
+        np.testing.assert_allclose(error, errors.numpy() * reach, atol=0.02)
 
-    def test_it_is_odd(self):
-        network = Network(SMALL).export()
-        observations = np.random.default_rng(0).uniform(-1, 1, size=(20, 41))
-        assert network.act(-observations) == pytest.approx(-network.act(observations))
+    def test_nothing_is_added_at_rest(self):
+        net = lively(SMALL)
+        rest = torch.randn(5, through_plant.INPUTS)
+        assert net(rest, rest)[1].abs().max() < 1e-6
+        assert net(rest + 0.1, rest)[1].abs().min() > 1e-5
 
-    def test_it_begins_close_to_what_holds_the_set_point(self):
-        # 5 degC needs 5 * 0.07273 / -0.04964 = -7.3258 t/h.
-        network = Network(SMALL).export()
-        steady = np.concatenate([[5.0], np.full(20, 5.0), np.full(20, -0.73258)])
-        network.act(steady)
-        assert network.command == pytest.approx(-7.3258, abs=0.2)
+    def test_in_numpy_it_is_what_it_was_in_torch(self):
+        net = lively(SMALL)
+        seen, at_rest = torch.randn(2, 50, through_plant.INPUTS)
+        found = net.export()(seen.double().numpy(), at_rest.double().numpy())
+        for ours, theirs in zip(found, net(seen, at_rest), strict=True):
+            np.testing.assert_allclose(ours, theirs.detach().numpy(), atol=1e-5)
 
 
 class TestDraws:
     def test_same_seed_same_draws(self):
         first, again, other = (
-            Draw(SMALL, 4, 60, *s).signals() for s in ((1, 2), (1, 2), (1, 3))
+            Draw(SMALL, 4, 60, *s).plants() for s in ((1, 2), (1, 2), (1, 3))
         )
         assert all(torch.equal(first[name], again[name]) for name in first)
-        assert not any(torch.equal(first[name], other[name]) for name in first)
+        assert not torch.equal(first["gain_factor"], other["gain_factor"])
 
-    def test_noise_is_that_of_the_plant(self):
-        noise = Draw(SMALL, 2000, 40, 0).noise(torch.full((2000,), 0.5))
-        assert noise.shape == (41, 2000)
-        assert not noise[0].any()
-        # One term, two, and all three: R times the squares of 1, 0.3574, 0.03392.
-        for k, factor in ((1, 1.0), (2, 1.12773), (30, 1.12889)):
-            assert noise[k].var().item() == pytest.approx(0.5 * factor, rel=0.1)
-        products = (noise[30] * noise[31]).mean().item()
-        assert products == pytest.approx(0.5 * (-0.3574 + 0.3574 * 0.03392), rel=0.15)
+    def test_plants_can_be_made_and_their_set_points_held(self):
+        numbers = Draw(SMALL, 500, 60, 0).plants()
+        room = torch.minimum(-numbers["u_min"], numbers["u_max"])
+        reach = room * numbers["gain_factor"] * through_plant.GAIN
+        assert (numbers["setpoint"].abs().amax(0) <= reach).all()
+        assert (numbers["dead_zone"] < room).all()
+        assert 0.1 < (numbers["noise_variance"] == 0.0).float().mean() < 0.7
 
-    def test_nominal_set_points_can_be_held(self):
-        signals = Draw(SMALL, 500, 60, 0).signals()
-        flows = signals["setpoint"].abs() * 0.07273 / 0.04964
-        assert (flows > signals["dead_zone"]).all()
-        assert (flows < 10.0).all()
-
-    def test_some_nominal_plants_are_calm(self):
-        noisy = Draw(SMALL, 1000, 10, 0).signals()["noise"].any(0)
-        assert noisy.float().mean().item() == pytest.approx(SMALL.noisy, abs=0.05)
-
-    def test_many_plants_stay_within_the_random_design(self):
-        signals = Draw(MANY, 1000, 10, 0).signals()
-        drifts = signals["gain_drift"] != 1.0
-        assert drifts.float().mean().item() == pytest.approx(0.5, abs=0.05)
-        for name in ("gain", "time_constant"):
-            factor = signals[f"{name}_factor"]
-            for values in (factor, factor * signals[f"{name}_drift"]):
-                low, high = SPANS[f"{name}_factor"]
-                assert low - 1e-5 < values.min() < low + 0.05
-                assert high - 0.05 < values.max() < high + 1e-5
-        assert set(signals["delay"].tolist()) == set(range(6, 37))
+    def test_what_is_told_wrongly_is_told_to_be_uncertain(self):
+        draw = Draw(replace(SMALL, spread=0.3), 4000, 1, 0)
+        numbers = draw.plants()
+        told = draw.told(numbers)
+        off = (told["gain_factor"] / numbers["gain_factor"]).log()
+        sure, unsure = (
+            off[mask] for mask in (told["uncertainty"] < 0.05, told["uncertainty"] > 0.2)
+        )
+        assert unsure.std() > 1.5 * sure.std()
+        exact = draw.told(numbers, exact=True)
+        assert torch.allclose(exact["gain_factor"], numbers["gain_factor"])
 
 
 class TestGradient:
     def test_it_is_that_of_differences(self):
-        training = replace(SMALL, samples=40, batch=3, noisy=0.0)
-        torch.manual_seed(0)
-        network = Network(training)
-        plants = through_plant.make_plants(training, 3, 40)
-        signals = Draw(training, 3, 40, 0).signals() | {"dead_zone": torch.zeros(3)}
+        net, samples = lively(SMALL).double(), 60
+        draw = Draw(SMALL, 3, samples, 0)
+        numbers = {name: value.double() for name, value in draw.plants().items()}
+        numbers |= {"dead_zone": torch.zeros(3, dtype=torch.double)}
+        told = draw.told(numbers, exact=True)
+        plants = environment(3, samples, dtype=torch.double)
 
         def loss():
-            return loss_of(*run(plants, network, signals, 40), training)
+            errors, applied = run(plants, net, numbers, told, samples, 0)
+            return loss_of(errors, applied, numbers["small"], SMALL)
 
-        loss().backward()
-        weight = network.layers[-1].weight
-        analytic = weight.grad.clone()
-        for i in range(4):
+        torch.set_default_dtype(torch.double)
+        try:
+            loss().backward()
+            weight = net.choosing[-1].weight
+            analytic = weight.grad.clone()
             at = []
-            for step in (1e-2, -1e-2):
+            for step in (1e-4, -1e-4):
                 with torch.no_grad():
-                    weight[0, i] += step
+                    weight[-1, 0] += step
                     at.append(loss().item())
-                    weight[0, i] -= step
-            numeric = (at[0] - at[1]) / 2e-2
-            assert analytic[0, i].item() == pytest.approx(numeric, rel=0.05, abs=2e-3)
+                    weight[-1, 0] -= step
+        finally:
+            torch.set_default_dtype(torch.float)
+        assert analytic[-1, 0].item() == pytest.approx((at[0] - at[1]) / 2e-4, rel=0.05)
 
-    @pytest.mark.parametrize("training", [SMALL, MANY])
-    def test_training_reduces_the_error(self, training):
-        trainer = Trainer(replace(training, steps=20, batch=16, samples=120, hidden=16))
-        before = trainer.record()["validation_mae"]
-        for _ in range(20):
-            trainer.advance()
-        assert trainer.record()["validation_mae"] < before
-
-    def test_every_step_meets_other_plants(self, monkeypatch):
-        met = []
-        signals = Draw.signals
-        monkeypatch.setattr(Draw, "signals", lambda draw: met.append(signals(draw)) or met[-1])
-        trainer = Trainer(SMALL)
-        for _ in range(2):
-            trainer.advance()
-        first, second = met
-        assert not any(torch.equal(first[name], second[name]) for name in first)
-
-    def test_a_price_on_moves_is_paid(self):
-        errors, applied = torch.zeros(3, 1), torch.tensor([[0.0], [2.0], [-1.0]])
-        assert loss_of(errors, applied, replace(SMALL, move_price=0.1)).item() == (
-            pytest.approx(0.1 * (2.0 + 3.0) / 2)
+    def test_training_reduces_the_error(self):
+        training = replace(SMALL, steps=30, plants=16, samples=150, choosing=16, adding=8)
+        torch.manual_seed(training.seed)
+        before = validate(Net(training), training)
+        after = train(training).provenance["validation"]
+        assert sum(after[kind] for kind in through_plant.KINDS) < sum(
+            before[kind] for kind in through_plant.KINDS
         )
 
-    def test_a_plant_in_numpy_answers_as_the_one_that_was_differentiated(self):
-        torch.manual_seed(0)
-        network = Network(SMALL)
-        signals = {
-            "dead_zone": torch.full((1,), 5.0),
-            "noise": torch.zeros(101, 1),
-            "setpoint": torch.full((101, 1), 5.0),
-        }
-        with torch.no_grad():
-            plants = through_plant.make_plants(SMALL, 1, 100)
-            errors, _ = run(plants, network, signals, 100)
-        policy = network.export()
-        plants = make_plants(1, 101, setpoint=5.0, **policy.observation)
-        trajectory = rollout(plants, policy, 101, seed=0)
-        error = trajectory.setpoint - trajectory.output
-        assert error[1:] == pytest.approx(errors.numpy(), abs=1e-4)
+    def test_moves_and_small_errors_are_paid(self):
+        errors, applied = torch.full((3, 1), 0.03), torch.tensor([[0.0], [0.2], [-0.1]])
+        paid = loss_of(errors, applied, torch.ones(1), replace(SMALL, move_price=0.1))
+        assert paid.item() == pytest.approx(np.log(0.03 - 0.0015 + 0.1 * 0.25))
 
 
 class TestKept:
-    def test_a_finished_network_is_loaded(self, tmp_path, monkeypatch):
-        trained = train(SMALL, tmp_path)
+    def test_one_that_was_stopped_goes_on_to_the_same_network(self, tmp_path, monkeypatch):
+        whole = train(SMALL)
+        advance = through_plant._advance
+
+        def stop(*arguments):
+            if arguments[-1] == 3:
+                raise KeyboardInterrupt
+            advance(*arguments)
+
+        state = tmp_path / "state.pt"
         with monkeypatch.context() as patch:
-            patch.setattr(Trainer, "advance", None)  # training again would raise
-            loaded = train(SMALL, tmp_path)
-        assert np.array_equal(weights(loaded), weights(trained))
-        (file,) = tmp_path.glob("*/network.npz")
+            patch.setattr(through_plant, "_advance", stop)
+            with pytest.raises(KeyboardInterrupt):
+                train(SMALL, state)
+        assert state.exists()
+        assert np.array_equal(weights(train(SMALL, state)), weights(whole))
+
+    def test_what_is_finished_is_not_trained_again(self, tmp_path):
+        trained = partial(command.trained, [SMALL], tmp_path, FanOut(1))
+        trained()
+        (file,) = tmp_path.glob("*/*")
         stamp = file.stat().st_mtime_ns
-        train(SMALL, tmp_path, retrain=True)
+        trained()
+        assert file.stat().st_mtime_ns == stamp
+        trained(retrain=True)
         assert file.stat().st_mtime_ns > stamp
 
-    def test_seed_is_honoured(self, tmp_path):
+    def test_seed_is_honoured(self):
         first, again, other = (
-            weights(train(replace(SMALL, steps=2, seed=seed), tmp_path / name))
-            for name, seed in (("first", 3), ("again", 3), ("other", 4))
+            weights(train(replace(SMALL, steps=2, seed=s))) for s in (3, 3, 4)
         )
         assert np.array_equal(first, again)
         assert not np.array_equal(first, other)
 
-    def test_a_damaged_file_is_named(self, tmp_path):
-        file = tmp_path / training_key(SMALL) / "network.npz"
-        file.parent.mkdir()
-        file.write_bytes(b"half of it")
-        with pytest.raises(ValueError, match="damaged") as error:
-            train(SMALL, tmp_path)
-        assert str(file) in str(error.value)
-        train(SMALL, tmp_path, retrain=True)
-
-    def test_the_best_in_validation_is_kept(self, tmp_path, monkeypatch):
-        scores = iter([3.0, 1.0, 2.0])
-
-        def validate(network, training):
-            return {"validation_mae": next(scores), "validation_travel": 0.0}
-
-        monkeypatch.setattr(through_plant, "validate", validate)
-        kept = train(SMALL, tmp_path)
-        trainer = Trainer(SMALL)
-        for _ in range(4):
-            trainer.advance()
-        assert np.array_equal(weights(kept), weights(trainer.averaged.export()))
-        assert kept.provenance["validation"]["step"] == 4
-
-    def test_provenance_is_kept(self, tmp_path):
-        kept = train(SMALL, tmp_path).provenance
-        assert kept["training"]["seed"] == SMALL.seed
-        assert kept["training"]["steps"] == 6
-        assert kept["validation"]["seed"] >= 3_000_000
-        assert {"torch", "numpy"} <= set(kept["versions"])
-        assert kept["cpu_seconds"] > 0.0
-        json.dumps(kept)
-
     def test_key_names_all_that_shapes_a_network(self):
-        keys = {training_key(t) for t in (SMALL, MANY, replace(SMALL, seed=1))}
-        assert len(keys) == 3
         assert training_key(SMALL) == training_key(replace(SMALL))
+        assert training_key(SMALL) != training_key(replace(SMALL, seed=1))
 
-
-class TestCommand:
-    @pytest.fixture(autouse=True)
-    def short(self, monkeypatch):
-        monkeypatch.setitem(TRAININGS, "nn-dpc", SMALL)
-
-    def test_it_trains_and_validation_chooses(self, tmp_path, capsys):
-        arguments = ["nn-dpc", "--networks", "2", "--out", str(tmp_path), "--jobs", "1"]
-        assert main(arguments) == 0
-        networks = [PolicyNetwork.load(path) for path in tmp_path.glob("*/network.npz")]
-        assert len(networks) == 2
-        best = min(networks, key=lambda network: network.provenance["validation"]["score"])
-        chosen = PolicyNetwork.load(tmp_path / "nn-dpc.npz")
-        assert chosen.provenance["training"] == best.provenance["training"]
-        seed = best.provenance["training"]["seed"]
+    def test_the_command_trains_and_validation_chooses(self, tmp_path, capsys):
+        arguments = ["nn-smith", "--networks", "2", "--steps", "1", "--jobs", "1"]
+        assert program.main([*arguments, "--out", str(tmp_path)]) == 0
+        seed = LawNetwork.load(tmp_path / "nn-smith.npz").provenance["training"]["seed"]
         assert f"chooses seed {seed}" in capsys.readouterr().out
 
-    def test_prices_are_drawn(self, tmp_path):
-        arguments = ["nn-dpc", "--networks", "1", "--prices", "0", "0.1", "--jobs", "1"]
-        assert main([*arguments, "--steps", "2", "--out", str(tmp_path)]) == 0
-        table = pd.read_csv(tmp_path / "nn-dpc-prices.csv")
-        assert list(table["price"]) == [0.0, 0.1]
-        assert (tmp_path / "nn-dpc-prices.png").stat().st_size > 1000
-
-    def test_policies_of_ppo_are_listed_by_their_seeds(self, tmp_path, capsys):
-        arguments = ["ppo", "--networks", "2", "--steps", "8", "--jobs", "1"]
-        assert main([*arguments, "--out", str(tmp_path)]) == 0
-        seeds = {"10000", "10001"}
-        assert seeds <= set(capsys.readouterr().out.split())
-        assert {file.stem for file in tmp_path.glob("*.npz")} == {f"ppo-{s}" for s in seeds}
-
-    def test_a_price_given_twice_is_trained_once(self, tmp_path):
-        arguments = ["nn-dpc", "--networks", "1", "--prices", "0.1", "0.1", "--jobs", "1"]
-        assert main([*arguments, "--steps", "1", "--out", str(tmp_path)]) == 0
-        assert len(pd.read_csv(tmp_path / "nn-dpc-prices.csv")) == 1
-
-    @pytest.mark.parametrize("prices", [["-1"], ["nan"], ["cheap"], ["0.1", "--keep"]])
-    def test_bad_prices_are_named(self, prices, capsys):
-        with pytest.raises(SystemExit):
-            main(["nn-dpc", "--prices", *prices])
-        shown = capsys.readouterr().err
-        assert re.search(
-            "--prices: (must be a number of at least 0|goes without --keep)", shown
-        )
+    def test_the_one_of_the_project_is_that_of_the_defaults(self):
+        kept = LawNetwork.load(PRETRAINED / "nn-smith.npz").provenance
+        assert kept["training"] == json.loads(json.dumps(through_plant.asdict(Training())))
+        assert kept["validation"]["seed"] >= 3_000_000
+        assert kept["cpu_seconds"] > 60.0
 
 
-@pytest.mark.parametrize("name", ["nn-dpc", "nn-adaptive"])
-def test_the_networks_that_come_with_the_project(name):
-    network = PolicyNetwork.pretrained(name)
-    training = TRAININGS[name]
-    assert network.observation == through_plant.windows(training.window)
-    assert network.provenance["training"]["plants"] == training.plants
-    assert network.provenance["validation"]["seed"] >= 3_000_000
+def test_policies_of_ppo_are_listed_by_their_seeds(tmp_path, capsys):
+    arguments = ["ppo", "--networks", "2", "--steps", "8", "--jobs", "1"]
+    assert program.main([*arguments, "--out", str(tmp_path)]) == 0
+    seeds = {"10000", "10001"}
+    assert seeds <= set(capsys.readouterr().out.split())
+    assert {file.stem for file in tmp_path.glob("*.npz")} == {f"ppo-{s}" for s in seeds}
+
+
+def test_one_of_your_own_learns_in_a_few_steps():
+    assert example.main(6, 16, 200) < 1.5  # the paper's PI controller has 2.26

@@ -8,7 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents import DirectNNController, PIController, SelfTuningController, SmithPredictor
+from agents import (
+    DirectNNController,
+    NeuralSelfTuningController,
+    NeuralSmithPredictor,
+    PIController,
+    SelfTuningController,
+    SmithPredictor,
+)
 from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.records import Factory
@@ -100,6 +107,16 @@ def smith(plant: Parameters, runs: int = 1, seed: int = 0) -> SmithPredictor:
 def self_tuning(plant: Parameters, runs: int, seed: int) -> SelfTuningController:
     """Return a self-tuning controller that starts from what a step test shows."""
     return SelfTuningController(**asdict(step_test(plant)), **data_sheet(plant))
+
+
+def nn_smith(plant: Parameters, runs: int = 1, seed: int = 0) -> NeuralSmithPredictor:
+    """Return the network behind a model, told what a Smith predictor is told."""
+    return NeuralSmithPredictor(**asdict(step_test(plant)), **data_sheet(plant))
+
+
+def nn_self_tuning(plant: Parameters, runs: int, seed: int) -> NeuralSelfTuningController:
+    """Return the network behind a bank of models that starts from what a step test shows."""
+    return NeuralSelfTuningController(**asdict(step_test(plant)), **data_sheet(plant))
 
 
 def mpc(plant: Parameters, runs: int, seed: int) -> PredictiveController:

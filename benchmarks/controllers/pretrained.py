@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from agents import PolicyNetwork
+from agents import LawNetwork, PolicyNetwork
 from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Cost, Factory, Members
+from benchmarks.rollout import Agent
 from benchmarks.train import ppo
 from benchmarks.train.ppo_arguments import RANDOMISED, PPOArguments
 from mptc_gym import Parameters
@@ -48,11 +49,12 @@ class Trained:
         return network
 
 
-def network(name: str) -> Members:
-    """Return the members of a network that comes with the project, such as "nn-dpc"."""
+def told_network(make: Callable[..., Agent]) -> Members:
+    """Return the members of a controller that has the told network."""
 
     def members(_: ppo.PolicyRequest) -> list[Factory]:
-        return [_factory(PolicyNetwork.pretrained(name), f"{name}.npz")]
+        about = dict(LawNetwork.load().provenance)
+        return [Factory(make, provenance={"file": "nn-smith.npz", **about})]
 
     return members
 

@@ -10,6 +10,7 @@ from benchmarks.controllers import engineered, pretrained
 from benchmarks.controllers.records import Cost, RosterEntry, Tuning, alone
 
 _STEP_TEST = "gain, time constant, delay"
+_NETWORK = "8,427 weights for all plants"
 _SEARCH = "566 M (search)"
 
 ROSTER: dict[str, RosterEntry] = {
@@ -139,20 +140,22 @@ ROSTER: dict[str, RosterEntry] = {
             compared=False,
         ),
         RosterEntry(
-            "nn-dpc",
-            "NN, trained through the plant",
-            pretrained.network("nn-dpc"),
-            Cost("the paper's plant: its equations, ranges of dead zone and noise"),
-            told=False,
+            "nn-smith",
+            "NN, told",
+            pretrained.told_network(engineered.nn_smith),
+            Cost(f"{_STEP_TEST}, dead zone, limits", _NETWORK, "one step test; 23 M, once"),
             swept=True,
             drawn=True,
         ),
         RosterEntry(
-            "nn-adaptive",
-            "NN, trained on many plants",
-            pretrained.network("nn-adaptive"),
-            Cost("the class of plants: equations, and ranges of their numbers"),
-            told=False,
+            "nn-self-tuning",
+            "NN, self-tuning",
+            pretrained.told_network(engineered.nn_self_tuning),
+            Cost(
+                f"{_STEP_TEST}, dead zone, limits; delay range",
+                f"a bank of models, 30 settings; {_NETWORK}",
+                "one step test; 23 M, once",
+            ),
             swept=True,
             drawn=True,
         ),

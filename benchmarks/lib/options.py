@@ -112,7 +112,6 @@ Runs = Annotated[int, reads(int, "an integer of at least 1", 1, 100_000)]
 Seed = Annotated[int, reads(int, "an integer of at least 0", 0, 2**63)]
 Finite = Annotated[float, reads(float, "a finite number", -math.inf)]
 Positive = Annotated[float, reads(float, "a number above 0", math.nextafter(0.0, 1.0))]
-Prices = Annotated[tuple[float, ...], reads(float, "a number of at least 0", 0.0, many=-1)]
 Orders = Annotated[
     tuple[int, int, int], reads(int, "an integer of at least 0", 0, 1000, many=3)
 ]

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from benchmarks.lib.options import Count, FanOutOptions, Folder, Prices, choice, options
+from benchmarks.lib.options import Count, FanOutOptions, Folder, choice, options
 
-NETWORKS = ("nn-dpc", "nn-adaptive", "ppo")
+OUT = Path("results/networks")
 
 
 @options
@@ -16,24 +16,18 @@ NETWORKS = ("nn-dpc", "nn-adaptive", "ppo")
 class Options:
     """Train the networks that control: by the gradient through the plant, or by PPO.
 
-    nn-dpc is for the paper's plant, nn-adaptive for many plants. Several networks are trained,
-    which differ in their seeds, and validation chooses one. ppo trains the policies of
-    Stable-Baselines3's PPO, all of which are compared. What is finished is kept: the same
-    command, run again after it was interrupted, trains what is missing.
+    What is finished is kept: the same command trains what is missing.
     """
 
-    network: Annotated[str, choice(NETWORKS, "What to train")] = field(kw_only=False)
-    networks: Count = 5
-    """How many to train, each from a seed of its own."""
+    network: Annotated[str, choice(("nn-smith", "ppo"), "What to train")] = field(kw_only=False)
+    networks: Count | None = None
+    """How many to train, each from a seed of its own (default: 1 of nn-smith, of which
+    validation would choose one, and 5 of PPO, all of which are compared)."""
     steps: Count | None = None
-    """Steps of the optimiser, for PPO samples of experience (default: those of the networks
-    that come with the project)."""
-    prices: Prices = ()
-    """Train with each of these prices of valve travel, °C for each t/h a sample, and draw what
-    it buys."""
+    """Steps of the optimiser, for PPO samples of experience (default: as published)."""
     retrain: bool = False
     """Train even what is finished."""
     keep: bool = False
-    """Put what is chosen into agents/pretrained."""
-    out: Folder = Path("results/networks")
+    """Put the result into agents/pretrained."""
+    out: Folder = OUT
     fan_out: FanOutOptions = field(default_factory=FanOutOptions)

@@ -1,385 +1,448 @@
-"""Networks trained by the gradient through the plant.
+"""Trains the network of `nn-smith` by the gradient through plants of all kinds.
 
-A batch of simulated plants is run under the network, and the error of the whole run is
-differentiated with respect to the weights, back through controller, actuator and plant. That
-needs a model of the plant in PyTorch, and a loss; no value function, and no exploration. The
-literature calls it differentiable predictive control (J. Drgona et al., "Differentiable
-predictive control: deep learning alternative to explicit model predictive control for unknown
-nonlinear systems", Journal of Process Control 116, 2022, 80-92) or analytic policy gradients.
+A batch of simulated plants is run under the network, each behind a model that is told its
+numbers, and the error of the whole run is differentiated with respect to the weights, back
+through law, actuator and plant. The literature calls it differentiable predictive control (J.
+Drgona et al., "Differentiable predictive control: deep learning alternative to explicit model
+predictive control for unknown nonlinear systems", Journal of Process Control 116, 2022, 80-92).
 """
 
 from __future__ import annotations
 
-import itertools
+import copy
 import math
 import time
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from agents import PolicyNetwork
-from benchmarks.designs import SPANS
+from agents.neural_law import INPUTS, MOST_ADDED, OUTPUTS, Law, LawNetwork, Prior
 from benchmarks.lib.fingerprint import fingerprint
-from benchmarks.lib.storage import versions
+from benchmarks.lib.storage import replacing, versions
 from mptc_gym import Parameters
+from mptc_gym.plant import Dynamics
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
-NOMINAL = Parameters()
-GAIN = sum(NOMINAL.b) / sum(NOMINAL.a)  # steady-state, degC per t/h; limits are +-10 t/h
-HOLDS = 0.1 / GAIN  # action that holds the output, per degC
-VALIDATION_PLANTS, VALIDATION_SAMPLES = 64, 600
-VALIDATION_SEED = 3_000_000  # met neither in training nor by any comparison
-DRIFT_SAMPLES = 1200  # of plants that drift, as in the random design
-LAST_RATE = 0.01  # what the learning rate falls to, as a share of the first
+NOMINAL = Parameters(time_constant_factor=[0.2, 5.0])  # a range, so that it can be changed
+DYNAMICS = Dynamics(NOMINAL)
+GAIN = abs(sum(NOMINAL.b) / sum(NOMINAL.a))  # degC per t/h
+RATE = 1.0 - float(np.abs(np.roots(NOMINAL.a)).max())  # of the dominant pole
+LONGEST, BLOCK = 44, 4  # samples: the longest delay that is told, the shortest
+VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED = 64, 600, 3_000_000
+SAVED_EVERY = 50  # steps of a training of minutes
+KINDS = "calm", "noise", "load", "boiler", "drift"
 
-Signals = dict[str, Tensor]
-Curve = list[dict[str, float]]
+Numbers = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
 class Training:
-    """Everything that shapes a network, except versions and code."""
+    """Everything that shapes the network, except versions and code."""
 
-    plants: str = "nominal"
-    """What to train on: "nominal", the paper's plant with any dead zone from 4 to 6.7 t/h; or
-    "many", plants drawn as in the random design of `benchmarks.sweep`, half of which drift."""
     seed: int = 10_000
-    """Of the initial weights, and of plants, set points and noise."""
-    steps: int = 150
-    """Of the optimiser, each on a new batch of plants."""
-    batch: int = 64
-    """Plants of a step."""
-    samples: int = 400
+    """Of the initial weights, and of all that the plants meet."""
+    steps: int = 600
+    """Of the optimiser, each on new plants."""
+    plants: int = 128
+    """Of a step."""
+    samples: int = 300
     """Length of their runs."""
-    window: int = 24
-    """Past outputs and past actions that the network sees."""
-    hidden: int = 64
-    """Nodes of each of the two hidden layers."""
-    learning_rate: float = 3e-3
-    """Of Adam at the start; it falls linearly."""
-    move_price: float = 0.01
-    """Price of valve travel: degC per t/h that the applied flow moves in a sample."""
-    tolerance: float = 0.02
-    """Below this error, degC, the loss is quadratic (Huber), and above it linear. With 0.2 the
-    network stays a little short of the set point, closer to where the next one may be."""
-    noisy: float = 0.3
-    """Share of the nominal plants that have noise."""
-    noise_variance: float = 0.6
-    """R of those that have is uniform from 0 to this, degC^2."""
-    averaging: float = 0.95
-    """What is kept and validated is the exponential mean of the weights of past steps."""
-    validate_every: int = 25
-    """Steps between two validations."""
+    choosing: int = 64
+    """Nodes of each hidden layer of the network that chooses."""
+    adding: int = 24
+    """The same of the one that adds to the flow."""
+    learning_rate: float = 2e-3
+    """Of Adam at the start; it falls linearly, to a hundredth."""
+    move_price: float = 0.02
+    """Of what the flow travels a sample, half the range, in multiples of the reach."""
+    tolerance: float = 0.003
+    """Below this error, a share of the reach, the loss is quadratic (Huber)."""
+    spread: float = 0.4
+    """The largest uncertainty of what is told."""
+    averaging: float = 0.98
+    """What is kept is the exponential mean of the weights of past steps."""
 
 
-TRAININGS: dict[str, Training] = {
-    "nn-dpc": Training(),
-    "nn-adaptive": Training(
-        plants="many", steps=450, batch=128, samples=400, window=64, hidden=128,
-        learning_rate=2e-3, averaging=0.98,
-    ),
-}  # fmt: skip
-
-
-class Network(nn.Module):
-    """The policy, odd in its inputs: what it does at a set point it undoes at the opposite one.
-
-    It adds to the action that holds the set point on the nominal plant. Its inputs are the set
-    point, the errors of past outputs from it, and past actions less that action. In the steady
-    state of the nominal plant all but the set point are 0. An odd function without that input
-    is 0 there for certain; with little of it, nearly so.
-
-    Parameters
-    ----------
-    training
-        Sizes.
-    """
-
-    SET_POINT, ERROR, REACH = 0.02, 0.5, 2.4  # input scales, per degC; largest output
-
-    features: Tensor
+class Net(nn.Module):
+    """The two networks of the law, in PyTorch."""
 
     def __init__(self, training: Training) -> None:
         super().__init__()
-        window, hidden = training.window, training.hidden
-        self.window = window
-        # From the observation (set point, outputs, actions) to the inputs.
-        features = torch.zeros(1 + 2 * window, 1 + 2 * window)
-        features[0, 0] = self.SET_POINT
-        features[1:, 0] = torch.tensor([self.ERROR, -HOLDS]).repeat_interleave(window)
-        scales = torch.tensor([-self.ERROR, 1.0]).repeat_interleave(window)
-        features[1:, 1:] = torch.diag(scales)
-        self.register_buffer("features", features)
-        sizes = (1 + 2 * window, hidden, hidden, 1)
-        self.layers = nn.ModuleList(
-            nn.Linear(before, after, bias=False) for before, after in itertools.pairwise(sizes)
-        )
-        last = cast("nn.Linear", self.layers[-1])
+
+        def layers(hidden: int, outputs: int) -> nn.Sequential:
+            return nn.Sequential(
+                nn.Linear(INPUTS, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(),
+                nn.Linear(hidden, outputs),
+            )  # fmt: skip
+
+        self.choosing = layers(training.choosing, OUTPUTS)
+        self.adding = layers(training.adding, 1)
         with torch.no_grad():
-            last.weight.mul_(0.1)  # begins close to the action that holds
+            for last in (cast("nn.Linear", part[-1]) for part in (self.choosing, self.adding)):
+                last.weight.mul_(0.1)
+                last.bias.zero_()
 
-    def weights(self) -> list[Tensor]:
-        """Return the weights of each layer, the first for observations."""
-        first, *others = self.parameters()
-        return [first @ self.features, *others]
+    def forward(self, seen: Tensor, at_rest: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the law asks for; see `agents.neural_law.Network`."""
+        added = torch.tanh(self.adding(torch.cat([seen, at_rest])))[:, 0]
+        n = len(seen)
+        return self.choosing(seen), MOST_ADDED * (added[:n] - added[n:])
 
-    def export(self, **provenance: Any) -> PolicyNetwork:
-        """Return the network in NumPy."""
-        layers = [(W.detach().numpy(), np.zeros(len(W))) for W in self.weights()]
-        direct = np.zeros(1 + 2 * self.window)
-        direct[0] = HOLDS
-        return PolicyNetwork(
-            layers,
-            observation=windows(self.window),
-            input_scale=np.ones(1 + 2 * self.window),
-            activation="tanh",
-            output="tanh",
-            output_scale=self.REACH,
-            direct=direct,
-            provenance=provenance,
-        )
-
-
-def act(weights: list[Tensor], observations: Tensor) -> Tensor:
-    """Return actions, shape (n, 1), for observations, shape (n, n_obs); they may exceed 1."""
-    x = observations.t()
-    setpoint = x[:1]
-    for W in weights[:-1]:
-        x = torch.tanh(W @ x)
-    return (HOLDS * setpoint + Network.REACH * torch.tanh(weights[-1] @ x)).t()
-
-
-def windows(window: int) -> dict[str, int]:
-    """Return the arguments of the environment for what a network sees."""
-    return {
-        "setpoint_window": 1,
-        "error_window": 0,
-        "output_window": window,
-        "action_window": window,
-    }
-
-
-def make_plants(training: Training, count: int, samples: int) -> MiddlePointTorchEnv:
-    """Return plants that take all that differs between them as signals at each reset."""
-    arguments: dict[str, Any] = {"dead_zone": (0.0, 8.0)}
-    if training.plants == "many":
-        arguments |= SPANS
-        for name in ("gain", "time_constant"):
-            low, high = SPANS[f"{name}_factor"]
-            arguments[f"{name}_drift"] = (low / high, high / low)
-        arguments["drift_samples"] = DRIFT_SAMPLES
-    arguments["noise_variance"] = 0.0  # handed in, too
-    arguments |= windows(training.window)
-    return MiddlePointTorchEnv(
-        count,
-        max_episode_steps=samples,
-        differentiable=True,
-        **arguments,
-    )
+    def export(self, **provenance: Any) -> LawNetwork:
+        """Return the networks in NumPy."""
+        parts = [
+            [
+                (layer.weight.detach().double().numpy(), layer.bias.detach().double().numpy())
+                for layer in part
+                if isinstance(layer, nn.Linear)
+            ]
+            for part in (self.choosing, self.adding)
+        ]
+        return LawNetwork(parts[0], parts[1], provenance)
 
 
 class Draw:
-    """Draws what a batch of plants meets, all from one generator."""
+    """Draws what a batch of plants is, what it meets, and what is told of it."""
 
-    def __init__(self, training: Training, count: int, samples: int, *seed: int) -> None:
-        self._training, self._count, self._samples = training, count, samples
+    def __init__(self, training: Training, n: int, samples: int, *seed: int) -> None:
+        self._n, self._samples, self._spread = n, samples, training.spread
         self._generator = torch.Generator()
         # Hashed, so that the draws of neighbouring seeds have nothing in common.
         state = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
         self._generator.manual_seed(int(state >> np.uint64(1)))
 
-    def uniform(self, low: float, high: float, *shape: int) -> Tensor:
-        """Draw uniformly, shape (count,) if no other is given."""
-        drawn = torch.rand(*(shape or (self._count,)), generator=self._generator)
-        return low + drawn * (high - low)
+    def uniform(self, low: Any, high: Any, *shape: int) -> Tensor:
+        """Draw uniformly, shape (n,) if no other is given."""
+        drawn = torch.rand(*(shape or (self._n,)), generator=self._generator)
+        values: Tensor = low + drawn * (high - low)
+        return values
 
-    def noise(self, variance: Tensor) -> Tensor:
-        """Draw n(k) of (28) for k = 0 to `samples`, degC; xi is 0 up to k = 0."""
-        order = len(NOMINAL.c) - 1
-        xi = torch.randn(self._samples + 1, self._count, generator=self._generator)
-        xi = torch.cat([torch.zeros(order, self._count), xi * variance.sqrt()])
-        xi[order] = 0.0
-        lags = [xi[order - i : len(xi) - i] * c for i, c in enumerate(NOMINAL.c)]
-        return torch.stack(lags).sum(0)
+    def some(self, share: float, values: Tensor | float) -> Tensor:
+        """Return values for a share of the plants, and 0 for the others."""
+        return values * (self.uniform(0.0, 1.0) < share)
 
-    def levels(self, least: Tensor | float) -> Tensor:
-        """Draw set points for k = 0 to `samples`: held for 100, or the square wave."""
-        n, age = self._count, torch.arange(self._samples + 1)[:, None]
-        begins = torch.randint(0, 100, (n,), generator=self._generator)
-        size = least + (6.0 - least) * self.uniform(0.0, 1.0, self._samples // 100 + 2, n)
-        sign = torch.sign(self.uniform(-1.0, 1.0, *size.shape))
-        random = (size * sign).gather(0, (age + begins) // 100)
-        begins = torch.randint(0, 600, (n,), generator=self._generator)
-        square = torch.where((age + begins) // 300 % 2 == 0, size[0], -size[0])
-        return torch.where(self.uniform(0.0, 1.0) < 0.4, square, random)
+    def plants(self) -> Numbers:
+        """Draw the numbers of the plants, those of `MiddlePointTorchEnv`, and `small`.
 
-    def signals(self) -> Signals:
-        """Draw all that a batch of training plants needs."""
-        if self._training.plants == "many":
-            return self._many()
-        dead_zone = self.uniform(4.0, 6.7)
-        noisy = self.uniform(0.0, 1.0) < self._training.noisy
-        variance = torch.where(noisy, self.uniform(0.0, self._training.noise_variance), 0.0)
-        # Smaller set points would need a flow within the dead zone, and nothing holds them.
-        return {
-            "dead_zone": dead_zone,
-            "noise": self.noise(variance),
-            "setpoint": self.levels(4.6),
+        `small` is a factor of set point, dead zone, noise and load: the same problem in a
+        corner of what the plant can reach.
+        """
+        one = torch.ones(self._n)
+        gain, constant = (
+            torch.exp(self.uniform(math.log(low), math.log(high)))
+            for low, high in ((0.7, 1.7), (0.45, 2.2))
+        )
+        skewed = self.uniform(0.0, 1.0) < 0.25
+        u_min = torch.where(skewed, -self.uniform(8.5, 13.0), -10.0 * one)
+        u_max = torch.where(skewed, self.uniform(8.5, 13.0), 10.0 * one)
+        small = torch.where(self.uniform(0.0, 1.0) < 0.25, self.uniform(0.1, 0.6), one)
+        kind = self.uniform(0.0, 1.0)  # calm, load alone, or everything
+        noisy = (kind > 0.35).float()
+        drifts = self.uniform(0.0, 1.0) < 0.2
+        numbers = {
+            "gain_factor": gain,
+            "time_constant_factor": constant,
+            "delay": self.uniform(6.0, 37.0).floor(),
+            "dead_zone": self.some(0.9, self.uniform(0.0, 8.0)) * small,
+            "u_min": u_min,
+            "u_max": u_max,
+            "noise_variance": noisy * self.some(0.85, self.uniform(0.0, 1.0)) * small**2,
+            "measurement_noise_variance": noisy
+            * self.some(0.5, self.uniform(0.0, 0.2))
+            * small**2,
+            "disturbance_amplitude": self.some(0.6, self.uniform(0.0, 2.5)) * small,
+            "disturbance_interval": self.uniform(100.0, 300.0),
+            "disturbance_walk_variance": noisy
+            * self.some(0.5, self.uniform(0.0, 0.001))
+            * small**2,
+            "small": small,
         }
-
-    def _many(self) -> Signals:
-        drifts = self.uniform(0.0, 1.0) < 0.5
-        signals: Signals = {}
+        numbers["disturbance_amplitude"] *= (kind > 0.15).float()
         for name in ("gain", "time_constant"):
-            span = SPANS[f"{name}_factor"]
-            factor, later = self.uniform(*span), self.uniform(*span)
-            signals[f"{name}_factor"] = factor
-            signals[f"{name}_drift"] = torch.where(drifts, later / factor, 1.0)
-        shortest, longest = SPANS["delay"]
-        return signals | {
-            "delay": self.uniform(shortest, longest + 1).floor(),
-            "dead_zone": self.uniform(*SPANS["dead_zone"]),
-            "noise": self.noise(self.uniform(*SPANS["noise_variance"])),
-            "setpoint": self.levels(3.0),
-        }
+            numbers[f"{name}_drift"] = torch.where(drifts, self.uniform(0.75, 1.33), one)
+        numbers["setpoint"] = self.levels(numbers)
+        return numbers
+
+    def levels(self, numbers: Numbers) -> Tensor:
+        """Draw set points for k = 0 to `samples`: levels held for a while, or a square wave."""
+        n, age = self._n, torch.arange(self._samples + 1)[:, None]
+        room = torch.minimum(-numbers["u_min"], numbers["u_max"]) * GAIN
+        most = (room * numbers["gain_factor"] * numbers["small"]).clamp(max=6.5)
+        size = (0.3 + 0.65 * self.uniform(0.0, 1.0, self._samples // 60 + 2, n)) * most
+        sign = torch.sign(self.uniform(-1.0, 1.0, *size.shape))
+        begun, length = self.uniform(0.0, 150.0).floor(), self.uniform(60.0, 160.0).floor()
+        held = (size * sign).gather(
+            0, ((age + begun) // length).long().clamp(max=len(size) - 1)
+        )
+        phase = self.uniform(0.0, 600.0).floor()
+        square = torch.where((age + phase) // 300 % 2 == 0, size[0], -size[0])
+        return torch.where(self.uniform(0.0, 1.0) < 0.5, square, held)
+
+    def told(self, numbers: Numbers, *, exact: bool = False) -> Numbers:
+        """Draw what is told of plants: half of it by numbers of first order, some wrongly."""
+        told = {name: numbers[name] for name in ("u_min", "u_max", "dead_zone")}
+        told["first"] = self.uniform(0.0, 1.0) < 0.6
+        k = self.some(0.0 if exact else 0.5, self.uniform(0.0, self._spread))
+        # Some were right once, and nobody knows that they are not any more.
+        aged = self.some(0.0 if exact else 0.2, self.uniform(0.0, 0.3))
+        wrong = torch.randn(3, self._n, generator=self._generator) * k
+        wrong[:2] += self.uniform(-1.5, 1.5, 2, self._n) * aged
+        told["uncertainty"] = k
+        told["gain_factor"] = numbers["gain_factor"] * torch.exp(wrong[0])
+        constant = numbers["time_constant_factor"] * torch.exp(1.5 * wrong[1])
+        told["time_constant_factor"] = constant.clamp(0.3, 3.3)
+        delay = numbers["delay"] + (20.0 * wrong[2]).round()
+        told["delay"] = delay.clamp(BLOCK, LONGEST - BLOCK)
+        return told
+
+
+class Loops:
+    """The law and the told models of a batch, as `NeuralSmithPredictor` has them."""
+
+    def __init__(self, told: Numbers) -> None:
+        gain, constant = told["gain_factor"], told["time_constant_factor"]
+        low, high, first = told["u_min"], told["u_max"], told["first"]
+        zero = self._zero = torch.zeros_like(gain)
+        self._first = first
+        self._low, self._half = low, (high - low) / 2.0
+        self.reach = gain * GAIN * self._half
+        alpha, _, unit = DYNAMICS.coefficients(gain, constant)
+        pole = 1.0 - RATE / constant
+        self._alpha = (
+            torch.where(first, pole, alpha[0] + zero),
+            torch.where(first, zero, alpha[1] + zero),
+        )
+        self._unit = torch.where(first, 1.0 - pole, unit + zero)
+        shares = [b / sum(NOMINAL.b) for b in NOMINAL.b]
+        self._beta = (
+            torch.where(first, self._unit, self._unit * shares[0]),
+            torch.where(first, zero, self._unit * shares[1]),
+        )
+        self._delay = told["delay"].long()
+        self.law = Law(
+            Prior(
+                unit=self._unit,
+                fading=pole ** (told["delay"] + 1.0 + 0.5 * first),
+                time_constant=constant,
+                delay=told["delay"],
+                dead_zone=told["dead_zone"] / self._half,
+                centre=-(high + low) / (high - low),
+                uncertainty=told["uncertainty"],
+            ),
+            torch,
+            Tensor.detach,
+        )
+        self._before = torch.zeros(LONGEST + BLOCK, len(gain))  # the model's outputs
+        self._new: list[Tensor] = []
+        self._model = self._last_model = self._flow = self._last_flow = zero
+        self._residual = self._last_residual = self._off = zero
+
+    def act(self, net: Net, observations: Tensor) -> Tensor:
+        """Return actions, shape (n, 1)."""
+        setpoint, output = (observations / self.reach[:, None]).unbind(1)
+        k = len(self._new) % BLOCK
+        if k == 0:  # looked up for some samples at once: it costs less
+            if self._new:
+                self._before = torch.cat([self._before[BLOCK:], torch.stack(self._new)])
+                self._new = []
+            rows = len(self._before) - self._delay + torch.arange(BLOCK)[:, None]
+            self._delayed = self._before.gather(0, rows).unbind()
+        off = output - self._delayed[k]
+        residual = torch.where(self._first, (off + self._off) / 2.0, off)
+        self._off = off
+        load = residual - self._alpha[0] * self._residual - self._alpha[1] * self._last_residual
+        self._residual, self._last_residual = residual, self._residual
+        state = self._model, self._last_model, self._flow
+        wanted, passed = self.law.applied(self.law.flow(net, setpoint, residual, load, state))
+        self._new.append(self._model)
+        self._flow, self._last_flow = passed, self._flow
+        new = self._alpha[0] * self._model + self._alpha[1] * self._last_model
+        new = new + self._beta[0] * self._flow + self._beta[1] * self._last_flow
+        self._model, self._last_model = new, self._model
+        # The plant answers downwards.
+        action: Tensor = (-wanted * self._half - self._low) / self._half - 1.0
+        return action[:, None]
+
+
+def environment(
+    n: int, samples: int, dtype: torch.dtype = torch.float32
+) -> MiddlePointTorchEnv:
+    """Return plants that take all that differs between them as signals at each reset."""
+    return MiddlePointTorchEnv(
+        n,
+        max_episode_steps=samples,
+        dtype=dtype,
+        differentiable=True,
+        setpoint_window=1,
+        error_window=0,
+        output_window=1,
+        action_window=0,
+        drift_samples=1200,
+        delay=(4, 60),
+        dead_zone=(0.0, 8.5),
+        gain_factor=(0.3, 3.0),
+        time_constant_factor=(0.2, 5.0),
+        gain_drift=(0.3, 3.0),
+        time_constant_drift=(0.3, 3.0),
+        noise_variance=(0.0, 1.0),
+        measurement_noise_variance=(0.0, 0.2),
+        disturbance_amplitude=(0.0, 3.0),
+        disturbance_interval=(50.0, 400.0),
+        disturbance_walk_variance=(0.0, 0.001),
+        u_min=(-14.0, -8.5),
+        u_max=(8.5, 14.0),
+    )
 
 
 def run(
-    plants: MiddlePointTorchEnv, network: Network, signals: Signals, samples: int
+    plants: MiddlePointTorchEnv,
+    net: Net,
+    numbers: Numbers,
+    told: Numbers,
+    samples: int,
+    seed: int,
 ) -> tuple[Tensor, Tensor]:
-    """Return e(k + 1), degC, and u_a(k), t/h, for k = 0, 1, ..., each (samples, plants)."""
-    observations, _ = plants.reset(seed=0, options={"signals": signals})
-    weights = network.weights()
+    """Return e(k + 1) in multiples of the reach, u_a(k) of half the range: (samples, n)."""
+    signals = {name: values for name, values in numbers.items() if name != "small"}
+    observations, _ = plants.reset(seed=seed, options={"signals": signals})
+    loops = Loops(told)
     errors, applied = [], []
     for _ in range(samples):
-        observations, _, _, _, infos = plants.step(act(weights, observations))
+        observations, _, _, _, infos = plants.step(loops.act(net, observations))
         errors.append(infos["error"])
         applied.append(infos["applied"])
-    return torch.stack(errors), torch.stack(applied)
+    return torch.stack(errors) / loops.reach, torch.stack(applied) / loops._half
 
 
-def loss_of(errors: Tensor, applied: Tensor, training: Training) -> Tensor:
-    """Return what is minimised, degC."""
-    tolerance = training.tolerance
-    error = nn.functional.huber_loss(errors, torch.zeros_like(errors), delta=tolerance)
-    return error / tolerance + training.move_price * applied.diff(dim=0).abs().mean()
+def loss_of(errors: Tensor, applied: Tensor, small: Tensor, training: Training) -> Tensor:
+    """Return the mean logarithm of each plant's error and price of moves."""
+    tolerance = training.tolerance * small
+    size = errors.abs()
+    huber = torch.where(size < tolerance, size**2 / (2.0 * tolerance), size - tolerance / 2.0)
+    moves = applied.diff(dim=0).abs().mean(0)
+    return (huber.mean(0) + training.move_price * moves).clamp(min=tolerance).log().mean()
 
 
-def validate(network: Network, training: Training) -> dict[str, float]:
-    """Return mean |e|, degC, and what the valve travels a sample, t/h, on held-out plants."""
-    plants = make_plants(training, VALIDATION_PLANTS, VALIDATION_SAMPLES)
-    draw = Draw(training, VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED)
+def validation(training: Training) -> dict[str, tuple[Numbers, Numbers]]:
+    """Return plants of each kind, which training does not meet, and what is told of them."""
+    sets = {}
+    for i, kind in enumerate(KINDS):
+        draw = Draw(training, VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED, i)
+        numbers = draw.plants()
+        s, one = numbers["small"], torch.ones(VALIDATION_PLANTS)
+        for name in numbers:
+            if "disturbance" in name or "noise" in name:
+                numbers[name] = 0.0 * one if name != "disturbance_interval" else 200.0 * one
+            if name.endswith("_drift"):
+                numbers[name] = one
+        if kind in ("noise", "drift"):
+            numbers["noise_variance"] = draw.uniform(0.1, 1.0) * s**2
+        if kind == "drift":
+            numbers["gain_drift"], numbers["time_constant_drift"] = (
+                draw.uniform(0.6, 1.6) for _ in range(2)
+            )
+        if kind == "load":
+            numbers["disturbance_amplitude"] = draw.uniform(0.5, 2.5) * s
+        if kind == "boiler":
+            numbers["noise_variance"] = draw.uniform(0.3, 0.7) * s**2
+            numbers["measurement_noise_variance"] = draw.uniform(0.05, 0.15) * s**2
+            numbers["disturbance_amplitude"] = draw.uniform(1.0, 2.5) * s
+            numbers["disturbance_walk_variance"] = draw.uniform(2e-4, 8e-4) * s**2
+        sets[kind] = numbers, draw.told(numbers, exact=True)
+    return sets
+
+
+def validate(net: Net, training: Training) -> dict[str, float]:
+    """Return the mean logarithm of the mean |e|, and the travel, of each kind of plants."""
+    plants = environment(VALIDATION_PLANTS, VALIDATION_SAMPLES)
+    found = {}
     with torch.no_grad():
-        errors, applied = run(plants, network, draw.signals(), VALIDATION_SAMPLES)
-    return {
-        "validation_mae": float(errors.abs().mean()),
-        "validation_travel": float(applied.diff(dim=0).abs().mean()),
-    }
+        for kind, (numbers, told) in validation(training).items():
+            errors, applied = run(
+                plants, net, numbers, told, VALIDATION_SAMPLES, VALIDATION_SEED
+            )
+            each = errors.abs().mean(0).log()
+            found[kind] = float(each.mean())
+            for first in (True, False):
+                found[f"{kind} {1 if first else 2}"] = float(
+                    each[told["first"] == first].mean()
+                )
+            found[f"{kind}, travel"] = 10.0 * float(applied.diff(dim=0).abs().mean())
+    return found
 
 
-class Trainer:
-    """A training, step by step.
-
-    Parameters
-    ----------
-    training
-        What to do.
-
-    Attributes
-    ----------
-    step : int
-        How many steps have been taken.
-    averaged : Network
-        Mean of the weights of past steps.
-    curve : list of dict
-        A row each validation.
-    """
-
-    def __init__(self, training: Training) -> None:
-        self.training = training
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(training.seed)
-            self._network = Network(training)
-        self.averaged = Network(training)
-        self.averaged.load_state_dict(self._network.state_dict())
-        self._optimiser = torch.optim.Adam(self._network.parameters())
-        self._plants = make_plants(training, training.batch, training.samples)
-        self.step = 0
-        self.curve: Curve = []
-        self._best = self.averaged.state_dict()
-        self._seconds = 0.0
-
-    def advance(self) -> float:
-        """Take a step of the optimiser and return the loss, degC."""
-        began = time.process_time()
-        training = self.training
-        left = max(1.0 - self.step / training.steps, LAST_RATE)
-        self._optimiser.param_groups[0]["lr"] = training.learning_rate * left
-        draw = Draw(training, training.batch, training.samples, training.seed, self.step)
-        errors, applied = run(self._plants, self._network, draw.signals(), training.samples)
-        loss = loss_of(errors, applied, training)
-        self._optimiser.zero_grad()
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(self._network.parameters(), 1.0)
-        if math.isfinite(norm):
-            self._optimiser.step()
-        self.step += 1
-        # At first the mean forgets faster, so that the initial weights have no part in it.
-        share = 1.0 - min(training.averaging, self.step / (self.step + 10.0))
-        with torch.no_grad():
-            pairs = zip(self.averaged.parameters(), self._network.parameters(), strict=True)
-            for mean, new in pairs:
-                mean.lerp_(new, share)
-        self._seconds += time.process_time() - began
-        return loss.item()
-
-    def record(self) -> dict[str, float]:
-        """Validate, add a row to the curve, and keep the weights if they are the best yet."""
-        row = {"step": self.step, **validate(self.averaged, self.training)}
-        row["score"] = row["validation_mae"]
-        row["score"] += self.training.move_price * row["validation_travel"]
-        row["cpu_seconds"] = round(self._seconds, 2)
-        if not self.curve or row["score"] < min(each["score"] for each in self.curve):
-            self._best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
-        self.curve.append(row)
-        return row
-
-    def best(self) -> Network:
-        """Return the network that did best in validation."""
-        network = Network(self.training)
-        network.load_state_dict(self._best)
-        return network
-
-
-def train(training: Training, source: str) -> PolicyNetwork:
-    """Train, and return the network that did best in validation.
+def train(training: Training, state: Path | None = None, source: str = "") -> LawNetwork:
+    """Train, and return the network.
 
     Parameters
     ----------
     training
         What to do.
+    state
+        A file that keeps how far the training got, and that it goes on from.
     source
         The commit that this is run from, for the provenance.
     """
     torch.set_num_threads(1)  # the network is too small for more
-    trainer = Trainer(training)
-    while trainer.step < training.steps:
-        trainer.advance()
-        if trainer.step == training.steps or trainer.step % training.validate_every == 0:
-            trainer.record()
-    best = min(trainer.curve, key=lambda row: row["score"])
-    return trainer.best().export(
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(training.seed)
+        net = Net(training)
+    mean, optimiser = copy.deepcopy(net), torch.optim.Adam(net.parameters())
+    done, seconds = 0, 0.0
+    parts: dict[str, Any] = {"net": net, "mean": mean, "optimiser": optimiser}
+    if state is not None and state.exists():
+        kept = torch.load(state, weights_only=True)
+        for name, part in parts.items():
+            part.load_state_dict(kept[name])
+        done, seconds = kept["done"], kept["seconds"]
+    plants = environment(training.plants, training.samples)
+    for step in range(done, training.steps):
+        began = time.process_time()
+        _advance(net, mean, optimiser, plants, training, step)
+        seconds += time.process_time() - began
+        if state is not None and step % SAVED_EVERY == SAVED_EVERY - 1:
+            kept = {name: part.state_dict() for name, part in parts.items()}
+            with replacing(state) as file:
+                torch.save({**kept, "done": step + 1, "seconds": seconds}, file)
+    return mean.export(
         training=asdict(training),
-        validation={"seed": VALIDATION_SEED, "plants": VALIDATION_PLANTS, **best},
-        cpu_seconds=trainer.curve[-1]["cpu_seconds"],
-        curve=trainer.curve,
+        validation={"seed": VALIDATION_SEED, **validate(mean, training)},
+        cpu_seconds=round(seconds, 1),
         code=training_key(training),
         versions=versions(),
         commit=source,
     )
+
+
+def _advance(
+    net: Net,
+    mean: Net,
+    optimiser: torch.optim.Adam,
+    plants: MiddlePointTorchEnv,
+    training: Training,
+    step: int,
+) -> None:
+    """Take a step of the optimiser, on new plants."""
+    left = max(1.0 - step / training.steps, 0.01)
+    optimiser.param_groups[0]["lr"] = training.learning_rate * left
+    draw = Draw(training, training.plants, training.samples, training.seed, step)
+    numbers = draw.plants()
+    told = draw.told(numbers)
+    errors, applied = run(plants, net, numbers, told, training.samples, step)
+    loss = loss_of(errors, applied, numbers["small"], training)
+    optimiser.zero_grad()
+    loss.backward()
+    if math.isfinite(nn.utils.clip_grad_norm_(net.parameters(), 1.0)):
+        optimiser.step()
+    # At first the mean forgets faster, so that the initial weights have no part in it.
+    share = 1.0 - min(training.averaging, (step + 1) / (step + 11))
+    with torch.no_grad():
+        for slow, new in zip(mean.parameters(), net.parameters(), strict=True):
+            slow.lerp_(new, share)
 
 
 def training_key(training: Training) -> str:

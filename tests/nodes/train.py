@@ -5,11 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.train.__main__ import run
+from benchmarks.train.command import trained
 from benchmarks.train.through_plant import Training
 
-SMALL = Training(steps=6, batch=4, samples=60, window=20, hidden=4, validate_every=2)
+SMALL = Training(steps=3, plants=4, samples=60, choosing=4, adding=3)
 TRAININGS = [replace(SMALL, seed=seed) for seed in range(3)]
 
 if __name__ == "__main__":
-    run(TRAININGS, Path(sys.argv[1]), FanOut(backend="ray"))
+    trained(TRAININGS, Path(sys.argv[1]), FanOut(backend="ray"), here=False)
