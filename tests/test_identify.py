@@ -19,7 +19,7 @@ from benchmarks.identify.__main__ import main
 from benchmarks.identify.armax import Orders, Rows
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Columns, Log, read_log
-from benchmarks.identify.model import CannotTellError, HeldOut, Options
+from benchmarks.identify.model import CannotTellError, HeldOut, Interval, Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges, simulation
 from benchmarks.identify.report import fault, headline
 from benchmarks.identify.study.command import (
@@ -203,7 +203,7 @@ class TestRealLogs:
     def test_spikes_are_left_out_and_counted(self, good):
         log, whole = good
         spiked = log.temperature.copy()
-        spiked[[150, 400, 401, 900]] += [40.0, -30.0, -30.0, 25.0]
+        spiked[[20, 400, 401, 900]] += [40.0, -30.0, -30.0, 25.0]
         model = identify(Log(log.flow, spiked, 8.0))
         assert any(note.startswith("4 spikes of the temperature") for note in model.notes)
         assert model.estimates["gain"].value == pytest.approx(whole.plant.gain, rel=0.02)
@@ -321,6 +321,8 @@ class TestTuning:
         poor = replace(model, held_out=HeldOut(0.6, 0.8))
         assert "**The model should not be used:**" in headline(poor)
         assert "80.0 %" in headline(poor)
+        gain = {**model.estimates, "gain": Interval(-0.7, -1.0, 0.1)}
+        assert "the direction" in fault(replace(model, estimates=gain))
 
 
 class TestRows:

@@ -73,18 +73,19 @@ def without_noise_of_held_flow(log: Log) -> Log:
     return replace(log, flow=means, notes=[*log.notes, note])
 
 
-def suspects(log: Log) -> Flags:
-    """Return which temperatures stick out from those before and after, as spikes do."""
+def protrusion(log: Log) -> Array:
+    """Return how far temperatures stick out from those before and after, in deviations.
+
+    It is 0 for all but the furthest ones, of which `MOST_SPIKES` may be above `SPIKE`.
+    """
     series = pd.Series(log.temperature)
     apart = (series - series.rolling(7, center=True, min_periods=3).median()).abs()
-    known = np.sort(np.unique(log.temperature[np.isfinite(log.temperature)]))
+    known = np.unique(log.temperature[np.isfinite(log.temperature)])
     finest = float(np.min(np.diff(known))) if len(known) > 1 else 0.0
     scale = max(1.4826 * float(np.nanmedian(apart)), finest, 1e-3 * float(np.ptp(known)))
-    found = np.array(apart > SPIKE * scale, bool)
-    most = int(MOST_SPIKES * len(found))
-    if found.sum() > most:
-        found &= apart.to_numpy() >= np.sort(apart.fillna(0.0).to_numpy())[-max(most, 1)]
-    return found
+    found = apart.fillna(0.0).to_numpy(dtype=np.float64) / max(scale, 1e-300)
+    least = np.sort(found)[-max(int(MOST_SPIKES * len(found)), 1)]
+    return np.where(found >= max(least, SPIKE), found, 0.0)
 
 
 def without(log: Log, spikes: Flags) -> Log:

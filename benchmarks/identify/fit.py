@@ -11,7 +11,7 @@ from benchmarks.identify import simulation
 from benchmarks.identify.armax import Array, Orders
 from benchmarks.identify.cleaning import (
     at_one_rate,
-    suspects,
+    protrusion,
     without,
     without_noise_of_held_flow,
 )
@@ -39,6 +39,7 @@ WORSE = 1.2  # times the least share that is left open: what is more takes no pa
 WEAK = 100.0  # twice the log likelihood, below which a log may be the wrong way round
 CHANCE = 0.01  # that a flow without effect is taken for one with effect
 OUTLYING = 6.0  # robust deviations of prediction errors, from which a suspect is a spike
+PLAIN = 24.0  # deviations that a suspect without a prediction sticks out, to be a spike
 SLOW = 3.0  # time constants that a log should hold
 
 
@@ -115,16 +116,20 @@ def identify(log: Log, options: Options | None = None) -> Model:
 
 def _cleaned(log: Log, options: Options) -> Log:
     """Return a log without its spikes: suspects that no answer to the flow explains."""
-    found = suspects(log)
+    apart = protrusion(log)
+    found = apart > 0.0
     if not found.any():
         return log
     orders = options.orders or TO_FORESEE
     likelihood = Likelihood(log, replace(options, orders=orders), orders.b)
-    errors = np.nan_to_num(likelihood.errors(_first(likelihood)[0]))
-    scale = 1.4826 * float(np.median(np.abs(errors[likelihood.rows.index])))
-    # The second sample of a spike may follow from the first one.
+    errors = np.abs(likelihood.errors(_first(likelihood)[0]))
+    scale = 1.4826 * float(np.nanmedian(errors))
+    # The first rows have no prediction: they go with the others, if those are spikes all. The
+    # second sample of a spike may follow from the first.
+    outlying, known = errors > OUTLYING * scale, np.isfinite(errors)
+    outlying |= ~known & (apart > PLAIN) & bool(outlying[found & known].all())
     runs = np.cumsum(np.diff(found, prepend=False))
-    outlying = np.unique(runs[found & (np.abs(errors) > OUTLYING * scale)])
+    outlying = np.unique(runs[found & outlying])
     return without(log, found & np.isin(runs, outlying))
 
 

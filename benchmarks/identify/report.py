@@ -85,6 +85,9 @@ def fault(model: Model) -> str:
     share, rival = model.held_out.model, model.held_out.impulse_response
     if share < rival - BEHIND:
         return "it explains clearly less than an impulse response does: its form does not fit"
+    gain = model.estimates["gain"]
+    if gain.low < 0.0 < gain.high:
+        return "not even the direction is known in which the temperature answers the flow"
     if share < POOR:
         return "it leaves more than half open: the noise hides the response, or it changes"
     return ""
