@@ -180,7 +180,7 @@ def evaluate(
         samples = (single.spec and single.spec.max_episode_steps) or SAMPLES
         batch = native_batch(single) or partial(_side_by_side, make)
     seeds = range(first, first + episodes)
-    errors, travels, samples = _run(batch, partial(_episode_of, policy), seeds, samples)
+    errors, travels, samples = _run(batch, partial(acting, policy), seeds, samples)
     found: dict[str, Any] = {
         "env": name,
         "mean_error": float(errors.mean()),
@@ -308,19 +308,19 @@ def _check_fit(policy: Any, single: gymnasium.Env[Any, Any], parameters: Paramet
             f"env must have observations of shape {own.shape}, as policy reads them, got "
             f"{shape}: give it the windows of the training, such as action_window=20"
         )
-    wanted = getattr(policy, "observation", {})
-    if isinstance(wanted, Mapping) and any(
+    wanted, place = getattr(policy, "observation", {}), getattr(policy, "error_index", None)
+    if place is not None:
+        if place != parameters.heads[0] or not parameters.error_window:
+            raise ValueError(
+                f"env must show its newest error as element {place} of the observation, where "
+                f"policy reads it, got windows {parameters.windows}"
+            )
+    elif isinstance(wanted, Mapping) and any(
         getattr(parameters, name) != value for name, value in wanted.items()
     ):
         asked = ", ".join(f"{name}={value}" for name, value in wanted.items())
         raise ValueError(
             f"env must have the windows that policy wants, {asked}, got {parameters.windows}"
-        )
-    place = getattr(policy, "error_index", None)
-    if place is not None and (place != parameters.heads[0] or not parameters.error_window):
-        raise ValueError(
-            f"env must show its newest error as element {place} of the observation, where "
-            f"policy reads it, got windows {parameters.windows}"
         )
     spec, now = trained_on(policy), single.spec
     if spec is not None and now is not None:
@@ -394,7 +394,7 @@ def _side_by_side(
     return SyncVectorEnv([make] * n)
 
 
-def _episode_of(policy: Any) -> Act:
+def acting(policy: Any) -> Act:
     """Bring a policy to the start of a batch of episodes, and return how it acts in it."""
     if callable(getattr(policy, "predict", None)):
         return _predicting(policy)

@@ -354,7 +354,7 @@ class TestCompare:
         runs = pd.read_csv(out / "runs.csv")
         assert list(runs.columns) == ["scenario", "agent", "policy", "seed", *METRICS]
         cells = [(s, a) for a in ("nn", "pi") for s in ("constant", "constant-noise")]
-        expected = [(s, a, 0, i) for s, a in cells for i in range(3)]
+        expected = [(s, a, 0, SEED + i) for s, a in cells for i in range(3)]
         assert list(runs.iloc[:, :4].itertuples(index=False, name=None)) == expected
         # The paper's PI is the same in every run without noise, and never settles.
         pi = runs[(runs.agent == "pi") & (runs.scenario == "constant")]
@@ -491,7 +491,7 @@ class TestCompare:
     def test_the_example_of_the_page(self, tmp_path, monkeypatch):
         readme = (ROOT / "benchmarks/compare/README.md").read_text(encoding="utf-8")
         (example,) = re.findall(r"```python\n(from agents import PIC.*?)```", readme, re.DOTALL)
-        (option,) = re.findall(r"--agent (\w+=\S+)`", readme)
+        (option,) = re.findall(r"--agent (\w+=my_\S+)`", readme)
         (tmp_path / "my_controllers.py").write_text(example)
         monkeypatch.syspath_prepend(tmp_path)
         run_compare(

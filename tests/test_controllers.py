@@ -1,7 +1,9 @@
 """The roster: what holds for any controller, as every command runs it; and a user's own."""
 
+import gymnasium
 import numpy as np
 import pytest
+from stable_baselines3 import PPO
 
 from benchmarks.controllers import pretrained
 from benchmarks.controllers.options import chosen
@@ -10,10 +12,14 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import UsageError
 from benchmarks.limits.verify import errors
 from benchmarks.metrics import mean_error
+from benchmarks.rollout import make_plants, rollout
 from benchmarks.scenarios import Scenario
 from benchmarks.sweep.cells import agent_cell
 from benchmarks.train.ppo import PolicyRequest
 from benchmarks.watch import rivals
+from mptc_gym import IDS, PRESETS, evaluate
+from mptc_gym.evaluation import SEED
+from mptc_gym.sb3 import make_vec_env, spec_of
 
 ACTUATOR = {"u_min": -9.0, "u_max": 14.0, "dead_zone": 4.0}
 # A plant of the other direction, which shows an input sooner.
@@ -123,3 +129,65 @@ class TestOwnControllers:
     def test_bad_ones(self, code, complaint, written):
         with pytest.raises(UsageError, match=complaint):
             chosen([], [f"mine={written(code)}"])
+
+
+@pytest.fixture(scope="module")
+def zips(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models")
+    for seed in (0, 1):
+        plants = make_vec_env(
+            "MiddlePoint-v0",
+            2,
+            wrapper={"max_move": 0.3, "undo_dead_zone": True},
+            action_window=20,
+            error_window=2,
+        )
+        model = PPO("MlpPolicy", plants, n_steps=8, batch_size=16, seed=seed, device="cpu")
+        model.save(folder / f"velocity-{seed}.zip")
+    bare = PPO("MlpPolicy", gymnasium.make("MiddlePoint-v0"), device="cpu")
+    bare.save(folder / "bare.zip")
+    return folder
+
+
+class TestSavedPolicies:
+    """Zips of Stable-Baselines3, which say how their policies were trained."""
+
+    @pytest.mark.parametrize("preset", ["noisy", "hard"])
+    def test_it_does_what_it_was_trained_to(self, preset, zips):
+        file = zips / "velocity-0.zip"
+        entry = chosen([], [f"mine=PPO:{file}"])["mine"]
+        (factory,) = entry.members()
+        assert factory.cost.samples == "0 M a policy"
+        controller = factory(PRESETS[preset], 3, SEED)
+        found = errors(factory, 3, 1200, **PRESETS[preset])
+        model = PPO.load(file, device="cpu")
+        expected = evaluate(model, spec_of(file, IDS[preset]), episodes=3)
+        np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-12)
+        # What it remembers, the flow, is forgotten at the beginning of an episode.
+        plants = make_plants(3, 50, **factory.arguments(PRESETS[preset]))
+        first, again = (rollout(plants, controller, 50, SEED).applied for _ in range(2))
+        np.testing.assert_array_equal(first, again)
+
+    def test_several_trainings_are_members_of_one(self, zips):
+        both = [f"mine=PPO:{zips / 'velocity-0.zip'}", f"mine=PPO:{zips / 'velocity-1.zip'}"]
+        pattern = [f"mine=PPO:{zips / 'velocity-*.zip'}"]
+        for texts in (both, pattern):
+            (entry,) = chosen([], texts).values()
+            files = [member.provenance["file"] for member in entry.members()]
+            assert files == ["velocity-0.zip", "velocity-1.zip"]
+        assert (
+            entry.members()[0].provenance["sha256"] != entry.members()[1].provenance["sha256"]
+        )
+
+    @pytest.mark.parametrize(
+        ("location", "complaint"),
+        [
+            ("PPO:{}/bare.zip", "policy must be one that knows how it was trained"),
+            ("PPO:{}/none.zip", "there is no file .*none.zip"),
+            ("SAC:{}/velocity-0.zip", "cannot be loaded as SAC"),
+            ("PIO:{}/velocity-0.zip", "'PIO' is no algorithm of stable_baselines3"),
+        ],
+    )
+    def test_what_is_refused(self, location, complaint, zips):
+        with pytest.raises(UsageError, match=f"^--agent: .*{complaint}"):
+            chosen([], [f"mine={location.format(zips)}"])

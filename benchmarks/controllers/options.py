@@ -16,6 +16,8 @@ from benchmarks.lib.command_line import UsageError, known, out_folder
 from benchmarks.lib.options import Count, FanOutOptions, Names, Repeated, options
 from benchmarks.train.ppo import KEPT, PolicyRequest
 
+LOCATION = "MODULE:FACTORY or NEW_NAME=PPO:FILE.zip"
+
 AgentNames = Annotated[
     Names,
     Parameter(help=f"Controllers to run, out of {', '.join(ROSTER)}."),
@@ -28,7 +30,8 @@ class ControllerOptions:
     """Controllers of one's own, and how those that learn are trained."""
 
     agent: Repeated = ()
-    """A controller of your own, NAME=MODULE:FACTORY, beside those of --agents (repeatable)."""
+    """A controller of your own beside those of --agents, NAME=MODULE:FACTORY or
+    NAME=PPO:FILE.zip; the same name again is another training of it (repeatable)."""
     training_steps: Count | None = None
     """Train each policy of PPO with so many samples of experience (default: take those that
     come with the project)."""
@@ -64,7 +67,7 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEnt
     names
         Of the roster, with spaces or commas between them.
     own
-        A user's own, each `NAME=MODULE:FACTORY`.
+        A user's own, each `NAME=MODULE:FACTORY` or `NAME=ALGORITHM:FILE.zip`.
 
     Returns
     -------
@@ -77,29 +80,31 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEnt
         If there is no such controller, or no controller at all.
     """
     found = {name: ROSTER[name] for name in known("--agents", names, list(ROSTER))}
+    locations: dict[str, list[str]] = {}
     for text in own:
         name, equals, location = text.partition("=")
         if not (name and equals):
-            raise UsageError(f"--agent must be NEW_NAME=MODULE:FACTORY, got {text!r}")
+            raise UsageError(f"--agent must be NEW_NAME={LOCATION}, got {text!r}")
         if name.lower() in {*ROSTER, *found}:
             raise UsageError(
-                f"--agent must be NEW_NAME=MODULE:FACTORY, and {name!r} is taken, got {text!r}"
+                f"--agent must be NEW_NAME={LOCATION}, and {name!r} is taken, got {text!r}"
             )
-        found[name] = own_controller(name, location)
+        locations.setdefault(name, []).append(location)
+    found |= {name: own_controller(name, each) for name, each in locations.items()}
     if not found:
         raise UsageError("--agents, --agent: no controller to run")
     return found
 
 
-def own_controller(name: str, location: str) -> RosterEntry:
+def own_controller(name: str, locations: Sequence[str]) -> RosterEntry:
     """Return an entry for a user's own controller, which has been tried out.
 
     Raises
     ------
     UsageError
-        If there is no such factory, or if what it makes is no controller.
+        If there is no such factory or file, or if what it makes is no controller.
     """
     try:
-        return own_entry(name, location)
+        return own_entry(name, locations)
     except ValueError as error:
         raise UsageError(f"--agent: {error}") from error

@@ -1,18 +1,18 @@
-"""Make roster entries of a user's own controllers, given as MODULE:FACTORY."""
+"""Make roster entries of a user's own controllers: MODULE:FACTORY, or PPO:model.zip."""
 
 from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from agents.policy_network import WINDOWS
 from benchmarks.controllers.engineered import limits
-from benchmarks.controllers.records import Factory, RosterEntry
+from benchmarks.controllers.records import Cost, Factory, RosterEntry
 from benchmarks.rollout import Agent, make_plants
 from mptc_gym import Parameters
 
@@ -42,7 +42,8 @@ def own_factory(location: str) -> Factory:
         `u_min`, `u_max` (t/h) and `parameters` (all arguments of the environment). It returns
         an object with `reset()` and `act(observations) -> actions`. Its attribute
         `observation`, if it has one, is a dict of the environment's `*_window` arguments, and
-        gives the controller the observation that it wants.
+        gives the controller the observation that it wants. Its attributes `prior_knowledge`,
+        `parameters` and `samples` fill its row in the report's table of costs.
 
     Raises
     ------
@@ -60,15 +61,29 @@ def own_factory(location: str) -> Factory:
                 f"observation of {found!r} must have names out of {', '.join(WINDOWS)}, "
                 f"got {name!r}"
             )
-    factory = Factory(_Own(found), dict(observation), code=found.__module__)
+    cost = Cost(*(str(getattr(found, each.name, "")) for each in fields(Cost)))
+    factory = Factory(_Own(found), dict(observation), code=found.__module__, cost=cost)
     _try_out(factory, repr(found))
     return factory
 
 
-def own_entry(name: str, location: str) -> RosterEntry:
-    """Return an entry for a user's own controller; ValueError as `own_factory` raises it."""
-    factory = own_factory(location)
-    return RosterEntry(name, name, lambda request: [factory], drawn=True)
+def own_entry(name: str, locations: Sequence[str]) -> RosterEntry:
+    """Return an entry for a user's own controller, with one member or more for each location.
+
+    Raises
+    ------
+    ValueError
+        As `own_factory` and `benchmarks.controllers.saved.policies` raise it.
+    """
+    factories: list[Factory] = []
+    for location in locations:
+        if location.endswith(".zip"):
+            from benchmarks.controllers import saved  # here: PyTorch takes seconds to load
+
+            factories += saved.policies(location)
+        else:
+            factories.append(own_factory(location))
+    return RosterEntry(name, name, lambda request: factories, drawn=True)
 
 
 def _imported(location: str) -> Callable[..., Any]:

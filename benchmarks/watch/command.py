@@ -210,11 +210,13 @@ FILMS: dict[str, Film] = {".mp4": Film(_mp4, 30), ".gif": Film(_gif, 10)}
 
 
 def _controller(agent: str) -> RosterEntry:
+    name, equals, location = agent.partition("=")
     if ":" in agent:
-        return own_controller(agent, agent)
+        return own_controller(name, [location if equals else agent])
     if agent not in ROSTER:
         raise UsageError(
-            f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, {YOU}, and MODULE:FACTORY "
+            f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, {YOU}, and "
+            "NAME=MODULE:FACTORY or NAME=PPO:FILE.zip "
             "of your own"
         )
     return ROSTER[agent]

@@ -16,7 +16,8 @@ from mptc_gym import MiddlePointEnv
 
 YOU = "you"  # the agent that is no controller
 _AGENTS = (
-    f"Who controls: {', '.join(ROSTER)}, {YOU}, or MODULE:FACTORY for a controller of your own."
+    f"Who controls: {', '.join(ROSTER)}, {YOU}, or a controller of your own, "
+    "NAME=MODULE:FACTORY or NAME=PPO:FILE.zip."
 )
 _CASES = (
     f"Case to run: {', '.join(SCENARIOS)}; on a plant of your own "

@@ -159,6 +159,11 @@ class Actuator:
             for limit in (self.u_max, -self.u_min)
         )
 
+    def moved(self, flows: NDArray[np.float64], moves: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the wanted flows of many plants, t/h, after actions of the wrapper."""
+        moved: NDArray[np.float64] = flows + self.move * np.clip(moves, -1.0, 1.0)
+        return moved.clip(self.u_min, self.u_max)
+
     def action(self, flow: Any) -> Any:
         """Return the environment's action for a wanted flow in t/h, a float or an array."""
         if not self._undoes:

@@ -101,9 +101,7 @@ class IncrementalAction(VectorActionWrapper):
         moves[self._ended] = 0.0  # ignored
         if not np.isfinite(moves).all():
             reject("actions", actions, "finite")
-        actuator = self._actuator
-        moved: NDArray[np.float64] = flows + actuator.move * moves.clip(-1.0, 1.0)
-        return moved.clip(actuator.u_min, actuator.u_max)
+        return self._actuator.moved(flows, moves)
 
     def _restart(self, begun: NDArray[np.bool_], infos: dict[str, Any]) -> None:
         """Want no flow where an episode has begun, and note what was drawn for it."""
