@@ -379,7 +379,7 @@ class TestCompare:
 
         provenance = json.loads((out / "provenance.json").read_text())
         assert provenance["complete"] is True
-        assert provenance["seeds"] == [0, 1, 2]
+        assert provenance["seeds"] == [SEED, SEED + 1, SEED + 2]
         assert provenance["options"]["agents"] == ["nn", "pi"]
         assert {"gymnasium", "numpy", "torch"} <= set(provenance["versions"])
 

@@ -257,7 +257,7 @@ class TestRefusals:
             match=r"env must have the windows that policy wants, .*n_window=\d+, got",
         ):
             evaluate(network)
-        with pytest.raises(ValueError, match="setpoint_window=3, error_window=3"):
+        with pytest.raises(ValueError, match="newest error as element 3"):
             evaluate(PIController(), setpoint_window=7)
 
     def test_a_policy_that_was_trained_with_a_wrapper(self):
