@@ -243,7 +243,7 @@ class TestNodes:
         top = {path.name for path in there.iterdir()}
         assert top == {"agents", "benchmarks", "mptc_gym", "mine.py"}
         files = [path for path in there.rglob("*") if path.is_file()]
-        assert {path.suffix for path in files} <= {".py", ".npz", ".csv", ".typed"}
+        assert {path.suffix for path in files} <= {".py", ".npz", ".csv", ".json", ".typed"}
         assert sum(path.stat().st_size for path in files) < 2e6
 
 
