@@ -1,4 +1,4 @@
-"""Holds what the vector environments share: arguments, masks, time limits, autoresets, infos.
+"""Hold what the vector environments share: arguments, masks, time limits, autoresets, infos.
 
 `MiddlePointVectorEnv` in NumPy and `MiddlePointTorchEnv` in PyTorch each add how their plants
 move, in arrays or in tensors of their own.

@@ -1,4 +1,4 @@
-"""Checks of single values: each returns a plain Python value, or raises a ValueError."""
+"""Check single values: each function returns a plain Python value, or raises a ValueError."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Gymnasium environment `MiddlePoint-v0`: one plant, its set point and its transmitter."""
+"""Run one plant, its set point and its transmitter: the environment `MiddlePoint-v0`."""
 
 from __future__ import annotations
 

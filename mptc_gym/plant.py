@@ -1,4 +1,4 @@
-"""The plant and its actuator: arithmetic on state, input and parameters, nothing else.
+"""Move the plant and its actuator: arithmetic on state, input and parameters, nothing else.
 
 It stands here twice, side by side: `Plant` in plain floats, which are fastest for one plant,
 and `PlantBatch` in arrays. Both do the same operations in the same order, and agree to the bit.

@@ -1,4 +1,4 @@
-"""Runs many plants side by side in PyTorch, on any device and with gradients if asked for."""
+"""Run many plants side by side in PyTorch, on any device and with gradients if asked for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Moves many plants in PyTorch by (28) and (29), a block of samples at a time.
+"""Move many plants in PyTorch by (28) and (29), a block of samples at a time.
 
 `PlantBatch` in `mptc_gym.plant` is the same in NumPy, a sample at a time.
 """

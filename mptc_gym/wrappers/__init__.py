@@ -1,4 +1,4 @@
-"""Wrappers of one environment: `IncrementalAction`, whose action changes the flow.
+"""Wrap one environment: the action of `IncrementalAction` changes the flow.
 
 `mptc_gym.wrappers.vector` has the same for vector environments.
 """

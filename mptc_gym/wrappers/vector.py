@@ -1,4 +1,4 @@
-"""Wrappers of many environments side by side: `IncrementalAction`."""
+"""Wrap many environments side by side: the action of `IncrementalAction` changes the flow."""
 
 from __future__ import annotations
 
