@@ -1,4 +1,4 @@
-"""The middle-point temperature of a once-through boiler, as a Gymnasium environment.
+"""Control the middle-point temperature of a once-through boiler: a Gymnasium environment.
 
 Importing this package registers `MiddlePoint-v0`, and each of `PRESETS` under an id of its own.
 """

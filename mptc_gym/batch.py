@@ -1,4 +1,4 @@
-"""Holds what the vector environments share: arguments, masks, time limits, autoresets, infos.
+"""Hold what the vector environments share: arguments, masks, time limits, autoresets, infos.
 
 `MiddlePointVectorEnv` in NumPy and `MiddlePointTorchEnv` in PyTorch each add how their plants
 move, in arrays or in tensors of their own.
@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mptc_gym.checks import MOST_PLANTS, count, is_count, reject
+from mptc_gym.checks import MOST_NUMBERS, MOST_PLANTS, count, is_count, reject
 from mptc_gym.env import action_space, observation_space
 from mptc_gym.parameters import Parameters
 from mptc_gym.signals import FOREVER
@@ -47,7 +47,7 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
         arguments: Mapping[str, Any],
     ) -> None:
         self.parameters = Parameters.of_environment(arguments)
-        self.num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
+        self.num_envs = _checked_count(num_envs, self.parameters)
         self._limit = _checked_limit(max_episode_steps)
         self.autoreset_mode = _checked_mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
@@ -198,7 +198,7 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
         ):
             allowed = f"an array of bool, shape ({self.num_envs},), at least one of them True"
             reject("options['reset_mask']", given, allowed)
-        return mask
+        return mask.copy()
 
     # What an environment adds.
 
@@ -236,6 +236,16 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
     def _final(self, ended: Mask, observations: Array) -> Array:
         """Return `final_obs`."""
         raise NotImplementedError
+
+
+def _checked_count(num_envs: int, parameters: Parameters) -> int:
+    """Return the number of plants, if they fit in the memory of usual machines."""
+    num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
+    inputs = parameters.range_of("delay")[1] + len(parameters.b)
+    most = int(MOST_NUMBERS // (3 * inputs + parameters.observation_size))
+    if num_envs > most:
+        reject("num_envs", num_envs, f"at most {most:,} with this delay and these windows")
+    return num_envs
 
 
 def _checked_limit(max_episode_steps: int | None) -> int:

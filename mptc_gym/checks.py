@@ -1,4 +1,4 @@
-"""Checks of single values: each returns a plain Python value, or raises a ValueError."""
+"""Check single values: each function returns a plain Python value, or raises a ValueError."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import numpy as np
 # their meaning.
 LARGEST: Final[Any] = 10**9
 # Far more than any plant needs. Beyond them, a mistyped number would fill the memory.
-LONGEST: Final = 100_000  # samples of a delay or of a window
+LONGEST: Final = 10_000  # samples of a delay or of a window
 MOST_COEFFICIENTS: Final = 1_000
 MOST_PLANTS: Final = 10_000_000  # of one environment
+MOST_NUMBERS: Final = 1_000_000_000  # that the plants of one environment keep together
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
 _SHOWN = 80  # characters of a value that an error message shows

@@ -1,4 +1,4 @@
-"""Pictures in pixels of a record of the loop, by pygame: a strip chart, and a window for it."""
+"""Draw a record of the loop with pygame: a strip chart in pixels, and a window for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Gymnasium environment `MiddlePoint-v0`: one plant, its set point and its transmitter."""
+"""Run one plant, its set point and its transmitter: the environment `MiddlePoint-v0`."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     <arguments>
 
     `render_mode` is None, "human", "rgb_array" or "ansi"; see Rendering. A list or tuple may also
-    be a NumPy array. Numbers are within +-1e9, the delay and each window at most 100,000 samples,
+    be a NumPy array. Numbers are within +-1e9, the delay and each window at most 10,000 samples,
     and `a`, `b` and `c` have at most 1,000 coefficients each.
 
     ## Info

@@ -1,4 +1,4 @@
-"""Every argument of the environment, each declared once, in a dataclass that checks itself."""
+"""Declare every argument of the environment, once, in a dataclass that checks itself."""
 
 # ruff: noqa: RUF009 (`_linear` makes fields)
 

@@ -1,4 +1,4 @@
-"""The plant and its actuator: arithmetic on state, input and parameters, nothing else.
+"""Move the plant and its actuator: arithmetic on state, input and parameters, nothing else.
 
 It stands here twice, side by side: `Plant` in plain floats, which are fastest for one plant,
 and `PlantBatch` in arrays. Both do the same operations in the same order, and agree to the bit.
@@ -23,6 +23,15 @@ DRIFT_INTERVAL: Final = 10  # samples between two changes of drifting dynamics
 def action_from_command(command: Any, u_min: Any, u_max: Any) -> Any:
     """Scale a command (t/h) to a normalised action in float64: -1 at `u_min`, 1 at `u_max`."""
     return 2.0 * (command - u_min) / (u_max - u_min) - 1.0
+
+
+def least_effective(dead_zone: Any, u_min: Any, u_max: Any, rounding: float = 2.0**-50) -> Any:
+    """Return the smallest magnitude of a command that passes the dead zone, t/h.
+
+    A command on the edge of the dead zone passes. Scaled to an action and back, it may come out
+    smaller by some roundings, each of 2^-53 of what is rounded; and it passes all the same.
+    """
+    return dead_zone - rounding * (u_max - u_min + abs(u_max) + abs(u_min))
 
 
 def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
@@ -145,7 +154,8 @@ class Plant:
 
     def __init__(self, parameters: Parameters, numbers: PlantNumbers[float]) -> None:
         u_min, u_max = numbers.u_min, numbers.u_max
-        self._actuator = numbers.dead_zone, u_min, u_max, (u_max - u_min) / 2.0
+        edge = least_effective(numbers.dead_zone, u_min, u_max)
+        self._actuator = edge, u_min, u_max, (u_max - u_min) / 2.0
         self._numbers = numbers
         self._drifts = parameters.drifts
         self._may_overflow = not parameters.is_stable
@@ -184,10 +194,10 @@ class Plant:
             self._age += 1
             if self._age % DRIFT_INTERVAL == 0:
                 self._update_dynamics()
-        dead_zone, u_min, u_max, half_range = self._actuator
+        edge, u_min, u_max, half_range = self._actuator
         command = u_min + (action + 1.0) * half_range  # Section 4, last formula
         applied = command  # (29) from here on
-        if -dead_zone < command < dead_zone:
+        if -edge < command < edge:
             applied = 0.0
         elif command < u_min:
             applied = u_min
@@ -244,12 +254,8 @@ class PlantBatch:
                 for name in PLANT_NUMBERS
             }
         )
-        zero, one = np.array(0.0), np.array(1.0)
-        u_min, u_max = self._numbers.u_min, self._numbers.u_max
-        self._half_range = np.array((u_max - u_min) / 2.0)
-        self._limits = np.full(num_envs, u_min), np.full(num_envs, u_max)
-        dead_zone = self._numbers.dead_zone
-        self._actuator = zero, one, self._half_range, u_min, dead_zone, *self._limits
+        self._num_envs = num_envs
+        self._update_actuator()
 
         self._dynamics = Dynamics(parameters)
         self._drifts = parameters.drifts
@@ -298,11 +304,8 @@ class PlantBatch:
             outputs[which] = 0.0
         for name, values in numbers.chosen(self._drawn).items():
             getattr(self._numbers, name)[which] = values
-        if "u_min" in self._drawn or "u_max" in self._drawn:
-            u_min, u_max = self._numbers.u_min, self._numbers.u_max
-            for limit, values in zip(self._limits, (u_min, u_max), strict=True):
-                limit[:] = values
-            self._half_range[:] = (u_max - u_min) / 2.0
+        if {"dead_zone", "u_min", "u_max"}.intersection(self._drawn):
+            self._update_actuator()
         if self._longer:
             self._window()[:, which] = 0.0
             rows = np.arange(self._samples)[:, np.newaxis] + self._longer + self._shortest
@@ -337,7 +340,7 @@ class PlantBatch:
             self._clock += 1
             if self._clock >= self._next_update:
                 self._update_dynamics()
-        zero, one, half_range, offset, dead_zone, u_min, u_max = self._actuator
+        zero, one, half_range, offset, edge, u_min, u_max = self._actuator
         command = action + one
         command *= half_range
         command += offset
@@ -345,7 +348,7 @@ class PlantBatch:
         np.maximum(applied, u_min, out=applied)
         # A product is faster than a mask, whose branches processors cannot predict. It makes -0
         # of some numbers, and adding 0 makes 0 of that.
-        applied *= np.abs(command) >= dead_zone
+        applied *= np.abs(command) >= edge
         applied += zero
         place = self._place
         self._inputs[self._older + place] = applied
@@ -387,6 +390,16 @@ class PlantBatch:
     def _window(self) -> NDArray[np.float64]:
         """Return the earlier responses that are still to be taken, the oldest first."""
         return self._earlier[self._first_row : self._first_row + self._window_rows]
+
+    def _update_actuator(self) -> None:
+        """Work out what commands and (29) take from the plant numbers."""
+        dead_zone, u_min, u_max = (
+            getattr(self._numbers, name) for name in ("dead_zone", "u_min", "u_max")
+        )
+        half_range, edge = (u_max - u_min) / 2.0, least_effective(dead_zone, u_min, u_max)
+        numbers = map(np.array, (0.0, 1.0, half_range, u_min, edge))
+        limits = (np.full(self._num_envs, limit) for limit in (u_min, u_max))
+        self._actuator = *numbers, *limits
 
     def _update_dynamics(self) -> None:
         """Bring the dynamics to the plants' ages."""

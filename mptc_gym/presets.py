@@ -1,4 +1,4 @@
-"""Named variants of the environment, from the paper's cases to a hard one."""
+"""Name variants of the environment, from the paper's cases to a hard one."""
 
 from __future__ import annotations
 

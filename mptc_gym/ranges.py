@@ -1,4 +1,4 @@
-"""Draws the plant numbers of an episode from their ranges, or takes them as they are given."""
+"""Draw the plant numbers of an episode from their ranges, or take them as they are given."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a picture shows of an episode: a record of its last samples, and the axes for them.
+"""Record the last samples of an episode for a picture, and choose the axes for them.
 
 Environments hand in plain numbers, one call a sample. A record holds numbers alone, so that it
 can be copied.

@@ -1,4 +1,4 @@
-"""The render modes of the environments, and the picture in text.
+"""Render an episode in the mode that was asked for; draw the picture in text.
 
 Pictures in pixels are made by `mptc_gym.drawing`, which is loaded with the first of them.
 """

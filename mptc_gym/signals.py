@@ -1,4 +1,4 @@
-"""Makes what comes from outside during an episode: set point, noise and load disturbance.
+"""Make what comes from outside during an episode: set point, noise and load disturbance.
 
 Every signal has two verbs, here and in `mptc_gym.torch_signals`. `reset` begins an episode and
 returns the signal at k = 0, and `next` returns it at the samples that follow:

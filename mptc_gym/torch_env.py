@@ -1,4 +1,4 @@
-"""Runs many plants side by side in PyTorch, on any device and with gradients if asked for."""
+"""Run many plants side by side in PyTorch, on any device and with gradients if asked for."""
 
 from __future__ import annotations
 
@@ -293,9 +293,10 @@ class MiddlePointTorchEnv(BatchEnv):
 
     def _hand_in(self, signals: Any) -> None:
         """Take signals and plant numbers instead of draws, if there are any."""
-        self._handed, self._last = {}, None
+        handed_in: tuple[dict[str, Handed], int | None] = {}, None
         if signals is not None:
-            self._handed, self._last = handed_signals(signals, self.parameters, self._episodes)
+            handed_in = handed_signals(signals, self.parameters, self._episodes)
+        self._handed, self._last = handed_in
         handed = {name: each for name, each in self._handed.items() if name in SIGNALS}
         self._signals = {**self._drawn, **handed}
 

@@ -1,4 +1,4 @@
-"""Moves many plants in PyTorch by (28) and (29), a block of samples at a time.
+"""Move many plants in PyTorch by (28) and (29), a block of samples at a time.
 
 `PlantBatch` in `mptc_gym.plant` is the same in NumPy, a sample at a time.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import islice
 from typing import Any
 
@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mptc_gym.parameters import Parameters, PlantNumbers
-from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
+from mptc_gym.plant import DRIFT_INTERVAL, Dynamics, least_effective
 from mptc_gym.torch_signals import Episodes, Number
 
 
@@ -31,7 +31,7 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     command
         u, t/h, shape (n,).
     edge
-        The largest magnitude of a command without effect: see `largest_dead`.
+        The largest magnitude of a command without effect.
     u_min, u_max
         The limits, t/h, both floats or both of shape (n,).
     """
@@ -48,22 +48,15 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     return torch.addcmul(limited, limited.detach(), passes.sub_(1.0))
 
 
-def largest_dead(numbers: Mapping[str, Any], like: Tensor) -> Number:
-    """Return the largest magnitude of a command without effect, as numbers of a type go.
-
-    In float64 it is the number before the dead zone, as commands are worked out as in NumPy. In
-    float32 each operation rounds by up to 2^-24 of what it works on, so that a command may come
-    out inside. There, commands that lie inside by no more than such errors pass, too.
-    """
-    dead_zone, u_min, u_max = (numbers[name] for name in ("dead_zone", "u_min", "u_max"))
-    edge: Number
+def _largest_dead(dead_zone: Number, u_min: Number, u_max: Number, like: Tensor) -> Number:
+    """Return the largest magnitude of a command without effect, as numbers of a type go."""
     if like.dtype == torch.float32:
-        edge = dead_zone - 2.0**-22 * (u_max - u_min + abs(u_max) + abs(u_min))
-    elif isinstance(dead_zone, Tensor):
-        edge = dead_zone.nextafter(torch.full_like(dead_zone, -1.0))
-    else:
-        edge = math.nextafter(dead_zone, -1.0)
-    return edge
+        edge: Number = least_effective(dead_zone, u_min, u_max, rounding=2.0**-21)
+        return edge
+    edge = least_effective(dead_zone, u_min, u_max)
+    if isinstance(edge, Tensor):
+        return edge.nextafter(torch.full_like(edge, -math.inf))
+    return math.nextafter(edge, -math.inf)
 
 
 class TorchPlants:
@@ -121,11 +114,10 @@ class TorchPlants:
         else:
             self._history = [each.masked_fill(which, 0.0) for each in self._past()]
             self._flows.extend(torch.stack([*self._flows]).masked_fill_(which, 0.0).unbind())
-        self._limits = numbers["u_min"], numbers["u_max"]
-        u_min, u_max = self._limits
+        self._limits = u_min, u_max = numbers["u_min"], numbers["u_max"]
         self._middle = zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
-        self._edge = largest_dead(numbers, zeros)
+        self._edge = _largest_dead(numbers["dead_zone"], u_min, u_max, zeros)
         delay, n = numbers["delay"], len(zeros)
         self._places = None  # of what each plant is shown, where delays differ
         if isinstance(delay, Tensor):

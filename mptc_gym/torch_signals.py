@@ -1,4 +1,4 @@
-"""Makes what comes from outside in PyTorch: drawn from one generator, or handed in.
+"""Make what comes from outside in PyTorch: drawn from one generator, or handed in.
 
 The signals have the two verbs of those in `mptc_gym.signals`, for many plants and a block of
 samples at a time, without a loop over plants. `reset(which)` begins an episode of some plants,

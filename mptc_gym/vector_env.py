@@ -1,4 +1,4 @@
-"""Runs many plants side by side in NumPy, as a Gymnasium vector environment."""
+"""Run many plants side by side in NumPy, as a Gymnasium vector environment."""
 
 from __future__ import annotations
 

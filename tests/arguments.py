@@ -1,51 +1,44 @@
-"""Arguments of the environment, drawn from all that is valid."""
+"""Draws arguments of the environment from all that is valid, by how they are declared."""
 
 from hypothesis import strategies as st
 
-coefficients = st.floats(-0.3, 0.3)
+from mptc_gym import checks
+from mptc_gym.parameters import ARGUMENTS
+
+few = st.floats(-0.3, 0.3)
+tails = st.lists(few, max_size=3).map(lambda tail: [1.0, *tail])
+levels = st.floats(-100, 100)
+BY_CHECK = {
+    checks.samples: st.integers(0, 30),
+    checks.duration: st.integers(1, 100),
+    checks.not_negative: st.floats(0, 4),
+    checks.at_least_1: st.floats(1, 100),
+    checks.positive: st.floats(0.5, 4),
+    checks.polynomial: tails,
+    checks.coefficients: st.lists(few, min_size=1, max_size=5),
+    checks.reward: st.sampled_from(checks.REWARDS),
+    checks.setpoint: st.sampled_from(checks.SETPOINTS)
+    | levels
+    | st.lists(levels, min_size=1, max_size=5),
+}
+BY_NAME = {  # what fits together, and readings that are not always at the end of the span
+    "dead_zone": st.floats(0, 10),
+    "u_min": st.floats(-20, -10),
+    "u_max": st.floats(0, 20),
+    "temperature_span": st.floats(0.5, 200),
+}
 
 
-def or_range(numbers):
-    """Return a strategy for numbers, and for ranges of them."""
+def _strategy(name, argument):
+    """Return a strategy for an argument, and for ranges of it where they are valid."""
+    numbers = BY_NAME[name] if name in BY_NAME else BY_CHECK[argument.check]
+    if argument.draw is None:
+        return numbers
     return numbers | st.lists(numbers, min_size=2, max_size=2).map(sorted)
 
 
-STRATEGIES = {
-    "a": st.lists(coefficients, max_size=3).map(lambda tail: [1.0, *tail]),
-    "b": st.lists(coefficients, min_size=1, max_size=5),
-    "c": st.lists(coefficients, max_size=3).map(lambda tail: [1.0, *tail]),
-    "delay": or_range(st.integers(0, 30)),
-    "dead_zone": or_range(st.floats(0, 10)),
-    "u_min": or_range(st.floats(-20, -10)),
-    "u_max": or_range(st.floats(0, 20)),
-    "noise_variance": or_range(st.floats(0, 4)),
-    "measurement_noise_variance": or_range(st.floats(0, 4)),
-    "disturbance_amplitude": or_range(st.floats(0, 10)),
-    "disturbance_interval": or_range(st.floats(1, 100)),
-    "disturbance_walk_variance": or_range(st.floats(0, 1)),
-    "gain_factor": or_range(st.floats(0.1, 10)),
-    "time_constant_factor": or_range(st.floats(0.5, 4)),
-    "gain_drift": or_range(st.floats(0.1, 10)),
-    "time_constant_drift": or_range(st.floats(0.2, 4)),
-    "drift_samples": st.integers(1, 100),
-    "sampling_interval": st.floats(0.1, 60),
-    "setpoint": st.one_of(
-        st.sampled_from(["square", "random"]),
-        st.floats(-100, 100),
-        st.lists(st.floats(-100, 100), min_size=1, max_size=5),
-    ),
-    "setpoint_amplitude": st.floats(0, 100),
-    "setpoint_period": st.integers(1, 1000),
-    "setpoint_window": st.integers(0, 5),
-    "error_window": st.integers(0, 5),
-    "output_window": st.integers(0, 5),
-    "action_window": st.integers(0, 30),
-    "temperature_span": st.floats(0.5, 200),
-    "reward": st.sampled_from(["quadratic", "absolute"]),
-    "error_scale": st.floats(0.1, 20),
-    "move_weight": st.floats(0, 2),
-}
-WINDOWS = {"setpoint_window": 3, "error_window": 3, "output_window": 0, "action_window": 0}
+STRATEGIES = {name: _strategy(name, argument) for name, argument in ARGUMENTS.items()}
+WINDOWS = ("setpoint_window", "error_window", "output_window", "action_window")
 
 
 def _without(*names):
@@ -55,8 +48,8 @@ def _without(*names):
 
 # Another A, or other time constants of the paper's A: not every A has one to change.
 valid_arguments = (
-    _without("a") | _without("time_constant_factor", "time_constant_drift")
+    _without("a") | _without(*(name for name in ARGUMENTS if name.startswith("time_constant")))
 ).filter(
     # An observation with no element is refused.
-    lambda arguments: any(arguments.get(name, default) for name, default in WINDOWS.items())
+    lambda arguments: any(arguments.get(name, ARGUMENTS[name].default) for name in WINDOWS)
 )

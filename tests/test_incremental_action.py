@@ -152,6 +152,10 @@ def test_bad_arguments_are_named(name, value):
 def test_other_environments_are_refused():
     with pytest.raises(ValueError, match="env"):
         IncrementalAction(gymnasium.make("CartPole-v1"))
+    with pytest.raises(ValueError, match=r"mptc_gym\.wrappers\.vector\.IncrementalAction"):
+        IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2))
+    with pytest.raises(ValueError, match=r"mptc_gym\.wrappers\.IncrementalAction"):
+        many.IncrementalAction(gymnasium.make("MiddlePoint-v0"))
     for others in (
         gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="sync"),
         gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="vector_entry_point"),

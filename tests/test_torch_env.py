@@ -1,7 +1,6 @@
 """The environment in PyTorch: equal to that in NumPy, its draws, gradients, and no waiting."""
 
 import gc
-import inspect
 import subprocess
 import sys
 from typing import ClassVar
@@ -11,13 +10,13 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="it is what is tested")
 
-from gymnasium.error import ResetNeeded  # noqa: E402 (torch first)
 from gymnasium.vector import AutoresetMode  # noqa: E402
 from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters  # noqa: E402
+from mptc_gym import PRESETS, MiddlePointVectorEnv  # noqa: E402
+from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
 from mptc_gym.signals import Streams  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv  # noqa: E402
 from tests.arguments import valid_arguments  # noqa: E402
@@ -185,15 +184,51 @@ def test_it_equals_the_environment_in_numpy(
 def test_it_equals_it_over_long_episodes_in_both_types(mode, rng):
     arguments = {
         **PRESETS["hard"], "action_window": 20, "output_window": 2, "move_weight": 0.1,
-        "max_episode_steps": 600, "autoreset_mode": mode,
+        "max_episode_steps": 400, "autoreset_mode": mode,
     }  # fmt: skip
     recording = record(
-        MiddlePointVectorEnv(3, **arguments), steps=1200, rng=rng, partial_resets=0.001
+        MiddlePointVectorEnv(3, **arguments), steps=600, rng=rng, partial_resets=0.002
     )
     replay(recording, MiddlePointTorchEnv(3, dtype=torch.float64, **arguments))
     # float32 has 24 bits. Errors of rounding grow with the slowest pole's time constant of
     # some 20 samples, and temperatures are some 10 degC: 10 * 20 * 2^-24 = 1e-5.
     replay(recording, MiddlePointTorchEnv(3, **arguments), rtol=1e-5, atol=1e-4)
+
+
+class TestEdgeOfTheDeadZone:
+    """Where a command has an effect if it is as large as the dead zone, and none if smaller."""
+
+    def passes(self, rng, dtype, action_of):
+        """Return what plants with limits of their own apply, in NumPy and in PyTorch."""
+        n, ranges = 600, {"u_min": [-12, -5], "u_max": [5, 12], "dead_zone": [0.1, 5]}
+        envs = MiddlePointVectorEnv(n, **ranges)
+        _, infos = envs.reset(seed=int(rng.integers(2**30)))
+        drawn = {name: infos[name] for name in ("u_min", "u_max", "dead_zone")}
+        commands = rng.choice([-1, 1], n) * drawn["dead_zone"]
+        actions = action_of(commands, **drawn)[:, None]
+        env = MiddlePointTorchEnv(n, dtype=dtype, **ranges)
+        env.reset(options={"signals": {k: torch.tensor(each) for k, each in drawn.items()}})
+        ours = env.step(torch.tensor(actions))[-1]["applied"]
+        return commands, envs.step(actions)[-1]["applied"], ours.numpy()
+
+    def test_in_float64_it_is_that_of_numpy(self, rng):
+        def action_of(command, u_min, u_max, dead_zone):
+            return action_from_command(command, u_min, u_max)
+
+        commands, theirs, ours = self.passes(rng, torch.float64, action_of)
+        np.testing.assert_array_equal(ours, theirs)
+        np.testing.assert_allclose(ours, commands, rtol=0, atol=1e-13)
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_every_action_that_is_made_to_pass_does(self, rng, dtype):
+        commands, theirs, ours = self.passes(rng, dtype, float32_action)
+        for applied in (theirs, ours):
+            np.testing.assert_allclose(applied, commands, rtol=0, atol=1e-5)
+
+    def test_limits_in_odd_numbers(self):
+        env = make(1, u_min=-8.62, dead_zone=10.0)
+        env.reset(seed=0)
+        assert env.step(torch.ones(1, 1))[-1]["applied"].item() == pytest.approx(10.0)
 
 
 def make(num_envs=2, **arguments):
@@ -291,8 +326,8 @@ class TestDraws:
         middle, count = (shortest + longest) / 2, longest - shortest + 1
         spread = ((count**2 - 1) / 12 / lengths.size) ** 0.5
         assert abs(lengths.mean() - middle) <= 5 * spread
-        if count > 1:
-            assert {lengths.min(), lengths.max()} == {shortest, longest} or count > 100
+        if count < 100:
+            assert {lengths.min(), lengths.max()} == {shortest, longest}
         starts = levels[0]
         assert abs(starts.mean()) < 5 * amplitude / (3 * n) ** 0.5
         # The variance of x^2, x uniform in [-1, 1], is 1/5 - 1/9.
@@ -544,8 +579,8 @@ class TestGradients:
         env.reset(seed=0)
         weight = torch.ones(1, 1, dtype=torch.float64, requires_grad=differentiable)
         counts = []
-        for _ in range(4):
-            for _ in range(100):
+        for _ in range(3):
+            for _ in range(40):
                 env.step(torch.full((3, 1), 0.7) * weight)
                 env.detach()
             gc.collect()
@@ -595,65 +630,16 @@ def test_a_step_never_waits_for_the_device(mode, differentiable):
                 env.step(torch.zeros(3, 1, dtype=torch.float64))
 
 
-def test_the_interface_is_that_of_the_one_in_numpy():
-    ours, theirs = make(3, output_window=2), MiddlePointVectorEnv(3, output_window=2)
-    for name in ("action_space", "observation_space"):
-        assert getattr(ours, name) == getattr(theirs, name)
-        assert getattr(ours, f"single_{name}") == getattr(theirs, f"single_{name}")
-    assert ours.autoreset_mode is ours.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    assert ours.num_envs == 3
-    assert ours.np_random_seed is None
-    ours.reset(seed=7)
-    assert ours.np_random_seed == 7
-
-
-def test_help_shows_every_argument():
-    names = set(inspect.signature(MiddlePointTorchEnv).parameters)
-    own = {
-        "num_envs",
-        "device",
-        "dtype",
-        "max_episode_steps",
-        "autoreset_mode",
-        "differentiable",
-    }
-    assert names == own | set(inspect.signature(Parameters).parameters)
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("num_envs", 0), ("num_envs", 2.0), ("max_episode_steps", 0),
-        ("autoreset_mode", "Never"), ("dead_zone", -1.0), ("delay", 1.5),
-        ("dtype", torch.float16), ("dtype", "float32"),
-        ("device", "toaster"), ("differentiable", "yes"), ("device", "meta"),
-        ("render_mode", "rgb_array"), ("num_envs", 10**9), ("dtype", np.ones(2)),
+        ("dtype", torch.float16), ("dtype", "float32"), ("dtype", np.ones(2)),
+        ("device", "toaster"), ("device", "meta"), ("differentiable", "yes"),
     ],
 )  # fmt: skip
 def test_bad_argument_is_named(name, value):
     with pytest.raises(ValueError, match=name):
         MiddlePointTorchEnv(**{"num_envs": 2, name: value})
-
-
-def test_unknown_argument_is_refused():
-    with pytest.raises(TypeError, match="deadzone"):
-        MiddlePointTorchEnv(2, deadzone=5.0)
-
-
-@pytest.mark.parametrize("seed", [-1, 1.5, True, "12", [1, 2]])
-def test_bad_seed_is_refused(seed):
-    with pytest.raises(ValueError, match="seed"):
-        make().reset(seed=seed)
-
-
-@pytest.mark.parametrize(
-    "mask", [[True, False], torch.tensor([1, 0]), torch.tensor([True]), torch.zeros(2).bool()]
-)
-def test_bad_reset_mask_is_refused(mask):
-    env = make()
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="reset_mask"):
-        env.reset(options={"reset_mask": mask})
 
 
 @pytest.mark.parametrize(
@@ -675,12 +661,6 @@ def test_bad_signals_are_named(signals, named):
         env.reset(options={"signals": signals})
 
 
-@pytest.mark.parametrize("options", ["reset_mask", 5, [True, False]])
-def test_options_that_are_no_dict_are_refused(options):
-    with pytest.raises(ValueError, match=r"^options must be a dict or None"):
-        make().reset(options=options)
-
-
 def test_signals_end_with_an_error_and_with_a_reset_without():
     env = make(noise_variance=0.5)
     env.reset(seed=0, options={"signals": {"noise": torch.ones(4, 2)}})
@@ -694,79 +674,6 @@ def test_signals_end_with_an_error_and_with_a_reset_without():
         env.step(torch.zeros(2, 1))
     env.reset()
     assert env.step(torch.zeros(2, 1))[-1]["noise"].tolist() != [1.0, 1.0]
-
-
-BAD_ACTIONS = [
-    torch.zeros(2), torch.zeros(1, 1), torch.zeros(2, 2), torch.tensor([[torch.nan], [0.0]]),
-    torch.tensor([[0.0], [torch.inf]]), [["up"], ["down"]], None, np.zeros((2, 1)) * 1j,
-    torch.zeros(2, 1) * 1j,
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("differentiable", [False, True])
-@pytest.mark.parametrize("actions", BAD_ACTIONS)
-def test_bad_actions_leave_the_plants_untouched(actions, differentiable):
-    noisy = {"noise_variance": 0.5, "setpoint": "random", "differentiable": differentiable}
-    env, twin = make(**noisy), make(**noisy)
-    env.reset(seed=0), twin.reset(seed=0)
-    for _ in range(40):
-        with pytest.raises(ValueError, match="actions"):
-            env.step(actions)
-        ours, theirs = env.step(torch.ones(2, 1)), twin.step(torch.ones(2, 1))
-        assert torch.equal(ours[0], theirs[0])
-        assert torch.equal(ours[1], theirs[1])
-
-
-def test_huge_actions_are_taken():
-    env = make()
-    env.reset(seed=0)
-    actions = torch.tensor([[1e200], [-1e200]], dtype=torch.float64)
-    assert env.step(actions)[-1]["applied"].tolist() == [10.0, -10.0]
-
-
-def test_reset_is_asked_for():
-    env = make(max_episode_steps=2, autoreset_mode="Disabled")
-    actions = torch.zeros(2, 1)
-    with pytest.raises(ResetNeeded):
-        env.step(actions)
-    with pytest.raises(ResetNeeded):
-        env.reset(options={"reset_mask": torch.tensor([True, False])})
-    env.reset(seed=0)
-    env.step(actions)
-    env.step(actions)
-    env.reset(options={"reset_mask": torch.tensor([True, False])})
-    with pytest.raises(ResetNeeded, match=r"\[1\]"):
-        env.step(actions)
-    env.reset(options={"reset_mask": torch.tensor([False, True])})
-    env.step(actions)
-
-
-@pytest.mark.parametrize("plant", [{}, PRESETS["hard"]], ids=["calm", "hard"])
-def test_what_is_returned_can_be_overwritten(plant):
-    arguments = {"autoreset_mode": "SameStep", "move_weight": 0.1, "output_window": 1, **plant}
-    arguments |= {"max_episode_steps": 30}
-    for window in (0, 3):
-        env, twin = (make(4, action_window=window, **arguments) for _ in range(2))
-        returned, theirs = env.reset(seed=1), twin.reset(seed=1)
-        rng = torch.Generator().manual_seed(0)
-        for k in range(100):
-            for tensor in (*returned[:-1], *returned[-1].values()):
-                if isinstance(tensor, torch.Tensor):
-                    tensor.fill_(k % 2 if tensor.dtype == torch.bool else 77)
-            actions = torch.randn(4, 1, generator=rng, dtype=torch.float64)
-            kept = actions.clone()
-            returned, theirs = env.step(actions), twin.step(kept.clone())
-            assert torch.equal(actions, kept)
-            actions.fill_(9.0)
-            for own, other in zip(returned[:4], theirs[:4], strict=True):
-                assert torch.equal(own, other)
-            for name in ("output", "applied", "command", "noise", "setpoint", "error"):
-                assert torch.equal(returned[-1][name], theirs[-1][name])
-            if k % 10 == 0:
-                options = {"reset_mask": torch.tensor([True, False, False, True])}
-                returned, theirs = env.reset(options=options), twin.reset(options=options)
-                assert torch.equal(returned[0], theirs[0])
-                assert options["reset_mask"].tolist() == [True, False, False, True]
 
 
 @pytest.mark.parametrize("ask", ["medium", "autocast"])

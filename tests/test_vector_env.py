@@ -1,23 +1,19 @@
 """The vector environment: equal, to the bit, to one environment after the other."""
 
 import copy
-import inspect
 import pickle
-import time
 import tracemalloc
 from unittest.mock import patch
 
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
+from mptc_gym import MiddlePointVectorEnv
 from tests.arguments import valid_arguments
 
 NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
@@ -63,7 +59,7 @@ def compare(native, sync, *, steps, rng, partial_resets):
             assert_equal(*both)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     arguments=valid_arguments,
     num_envs=st.integers(1, 6),
@@ -97,19 +93,13 @@ def test_it_equals_them_over_long_episodes(mode, rng):
     compare(native, sync, steps=1300, rng=rng, partial_resets=0.001)
 
 
-def test_spaces_are_those_of_gymnasium():
-    native, sync = make_both(3, "NextStep", None, setpoint=70.0, output_window=2)
-    for name in ("action_space", "observation_space"):
-        assert getattr(native, name) == getattr(sync, name)
-        assert getattr(native, f"single_{name}") == getattr(sync, f"single_{name}")
-    assert native.autoreset_mode is sync.autoreset_mode
-    assert native.metadata == {**sync.metadata, "render_modes": ["rgb_array"]}
-
-
-@pytest.mark.parametrize("reward", ["quadratic", "absolute"])
 @pytest.mark.parametrize(
-    "a", [[1.0, -3.0, 4.0], [1.0, -2.0, -3.0], [1.0, 1.5], [1.0, -3.0, 3.0, 2.0]]
-)
+    ("a", "reward"),
+    [
+        ([1.0, -3.0, 4.0], "quadratic"), ([1.0, -2.0, -3.0], "absolute"),
+        ([1.0, 1.5], "quadratic"), ([1.0, -3.0, 3.0, 2.0], "absolute"),
+    ],
+)  # fmt: skip
 def test_a_plant_beyond_all_floats_equals_the_one_alone(a, reward):
     native, sync = make_both(
         2, "NextStep", None, a=a, reward=reward, output_window=1, move_weight=0.1,
@@ -121,26 +111,10 @@ def test_a_plant_beyond_all_floats_equals_the_one_alone(a, reward):
             ours, theirs = (envs.step(np.full((2, 1), action)) for envs in (native, sync))
             np.testing.assert_array_equal(ours[0], theirs[0])
             for name in ("output", "error"):
-                assert (
-                    ours[4][name].tobytes() == theirs[4][name].tobytes()
-                )  # of NaN the sign, too
+                # Of NaN the sign, too.
+                assert ours[4][name].tobytes() == theirs[4][name].tobytes()
             assert ours[1].tobytes() == theirs[1].tobytes()
     assert not np.isfinite(ours[4]["output"]).any()
-
-
-def test_a_wide_range_of_delays_costs_little_more_than_one_delay():
-    def seconds(delay):
-        envs = MiddlePointVectorEnv(512, delay=delay)
-        envs.reset(seed=0)
-        actions, taken = np.ones((512, 1), np.float32), []
-        for _ in range(5):
-            start = time.process_time()
-            for _ in range(100):
-                envs.step(actions)
-            taken.append(time.process_time() - start)
-        return min(taken)
-
-    assert seconds([0, 1000]) < 8 * seconds(18)  # two or three times as long
 
 
 def test_many_plants_share_a_bounded_memory_for_noise(rng):
@@ -166,25 +140,6 @@ def test_ranges_of_delays_over_a_long_time(delay, rng):
     compare(native, sync, steps=700, rng=rng, partial_resets=0.01)
 
 
-def test_time_limit_is_that_of_the_registration_unless_another_is_given():
-    def truncations(**limit):
-        envs = gymnasium.make_vec("MiddlePoint-v0", 2, **limit)
-        envs.reset(seed=0)
-        return [bool(envs.step(np.zeros((2, 1)))[3].all()) for _ in range(1300)]
-
-    assert np.flatnonzero(truncations()) == 1199
-    assert np.flatnonzero(truncations(max_episode_steps=700)) == 699
-    assert not any(truncations(max_episode_steps=None))
-    assert not any(truncations(max_episode_steps=-1))
-
-
-def test_autoreset_mode_is_an_attribute_as_in_gymnasium_s_own_and_in_the_metadata():
-    given = [*MODES, *AutoresetMode]
-    made = [MiddlePointVectorEnv(2, autoreset_mode=mode) for mode in given]
-    for mode, envs in zip(given, made, strict=True):
-        assert envs.metadata["autoreset_mode"] is envs.autoreset_mode is AutoresetMode(mode)
-
-
 def test_an_actuator_that_does_not_reach_zero_flow(rng):
     native, sync = make_both(
         2, "NextStep", 9, u_min=6.0, u_max=8.0, dead_zone=2.0, action_window=3, move_weight=0.5
@@ -200,32 +155,6 @@ def test_limits_of_minus_zero():
     assert_equal(native.step(actions), sync.step(actions))
 
 
-@pytest.mark.parametrize("plant", [NOISY, {"setpoint": 5.0}], ids=["noisy", "calm"])
-def test_what_is_returned_can_be_overwritten(plant, rng):
-    arguments = {"autoreset_mode": "SameStep", "action_window": 2, "move_weight": 0.1, **plant}
-    native, twin = (
-        MiddlePointVectorEnv(4, max_episode_steps=30, **arguments) for _ in range(2)
-    )
-    returned = native.reset(seed=1)
-    twin.reset(seed=1)
-    for k in range(100):
-        for array in (*returned[:-1], *returned[-1].values()):
-            if isinstance(array, np.ndarray) and array.dtype != object:
-                array[...] = k % 2 if array.dtype == bool else 77
-        actions = rng.normal(0, 1, (4, 1)).astype(np.float32)
-        kept = actions.copy()
-        returned = native.step(actions)
-        np.testing.assert_array_equal(actions, kept)
-        assert_equal(returned, twin.step(actions))
-        if k % 10 == 0:
-            mask = np.array([True, False, False, True])
-            options = {"reset_mask": mask}
-            returned = native.reset(options=options)
-            assert_equal(returned, twin.reset(options=options))
-            assert list(options) == ["reset_mask"]
-            assert list(mask) == [True, False, False, True]
-
-
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_copies_in_the_middle_of_an_episode_go_on_alike(copied, mode, rng):
@@ -239,20 +168,6 @@ def test_copies_in_the_middle_of_an_episode_go_on_alike(copied, mode, rng):
     for _ in range(700):
         actions = rng.uniform(-1, 1, (3, 1))
         assert_equal(envs.step(actions), twin.step(actions))
-
-
-def test_episode_statistics_of_gymnasium():
-    envs = RecordEpisodeStatistics(
-        gymnasium.make_vec("MiddlePoint-v0", 3, max_episode_steps=5, **NOISY)
-    )
-    envs.reset(seed=0)
-    total = np.zeros(3)
-    for _ in range(5):
-        _, rewards, _, _, infos = envs.step(np.ones((3, 1), np.float32))
-        total += rewards
-    np.testing.assert_allclose(infos["episode"]["r"], total, rtol=1e-6)
-    assert list(infos["episode"]["l"]) == [5, 5, 5]
-    envs.reset(options={"reset_mask": np.array([True, False, True])})
 
 
 def test_seeds_are_told():
@@ -274,12 +189,12 @@ def test_unseeded_plants_meet_different_noise():
 
 
 def test_nothing_grows_in_the_long_run():
-    envs = MiddlePointVectorEnv(2, autoreset_mode="SameStep", max_episode_steps=1000, **NOISY)
+    envs = MiddlePointVectorEnv(2, autoreset_mode="SameStep", max_episode_steps=100, **NOISY)
     actions = np.full((2, 1), 0.6, np.float32)
     envs.reset(seed=0)
     sizes = []
     for _ in range(2):
-        for _ in range(50_000):
+        for _ in range(5_000):
             envs.step(actions)
         sizes.append(len(pickle.dumps(envs)))
     # The counters become longer numbers, no more.
@@ -298,30 +213,7 @@ def test_a_plant_costs_a_few_kib(limit):
     assert used / plants < 12 * 1024
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("num_envs", 0), ("num_envs", 2.0), ("num_envs", True), ("max_episode_steps", 0),
-        ("max_episode_steps", 1.5), ("autoreset_mode", "Never"), ("dead_zone", -1.0),
-        ("delay", 1.5), ("num_envs", 10**9), ("max_episode_steps", np.ones(2)),
-        ("max_episode_steps", -2), ("render_mode", np.ones(2)),
-    ],
-)  # fmt: skip
-def test_bad_argument_is_named(name, value):
-    arguments = {"num_envs": 2, name: value}
-    with pytest.raises(ValueError, match=f"^{name} must be"):
-        MiddlePointVectorEnv(**arguments)
-
-
-def test_unknown_argument_is_refused():
-    with pytest.raises(TypeError, match="deadzone"):
-        MiddlePointVectorEnv(2, deadzone=5.0)
-
-
-@pytest.mark.parametrize(
-    "seed",
-    [-1, 1.5, True, "12", b"12", np.array(3), [1], [1, 2, 3], [1, -2], [1, 1.5], [1, "2"]],
-)
+@pytest.mark.parametrize("seed", [np.array(3), [1], [1, 2, 3], [1, -2], [1, 1.5], [1, "2"]])
 def test_bad_seed_is_refused(seed):
     with pytest.raises(ValueError, match="seed"):
         MiddlePointVectorEnv(2).reset(seed=seed)
@@ -332,101 +224,3 @@ def test_seed_may_be_a_numpy_integer():
         MiddlePointVectorEnv(2, **NOISY).reset(seed=seed) for seed in (np.int64(3), [3, 4])
     )
     assert_equal(ours, theirs)
-
-
-@pytest.mark.parametrize(
-    "mask",
-    [[True, False], np.array([1, 0]), np.array([True]), np.array([False, False]), None],
-)
-def test_bad_reset_mask_is_refused(mask):
-    envs = MiddlePointVectorEnv(2)
-    envs.reset(seed=0)
-    with pytest.raises(ValueError, match="reset_mask"):
-        envs.reset(options={"reset_mask": mask})
-
-
-@pytest.mark.parametrize("options", ["reset_mask", 5, [True, False]])
-def test_options_that_are_no_dict_are_refused(options):
-    with pytest.raises(ValueError, match=r"^options must be a dict or None"):
-        MiddlePointVectorEnv(2).reset(options=options)
-
-
-def test_an_error_shows_the_beginning_of_a_large_array_and_its_shape():
-    envs = MiddlePointVectorEnv(2)
-    envs.reset(seed=0)
-    with pytest.raises(
-        ValueError, match=r"shape \(2, 1\), got array.*shape \(300, 3\)"
-    ) as error:
-        envs.step(np.zeros((300, 3)))
-    assert len(str(error.value)) < 200
-    assert "\n" not in str(error.value)
-
-
-BAD_ACTIONS = [
-    np.zeros(2), np.zeros((1, 1)), np.zeros((2, 2)), np.array([[np.nan], [0.0]]),
-    np.array([[0.0], [np.inf]]), [[10**400], [0]], [["up"], ["down"]], [[0.0], [None]], None,
-    [["0.3"], ["0.3"]], np.array([["0.3"], ["0.3"]]), np.array([["0.3"], ["0.3"]], object),
-    [[b"0.3"], [b"0.3"]], [["0.3"], [0.3]], np.array([["0.3"], [0.3]], object), [[0.3], [0.3j]],
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("actions", BAD_ACTIONS)
-def test_bad_actions_leave_the_plants_untouched(actions):
-    envs, twin = (MiddlePointVectorEnv(2, **NOISY) for _ in range(2))
-    envs.reset(seed=0), twin.reset(seed=0)
-    for _ in range(40):
-        with pytest.raises(ValueError, match="actions"):
-            envs.step(actions)
-        assert_equal(envs.step(np.ones((2, 1))), twin.step(np.ones((2, 1))))
-
-
-@pytest.mark.parametrize(
-    "actions",
-    [[[1], [0]], [[True], [False]], np.array([[1.0], [0.0]], object), np.array([[1], [0]])],
-)
-def test_any_numbers_are_actions(actions):
-    envs, twin = (MiddlePointVectorEnv(2) for _ in range(2))
-    envs.reset(seed=0), twin.reset(seed=0)
-    assert_equal(envs.step(actions), twin.step(np.array([[1.0], [0.0]], np.float32)))
-
-
-def test_huge_actions_are_taken():
-    envs = MiddlePointVectorEnv(2)
-    envs.reset(seed=0)
-    with np.errstate(over="ignore"):
-        infos = envs.step(np.array([[1e200], [-1e200]]))[4]
-    assert list(infos["applied"]) == [10.0, -10.0]
-
-
-def test_the_action_of_a_plant_that_is_reset_is_ignored():
-    envs = MiddlePointVectorEnv(2, max_episode_steps=1)
-    envs.reset(seed=0)
-    envs.reset(options={"reset_mask": np.array([True, False])})
-    assert list(envs.step(np.zeros((2, 1)))[3]) == [True, True]
-    envs.reset(options={"reset_mask": np.array([True, False])})
-    envs.step(np.array([[0.0], [np.nan]]))
-    with pytest.raises(ValueError, match="actions"):
-        envs.step(np.array([[0.0], [np.nan]]))
-
-
-def test_reset_is_asked_for():
-    envs = MiddlePointVectorEnv(2, max_episode_steps=2, autoreset_mode="Disabled")
-    with pytest.raises(ResetNeeded):
-        envs.step(np.zeros((2, 1)))
-    with pytest.raises(ResetNeeded):
-        envs.reset(options={"reset_mask": np.array([True, False])})
-    envs.reset(seed=0)
-    envs.step(np.zeros((2, 1)))
-    envs.step(np.zeros((2, 1)))
-    envs.reset(options={"reset_mask": np.array([True, False])})
-    with pytest.raises(ResetNeeded, match=r"\[1\]"):
-        envs.step(np.zeros((2, 1)))
-    envs.reset(options={"reset_mask": np.array([False, True])})
-    envs.step(np.zeros((2, 1)))
-
-
-def test_help_shows_every_argument():
-    names = set(inspect.signature(MiddlePointVectorEnv).parameters)
-    assert names == {"num_envs", "max_episode_steps", "autoreset_mode"} | set(
-        inspect.signature(MiddlePointEnv).parameters
-    )

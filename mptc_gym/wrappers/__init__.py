@@ -1,4 +1,4 @@
-"""Wrappers of one environment: `IncrementalAction`, whose action changes the flow.
+"""Wrap one environment: the action of `IncrementalAction` changes the flow.
 
 `mptc_gym.wrappers.vector` has the same for vector environments.
 """
@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from mptc_gym.checks import is_number, reject
@@ -88,6 +89,11 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         max_move: float = 0.4,
         undo_dead_zone: bool | float = False,
     ) -> None:
+        if isinstance(env, VectorEnv):
+            raise ValueError(
+                "env must be one environment; the wrapper of many is "
+                f"mptc_gym.wrappers.vector.IncrementalAction, got {env}"
+            )
         RecordConstructorArgs.__init__(self, max_move=max_move, undo_dead_zone=undo_dead_zone)
         gymnasium.ActionWrapper.__init__(self, env)
         check_arguments(max_move, undo_dead_zone)

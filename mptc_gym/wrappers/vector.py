@@ -1,4 +1,4 @@
-"""Wrappers of many environments side by side: `IncrementalAction`."""
+"""Wrap many environments side by side: the action of `IncrementalAction` changes the flow."""
 
 from __future__ import annotations
 
@@ -50,6 +50,11 @@ class IncrementalAction(VectorActionWrapper):
         max_move: float = 0.4,
         undo_dead_zone: bool | float = False,
     ) -> None:
+        if not isinstance(env, VectorEnv):
+            raise ValueError(
+                "env must be a vector environment; the wrapper of one environment is "
+                f"mptc_gym.wrappers.IncrementalAction, got {env}"
+            )
         super().__init__(env)
         check_arguments(max_move, undo_dead_zone)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)

@@ -1,0 +1,280 @@
+"""What holds for many plants in NumPy and in PyTorch alike: the shell that both share."""
+
+import inspect
+from functools import partial
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.vector import AutoresetMode
+
+from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters
+from mptc_gym.batch import FACTORS, INFO
+
+MODES = [mode.value for mode in AutoresetMode]
+NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
+SHELL = {"num_envs", "max_episode_steps", "autoreset_mode"}
+
+
+@pytest.fixture(params=["NumPy", "PyTorch"])
+def library(request):
+    """Return the environment of a library, and how to make its arrays."""
+    if request.param == "NumPy":
+        return SimpleNamespace(
+            cls=MiddlePointVectorEnv,
+            array=np.array,
+            own={"render_mode"},
+            shared={},
+            make=partial(_made, MiddlePointVectorEnv),
+        )
+    torch = pytest.importorskip("torch", reason="it is what is tested")
+    from mptc_gym.torch_env import MiddlePointTorchEnv
+
+    return SimpleNamespace(
+        cls=MiddlePointTorchEnv,
+        array=torch.tensor,
+        own={"device", "dtype", "differentiable"},
+        # Several steps may return the same, as documented.
+        shared={*FACTORS, *(f"_{name}" for name in (*INFO, *FACTORS, "disturbance"))},
+        make=partial(_made, MiddlePointTorchEnv, dtype=torch.float64),
+    )
+
+
+def _made(cls, num_envs=2, **arguments):
+    return cls(num_envs, **{"max_episode_steps": None, **arguments})
+
+
+def plain(returned):
+    """Return a copy of what an environment returned, in lists and arrays of NumPy."""
+    if isinstance(returned, dict):
+        return {name: plain(each) for name, each in returned.items()}
+    if isinstance(returned, tuple):
+        return tuple(plain(each) for each in returned)
+    return np.asarray(returned).copy()
+
+
+def assert_equal(ours, theirs):
+    assert data_equivalence(plain(ours), plain(theirs), exact=True)
+
+
+def test_spaces_are_those_of_gymnasium(library):
+    arguments = {"setpoint": 70.0, "output_window": 2}
+    ours = library.make(3, **arguments)
+    theirs = gymnasium.make_vec("MiddlePoint-v0", 3, vectorization_mode="sync", **arguments)
+    for name in ("action_space", "observation_space"):
+        assert getattr(ours, name) == getattr(theirs, name)
+        assert getattr(ours, f"single_{name}") == getattr(theirs, f"single_{name}")
+    assert ours.num_envs == 3
+    assert set(ours.metadata) >= {"autoreset_mode", "render_modes"}
+
+
+def test_autoreset_mode_is_an_attribute_as_in_gymnasium_s_own_and_in_the_metadata(library):
+    assert library.make().autoreset_mode is AutoresetMode.NEXT_STEP
+    for mode in [*MODES, *AutoresetMode]:
+        envs = library.make(autoreset_mode=mode)
+        assert envs.metadata["autoreset_mode"] is envs.autoreset_mode is AutoresetMode(mode)
+
+
+def test_help_shows_every_argument(library):
+    names = set(inspect.signature(library.cls).parameters)
+    assert names == SHELL | library.own | set(inspect.signature(Parameters).parameters)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("num_envs", 0), ("num_envs", 2.0), ("num_envs", True), ("num_envs", 10**9),
+        ("max_episode_steps", 0), ("max_episode_steps", 1.5), ("max_episode_steps", -2),
+        ("max_episode_steps", np.ones(2)), ("autoreset_mode", "Never"), ("dead_zone", -1.0),
+        ("delay", 1.5), ("render_mode", np.ones(2)), ("render_mode", "human"),
+    ],
+)  # fmt: skip
+def test_bad_argument_is_named(library, name, value):
+    with pytest.raises(ValueError, match=f"^{name} must be"):
+        library.make(**{name: value})
+
+
+def test_more_plants_than_a_memory_holds_are_refused(library):
+    with pytest.raises(ValueError, match=r"^num_envs must be at most 33,\d+ with this delay"):
+        library.make(1_000_000, delay=[0, 10_000])
+
+
+def test_unknown_argument_is_refused(library):
+    with pytest.raises(TypeError, match="deadzone"):
+        library.make(deadzone=5.0)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, True, "12", b"12", np.array(3.0), [1], [1, 2, "3"]])
+def test_bad_seed_changes_nothing(library, seed):
+    envs, twin = library.make(**NOISY), library.make(**NOISY)
+    envs.reset(seed=0), twin.reset(seed=0)
+    with pytest.raises(ValueError, match="seed must be"):
+        envs.reset(seed=seed)
+    actions = library.array([[1.0], [0.0]])
+    for _ in range(3):
+        assert_equal(envs.step(actions), twin.step(actions))
+    assert_equal(envs.reset(), twin.reset())
+
+
+@pytest.mark.parametrize("mask", [[True, False], [1, 0], [True], [False, False], None])
+@pytest.mark.parametrize("of_library", [False, True])
+def test_bad_reset_mask_is_refused(library, mask, of_library):
+    envs = library.make()
+    envs.reset(seed=0)
+    if of_library and mask is not None:
+        mask = library.array(mask) if mask != [True, False] else library.array(mask)[None]
+    with pytest.raises(ValueError, match="reset_mask"):
+        envs.reset(options={"reset_mask": mask})
+
+
+def test_masks_may_be_views_that_cannot_be_written(library):
+    envs, twin = library.make(**NOISY), library.make(**NOISY)
+    envs.reset(seed=0), twin.reset(seed=0)
+    mask = np.array([True, False])[::-1]
+    mask.flags.writeable = False
+    options = {"reset_mask": mask}
+    assert_equal(
+        envs.reset(options=options), twin.reset(options={"reset_mask": np.array([False, True])})
+    )
+    assert list(options) == ["reset_mask"]
+
+
+@pytest.mark.parametrize("options", ["reset_mask", 5, [True, False]])
+def test_options_that_are_no_dict_are_refused(library, options):
+    with pytest.raises(ValueError, match=r"^options must be a dict or None"):
+        library.make().reset(options=options)
+
+
+def test_an_error_shows_the_beginning_of_a_large_array_and_its_shape(library):
+    envs = library.make()
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape \(2, 1\), got .*shape \(300, 3\)") as error:
+        envs.step(library.array(np.zeros((300, 3))))
+    assert len(str(error.value)) < 200
+    assert "\n" not in str(error.value)
+
+
+BAD_ACTIONS = [
+    np.zeros(2), np.zeros((1, 1)), np.zeros((2, 2)), np.array([[np.nan], [0.0]]),
+    np.array([[0.0], [np.inf]]), [[10**400], [0]], [["up"], ["down"]], [[0.0], [None]], None,
+    [["0.3"], ["0.3"]], np.array([["0.3"], ["0.3"]]), [[b"0.3"], [b"0.3"]], [["0.3"], [0.3]],
+    [[0.3], [0.3j]],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("actions", BAD_ACTIONS, ids=range(len(BAD_ACTIONS)))
+def test_bad_actions_leave_the_plants_untouched(library, actions):
+    if isinstance(actions, np.ndarray) and actions.dtype == float:
+        actions = library.array(actions)
+    envs, twin = library.make(**NOISY), library.make(**NOISY)
+    envs.reset(seed=0), twin.reset(seed=0)
+    good = library.array(np.ones((2, 1)))
+    for _ in range(25):
+        with pytest.raises(ValueError, match="actions"):
+            envs.step(actions)
+        assert_equal(envs.step(good), twin.step(good))
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [[[1], [0]], [[True], [False]], np.array([[1], [0]]), np.array([[1.0], [0.0]], np.float32)],
+)
+def test_any_numbers_are_actions(library, actions):
+    envs, twin = library.make(), library.make()
+    envs.reset(seed=0), twin.reset(seed=0)
+    assert_equal(envs.step(actions), twin.step(library.array([[1.0], [0.0]])))
+
+
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
+def test_huge_actions_are_taken(library):
+    envs = library.make()
+    envs.reset(seed=0)
+    infos = envs.step(library.array(np.array([[1e200], [-1e200]])))[4]
+    assert infos["applied"].tolist() == [10.0, -10.0]
+
+
+def test_the_action_of_a_plant_that_is_reset_is_ignored(library):
+    envs = library.make(max_episode_steps=1)
+    first = {"reset_mask": np.array([True, False])}
+    envs.reset(seed=0)
+    envs.reset(options=first)
+    assert envs.step(np.zeros((2, 1)))[3].tolist() == [True, True]
+    envs.reset(options=first)
+    bad = np.array([[0.0], [np.nan]])
+    envs.step(bad)
+    with pytest.raises(ValueError, match="actions"):
+        envs.step(bad)
+
+
+def test_reset_is_asked_for(library):
+    envs = library.make(max_episode_steps=2, autoreset_mode="Disabled")
+    actions = np.zeros((2, 1))
+    first, second = ({"reset_mask": np.arange(2) == i} for i in range(2))
+    with pytest.raises(ResetNeeded):
+        envs.step(actions)
+    with pytest.raises(ResetNeeded):
+        envs.reset(options=first)
+    envs.reset(seed=0)
+    envs.step(actions)
+    envs.step(actions)
+    envs.reset(options=first)
+    with pytest.raises(ResetNeeded, match=r"\[1\]"):
+        envs.step(actions)
+    envs.reset(options=second)
+    envs.step(actions)
+
+
+def test_time_limit(library):
+    def truncations(limit):
+        envs = library.make(max_episode_steps=limit)
+        envs.reset(seed=0)
+        return [bool(envs.step(np.zeros((2, 1)))[3].all()) for _ in range(20)]
+
+    assert np.flatnonzero(truncations(7)).tolist() == [6, 14]  # a reset lies between
+    assert not any(truncations(None))
+    assert not any(truncations(-1))
+
+
+def overwrite(returned, value, shared):
+    named = returned.items() if isinstance(returned, dict) else enumerate(returned)
+    for name, each in named:
+        if isinstance(each, dict):
+            overwrite(each, value, shared)
+        elif each.dtype != object and name not in shared:
+            each[...] = bool(value % 2) if "bool" in str(each.dtype) else value
+
+
+@pytest.mark.parametrize("plant", [NOISY, {"setpoint": 5.0}, PRESETS["hard"]])
+@pytest.mark.parametrize("window", [0, 3])
+def test_what_is_returned_can_be_overwritten(library, plant, window, rng):
+    arguments = {"autoreset_mode": "SameStep", "move_weight": 0.1, "output_window": 1}
+    arguments |= {"max_episode_steps": 30, "action_window": window, **plant}
+    envs, twin = library.make(4, **arguments), library.make(4, **arguments)
+    returned = envs.reset(seed=1)
+    twin.reset(seed=1)
+    for k in range(80):
+        overwrite(returned, 76 + k % 2, shared=library.shared)
+        actions = library.array(rng.normal(0, 1, (4, 1)))
+        kept = plain(actions)
+        returned = envs.step(actions)
+        np.testing.assert_array_equal(plain(actions), kept)
+        actions[...] = 9.0
+        assert_equal(returned, twin.step(kept))
+        if k % 10 == 0:
+            mask = library.array([True, False, False, True])
+            returned = envs.reset(options={"reset_mask": mask})
+            assert_equal(returned, twin.reset(options={"reset_mask": mask}))
+            assert mask.tolist() == [True, False, False, True]
+
+
+def test_gymnasium_s_time_limit_is_that_of_the_registration_unless_another_is_given():
+    def truncations(**limit):
+        envs = gymnasium.make_vec("MiddlePoint-v0", 2, **limit)
+        envs.reset(seed=0)
+        return [bool(envs.step(np.zeros((2, 1)))[3].all()) for _ in range(1210)]
+
+    assert np.flatnonzero(truncations()) == 1199
+    assert not any(truncations(max_episode_steps=None))
