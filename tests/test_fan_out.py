@@ -1,6 +1,5 @@
 """Fan-out: nothing depends on where and when cells run, and nothing that is done is lost."""
 
-import argparse
 import json
 import os
 import select
@@ -8,13 +7,16 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from benchmarks.lib import cluster, command_line, fan_out, storage
+from benchmarks.lib import cluster, fan_out, storage
+from benchmarks.lib.command_line import UsageError
 from benchmarks.lib.fan_out import CellsFailedError, FanOut
+from benchmarks.lib.options import FanOutOptions, options, read
 from tests import cells
 
 ROOT = Path(__file__).parent.parent
@@ -200,23 +202,28 @@ class TestFailures:
         assert len(list(tmp_path.iterdir())) == 2
 
 
-class TestOptions:
-    def parse(self, *options):
-        parser = argparse.ArgumentParser()
-        command_line.add_fan_out(parser, "cells")
-        return command_line.fan_out(parser.parse_args(options))
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What a command reads."""
 
+    fan_out: FanOutOptions = field(default_factory=FanOutOptions)
+
+
+class TestOptions:
     def test_of_the_command_line(self):
-        assert (self.parse("--jobs", "3").jobs, self.parse().backend) == (3, "loky")
-        assert self.parse().jobs >= 1
-        for wrong in (("--jobs", "0"), ("--backend", "dask")):
-            with pytest.raises(SystemExit):
-                self.parse(*wrong)
+        given = read(Options, "program", ["--jobs", "3"]), read(Options, "program", [])
+        asked, usual = (each.fan_out.open() for each in given)
+        assert (asked.jobs, usual.backend) == (3, "loky")
+        assert usual.jobs >= 1
+        for wrong in (["--jobs", "0"], ["--backend", "dask"]):
+            with pytest.raises(UsageError, match=wrong[0]):
+                read(Options, "program", wrong)
 
     def test_without_ray_it_says_how_to_install_it(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "ray", None)
         with pytest.raises(ValueError, match=r"pip install .*ray"):
-            self.parse("--backend", "ray")
+            FanOut(1, "ray")
 
     def test_an_unknown_backend_is_refused(self):
         with pytest.raises(ValueError, match="loky, ray, got 'dask'"):
@@ -243,7 +250,9 @@ class TestNodes:
         top = {path.name for path in there.iterdir()}
         assert top == {"agents", "benchmarks", "mptc_gym", "mine.py"}
         files = [path for path in there.rglob("*") if path.is_file()]
-        assert {path.suffix for path in files} <= {".py", ".npz", ".csv", ".json", ".typed"}
+        assert {path.suffix for path in files} <= {
+            ".py", ".npz", ".csv", ".ipynb", ".json", ".txt", ".typed"
+        }  # fmt: skip
         assert sum(path.stat().st_size for path in files) < 2e6
 
 

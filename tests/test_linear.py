@@ -106,5 +106,6 @@ def test_every_analysis_refuses_an_argument_that_is_not_declared_linear(analysis
 
 def test_no_analysis_sets_up_the_plant_again():
     benchmarks = Path(linear.__file__).parent
-    users = [file for file in benchmarks.rglob("*.py") if "Dynamics" in file.read_text()]
-    assert users == [benchmarks / "linear.py"]
+    users = {file for file in benchmarks.rglob("*.py") if "Dynamics" in file.read_text()}
+    # A training takes the coefficients of many plants as tensors.
+    assert users == {benchmarks / "linear.py", benchmarks / "train/through_plant.py"}
