@@ -463,7 +463,7 @@ class TestCompare:
         with monkeypatch.context() as patch:
             patch.setattr(ppo_training.PPO, "learn", None)
             assert run_compare(tmp_path / "three", *options, "--retrain") == 1
-            assert "seed 0: TypeError" in capsys.readouterr().out
+            assert "policy.npz: TypeError" in capsys.readouterr().out
 
     def test_a_controller_of_the_user(self, tmp_path, monkeypatch):
         (tmp_path / "mine.py").write_text(
