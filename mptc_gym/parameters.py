@@ -292,6 +292,8 @@ class Parameters(PlantNumbers[Number]):
             If an argument is out of range.
         """
         for name in arguments:
+            if name == "render_mode":
+                raise TypeError("render_mode is not an argument of the plant")
             if name not in ARGUMENTS:
                 close = difflib.get_close_matches(name, [*ARGUMENTS, "render_mode"], n=1)
                 hint = f": did you mean {close[0]!r}?" if close else ""

@@ -95,6 +95,23 @@ def test_an_unknown_option_is_named_in_one_line(name, capsys):
 
 
 @pytest.mark.parametrize(
+    ("given", "complaint"),
+    [
+        ("u_min=5", "constant set point, u_min=5: there is nothing to gain: doing nothing"),
+        ("time_constant_factor=100", "square wave, time_constant_factor=100: there is nothing"),
+        ("delay=100000", "--set: delay must be an integer from 0 to 10,000, got 100000"),
+        ("delay=2000", "there is nothing to gain"),
+        ("render_mode=human", "--set: render_mode is not an argument of the plant"),
+    ],
+)  # fmt: skip
+def test_a_plant_that_cannot_be_compared_is_refused_before_any_run(given, complaint, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main_of("compare")(["--agents", "pi", "--runs", "1", "--set", given])
+    assert stop.value.code == 2
+    assert complaint in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("name", "package", "extra"),
     [
         ("claims", "cyclopts", "compare"), ("compare", "pandas", "compare"),

@@ -666,8 +666,13 @@ class TestCompare:
     def test_as_a_command(self, tmp_path):
         command = [sys.executable, "-m", "benchmarks.compare", "--agents", "pi", "--runs", "1"]
         command += ["--scenarios", "constant", "--out", str(tmp_path / "out")]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+        # Neither a backend that there is not nor a terminal without ° stops it.
+        odd = os.environ | {"MPLBACKEND": "nonsense", "PYTHONIOENCODING": "ascii"}
+        done = subprocess.run(
+            command, cwd=ROOT, env=odd, capture_output=True, text=True, check=True
+        )
         assert "1.61" in done.stdout
+        assert "(?C)" in done.stdout
         assert (tmp_path / "out/report.md").exists()
 
 

@@ -402,6 +402,15 @@ class TestLeastPossible:
         found = errors(MPC, 40, 1200, **PRESETS["disturbed"])
         assert 1.0 < found.mean() / least.value < 1.1
 
+    def test_they_hold_for_those_who_read_the_transmitter(self):
+        noisy = {"setpoint": 5.0, "noise_variance": 0.5, "delay": 2}
+        least = least_possible(
+            samples=600, folder=None, measurement_noise_variance=100.0, **noisy
+        )
+        assert "reads the transmitter and not the true output" in least.holds_for
+        # One that reads the true output does better.
+        assert beats(errors(MPC, 40, 600, **noisy), least)
+
     def test_drawn_episodes_are_those_of_the_environment(self):
         # Without noise, a run and the bound of its plant and set point can be compared.
         arguments = {"delay": [5, 30], "gain_factor": [0.8, 1.4], "setpoint": 4.0}

@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.compare.comparison import Comparison
+from benchmarks.compare.estimates import scale_of
 from benchmarks.compare.options import COMPARED, RUNS, Options
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.records import Factory
@@ -38,7 +39,7 @@ def execute(options: Options, console: Console) -> str:
     training = options.controllers.training()
     members = {name: entry.members(training) for name, entry in controllers.items()}
     if plant.arguments:
-        _try_out(members, [scenarios[name] for name in names])
+        _try_out(members, [scenarios[name] for name in names], options.runs)
     out = options.out or _folder(
         [*controllers] if (*controllers,) != COMPARED else [],
         names if names != [*scenarios] else [],
@@ -63,8 +64,13 @@ def execute(options: Options, console: Console) -> str:
     return f"The report, tables, data and plots are in {out}/"
 
 
-def _try_out(members: Mapping[str, list[Factory]], scenarios: Sequence[Scenario]) -> None:
-    """Make each controller once, as not every one can be set up for every plant."""
+def _try_out(
+    members: Mapping[str, list[Factory]], scenarios: Sequence[Scenario], runs: int
+) -> None:
+    """Refuse a plant that has no score, or that a controller cannot be set up for."""
+    for scenario in scenarios:
+        with command_line.blame(scenario.title):
+            scale_of(scenario, runs).least.score(0.0)
     for name, scenario in itertools.product(members, scenarios):
         with command_line.blame(f"{name} on {scenario.title}"):
             members[name][0](scenario.arguments, 1, 0)

@@ -3,8 +3,8 @@
 Two bounds are theorems; the third number is a reference under a condition.
 
 "preview"
-    No controller at all does better on average, even one that knows the whole set point and
-    the drawn plant beforehand. Valid for every set point, however short it is held.
+    No controller does better on average, even one that knows the whole set point and the
+    drawn plant beforehand. Valid for every set point, however short it is held.
 "news"
     No controller does better to which a change of the set point is news. For random set points
     only, whose law it takes (`benchmarks.limits.news`). A controller between the two bounds
@@ -19,7 +19,7 @@ rewards, of |e(k)| over k = 1 to N. Each number is the mean over the episodes th
 environment draws: for each, the programme of `benchmarks.limits.programme` with what
 `benchmarks.limits.unknown` leaves. All rest on this: the plant is (28) and (29), a controller
 knows at k what the transmitter has shown up to k, and any set points, plant numbers and loads
-up to k besides; the dead zone may be undone.
+up to k besides, but not the true output, `info["output"]`; the dead zone may be undone.
 """
 
 from __future__ import annotations
@@ -92,8 +92,10 @@ class LeastPossible:
     def holds_for(self) -> str:
         """For which controllers nothing better is possible."""
         return {
-            "preview": "every controller, even one that knows the set point beforehand",
-            "news": "controllers to which a change of the set point is news",
+            "preview": "every controller that reads the transmitter and not the true output, "
+            "even one that knows the set point beforehand",
+            "news": "controllers that read the transmitter and not the true output, and to "
+            "which a change of the set point is news",
             "reference": "none: a reference, if each change finds the plant settled",
         }[self.kind]
 

@@ -73,10 +73,13 @@ def unknown(course: Course) -> Unknown:
     """Return what remains unknown at each sample of an episode."""
     numbers, samples = course.numbers, len(course.load)
     deviation = np.sqrt(noise_variance(course))
-    inside, weights = _load_weights(course)  # of the changes in a window, the latest first
     walk = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
     amplitude = numbers.disturbance_amplitude
-    if not deviation.any() and not ((walk or amplitude) and inside.any()):
+    # Of the changes of the load in a window, the latest first.
+    inside, weights = np.zeros((samples, 0), np.bool_), np.zeros((samples, 0))
+    if walk or amplitude:
+        inside, weights = _load_weights(course)
+    if not deviation.any() and not inside.any():
         return Unknown(np.ones(1), np.zeros((samples, 1)))
 
     # Means of slices of the standard normal distribution that are equally probable.
@@ -148,13 +151,13 @@ def _load_weights(course: Course) -> tuple[NDArray[np.bool_], Array]:
     samples, order = course.alpha.shape
     lag = min(course.lag, samples)
     changes = np.arange(LOAD_INTERVAL, samples, LOAD_INTERVAL)
-    answers: list[Array] = []  # to a unit step at each change, after 0, 1, ... samples
+    # To a unit step at each change, after 0, 1, ... samples.
+    answers = np.empty((lag, len(changes)))
     for t in range(lag):
         at = np.minimum(changes + t, samples - 1)
-        answer = course.load[at].copy()
+        answers[t] = course.load[at]
         for i in range(min(order, t)):
-            answer += course.alpha[at, i] * answers[t - 1 - i]
-        answers.append(answer)
+            answers[t] += course.alpha[at, i] * answers[t - 1 - i]
     k = np.arange(samples)
     weights = np.zeros((samples, -(-lag // LOAD_INTERVAL)))
     inside = np.zeros(weights.shape, np.bool_)
@@ -162,7 +165,7 @@ def _load_weights(course: Course) -> tuple[NDArray[np.bool_], Array]:
         change = k // LOAD_INTERVAL - place  # 1 is the first
         after = k - change * LOAD_INTERVAL
         there = (change >= 1) & (after < lag)
-        weights[there, place] = np.array(answers)[after[there], change[there] - 1]
+        weights[there, place] = answers[after[there], change[there] - 1]
         inside[:, place] = there
     return inside, weights
 
