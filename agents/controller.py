@@ -1,4 +1,4 @@
-"""What every controller is: something that resets and acts. And checks of arguments."""
+"""Define what every controller is, something that resets and acts, and check arguments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the examination of a claim draws, by the name of its table."""
+"""Draw the tables of examined claims, by their names."""
 
 from __future__ import annotations
 

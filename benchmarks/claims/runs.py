@@ -1,4 +1,4 @@
-"""What claims and figures are made of: the NN and the PI controller on a thousand plants."""
+"""Run the NN and the PI controller on a thousand plants, for claims and figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a step test shows of a plant: its gain, its time constant and its delay."""
+"""Read a gain, a time constant and a delay off the step response of a plant."""
 
 from __future__ import annotations
 

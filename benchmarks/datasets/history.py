@@ -1,4 +1,4 @@
-"""What a data set holds: the history of a plant under a controller, as a log has it."""
+"""Record the history of a plant under a controller, as a log has it."""
 
 from __future__ import annotations
 

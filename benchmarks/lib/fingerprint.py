@@ -1,4 +1,4 @@
-"""What makes a kept result valid: a name made of all that shapes it, and of nothing else.
+"""Name a kept result after all that shapes it, and nothing else.
 
 Three things shape a trained policy or a swept cell: its arguments, the code that runs, and the
 environment. Code is every module of this project that the code imports, directly or not,

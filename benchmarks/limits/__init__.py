@@ -1,4 +1,4 @@
-"""How far anyone can come: bounds that hold for every controller, a reference, and a score."""
+"""Lower bounds that hold for every controller, a reference, and a score."""
 
 from __future__ import annotations
 

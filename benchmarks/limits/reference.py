@@ -1,4 +1,4 @@
-"""What a controller without preview can come to if each change finds the plant settled.
+"""Plan as a controller without preview can, if each change finds the plant settled.
 
 Three things limit every controller of this plant: an input takes d + 1 samples to show, the
 actuator has limits, and the next set point is not known. How much the last costs depends on how

@@ -1,4 +1,4 @@
-"""What no command can answer in time, and the least mean error that it leaves.
+"""Bound the mean error from below by what no command can answer in time.
 
 A flow applied at j shows in y(j + d + 1) at the earliest. So the flows that shape y(k) are
 chosen at k - d - 1 or before, and cannot answer what happens after that: d + 1 samples of the

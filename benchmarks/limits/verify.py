@@ -1,4 +1,4 @@
-"""Every controller against the bound that applies to it, on cases that nothing was tuned on."""
+"""Run every controller against its bound, on cases that nothing was tuned on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where controllers still work on other plants: `python -m benchmarks.sweep --help`."""
+"""Run controllers on other plants: `python -m benchmarks.sweep --help`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""What the one who watches does: keys and mouse, and the flow that they ask for."""
+"""Turn keys and mouse into the flow that the player asks for."""
 
 from __future__ import annotations
 

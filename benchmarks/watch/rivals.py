@@ -1,4 +1,4 @@
-"""What the controllers do on the plant that someone has had in hand."""
+"""Run the controllers on the plant that someone has controlled by hand."""
 
 from __future__ import annotations
 
