@@ -1,4 +1,4 @@
-"""Runs cells on the Ray cluster of RAY_ADDRESS; one kills its worker, another fails."""
+"""Runs tasks on the Ray cluster of RAY_ADDRESS; one kills its worker, another fails."""
 
 import json
 import sys
@@ -7,20 +7,20 @@ from pathlib import Path
 
 from ray import cloudpickle
 
-from benchmarks.lib.fan_out import CellsFailedError, FanOut
-from tests import cells
+from benchmarks.lib.fan_out import FanOut, TasksFailedError
+from tests import tasks
 
-cloudpickle.register_pickle_by_value(cells)  # the tests do not travel
+cloudpickle.register_pickle_by_value(tasks)  # the tests do not travel
 
 scratch = Path(sys.argv[1])
 calls = scratch / "calls"
-work = {f"plant {seed}": partial(cells.draw, seed, calls, 0.05) for seed in range(24)}
-work["plant 9"] = partial(cells.die_once, 9, scratch / "died", calls)
+work = {f"plant {seed}": partial(tasks.draw, seed, calls, 0.05) for seed in range(24)}
+work["plant 9"] = partial(tasks.die_once, 9, scratch / "died", calls)
 fan_out = FanOut(backend="ray")
 results = fan_out.run(work, scratch / "results", progress=False)
-faulty = {"the fault": partial(cells.fail, 1), "plant 3": work["plant 3"]}
+faulty = {"the fault": partial(tasks.fail, 1), "plant 3": work["plant 3"]}
 try:
     fan_out.run(faulty, scratch / "results", progress=False)
-except CellsFailedError as error:
+except TasksFailedError as error:
     out = {"results": results, "errors": error.errors, "jobs": fan_out.jobs}
     (scratch / "out.json").write_text(json.dumps(out))

@@ -21,7 +21,7 @@ from agents import (
 )
 from agents.controller import action_from_command
 from agents.policy_network import PRETRAINED
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.parameters import PlantNumbers
 from mptc_gym.plant import Plant

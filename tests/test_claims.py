@@ -13,8 +13,8 @@ from benchmarks.claims.__main__ import main
 from benchmarks.claims.runs import Batch, converged_at, fail_node
 from benchmarks.claims.verdicts import Entry, Finding, Verdict, verdict
 from benchmarks.lib.statistics import Estimate
-from benchmarks.metrics import join, mean_error, settled, split
-from benchmarks.rollout import Trajectory
+from benchmarks.loop.metrics import join, mean_error, settled, split
+from benchmarks.loop.rollout import Trajectory
 
 
 def finding(low, high, **bounds):

@@ -25,9 +25,9 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage, tables
 from benchmarks.lib.report import Section, write_report
 from benchmarks.limits import least_possible
-from benchmarks.metrics import METRICS, measure
-from benchmarks.rollout import Trajectory, make_plants, rollout
-from benchmarks.scenarios import SCENARIOS
+from benchmarks.loop.metrics import METRICS, measure
+from benchmarks.loop.rollout import Trajectory, make_plants, rollout
+from benchmarks.loop.scenarios import SCENARIOS
 from benchmarks.train import ppo, ppo_training
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
@@ -652,8 +652,8 @@ class TestCompare:
             (["--agent", "x=agents:Nothing"], "agents:Nothing"),
             (["--agent", "x=.:y"], "'.:y' cannot be imported"),
             (["--agent", "x=..a:y"], "'..a:y' cannot be imported"),
-            (["--agent", "x=tests.cells:ObservesAList"], "observation of .* must be a dict"),
-            (["--agent", "x=tests.cells:ObservesText"], "observation of .* must be a dict"),
+            (["--agent", "x=tests.tasks:ObservesAList"], "observation of .* must be a dict"),
+            (["--agent", "x=tests.tasks:ObservesText"], "observation of .* must be a dict"),
         ],
     )
     def test_bad_options(self, options, complaint, capsys, tmp_path):

@@ -11,10 +11,10 @@ from benchmarks.controllers.own import own_factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import UsageError
 from benchmarks.limits.verify import errors
-from benchmarks.metrics import mean_error
-from benchmarks.rollout import make_plants, rollout
-from benchmarks.scenarios import Scenario
-from benchmarks.sweep.cells import agent_cell
+from benchmarks.loop.metrics import mean_error
+from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.scenarios import Scenario
+from benchmarks.sweep.tasks import agent_task
 from benchmarks.train.ppo import PolicyRequest
 from benchmarks.watch import rivals
 from mptc_gym import IDS, PRESETS, evaluate
@@ -45,7 +45,7 @@ def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, mo
     scenario = Scenario("other", "", 900, plant)
     ways = {
         "compare": errors(factory, 2, 900, **plant),
-        "sweep": agent_cell(factory, plant, plant, 900, 2, 0)["mae"],
+        "sweep": agent_task(factory, plant, plant, 900, 2, 0)["mae"],
         "watch": mean_error(rivals.replay(entry.name, {}, scenario, 0)),
     }
     for way, found in ways.items():

@@ -11,7 +11,7 @@ import torch
 from stable_baselines3 import PPO
 
 from agents import PIController
-from benchmarks.rollout import make_plants
+from benchmarks.loop.rollout import make_plants
 from benchmarks.train.defaults import command as defaults
 from benchmarks.train.defaults.__main__ import main
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents import DirectNNController, PIController, SmithPredictor
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
 SHOWN = {"time_constant": 161.0, "delay": 152.0}

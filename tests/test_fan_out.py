@@ -1,4 +1,4 @@
-"""Fan-out: nothing depends on where and when cells run, and nothing that is done is lost."""
+"""Fan-out: nothing depends on where and when tasks run, and nothing that is done is lost."""
 
 import json
 import os
@@ -15,19 +15,19 @@ import pytest
 
 from benchmarks.lib import cluster, fan_out, storage
 from benchmarks.lib.command_line import UsageError
-from benchmarks.lib.fan_out import CellsFailedError, FanOut
+from benchmarks.lib.fan_out import FanOut, TasksFailedError
 from benchmarks.lib.options import FanOutOptions, options, read
-from tests import cells
+from tests import tasks
 
 ROOT = Path(__file__).parent.parent
 
 
 def work(n, calls=None, seconds=0.0):
-    return {f"plant {seed}": partial(cells.draw, seed, calls, seconds) for seed in range(n)}
+    return {f"plant {seed}": partial(tasks.draw, seed, calls, seconds) for seed in range(n)}
 
 
-def run(cells_, folder=None, jobs=2):
-    return FanOut(jobs).run(cells_, folder, progress=False)
+def run(given, folder=None, jobs=2):
+    return FanOut(jobs).run(given, folder, progress=False)
 
 
 def counted(calls):
@@ -45,17 +45,17 @@ def calls(tmp_path):
 class TestNumbers:
     def test_jobs_and_order_do_not_matter(self):
         there = work(7)
-        there["plant 0"] = partial(cells.draw, 0, None, 0.3)  # the first is not ready first
+        there["plant 0"] = partial(tasks.draw, 0, None, 0.3)  # the first is not ready first
         back = dict(reversed(there.items()))
         one = run(there, jobs=1)
-        assert one == {f"plant {seed}": cells.draw(seed) for seed in range(7)}
+        assert one == {f"plant {seed}": tasks.draw(seed) for seed in range(7)}
         assert list(one) == list(there)
         for given, jobs in ((there, 2), (back, 2), (back, 1)):
             results = run(given, jobs=jobs)
             assert results == one
             assert list(results) == list(given)
 
-    def test_with_one_job_cells_run_here(self):
+    def test_with_one_job_tasks_run_here(self):
         assert run({"pid": os.getpid}, jobs=1) == {"pid": os.getpid()}
         assert run({"pid": os.getpid}) != {"pid": os.getpid()}
 
@@ -115,9 +115,9 @@ class TestResume:
     def test_a_killed_run_goes_on_where_it_was(self, tmp_path, calls):
         program = (
             "import sys; from functools import partial; from pathlib import Path\n"
-            "from benchmarks.lib.fan_out import FanOut; from tests import cells\n"
+            "from benchmarks.lib.fan_out import FanOut; from tests import tasks\n"
             "out, calls = map(Path, sys.argv[1:])\n"
-            "work = {f'plant {i}': partial(cells.draw, i, calls, 0.2) for i in range(40)}\n"
+            "work = {f'plant {i}': partial(tasks.draw, i, calls, 0.2) for i in range(40)}\n"
             "FanOut(2).run(work, out, progress=False)"
         )
         command = [sys.executable, "-c", program, str(tmp_path / "out"), str(calls)]
@@ -141,8 +141,8 @@ class TestResume:
         os.mkfifo(pipe)
         program = (
             "import sys; from functools import partial\n"
-            "from benchmarks.lib.fan_out import FanOut; from tests import cells\n"
-            "work = {str(i): partial(cells.hold, sys.argv[1], 60.0 * i) for i in range(2)}\n"
+            "from benchmarks.lib.fan_out import FanOut; from tests import tasks\n"
+            "work = {str(i): partial(tasks.hold, sys.argv[1], 60.0 * i) for i in range(2)}\n"
             "FanOut(2).run(work, progress=False)"
         )
         command = [sys.executable, "-c", program, str(pipe)]
@@ -157,41 +157,41 @@ class TestResume:
 class TestFailures:
     def test_a_lost_worker_costs_what_it_was_at(self, tmp_path, calls):
         lossy = work(20, calls, 0.05)
-        lossy["plant 8"] = partial(cells.die_once, 8, tmp_path / "died", calls)
+        lossy["plant 8"] = partial(tasks.die_once, 8, tmp_path / "died", calls)
         assert run(lossy, tmp_path / "out") == run(work(20))
         assert (tmp_path / "died").exists()
         times = counted(calls)
         assert set(times) == set(range(20))
-        # At most two cells were handed out for each of the two workers.
+        # At most two tasks were handed out for each of the two workers.
         assert sum(times.values()) - 20 <= 4
 
-    def test_a_cell_that_always_loses_its_worker_is_named(self, tmp_path):
-        lossy = {**work(8), "the killer": partial(cells.die, 0)}
-        with pytest.raises(CellsFailedError, match="the killer") as error:
+    def test_a_task_that_always_loses_its_worker_is_named(self, tmp_path):
+        lossy = {**work(8), "the killer": partial(tasks.die, 0)}
+        with pytest.raises(TasksFailedError, match="the killer") as error:
             run(lossy, tmp_path)
         assert list(error.value.errors) == ["the killer"]
         assert len(list(tmp_path.glob("plant *.json"))) == 8
 
-    def test_a_fault_of_all_cells_is_soon_given_up(self, monkeypatch):
+    def test_a_fault_of_all_tasks_is_soon_given_up(self, monkeypatch):
         monkeypatch.setattr(fan_out, "GIVE_UP", 2)
-        with pytest.raises(CellsFailedError, match="Not run") as error:
-            run({f"plant {seed}": partial(cells.die, seed) for seed in range(8)})
+        with pytest.raises(TasksFailedError, match="Not run") as error:
+            run({f"plant {seed}": partial(tasks.die, seed) for seed in range(8)})
         assert len(error.value.errors) == 8
 
     @pytest.mark.parametrize("jobs", [1, 2])
-    def test_an_exception_names_its_cell_and_spares_the_others(self, tmp_path, calls, jobs):
-        faulty = {"the fault": partial(cells.fail, 3), **work(4, calls)}
-        with pytest.raises(CellsFailedError, match="no such plant as 3") as error:
+    def test_an_exception_names_its_task_and_spares_the_others(self, tmp_path, calls, jobs):
+        faulty = {"the fault": partial(tasks.fail, 3), **work(4, calls)}
+        with pytest.raises(TasksFailedError, match="no such plant as 3") as error:
             run(faulty, tmp_path / "out", jobs)
         assert list(error.value.errors) == ["the fault"]
-        assert "1 of 5 cells failed" in str(error.value)
-        mended = {**faulty, "the fault": partial(cells.draw, 3)}
-        assert run(mended, tmp_path / "out", jobs)["the fault"] == cells.draw(3)
+        assert "1 of 5 tasks failed" in str(error.value)
+        mended = {**faulty, "the fault": partial(tasks.draw, 3)}
+        assert run(mended, tmp_path / "out", jobs)["the fault"] == tasks.draw(3)
         assert counted(calls) == Counter(range(4))
 
-    def test_a_result_that_cannot_be_saved_names_its_cell(self):
-        with pytest.raises(CellsFailedError, match=r"unfit: TypeError.*set"):
-            run({"unfit": partial(cells.unfit, 3)})
+    def test_a_result_that_cannot_be_saved_names_its_task(self):
+        with pytest.raises(TasksFailedError, match=r"unfit: TypeError.*set"):
+            run({"unfit": partial(tasks.unfit, 3)})
 
     def test_a_stop_by_the_user_is_not_a_failure(self, tmp_path):
         def stop():
@@ -233,9 +233,9 @@ class TestOptions:
 class TestNodes:
     def test_one_with_other_versions_computes_nothing(self):
         here = storage.versions()
-        assert cluster._answer(partial(cells.draw, 1), here) == (cells.draw(1), "", False)
+        assert cluster._answer(partial(tasks.draw, 1), here) == (tasks.draw(1), "", False)
         other = {**here, "numpy": "0.1", "more": "1.0"}
-        result, error, lost = cluster._answer(partial(cells.draw, 1), other)
+        result, error, lost = cluster._answer(partial(tasks.draw, 1), other)
         assert result is None
         assert lost
         assert f"numpy {here['numpy']} instead of 0.1, more missing instead of 1.0" in error

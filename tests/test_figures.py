@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.figures import command as figures
 from benchmarks.figures.__main__ import main
-from benchmarks.rollout import Trajectory
+from benchmarks.loop.rollout import Trajectory
 
 
 def test_the_typical_run_is_the_median_one():

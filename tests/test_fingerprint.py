@@ -59,8 +59,12 @@ def test_what_the_environment_does_counts(own, monkeypatch):
 
 
 def test_imports_are_followed_through_modules():
-    found = imported("benchmarks.sweep.cells")
-    assert {"benchmarks.sweep.cells", "benchmarks.rollout", "benchmarks.metrics"} <= found
+    found = imported("benchmarks.sweep.tasks")
+    assert {
+        "benchmarks.sweep.tasks",
+        "benchmarks.loop.rollout",
+        "benchmarks.loop.metrics",
+    } <= found
     assert not any(name.startswith("mptc_gym") for name in found)
     # Without loading them.
     assert "benchmarks.examples.rllib" not in sys.modules

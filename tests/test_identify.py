@@ -19,21 +19,21 @@ from benchmarks.identify.__main__ import main
 from benchmarks.identify.armax import Orders, Rows
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Columns, Log, read_log
+from benchmarks.identify.margins import margins
 from benchmarks.identify.model import CannotTellError, HeldOut, Interval, Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges, simulation
 from benchmarks.identify.report import fault, headline
 from benchmarks.identify.study.command import (
     KINDS,
     beside_rivals,
-    cell,
     synthetic_log,
     synthetic_plants,
     table,
+    task,
 )
 from benchmarks.identify.tuning import recommended, reduced
-from benchmarks.linear import LinearModel
-from benchmarks.margins import margins
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.linear import LinearModel
+from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
 PAPER = Parameters()
@@ -654,7 +654,7 @@ class TestCommand:
 
 class TestStudy:
     def test_log_of_a_known_plant(self):
-        found = cell({"delay": 12, "dead_zone": 3.0, "noise_variance": 0.02}, 1200, seed=705)
+        found = task({"delay": 12, "dead_zone": 3.0, "noise_variance": 0.02}, 1200, seed=705)
         truth, value, low, high = found["delay"]
         assert truth == 12
         assert abs(value - 12) <= 1

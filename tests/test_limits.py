@@ -18,10 +18,10 @@ from benchmarks.limits.programme import plan
 from benchmarks.limits.reference import TAIL, reference
 from benchmarks.limits.unknown import noise_variance, unknown
 from benchmarks.limits.verify import beats, controllers, errors
-from benchmarks.linear import course
-from benchmarks.metrics import mean_error
-from benchmarks.rollout import make_plants, rollout
-from benchmarks.scenarios import SCENARIOS
+from benchmarks.loop.linear import course
+from benchmarks.loop.metrics import mean_error
+from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.ranges import Ranges
@@ -323,13 +323,15 @@ class TestNews:
         plants = make_plants(runs, samples, **RANDOM)
         setpoints = rollout(plants, PIController(0.0, 0.0), samples, seed=1).setpoint
         starts = [np.array([0, *(np.flatnonzero(np.diff(s)) + 1)]) for s in setpoints.T]
-        tolls = np.array([law.toll(s, b) for s, b in zip(setpoints.T, starts, strict=True)])
+        penalties = np.array(
+            [law.penalty(s, b) for s, b in zip(setpoints.T, starts, strict=True)]
+        )
         ages = np.array(
             [np.arange(samples) - np.repeat(b, np.diff([*b, samples])) for b in starts]
         )
-        assert np.abs(tolls).mean() > 0.05
-        for known in (np.ones_like(tolls), setpoints.T, np.sign(setpoints.T) * (ages > 30)):
-            sums = (tolls * known).sum(axis=1)
+        assert np.abs(penalties).mean() > 0.05
+        for known in (np.ones_like(penalties), setpoints.T, np.sign(setpoints.T) * (ages > 30)):
+            sums = (penalties * known).sum(axis=1)
             assert abs(sums.mean()) < 4 * sums.std() / np.sqrt(runs)
             assert sums.std() > 1.0
 

@@ -8,13 +8,13 @@ import pytest
 from scipy import signal
 
 from agents import PIController
-from benchmarks import linear
 from benchmarks.controllers import engineered
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.step_test import step_test
+from benchmarks.identify.margins import margins
 from benchmarks.limits import frontier, least_possible
-from benchmarks.linear import Coefficients, LinearModel, course, nominal
-from benchmarks.margins import margins
+from benchmarks.loop import linear
+from benchmarks.loop.linear import Coefficients, LinearModel, course, nominal
 from benchmarks.watch.rivals import touched_plants
 from mptc_gym import MiddlePointEnv, Parameters
 from mptc_gym.parameters import ARGUMENTS
@@ -105,7 +105,7 @@ def test_every_analysis_refuses_an_argument_that_is_not_declared_linear(analysis
 
 
 def test_no_analysis_sets_up_the_plant_again():
-    benchmarks = Path(linear.__file__).parent
+    benchmarks = Path(linear.__file__).parents[1]
     users = {file for file in benchmarks.rglob("*.py") if "Dynamics" in file.read_text()}
     # A training takes the coefficients of many plants as tensors.
-    assert users == {benchmarks / "linear.py", benchmarks / "train/through_plant.py"}
+    assert users == {benchmarks / "loop/linear.py", benchmarks / "train/through_plant.py"}

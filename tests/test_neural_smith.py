@@ -9,7 +9,7 @@ import pytest
 
 from agents import LawNetwork, NeuralSelfTuningController, NeuralSmithPredictor, SmithPredictor
 from benchmarks.controllers.step_test import step_test
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
 SHOWN = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}

@@ -11,8 +11,8 @@ import torch
 
 from agents import PolicyNetwork
 from benchmarks.controllers.pretrained import Trained, ppo_policies
-from benchmarks.lib.fan_out import CellsFailedError, FanOut
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.lib.fan_out import FanOut, TasksFailedError
+from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.train import kept, ppo, ppo_arguments, ppo_training
 from benchmarks.train.ppo import PolicyRequest
 from mptc_gym import Parameters
@@ -302,7 +302,7 @@ class TestMembers:
             return whole(arguments)
 
         monkeypatch.setattr(ppo_training, "train", faulty)
-        with pytest.raises(CellsFailedError, match=r"1 of 2 cells failed(.|\n)*out of memory"):
+        with pytest.raises(TasksFailedError, match=r"1 of 2 tasks failed(.|\n)*out of memory"):
             self.members(tmp_path, jobs=1)
         assert len(list(tmp_path.glob("*/policy.npz"))) == 1
 

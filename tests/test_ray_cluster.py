@@ -110,7 +110,7 @@ def test_a_sweep_loses_a_node(cluster, results):
         env=cluster.environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         text=True,
     ) as driver:  # fmt: skip
-        begun = "cells/*/limit *.json"
+        begun = "tasks/*/limit *.json"
         try:
             until(lambda: driver.poll() or len(list(there.glob(begun))) > 1, SECONDS)
             cluster.order("lose")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents import SelfTuningController, SmithPredictor
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.rollout import make_plants, rollout
 
 STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
 # Steady-state gain of (28), degC per t/h, and 1 / (1 - p) samples of 8 s, p its slowest pole.

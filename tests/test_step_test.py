@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from benchmarks.controllers.step_test import StepTest, step_test
-from benchmarks.linear import nominal
-from benchmarks.metrics import reversals
-from benchmarks.plants import read_plant
+from benchmarks.loop.linear import nominal
+from benchmarks.loop.metrics import reversals
+from benchmarks.loop.plants import read_plant
 from mptc_gym import PRESETS, Parameters
 
 

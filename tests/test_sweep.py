@@ -1,4 +1,4 @@
-"""The robustness study: its plants, its cells, and what it makes of them."""
+"""The robustness study: its plants, its tasks, and what it makes of them."""
 
 import json
 
@@ -6,23 +6,23 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import designs
 from benchmarks.controllers.engineered import simc_pi
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.designs import SPANS, grid, random_design
-from benchmarks.sweep import cells, command, report
+from benchmarks.loop import designs
+from benchmarks.loop.designs import SPANS, grid, random_design
+from benchmarks.sweep import command, report, tasks
 from benchmarks.sweep.__main__ import main
-from benchmarks.sweep.cells import agent_cell, limit_cell
 from benchmarks.sweep.options import Options
+from benchmarks.sweep.tasks import agent_task, limit_task
 from mptc_gym import Parameters
 
 NOMINAL = {"delay": 18}
 
 
-def run_cell(agent, plant, *numbers):
+def run_task(agent, plant, *numbers):
     (factory,) = ROSTER[agent].members()
-    return agent_cell(factory, {}, plant, *numbers)
+    return agent_task(factory, {}, plant, *numbers)
 
 
 class TestDesigns:
@@ -58,22 +58,22 @@ class TestDesigns:
 
 class TestCells:
     def test_no_control_leaves_the_error_at_the_set_point(self):
-        cell = run_cell("nothing", NOMINAL, 1200, 2, 0)
-        assert cell["mae"] == cell["late"] == [5.0, 5.0]
-        assert cell["swing"] == [0.0, 0.0]
+        task = run_task("nothing", NOMINAL, 1200, 2, 0)
+        assert task["mae"] == task["late"] == [5.0, 5.0]
+        assert task["swing"] == [0.0, 0.0]
 
     def test_swing_is_the_deviation_within_stretches_by_hand(self):
         # Two stretches, of 1, 3 and of 10, 10, 10, 16: variances 1 and 6.75.
         error = np.array([[9.0], [1.0], [3.0], [9.0], [10.0], [10.0], [10.0], [16.0], [9.0]])
         steady = np.array([0, 1, 1, 0, 1, 1, 1, 1, 0], dtype=bool)
-        assert cells._swing(error, steady) == pytest.approx([np.sqrt(7.75 / 2)])
+        assert tasks._swing(error, steady) == pytest.approx([np.sqrt(7.75 / 2)])
 
     def test_the_limit_is_that_of_the_plant(self):
-        nominal = limit_cell(NOMINAL, 1200)["mae"]
+        nominal = limit_task(NOMINAL, 1200)["mae"]
         assert nominal == pytest.approx(0.911, abs=0.001)
-        assert limit_cell({"delay": 30}, 1200)["mae"] > nominal
+        assert limit_task({"delay": 30}, 1200)["mae"] > nominal
         # As the gain falls, 5 degC come to be out of reach.
-        assert limit_cell({"gain_drift": 0.5}, 1200)["mae"] > 1.4 * nominal
+        assert limit_task({"gain_drift": 0.5}, 1200)["mae"] > 1.4 * nominal
 
     def test_a_frozen_network_does_not_learn_and_starts_from_what_was_learnt(self):
         learning = ROSTER["nn"].members()[0].in_service({}, 3, 0)
@@ -86,13 +86,13 @@ class TestCells:
         np.testing.assert_array_equal(frozen.weights.W, before)
         assert not np.array_equal(learning.weights.W, before)
         # Commissioned, it knows the plant: better than one that begins to learn.
-        experienced = run_cell("nn-frozen", NOMINAL, 1200, 3, 0)["mae"]
+        experienced = run_task("nn-frozen", NOMINAL, 1200, 3, 0)["mae"]
         assert np.median(experienced) < 1.6
 
     def test_a_loop_with_too_much_delay_oscillates(self):
-        slow = run_cell("pi", {"delay": 40}, 1200, 1, 0)
+        slow = run_task("pi", {"delay": 40}, 1200, 1, 0)
         assert slow["swing"][0] > report.OSCILLATES
-        calm = run_cell("pi-simc", NOMINAL, 1200, 1, 0)
+        calm = run_task("pi-simc", NOMINAL, 1200, 1, 0)
         assert calm["swing"][0] < 0.2
 
 
@@ -116,13 +116,13 @@ class TestSweep:
         assert json.loads((tmp_path / "provenance.json").read_text())["seconds"] > 0
 
         # Again: nothing is run, and nothing changes.
-        saved = {file: file.stat().st_mtime_ns for file in (tmp_path / "cells").rglob("*.json")}
+        saved = {file: file.stat().st_mtime_ns for file in (tmp_path / "tasks").rglob("*.json")}
         assert len(saved) == 6 * (3 + 2)
         assert run_sweep(tmp_path, "--design", "random", "--plants", 6) == 0
         assert {file: file.stat().st_mtime_ns for file in saved} == saved
         pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "runs.csv"), runs)
 
-    def test_cells_of_other_options_are_not_taken(self, tmp_path):
+    def test_tasks_of_other_options_are_not_taken(self, tmp_path):
         first = ["--design", "random", "--plants", 2, "--agents", "pi-simc"]
         run_sweep(tmp_path / "one", *first)
         for out in ("one", "two"):
@@ -130,7 +130,7 @@ class TestSweep:
         ours, theirs = (pd.read_csv(tmp_path / name / "runs.csv") for name in ("one", "two"))
         pd.testing.assert_frame_equal(ours, theirs)
 
-    def test_everything_that_shapes_a_cell_is_in_the_key(self):
+    def test_everything_that_shapes_a_task_is_in_the_key(self):
         common = {
             "plants": [{"delay": 18}], "nominal": {}, "factories": [Factory(simc_pi)],
             "options": Options(runs=2, samples=700), "name": "pi",
@@ -159,22 +159,22 @@ class TestSweep:
             main(["--agents", "nobody", "--out", str(tmp_path)])
         assert "no 'nobody'; there are nothing, nn" in capsys.readouterr().err
 
-    def test_a_failed_cell_is_named_and_the_others_are_kept(
+    def test_a_failed_task_is_named_and_the_others_are_kept(
         self, tmp_path, capsys, monkeypatch
     ):
-        monkeypatch.setattr(command, "agent_cell", _fails_on_pi)
+        monkeypatch.setattr(command, "agent_task", _fails_on_pi)
         assert run_sweep(tmp_path, "--design", "random", "--plants", 2) == 1
         assert "pi-simc 0" in capsys.readouterr().out
-        assert len(list((tmp_path / "cells").rglob("nn *.json"))) == 2
+        assert len(list((tmp_path / "tasks").rglob("nn *.json"))) == 2
 
 
 def _fails_on_pi(factory, *arguments, **others):
     if factory.make is simc_pi:
         raise RuntimeError("no luck")
-    return agent_cell(factory, *arguments, **others)
+    return agent_task(factory, *arguments, **others)
 
 
-_fails_on_pi.__module__ = agent_cell.__module__
+_fails_on_pi.__module__ = agent_task.__module__
 
 
 class TestFindings:

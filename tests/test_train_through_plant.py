@@ -13,7 +13,7 @@ from agents import LawNetwork, NeuralSmithPredictor  # noqa: E402
 from agents.neural_law import PRETRAINED  # noqa: E402
 from benchmarks.examples import through_plant as example  # noqa: E402
 from benchmarks.lib.fan_out import FanOut  # noqa: E402
-from benchmarks.rollout import make_plants, rollout  # noqa: E402
+from benchmarks.loop.rollout import make_plants, rollout  # noqa: E402
 from benchmarks.train import __main__ as program  # noqa: E402
 from benchmarks.train import command, through_plant  # noqa: E402
 from benchmarks.train.through_plant import (  # noqa: E402

@@ -12,12 +12,12 @@ import pytest
 
 from agents import DirectNNController, PIController
 from agents.pi import SEARCHED_GAINS
-from benchmarks import scenarios
 from benchmarks.claims.runs import Batch
 from benchmarks.compare import comparison
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import fingerprint, storage
 from benchmarks.lib.fan_out import FanOut
+from benchmarks.loop import scenarios
 from benchmarks.train import ppo, ppo_training
 from benchmarks.tune import command as command
 from benchmarks.tune import objective
@@ -205,7 +205,7 @@ def search(tmp_path, monkeypatch):
 
 class TestKeptTrials:
     @pytest.mark.parametrize(
-        "edited", ["agents.pi", "benchmarks.tune.objective", "benchmarks.metrics"]
+        "edited", ["agents.pi", "benchmarks.tune.objective", "benchmarks.loop.metrics"]
     )
     def test_those_before_and_after_an_edit_are_not_mixed(self, search, edited, monkeypatch):
         search(2)

@@ -150,10 +150,10 @@ class TestManyPlants:
             assert ("episode" in theirs[4]) == ended.any()
             if ended.any():
                 episodes += ended.sum()
-                told = theirs[4]["episode"]
+                episode = theirs[4]["episode"]
                 np.testing.assert_array_equal(theirs[4]["_episode"], ended)
-                np.testing.assert_allclose(told["r"][ended], totals[ended])
-                np.testing.assert_array_equal(told["l"][ended], lengths[ended])
+                np.testing.assert_allclose(episode["r"][ended], totals[ended])
+                np.testing.assert_array_equal(episode["l"][ended], lengths[ended])
                 assert set(lengths[ended]) == {LIMIT}
             again = ended | (np.arange(PLANTS) == 1) if k == 19 else ended
             totals[again], lengths[again] = 0.0, 0

@@ -25,8 +25,8 @@ from benchmarks.claims.runs import (
 )
 from benchmarks.claims.verdicts import Entry, Finding
 from benchmarks.lib.statistics import Estimate, exact, median, quantile, share
-from benchmarks.metrics import mean_error, settled, split
-from benchmarks.scenarios import SETPOINTS as CASES
+from benchmarks.loop.metrics import mean_error, settled, split
+from benchmarks.loop.scenarios import SETPOINTS as CASES
 from mptc_gym import PRESETS, Parameters
 
 # What words are taken to mean: set before the numbers were known, the same for all claims.

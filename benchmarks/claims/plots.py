@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from benchmarks.lib.drawing import COLOURS, STYLE, colours, save
-from benchmarks.metrics import METRICS
+from benchmarks.loop.metrics import METRICS
 
 
 def plot_convergence(times: pd.DataFrame, path: Path) -> None:

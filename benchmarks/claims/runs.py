@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from agents import DirectNNController, PIController
 from agents.direct_nn import Weights
-from benchmarks.rollout import Agent, Trajectory, make_plants, rollout
+from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 
 Array = NDArray[np.float64]
 

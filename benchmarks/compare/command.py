@@ -17,7 +17,7 @@ from benchmarks.controllers.records import Factory
 from benchmarks.lib import command_line
 from benchmarks.lib.options import flat
 from benchmarks.lib.tables import on_screen
-from benchmarks.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
+from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
 
 OUT = Path("results/compare")
 LONGEST = 60  # characters of a folder's name

@@ -26,9 +26,9 @@ from benchmarks.controllers.roster import label
 from benchmarks.lib.report import Section, provenance_line, write_report
 from benchmarks.lib.storage import commit, read_object, versions, write_json
 from benchmarks.lib.tables import write_csv
-from benchmarks.metrics import join, mean_error, measure
-from benchmarks.rollout import Trajectory, make_plants, rollout
-from benchmarks.scenarios import Scenario
+from benchmarks.loop.metrics import join, mean_error, measure
+from benchmarks.loop.rollout import Trajectory, make_plants, rollout
+from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import SEED
 
 TWICE = "square"  # every controller runs this scenario a second time, with what it has learnt

@@ -22,7 +22,7 @@ from benchmarks.lib.statistics import (
 )
 from benchmarks.lib.tables import groups
 from benchmarks.limits import LeastPossible, frontier, is_random, least_possible
-from benchmarks.scenarios import Scenario
+from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
 
 BOOTSTRAP = 0  # seed of the bootstraps

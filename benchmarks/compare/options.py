@@ -11,8 +11,8 @@ from cyclopts import Parameter
 from benchmarks.controllers.options import AgentNames, ControllerOptions
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.options import Names, Runs, options
-from benchmarks.plants import PlantOptions
-from benchmarks.scenarios import SCENARIOS, SETPOINTS
+from benchmarks.loop.plants import PlantOptions
+from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS
 
 COMPARED = tuple(name for name, controller in ROSTER.items() if controller.compared)
 RUNS = 100

@@ -18,8 +18,8 @@ from matplotlib.ticker import LogLocator
 from benchmarks.controllers.roster import label
 from benchmarks.lib.drawing import COLOURS, STYLE, colours, save
 from benchmarks.lib.tables import groups
-from benchmarks.metrics import METRICS
-from benchmarks.scenarios import Scenario
+from benchmarks.loop.metrics import METRICS
+from benchmarks.loop.scenarios import Scenario
 
 
 def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> None:

@@ -11,9 +11,9 @@ import pandas as pd
 from benchmarks.compare.estimates import Scale
 from benchmarks.controllers.roster import label
 from benchmarks.lib.tables import PERCENTILES, percentiles
-from benchmarks.metrics import METRICS
-from benchmarks.rollout import Trajectory
-from benchmarks.scenarios import Scenario
+from benchmarks.loop.metrics import METRICS
+from benchmarks.loop.rollout import Trajectory
+from benchmarks.loop.scenarios import Scenario
 
 NOT_SETTLED = "not settled"
 NO_MEASURE = "not measured"

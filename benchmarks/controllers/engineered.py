@@ -20,7 +20,7 @@ from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.step_test import step_test
-from benchmarks.linear import nominal
+from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 from mptc_gym.plant import action_from_command
 

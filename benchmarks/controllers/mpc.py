@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import action_from_command
-from benchmarks.linear import Coefficients, coefficients
-from benchmarks.rollout import make_plants
+from benchmarks.loop.linear import Coefficients, coefficients
+from benchmarks.loop.rollout import make_plants
 from mptc_gym import Parameters
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import DRIFT_INTERVAL

@@ -13,7 +13,7 @@ import numpy as np
 from agents.policy_network import WINDOWS
 from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Cost, Factory, RosterEntry
-from benchmarks.rollout import Agent, make_plants
+from benchmarks.loop.rollout import Agent, make_plants
 from mptc_gym import Parameters
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from agents import LawNetwork, PolicyNetwork
 from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Cost, Factory, Members
-from benchmarks.rollout import Agent
+from benchmarks.loop.rollout import Agent
 from benchmarks.train import ppo
 from benchmarks.train.ppo_arguments import RANDOMISED, PPOArguments
 from mptc_gym import Parameters

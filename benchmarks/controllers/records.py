@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from agents.controller import PAPER_WINDOWS
-from benchmarks.rollout import Agent, make_plants, rollout
+from benchmarks.loop.rollout import Agent, make_plants, rollout
 from benchmarks.train.ppo import PolicyRequest
 from mptc_gym import Parameters
 
@@ -177,6 +177,10 @@ class RosterEntry:
     def members(self, request: PolicyRequest | None = None) -> list[Factory]:
         """Return the factories of its members: one, or several that were trained apart."""
         return list(self.made_by(request or PolicyRequest()))
+
+    def first(self) -> Factory:
+        """Return the factory of the first member; no other is trained for it."""
+        return self.members(PolicyRequest(policies=1))[0]
 
 
 def provenances(members: Mapping[str, Sequence[Factory]]) -> dict[str, list[dict[str, Any]]]:

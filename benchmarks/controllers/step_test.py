@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.linear import nominal
+from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]

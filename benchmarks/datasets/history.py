@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.controllers.engineered import Nothing
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.datasets.options import EPISODES, SAMPLES
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import PRESETS, Evaluation, Parameters, evaluate
 
 PLANTS = ("paper", "disturbed", "fouling")  # presets

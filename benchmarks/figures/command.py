@@ -18,8 +18,8 @@ from benchmarks.figures import plots
 from benchmarks.figures.options import Options
 from benchmarks.lib.command_line import out_folder
 from benchmarks.lib.tables import percentiles, write_csv
-from benchmarks.metrics import mean_error
-from benchmarks.rollout import Trajectory
+from benchmarks.loop.metrics import mean_error
+from benchmarks.loop.rollout import Trajectory
 from mptc_gym import PRESETS, Parameters
 
 SEED = 0

@@ -26,7 +26,7 @@ from benchmarks.identify.model import (
 )
 from benchmarks.identify.noise import in_the_environment
 from benchmarks.identify.posterior import Posterior
-from benchmarks.linear import LinearModel
+from benchmarks.loop.linear import LinearModel
 
 SECOND = np.array([-0.8])  # C of a second time constant, to begin with
 FIRST_ORDERS = Orders(2, 1, 2)  # to look for the delay with, before the orders are known

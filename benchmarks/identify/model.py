@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from benchmarks.identify.armax import Array, Orders
-from benchmarks.linear import LinearModel
+from benchmarks.loop.linear import LinearModel
 
 CONFIDENCE = 0.95  # of all intervals
 

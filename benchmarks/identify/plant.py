@@ -11,7 +11,7 @@ from benchmarks.identify.armax import Array
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import Interval, Model
 from benchmarks.identify.simulation import held, response
-from benchmarks.linear import LinearModel
+from benchmarks.loop.linear import LinearModel
 from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
 

@@ -12,7 +12,7 @@ from scipy import stats
 from benchmarks.identify.armax import Array
 from benchmarks.identify.likelihood import MOST_GAPS, Candidate, Gap, Likelihood, Place
 from benchmarks.identify.model import CONFIDENCE, Interval
-from benchmarks.linear import LinearModel
+from benchmarks.loop.linear import LinearModel
 
 ENDS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # of the posterior, where an interval ends
 NEAR = 25.0  # of deviances: what is further off has no probability worth a mention

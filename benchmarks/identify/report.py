@@ -11,15 +11,15 @@ import pandas as pd
 
 from benchmarks.identify import plots
 from benchmarks.identify.log import Log
+from benchmarks.identify.margins import Loop, Margins, plot_margins
 from benchmarks.identify.model import Interval, Model
 from benchmarks.identify.plant import plant_arguments
 from benchmarks.identify.tuning import Recommended, recommended, reduced
 from benchmarks.lib.report import Section
 from benchmarks.limits import least_possible
 from benchmarks.limits.programme import NotSolvedError
-from benchmarks.margins import Loop, Margins, plot_margins
-from benchmarks.metrics import mean_error, reversals, travel
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.metrics import mean_error, reversals, travel
+from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
 UNITS = {

@@ -13,10 +13,10 @@ from scipy import integrate
 
 from agents import PIController, SmithPredictor
 from benchmarks.identify.armax import Array
+from benchmarks.identify.margins import Margins, margins
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import settling
-from benchmarks.linear import LinearModel
-from benchmarks.margins import Margins, margins
+from benchmarks.loop.linear import LinearModel
 from mptc_gym import Parameters
 
 MOST_SENSITIVE = 2.0  # Ms of a loop that is recommended

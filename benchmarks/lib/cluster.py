@@ -1,6 +1,6 @@
-"""Cells on a Ray cluster: the code travels with the job, results come back as objects.
+"""Tasks on a Ray cluster: the code travels with the job, results come back as objects.
 
-The nodes need Ray and the packages that a cell imports. They share no folder, and no checkout
+The nodes need Ray and the packages that a task imports. They share no folder, and no checkout
 is on them: Ray unpacks the code where its workers run.
 """
 
@@ -23,7 +23,7 @@ from benchmarks.lib.storage import ROOT, versions
 
 TRAVELS = ("agents", "benchmarks", "mptc_gym")  # and the modules beside them
 STAYS = ("__pycache__", "published", "*.md")
-QUEUED = 4  # cells a core that are handed out; also for nodes that come later
+QUEUED = 4  # tasks a core that are handed out; also for nodes that come later
 
 INSTALL_RAY = 'Ray is not installed: pip install -e ".[bench,ray]"'
 START_RAY = (
@@ -70,35 +70,35 @@ class Cluster:
         self.cores = int(ray.cluster_resources().get("CPU", 1))
 
     def answers(
-        self, cells: Mapping[str, Callable[[], Any]], jobs: int | None, tries: int
+        self, tasks: Mapping[str, Callable[[], Any]], jobs: int | None, tries: int
     ) -> Iterator[tuple[str, Any, str, bool]]:
-        """Run cells and yield their answers as they come.
+        """Run tasks and yield their answers as they come.
 
         Parameters
         ----------
-        cells
+        tasks
             What to run, by name.
         jobs
             How many at once; None for as many as the cluster has cores.
         tries
-            How often a cell is begun at most, if its worker or node is lost.
+            How often a task is begun at most, if its worker or node is lost.
 
         Yields
         ------
         tuple
-            The name of a cell, its result, what went wrong, if anything, and whether that was
+            The name of a task, its result, what went wrong, if anything, and whether that was
             on the side of the cluster.
         """
         ray = self._ray
-        task = ray.remote(num_cpus=1, max_retries=tries - 1)(_answer)
-        waiting = iter(cells.items())
+        remote = ray.remote(num_cpus=1, max_retries=tries - 1)(_answer)
+        waiting = iter(tasks.items())
         running: dict[Any, str] = {}
         here = versions()
         try:
             while True:
                 room = (jobs or QUEUED * self.cores) - len(running)
-                for key, cell in islice(waiting, room):
-                    running[task.remote(cell, here)] = key
+                for key, task in islice(waiting, room):
+                    running[remote.remote(task, here)] = key
                 if not running:
                     return
                 for done in ray.wait(list(running))[0]:
@@ -115,8 +115,8 @@ class Cluster:
                 ray.cancel(left, force=True)
 
 
-def _answer(cell: Callable[[], Any], here: dict[str, str]) -> tuple[Any, str, bool]:
-    """Run a cell; return its result, what went wrong, and whether that was the node's fault."""
+def _answer(task: Callable[[], Any], here: dict[str, str]) -> tuple[Any, str, bool]:
+    """Run a task; return its result, what went wrong, and whether that was the node's fault."""
     there = _versions()
     other = [
         f"{name} {there.get(name, 'missing')} instead of {here.get(name, 'none')}"
@@ -126,7 +126,7 @@ def _answer(cell: Callable[[], Any], here: dict[str, str]) -> tuple[Any, str, bo
     if other:
         return None, f"A node would compute other numbers: it has {', '.join(other)}", True
     try:
-        return cell(), "", False
+        return task(), "", False
     except Exception:
         # As text, since not every exception survives the way to another process.
         return None, traceback.format_exc(), False
@@ -136,7 +136,7 @@ _versions = cache(versions)
 
 
 def _pack(folder: Path) -> None:
-    """Copy the code that cells import."""
+    """Copy the code that tasks import."""
     stays = shutil.ignore_patterns(*STAYS)
     for name in TRAVELS:
         package = importlib.import_module(name)  # mptc_gym may be installed

@@ -84,7 +84,7 @@ def _main(package: str, given: Sequence[str], width: int) -> int:
     execute = importlib.import_module(f"{package}.command").execute
     from rich.console import Console
 
-    from benchmarks.lib.fan_out import CellsFailedError
+    from benchmarks.lib.fan_out import TasksFailedError
     from benchmarks.lib.storage import NotWrittenError
 
     console = Console(
@@ -92,7 +92,7 @@ def _main(package: str, given: Sequence[str], width: int) -> int:
     )
     try:
         console.print(execute(options, console))
-    except (CellsFailedError, NotWrittenError) as error:
+    except (TasksFailedError, NotWrittenError) as error:
         console.print(str(error))
         return 1
     return 0

@@ -1,7 +1,7 @@
-"""Independent pieces of work, called cells, side by side: on this machine or on a Ray cluster.
+"""Independent pieces of work, called tasks, side by side: on this machine or on a Ray cluster.
 
-joblib hands them out here, Ray on a cluster. A cell's result is saved as soon as it is known,
-so that a run that was stopped goes on with what is missing. Which process runs a cell, and
+joblib hands them out here, Ray on a cluster. A task's result is saved as soon as it is known,
+so that a run that was stopped goes on with what is missing. Which process runs a task, and
 when, does not matter to its result as long as all its randomness comes from its arguments.
 """
 
@@ -25,47 +25,47 @@ from benchmarks.lib.cluster import Cluster
 from benchmarks.lib.storage import seal, unseal, write_text
 
 BACKENDS = ("loky", "ray")
-LOSSES = 3  # a cell that saw so many workers vanish runs alone, to see whether it is to blame
-GIVE_UP = 10  # when so many cells were to blame, there is another fault
-NAMED = 10  # failed cells in a message
+LOSSES = 3  # a task that saw so many workers vanish runs alone, to see whether it is to blame
+GIVE_UP = 10  # when so many tasks were to blame, there is another fault
+NAMED = 10  # failed tasks in a message
 PATIENCE = 0.5  # s between two looks at whether the parent is still there
 
-Cells = Mapping[str, Callable[[], Any]]
-# The name of a cell, its result, what went wrong, and whether its worker is lost.
+Tasks = Mapping[str, Callable[[], Any]]
+# The name of a task, its result, what went wrong, and whether its worker is lost.
 Answer = tuple[str, Any, str, bool]
 
 
-class CellsFailedError(RuntimeError):
-    """Some cells have no result; those of all others are kept.
+class TasksFailedError(RuntimeError):
+    """Some tasks have no result; those of all others are kept.
 
     Parameters
     ----------
     errors
-        What went wrong, by the name of the cell: a traceback, or a sentence.
-    cells
+        What went wrong, by the name of the task: a traceback, or a sentence.
+    tasks
         How many there were in all.
     """
 
-    def __init__(self, errors: Mapping[str, str], cells: int) -> None:
+    def __init__(self, errors: Mapping[str, str], tasks: int) -> None:
         self.errors = dict(errors)
         lines = [f"{key}: {text.strip().splitlines()[-1]}" for key, text in errors.items()]
         if len(lines) > NAMED:
             lines[NAMED:] = [f"and {len(lines) - NAMED} more"]
         first = next(iter(errors.values()))
         super().__init__(
-            f"{len(errors)} of {cells} cells failed; the results of the others are kept\n"
+            f"{len(errors)} of {tasks} tasks failed; the results of the others are kept\n"
             + "\n".join(lines)
             + f"\nThe first of them:\n{first}"
         )
 
 
 class FanOut:
-    """Runs cells on the cores of this machine, or on those of a Ray cluster.
+    """Runs tasks on the cores of this machine, or on those of a Ray cluster.
 
     Parameters
     ----------
     jobs
-        How many cells run at once; None means as many as there are cores. With 1 they run in
+        How many tasks run at once; None means as many as there are cores. With 1 they run in
         this process, if not on a cluster, which runs no more at once than it has cores.
     backend
         "loky", processes on this machine; or "ray", a Ray cluster that is running already.
@@ -89,22 +89,22 @@ class FanOut:
 
     def run(
         self,
-        cells: Cells,
+        tasks: Tasks,
         folder: Path | None = None,
         *,
-        title: str = "cells",
+        title: str = "tasks",
         progress: bool = True,
     ) -> dict[str, Any]:
-        """Run the cells that have no result yet, and return the results of all.
+        """Run the tasks that have no result yet, and return the results of all.
 
         Parameters
         ----------
-        cells
+        tasks
             What to run, by name: functions that can be pickled, such as `functools.partial`
             of a function of a module, and return what JSON can hold.
         folder
-            Where results are saved, a file a cell. What lies there under a cell's name is taken
-            for its result: cells with other arguments or code need a folder of their own. A
+            Where results are saved, a file a task. What lies there under a task's name is taken
+            for its result: tasks with other arguments or code need a folder of their own. A
             file that is not what was written is no result. None: they are not saved.
         title
             Stands before the progress bar.
@@ -114,20 +114,20 @@ class FanOut:
         Returns
         -------
         dict
-            The results in the order of the cells, as JSON gives them back.
+            The results in the order of the tasks, as JSON gives them back.
 
         Raises
         ------
-        CellsFailedError
-            At the end, if cells raised an exception or lost their worker again and again.
+        TasksFailedError
+            At the end, if tasks raised an exception or lost their worker again and again.
         """
         from tqdm import tqdm
 
-        results = {} if folder is None else _saved(cells, folder)
+        results = {} if folder is None else _saved(tasks, folder)
         missing = {
-            key: partial(_as_json, cell) for key, cell in cells.items() if key not in results
+            key: partial(_as_json, task) for key, task in tasks.items() if key not in results
         }
-        bar = tqdm(total=len(cells), initial=len(results), desc=title, disable=not progress)
+        bar = tqdm(total=len(tasks), initial=len(results), desc=title, disable=not progress)
         with bar:
             try:
                 for key, text in self.stream(missing):
@@ -135,30 +135,30 @@ class FanOut:
                     if folder is not None:
                         write_text(_file(folder, key), seal(results[key]))
                     bar.update()
-            except CellsFailedError as error:
-                raise CellsFailedError(error.errors, len(cells)) from None
-        return {key: results[key] for key in cells}
+            except TasksFailedError as error:
+                raise TasksFailedError(error.errors, len(tasks)) from None
+        return {key: results[key] for key in tasks}
 
-    def stream(self, cells: Cells) -> Iterator[tuple[str, Any]]:
-        """Run cells, and yield each name and result as they come.
+    def stream(self, tasks: Tasks) -> Iterator[tuple[str, Any]]:
+        """Run tasks, and yield each name and result as they come.
 
         Parameters
         ----------
-        cells
+        tasks
             As those of `run`, but what they return need only be such that it can be pickled.
 
         Raises
         ------
-        CellsFailedError
-            At the end, if cells raised an exception or lost their worker again and again.
+        TasksFailedError
+            At the end, if tasks raised an exception or lost their worker again and again.
         """
         errors: dict[str, str] = {}
         answered: set[str] = set()
         blamed = 0
         answers = (
-            self._cluster.answers(cells, self._asked, LOSSES)
+            self._cluster.answers(tasks, self._asked, LOSSES)
             if self._cluster
-            else self._local(cells)
+            else self._local(tasks)
         )
         for key, result, error, lost in answers:
             answered.add(key)
@@ -169,15 +169,15 @@ class FanOut:
             blamed += lost
             if blamed == GIVE_UP:
                 break
-        for key in cells.keys() - answered:
+        for key in tasks.keys() - answered:
             errors[key] = "Not run: too many lost their worker."
         if errors:
-            in_order = {key: errors[key] for key in cells if key in errors}
-            raise CellsFailedError(in_order, len(cells))
+            in_order = {key: errors[key] for key in tasks if key in errors}
+            raise TasksFailedError(in_order, len(tasks))
 
-    def _local(self, cells: Cells) -> Iterator[Answer]:
-        """Run cells on this machine, those again whose worker is lost."""
-        missing = dict(cells)
+    def _local(self, tasks: Tasks) -> Iterator[Answer]:
+        """Run tasks on this machine, those again whose worker is lost."""
+        missing = dict(tasks)
         losses: Counter[str] = Counter()
         while missing:
             suspect = next((key for key in missing if losses[key] >= LOSSES), None)
@@ -198,38 +198,38 @@ class FanOut:
                 del missing[suspect]
                 yield suspect, None, f"{lost}\nIts worker was lost each time.", True
 
-    def _answers(self, cells: Cells, started: list[str]) -> Iterator[tuple[str, Any, str]]:
-        """Run cells, yield their answers as they come, and note which were handed out."""
+    def _answers(self, tasks: Tasks, started: list[str]) -> Iterator[tuple[str, Any, str]]:
+        """Run tasks, yield their answers as they come, and note which were handed out."""
         import joblib
 
         parent = os.getpid()
 
-        def tasks() -> Iterator[Any]:
-            for key, cell in list(cells.items()):
+        def handed_out() -> Iterator[Any]:
+            for key, task in list(tasks.items()):
                 started.append(key)
-                yield joblib.delayed(_answer)(key, cell, parent)
+                yield joblib.delayed(_answer)(key, task, parent)
 
-        # With one process joblib would use this one, which no cell is to bring down.
-        processes = 1 if self.jobs == 1 else max(2, min(self.jobs, len(cells)))
+        # With one process joblib would use this one, which no task is to bring down.
+        processes = 1 if self.jobs == 1 else max(2, min(self.jobs, len(tasks)))
         parallel = joblib.Parallel(
             processes,
             backend="loky",
             return_as="generator_unordered",
             batch_size=1,  # a lost worker takes along no more than it must
         )
-        yield from parallel(tasks())
+        yield from parallel(handed_out())
 
 
-def _as_json(cell: Callable[[], Any]) -> str:
-    return json.dumps(cell())
+def _as_json(task: Callable[[], Any]) -> str:
+    return json.dumps(task())
 
 
-def _answer(key: str, cell: Callable[[], Any], parent: int) -> tuple[str, Any, str]:
-    """Run a cell; return its name, its result, and what went wrong, if anything."""
+def _answer(key: str, task: Callable[[], Any], parent: int) -> tuple[str, Any, str]:
+    """Run a task; return its name, its result, and what went wrong, if anything."""
     if parent != os.getpid():
         _end_with(parent)
     try:
-        return key, cell(), ""
+        return key, task(), ""
     except Exception:
         # As text, since not every exception survives the way to another process.
         return key, None, traceback.format_exc()

@@ -1,6 +1,6 @@
 """Name a kept result after all that shapes it, and nothing else.
 
-Three things shape a trained policy or a swept cell: its arguments, the code that runs, and the
+Three things shape a trained policy or a swept task: its arguments, the code that runs, and the
 environment. Code is every module of this project that the code imports, directly or not,
 without comments and docstrings. Of the environment it is what it does: trajectories. So an
 edited comment keeps a result, and a moved function cannot leave a stale one in use.

@@ -42,8 +42,8 @@ from benchmarks.limits.news import News
 from benchmarks.limits.programme import Plan, plan
 from benchmarks.limits.reference import SMOOTH, TAIL, held, reference
 from benchmarks.limits.unknown import Unknown, unknown
-from benchmarks.linear import Course, check_linear, course
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.linear import Course, check_linear, course
+from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
 from mptc_gym.parameters import PlantNumbers
@@ -254,11 +254,11 @@ class _Case:
             return reference(self.course, self.unknown, self.setpoint, price=max(price, SMOOTH))
         samples = len(self.setpoint)
         now, unknown = self.course.first(samples), self.unknown.of(0, samples)
-        toll = None
+        penalty = None
         if kind == "news" and self.parameters.setpoint_amplitude > 0.0:
             starts = np.array([start for start, _ in held(self.setpoint)])
-            toll = News(self.parameters, now, unknown).toll(self.setpoint, starts)
-        return plan(now, unknown, self.setpoint, price=price, toll=toll)
+            penalty = News(self.parameters, now, unknown).penalty(self.setpoint, starts)
+        return plan(now, unknown, self.setpoint, price=price, penalty=penalty)
 
     def least(self, kind: str) -> float:
         """Return the least sum of |e(k)| over k = 1 to N; nothing changes e(0)."""

@@ -15,11 +15,11 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import UsageError, out_folder
 from benchmarks.lib.statistics import bootstrap
 from benchmarks.lib.tables import on_screen
-from benchmarks.limits import package
+from benchmarks.limits import packaged
 from benchmarks.limits.bounds import CACHE, LeastPossible, least_possible
 from benchmarks.limits.options import Options
 from benchmarks.limits.verify import errors, verify
-from benchmarks.scenarios import SCENARIOS, scenarios_of
+from benchmarks.loop.scenarios import SCENARIOS, scenarios_of
 from mptc_gym import PRESETS
 
 SAMPLES = 1200  # of an episode of a preset
@@ -43,8 +43,8 @@ def execute(options: Options, console: Console) -> str:
         raise UsageError("--verify: goes without --mpc, --plant, --preset and --set")
     cache = out_folder(options.cache or CACHE, "--cache")
     if options.package:
-        package.write(cache)
-        return f"Written to {package.PLACE}"
+        packaged.write(cache)
+        return f"Written to {packaged.PLACE}"
     if options.verify:
         table, beaten = verify(options.runs, cache, options.fan_out.open())
         console.print(on_screen(table))

@@ -1,4 +1,4 @@
-"""What it costs not to know the next set point: a toll on flows that use the future.
+"""What it costs not to know the next set point: a penalty on flows that use the future.
 
 With `setpoint="random"` the set point has a law: levels are independent and uniform in
 [-A, A], and each is held for a number of samples that is uniform from S to L. To a controller
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from benchmarks.limits.unknown import Unknown
-from benchmarks.linear import Coefficients, Course
+from benchmarks.loop.linear import Coefficients, Course
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ class News:
         # The response to one t/h, after as many samples.
         self._impulse = np.concatenate([np.zeros(course.delay + 1), after])[:samples]
 
-    def toll(self, setpoint: Array, starts: NDArray[np.intp]) -> Array:
+    def penalty(self, setpoint: Array, starts: NDArray[np.intp]) -> Array:
         """Return pi, degC times samples for each t/h, shape (samples,).
 
         Parameters
@@ -109,8 +109,8 @@ class News:
                 ages = np.arange(j + 1 - start, samples - start)
                 expected = self._expected(ages, j - start, stay, change)
                 surprise[j + 1 :, j] = guess[j + 1 :] - expected
-        tolls: Array = (self._course.flow_response() * surprise).sum(axis=0)
-        return tolls
+        penalties: Array = (self._course.flow_response() * surprise).sum(axis=0)
+        return penalties
 
     def _expected(
         self, ages: NDArray[np.intp], now: int, stay: Array | float, change: Array

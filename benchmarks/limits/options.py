@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.lib.options import Count, FanOutOptions, Runs, options
-from benchmarks.plants import PlantOptions
+from benchmarks.loop.plants import PlantOptions
 from mptc_gym.evaluation import EPISODES
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import optimize, sparse
 
 from benchmarks.limits.unknown import Unknown
-from benchmarks.linear import Course
+from benchmarks.loop.linear import Course
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def plan(
     before: Plan | None = None,
     start: int = 0,
     price: float = 0.0,
-    toll: Array | None = None,
+    penalty: Array | None = None,
     least_slope: float = 0.0,
 ) -> Plan:
     """Minimise the sum of the bounds of E|e(k)| over the mean flow.
@@ -94,7 +94,7 @@ def plan(
         the plant has been at rest before k = 0, and `start` is 0.
     price
         Of valve travel, degC times samples for each t/h.
-    toll
+    penalty
         What each t/h of u_a(k) costs in addition, shape (samples,).
     least_slope
         Of the bounds of E|m - n|, while planning: above 0, of all plans that are as good by the
@@ -117,7 +117,9 @@ def plan(
     n = samples - 1 - start  # outputs after `start`, and flows from it on
     of_now = unknown.of(start, samples)
     if n:
-        solved = _solve(course, of_now, setpoint, output, flow, start, price, toll, least_slope)
+        solved = _solve(
+            course, of_now, setpoint, output, flow, start, price, penalty, least_slope
+        )
         output[start + 1 :], flow[start:-1] = solved[:n], solved[n : 2 * n]
     # The last flow shows in no output; without a move it costs nothing either.
     flow[-1] = flow[-2] if samples > 1 else 0.0
@@ -125,8 +127,8 @@ def plan(
     error[start:] = of_now.mean_error(setpoint[start:] - output[start:])
     moves = np.abs(np.diff(flow, prepend=0.0))[start:]
     value = error[start:].sum() + price * moves.sum()
-    if toll is not None:
-        value += float(toll[start:] @ flow[start:])
+    if penalty is not None:
+        value += float(penalty[start:] @ flow[start:])
     return Plan(error, output, flow, float(value))
 
 
@@ -138,7 +140,7 @@ def _solve(
     flow: Array,
     start: int,
     price: float,
-    toll: Array | None,
+    penalty: Array | None,
     least_slope: float,
 ) -> Array:
     """Return outputs after `start`, then flows from it on."""
@@ -164,7 +166,7 @@ def _solve(
               for sign in (1.0, -1.0)]  # fmt: skip
 
     # Columns: y, u, the pieces; then the moves up and down, if they have a price.
-    cost = [zeros, zeros if toll is None else toll[start:-1]]
+    cost = [zeros, zeros if penalty is None else penalty[start:-1]]
     cost += [max(slope, least_slope) * ones for slope, _, _ in pieces]
     bounds = [_bounds(-np.inf * ones, np.inf * ones)]
     bounds += [_bounds(course.low * ones, course.high * ones)]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from benchmarks.limits.programme import Plan, plan
 from benchmarks.limits.unknown import Unknown
-from benchmarks.linear import Course
+from benchmarks.loop.linear import Course
 
 Array = NDArray[np.float64]
 

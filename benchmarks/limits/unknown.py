@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.linear import Course
+from benchmarks.loop.linear import Course
 from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]

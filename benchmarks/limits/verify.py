@@ -17,9 +17,9 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.limits.bounds import LeastPossible, least_possible
-from benchmarks.linear import nominal
-from benchmarks.metrics import mean_error
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.linear import nominal
+from benchmarks.loop.metrics import mean_error
+from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.evaluation import SEED
 from mptc_gym.plant import action_from_command
@@ -132,13 +132,13 @@ def verify(
     """
     cases = cases or tuple(CASES)
     factories = controllers()
-    cells: dict[str, Callable[[], Any]] = {}
+    tasks: dict[str, Callable[[], Any]] = {}
     for case in cases:
-        cells[f"bound, {case}"] = partial(_bound, case, runs)
-        cells |= {f"{name}, {case}": partial(_errors, name, case, runs) for name in factories}
+        tasks[f"bound, {case}"] = partial(_bound, case, runs)
+        tasks |= {f"{name}, {case}": partial(_errors, name, case, runs) for name in factories}
     sources = [factory.module for factory in factories.values()]
     kept = folder / f"verify-{fingerprint('benchmarks.limits.verify', *sources, runs=runs)}"
-    results = fan_out.run(cells, kept, title="verify")
+    results = fan_out.run(tasks, kept, title="verify")
     rows, beaten = [], []
     for case in cases:
         least = LeastPossible(**results[f"bound, {case}"])

@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from agents import DirectNNController
 from benchmarks.lib.tables import on_screen
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.speed.options import Options
 from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv
 from mptc_gym.torch_env import MiddlePointTorchEnv

@@ -14,16 +14,16 @@ from rich.console import Console
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.records import Factory, provenances
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.designs import Plant, grid, random_design
 from benchmarks.lib.command_line import out_folder
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.options import flat
 from benchmarks.lib.report import provenance_line, write_report
 from benchmarks.lib.storage import commit, versions, write_json
 from benchmarks.lib.tables import on_screen, write_csv
-from benchmarks.sweep.cells import agent_cell, limit_cell
+from benchmarks.loop.designs import Arguments, grid, random_design
 from benchmarks.sweep.options import Options
 from benchmarks.sweep.report import report, table
+from benchmarks.sweep.tasks import agent_task, limit_task
 
 SEED = 0  # of a plant's first run
 NOTHING = "nothing"  # the controller that sets the scale
@@ -46,15 +46,15 @@ def execute(options: Options, console: Console) -> str:
     plants = [{**nominal, **plant} for plant in differing]
     began = time.perf_counter()
     results = training.fan_out.run(
-        _limit_cells(plants, options),
-        out / "cells" / _limit_key(plants, options),
+        _limit_tasks(plants, options),
+        out / "tasks" / _limit_key(plants, options),
         title="limit",
     )
     for name, factories in members.items():
         results |= training.fan_out.run(
-            _agent_cells(name, factories, plants, nominal, options),
-            # A folder for each, so that one more controller leaves the others' cells valid.
-            out / "cells" / agent_key(name, factories, plants, nominal, options),
+            _agent_tasks(name, factories, plants, nominal, options),
+            # A folder for each, so that one more controller leaves the others' tasks valid.
+            out / "tasks" / agent_key(name, factories, plants, nominal, options),
             title=name,
         )
     seconds = time.perf_counter() - began
@@ -77,25 +77,25 @@ def execute(options: Options, console: Console) -> str:
         console.print(section.title, *section.text, sep="\n")
         if section.table is not None:
             console.print(on_screen(section.table))
-    return f"{len(results)} cells in {seconds:.0f} s. The report, data and maps are in {out}/"
+    return f"{len(results)} tasks in {seconds:.0f} s. The report, data and maps are in {out}/"
 
 
-def _limit_cells(plants: list[Plant], options: Options) -> dict[str, Callable[[], Any]]:
+def _limit_tasks(plants: list[Arguments], options: Options) -> dict[str, Callable[[], Any]]:
     return {
-        f"limit {i}": partial(limit_cell, plant, options.samples)
+        f"limit {i}": partial(limit_task, plant, options.samples)
         for i, plant in enumerate(plants)
     }
 
 
-def _limit_key(plants: list[Plant], options: Options) -> str:
-    return fingerprint(limit_cell.__module__, plants=plants, samples=options.samples)
+def _limit_key(plants: list[Arguments], options: Options) -> str:
+    return fingerprint(limit_task.__module__, plants=plants, samples=options.samples)
 
 
-def _agent_cells(
+def _agent_tasks(
     name: str,
     factories: Sequence[Factory],
-    plants: list[Plant],
-    nominal: Plant,
+    plants: list[Arguments],
+    nominal: Arguments,
     options: Options,
 ) -> dict[str, Callable[[], Any]]:
     """Return a controller on every plant, by name."""
@@ -103,7 +103,7 @@ def _agent_cells(
     return {
         # Every plant has its own member, in turn: how much they differ shows in the maps.
         f"{name} {i}": partial(
-            agent_cell, factories[i % len(factories)], nominal, plant, **common
+            agent_task, factories[i % len(factories)], nominal, plant, **common
         )
         for i, plant in enumerate(plants)
     }
@@ -112,13 +112,13 @@ def _agent_cells(
 def agent_key(
     name: str,
     factories: Sequence[Factory],
-    plants: list[Plant],
-    nominal: Plant,
+    plants: list[Arguments],
+    nominal: Arguments,
     options: Options,
 ) -> str:
     """Return a name made of everything that shapes the results of a controller."""
     return fingerprint(
-        agent_cell.__module__,
+        agent_task.__module__,
         factories[0].module,
         options=[options.runs, options.samples],
         plants=plants,

@@ -49,13 +49,13 @@ def plot_grid(runs: pd.DataFrame, path: Path) -> None:
     path
         The PNG file to write.
     """
-    cells = _by_plant(runs, ["delay", "gain_factor"])
+    points = _by_plant(runs, ["delay", "gain_factor"])
     nominal = Parameters()
     gain = abs(sum(nominal.b) / sum(nominal.a))
     dead_zone, _ = nominal.range_of("dead_zone")
     with mpl.rc_context(STYLE | {"axes.grid": False}):
-        figure, panels = _panels(cells)
-        for axes, (_, rows) in zip(panels, cells.groupby("agent", sort=False), strict=False):
+        figure, panels = _panels(points)
+        for axes, (_, rows) in zip(panels, points.groupby("agent", sort=False), strict=False):
             table = rows.pivot_table(index="gain_factor", columns="delay", values="ratio")
             image = axes.pcolormesh(
                 table.columns, table.index, table, shading="nearest", **_COLOURS
@@ -87,10 +87,10 @@ def plot_plants(runs: pd.DataFrame, path: Path) -> None:
         The PNG file to write.
     """
     runs = runs.assign(largest=runs["gain_factor"] * runs["gain_drift"].fillna(1.0).clip(1.0))
-    cells = _by_plant(runs, ["delay", "largest", "gain_drift"])
+    points = _by_plant(runs, ["delay", "largest", "gain_drift"])
     with mpl.rc_context(STYLE):
-        figure, panels = _panels(cells)
-        for axes, (_, rows) in zip(panels, cells.groupby("agent", sort=False), strict=False):
+        figure, panels = _panels(points)
+        for axes, (_, rows) in zip(panels, points.groupby("agent", sort=False), strict=False):
             for drifts, marker in ((False, "s"), (True, "^")):
                 some = rows[rows["gain_drift"].notna() == drifts]
                 image = axes.scatter(
@@ -165,8 +165,8 @@ def _by_plant(runs: pd.DataFrame, plant: list[str]) -> pd.DataFrame:
     return by.agg(measures | firsts).reset_index()
 
 
-def _panels(cells: pd.DataFrame) -> tuple[Figure, list[Axes]]:
-    agents = cells["agent"].unique()
+def _panels(points: pd.DataFrame) -> tuple[Figure, list[Axes]]:
+    agents = points["agent"].unique()
     rows = math.ceil(len(agents) / _COLUMNS)
     figure = Figure(figsize=(3.4 * min(_COLUMNS, len(agents)) + 1, 3.2 * rows + 0.6))
     grid = figure.subplots(rows, min(_COLUMNS, len(agents)), squeeze=False)

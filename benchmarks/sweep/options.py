@@ -9,7 +9,7 @@ from typing import Literal
 from benchmarks.controllers.options import AgentNames, ControllerOptions
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.options import Runs, Seed, options
-from benchmarks.plants import PlantOptions
+from benchmarks.loop.plants import PlantOptions
 
 SWEPT = tuple(name for name, controller in ROSTER.items() if controller.swept)
 

@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.controllers.roster import label
-from benchmarks.designs import Plant
 from benchmarks.lib.report import Section
 from benchmarks.lib.statistics import Estimate, bootstrap, improvement
 from benchmarks.lib.tables import groups
+from benchmarks.loop.designs import Arguments
 from benchmarks.sweep import maps
 
 SEED = 0  # of the bootstraps
@@ -38,7 +38,7 @@ ADAPTING = (
 
 
 def table(
-    plants: Sequence[Plant], agents: Sequence[str], results: dict[str, Any]
+    plants: Sequence[Arguments], agents: Sequence[str], results: dict[str, Any]
 ) -> pd.DataFrame:
     """Return one row for each run: the plant, the measures, and how they compare.
 
@@ -49,23 +49,23 @@ def table(
     agents
         The controllers.
     results
-        Of all cells by name: "limit I", "nothing I" and "AGENT I" for plant I.
+        Of all tasks by name: "limit I", "nothing I" and "AGENT I" for plant I.
     """
     rows = []
     for i, plant in enumerate(plants):
         limit = results[f"limit {i}"]["mae"]
         nothing = pd.DataFrame(results[f"nothing {i}"])
         for agent in agents:
-            cell = pd.DataFrame(results[f"{agent} {i}"])
-            cell.insert(0, "plant", i)
-            cell.insert(1, "agent", agent)
-            cell.insert(2, "run", range(len(cell)))
-            cell["limit"] = np.nan if limit is None else limit
-            cell["ratio"] = cell["mae"] / cell["limit"]
+            task = pd.DataFrame(results[f"{agent} {i}"])
+            task.insert(0, "plant", i)
+            task.insert(1, "agent", agent)
+            task.insert(2, "run", range(len(task)))
+            task["limit"] = np.nan if limit is None else limit
+            task["ratio"] = task["mae"] / task["limit"]
             # The same noise with no control, which sets both scales.
-            cell["oscillates"] = cell["swing"] > nothing["swing"] + OSCILLATES
-            cell["useless"] = cell["mae"] >= nothing["mae"]
-            rows.append(cell.assign(**plant))
+            task["oscillates"] = task["swing"] > nothing["swing"] + OSCILLATES
+            task["useless"] = task["mae"] >= nothing["mae"]
+            rows.append(task.assign(**plant))
     return pd.concat(rows, ignore_index=True)
 
 

@@ -36,7 +36,7 @@ def train(
 
     Raises
     ------
-    CellsFailedError
+    TasksFailedError
         At the end, if some failed; the others are kept.
     """
     missing = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from benchmarks.designs import SPANS
+from benchmarks.loop.designs import SPANS
 
 DELAY, DEAD_ZONE = 18, 5.0  # of the paper's plant, samples and t/h
 

@@ -23,9 +23,9 @@ from torch import nn
 
 from agents import Increments, PolicyNetwork
 from benchmarks.lib.storage import versions
-from benchmarks.metrics import mean_error
-from benchmarks.rollout import make_plants, rollout
-from benchmarks.scenarios import SCENARIOS
+from benchmarks.loop.metrics import mean_error
+from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.scenarios import SCENARIOS
 from benchmarks.train.ppo_arguments import PPOArguments
 from mptc_gym import Parameters
 from mptc_gym.sb3 import GymnasiumVecEnv

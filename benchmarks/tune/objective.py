@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.controllers.records import Factory, Tuning
-from benchmarks.metrics import mean_error, settled, split
-from benchmarks.rollout import make_plants, rollout
-from benchmarks.scenarios import Scenario
+from benchmarks.loop.metrics import mean_error, settled, split
+from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.scenarios import Scenario
 
 # Neighbours of the paper's cases, each with its first sample that counts: three that begin with
 # an untrained controller, and two that show what comes after learning.

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.options import Count, FanOutOptions, Folder, Runs, choice, options
-from benchmarks.plants import PlantOptions
+from benchmarks.loop.plants import PlantOptions
 
 TUNED = {name: each.tuning for name, each in ROSTER.items() if each.tuning}
 _TRIALS = ", ".join(f"{tuning.trials} for {name}" for name, tuning in TUNED.items())

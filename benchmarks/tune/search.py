@@ -127,7 +127,7 @@ class Search:
         """Return a hash of the code that makes and judges the controller."""
         train = self._tuning.train
         maker = train.__module__ if train else self._controller.members()[0].module
-        judges = ("benchmarks.metrics", "benchmarks.rollout")
+        judges = ("benchmarks.loop.metrics", "benchmarks.loop.rollout")
         objective = code("benchmarks.tune.objective")  # and not all that it imports
         return fingerprint(maker, *judges, objective=objective)
 
@@ -197,7 +197,7 @@ class Search:
     ) -> list[dict[str, float]]:
         """Return, for each of the candidates, the mean of its members' scores."""
         members = self._tuning.members[final]
-        cells = {
+        tasks = {
             f"candidate {i}, member {member}": partial(
                 _score,
                 self._controller,
@@ -212,8 +212,8 @@ class Search:
             for member in range(members)
         }
         # One alone gains nothing from another process, which takes seconds to start.
-        fan_out = self._fan_out if len(cells) > 1 else FanOut(jobs=1)
-        answers = fan_out.run(cells, title="new runs for the best", progress=final)
+        fan_out = self._fan_out if len(tasks) > 1 else FanOut(jobs=1)
+        answers = fan_out.run(tasks, title="new runs for the best", progress=final)
         scores = pd.DataFrame(list(answers.values()))
         groups = [scores.iloc[i : i + members] for i in range(0, len(scores), members)]
         return [

@@ -21,10 +21,9 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import UsageError
 from benchmarks.lib.storage import replacing
 from benchmarks.lib.tables import on_screen
-from benchmarks.metrics import mean_error
-from benchmarks.rollout import Trajectory, make_plants, rollout
-from benchmarks.scenarios import SCENARIOS, Scenario, scenarios_of
-from benchmarks.train.ppo import PolicyRequest
+from benchmarks.loop.metrics import mean_error
+from benchmarks.loop.rollout import Trajectory, make_plants, rollout
+from benchmarks.loop.scenarios import SCENARIOS, Scenario, scenarios_of
 from benchmarks.watch import rivals
 from benchmarks.watch.hands import HELP, Closed, Hands
 from benchmarks.watch.options import YOU, Options
@@ -71,7 +70,7 @@ def execute(options: Options, console: Console) -> str:
     has_screen = film is None and _has_screen()
     if controller is None and not has_screen:
         raise UsageError(f"--agent {YOU}: needs a screen to open a window on, and no --video")
-    factory = controller.members(PolicyRequest(policies=1))[0] if controller else None
+    factory = controller.first() if controller else None
 
     if film is None and not has_screen:
         film = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.mp4"

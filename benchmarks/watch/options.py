@@ -10,8 +10,8 @@ from cyclopts import Parameter
 
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.options import Count, Seed, options
-from benchmarks.plants import PlantOptions
-from benchmarks.scenarios import SCENARIOS, SETPOINTS
+from benchmarks.loop.plants import PlantOptions
+from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS
 from mptc_gym import MiddlePointEnv
 
 YOU = "you"  # the agent that is no controller

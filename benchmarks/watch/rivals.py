@@ -11,9 +11,9 @@ import pandas as pd
 
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.limits import least_possible
-from benchmarks.metrics import mean_error, travel
-from benchmarks.rollout import Trajectory, rollout
-from benchmarks.scenarios import Scenario
+from benchmarks.loop.metrics import mean_error, travel
+from benchmarks.loop.rollout import Trajectory, rollout
+from benchmarks.loop.scenarios import Scenario
 from benchmarks.watch.touched import Touched
 from mptc_gym.record import Record
 

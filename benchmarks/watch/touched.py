@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.linear import check_linear, coefficients
+from benchmarks.loop.linear import check_linear, coefficients
 from mptc_gym import MiddlePointEnv
 from mptc_gym.ranges import Ranges
 from mptc_gym.record import Record

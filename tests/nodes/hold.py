@@ -1,6 +1,6 @@
 """Holds a Ray cluster of three nodes with a core each, and does what it reads a line at a time.
 
-"lose": end a node that is in the middle of a cell. "join": add one. It prints the address at
+"lose": end a node that is in the middle of a task. "join": add one. It prints the address at
 first, and a line when something is done.
 """
 
@@ -24,7 +24,7 @@ def processes(node):
 
 
 def at_work(node):
-    """Say whether a node runs a cell: Ray names its workers after what they run."""
+    """Say whether a node runs a task: Ray names its workers after what they run."""
     return any(name_of(worker).startswith("ray::_answer") for worker in processes(node)[1])
 
 

@@ -20,7 +20,6 @@ from rich.console import Console
 from scipy import signal
 
 from benchmarks.controllers.engineered import simc_pi
-from benchmarks.designs import Plant, random_design
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError
@@ -31,7 +30,8 @@ from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import share
 from benchmarks.lib.storage import write_text
 from benchmarks.lib.tables import on_screen, write_csv
-from benchmarks.linear import nominal
+from benchmarks.loop.designs import Arguments, random_design
+from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 
 NOISE = 0.02, 0.5  # R of the logs, degC^2
@@ -52,7 +52,9 @@ Question = Callable[[dict[str, Any]], bool]
 TELLING = 2.0  # t/h, dead zones that are counted
 
 
-def synthetic_plants(count: int, seed: int, samples: int, kind: str = "steps") -> list[Plant]:
+def synthetic_plants(
+    count: int, seed: int, samples: int, kind: str = "steps"
+) -> list[Arguments]:
     """Return plants of the random sweep that do not drift, with noise of `NOISE`.
 
     Those of the kind "second order" have two time constants, of `LONG` and `SHORT` samples.
@@ -77,7 +79,7 @@ def synthetic_plants(count: int, seed: int, samples: int, kind: str = "steps") -
     return plants
 
 
-def synthetic_log(plant: Plant, samples: int, seed: int, kind: str = "steps") -> Log:
+def synthetic_log(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> Log:
     """Return a log of a plant in the environment.
 
     Parameters
@@ -117,7 +119,7 @@ def synthetic_log(plant: Plant, samples: int, seed: int, kind: str = "steps") ->
     return Log(flow, temperature, Parameters(**plant).sampling_interval)
 
 
-def cell(plant: Plant, samples: int, seed: int, kind: str = "steps") -> dict[str, Any]:
+def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict[str, Any]:
     """Identify a plant from a log of it.
 
     Returns
@@ -190,14 +192,14 @@ def narmax(log: Log) -> tuple[float, float, float]:
 def execute(options: Options, console: Console) -> str:
     """Run the study and print its tables."""
     out = out_folder(options.out)
-    cells: dict[str, Callable[[], Any]] = {}
-    plants: list[tuple[str, Plant]] = []
+    tasks: dict[str, Callable[[], Any]] = {}
+    plants: list[tuple[str, Arguments]] = []
     for kind in KINDS:
         for i, plant in enumerate(
             synthetic_plants(options.logs, options.seed, options.samples, kind)
         ):
             seed = options.seed * 1_000_000 + i
-            cells[f"{kind} {i}"] = partial(cell, plant, options.samples, seed, kind)
+            tasks[f"{kind} {i}"] = partial(task, plant, options.samples, seed, kind)
             plants.append((kind, plant))
     key = fingerprint(
         "benchmarks.identify.study.command",
@@ -205,7 +207,7 @@ def execute(options: Options, console: Console) -> str:
         seed=options.seed,
         logs=options.logs,
     )
-    results = options.fan_out.open().run(cells, out / "cells" / key, title="logs")
+    results = options.fan_out.open().run(tasks, out / "tasks" / key, title="logs")
     found = list(results.values())
     by_kind = {
         kind: [each for (own, _), each in zip(plants, found, strict=True) if own == kind]
@@ -304,7 +306,7 @@ def beside_rivals(by_kind: dict[str, list[dict[str, Any]]]) -> pd.DataFrame:
     return shown
 
 
-def _row(kind: str, plant: Plant, found: dict[str, Any]) -> dict[str, Any]:
+def _row(kind: str, plant: Arguments, found: dict[str, Any]) -> dict[str, Any]:
     numbers = {name: value for name, value in plant.items() if not isinstance(value, list)}
     row = {"kind": kind, **numbers, "seconds": found["seconds"], "refused": found["refused"]}
     if found["refused"]:

@@ -30,8 +30,8 @@ from agents import PIController
 from benchmarks.lib.command_line import UsageError, out_folder
 from benchmarks.lib.drawing import STYLE, colours, save
 from benchmarks.lib.tables import write_csv
-from benchmarks.metrics import METRICS, mean_error
-from benchmarks.rollout import Agent, make_plants, rollout
+from benchmarks.loop.metrics import METRICS, mean_error
+from benchmarks.loop.rollout import Agent, make_plants, rollout
 from benchmarks.train.defaults.options import Options
 from mptc_gym import Parameters
 from mptc_gym.wrappers import IncrementalAction

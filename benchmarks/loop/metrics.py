@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.rollout import Trajectory
+from benchmarks.loop.rollout import Trajectory
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-Plant = dict[str, Any]  # arguments of the environment
+Arguments = dict[str, Any]  # of the environment
 
 # What drawn plants differ in, to sweep over or to train on. A gain below 0.74 puts 5 degC
 # beyond the limits.
@@ -20,7 +20,7 @@ SPANS = {
 GRID = {"delay": range(2, 42, 2), "gain_factor": np.linspace(0.75, 1.65, 10)}
 
 
-def grid() -> list[Plant]:
+def grid() -> list[Arguments]:
     """Return the paper's plant with other delays and other gains, without noise."""
     return [
         {"delay": delay, "gain_factor": round(float(gain), 6)}
@@ -29,7 +29,7 @@ def grid() -> list[Plant]:
     ]
 
 
-def random_design(count: int, seed: int, samples: int) -> list[Plant]:
+def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
     """Return plants that differ in everything, spread evenly over `SPANS`.
 
     The second half of them drift: in the course of `samples` samples, gain and time constant

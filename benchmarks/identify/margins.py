@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from benchmarks.lib.drawing import STYLE, colours, save
-from benchmarks.linear import nominal
+from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ from mptc_gym.parameters import slowest_pole
 
 
 @dataclass(frozen=True)
-class Plant:
+class ChosenPlant:
     """A plant that was asked for.
 
     Attributes
@@ -44,7 +44,7 @@ class PlantOptions:
     """An argument of the environment, such as delay=30 or delay=[12,24] (repeatable; it
     overrides those of --plant, and these override --preset)."""
 
-    def chosen(self) -> Plant:
+    def chosen(self) -> ChosenPlant:
         """Return the plant that is asked for.
 
         Raises
@@ -80,7 +80,7 @@ class PlantOptions:
                 f"{', '.join(given)}: a must not have a root beyond the unit circle, as "
                 f"nothing holds such a plant, got {list(parameters.a)}"
             )
-        return Plant(", ".join(names) or "the paper's plant", arguments)
+        return ChosenPlant(", ".join(names) or "the paper's plant", arguments)
 
 
 def read_plant(path: str | Path) -> dict[str, Any]:

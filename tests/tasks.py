@@ -1,4 +1,4 @@
-"""Cells for the tests of the fan-out; other processes import them from here."""
+"""Tasks for the tests of the fan-out; other processes import them from here."""
 
 from __future__ import annotations
 

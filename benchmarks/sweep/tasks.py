@@ -6,15 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.controllers.records import Factory
-from benchmarks.designs import Plant
 from benchmarks.limits import least_possible, steady_stretches
-from benchmarks.metrics import mean_error, travel
-from benchmarks.rollout import make_plants, rollout
+from benchmarks.loop.designs import Arguments
+from benchmarks.loop.metrics import mean_error, travel
+from benchmarks.loop.rollout import make_plants, rollout
 
-SETPOINT: Plant = {"setpoint": "square", "setpoint_period": 600}
+SETPOINT: Arguments = {"setpoint": "square", "setpoint_period": 600}
 
 
-def limit_cell(plant: Plant, samples: int) -> dict[str, float | None]:
+def limit_task(plant: Arguments, samples: int) -> dict[str, float | None]:
     """Return the least mean |e| on a plant, degC; None if it does not settle between changes.
 
     It is the least possible error if each change of the set point finds the plant settled and
@@ -28,8 +28,8 @@ def limit_cell(plant: Plant, samples: int) -> dict[str, float | None]:
     return {"mae": limit.value}
 
 
-def agent_cell(
-    factory: Factory, nominal: Plant, plant: Plant, samples: int, runs: int, seed: int
+def agent_task(
+    factory: Factory, nominal: Arguments, plant: Arguments, samples: int, runs: int, seed: int
 ) -> dict[str, list[float]]:
     """Run a controller on a plant that it was not made for.
 
