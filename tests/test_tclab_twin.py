@@ -40,6 +40,7 @@ def test_tuned_controllers_control_the_twin(model):
     uncontrolled = np.abs(tclab_twin.SETPOINTS).mean()
     assert errors["PI, SIMC"] < 1.3 * errors["PI, course"]
     assert errors["Smith"] < 1.7 * errors["PI, course"]
+    assert errors["nn-smith"] < errors["PI, course"]
     assert max(errors.values()) < 0.3 * uncontrolled
 
 
@@ -47,5 +48,5 @@ def test_page_prints_its_table(capsys):
     assert main([]) == 0
     printed = capsys.readouterr().out
     assert [line.split("  ")[0] for line in printed.splitlines()[4:-1]] == [
-        "PI, SIMC", "Smith", "PI, course",
+        "PI, SIMC", "Smith", "nn-smith", "PI, course",
     ]  # fmt: skip

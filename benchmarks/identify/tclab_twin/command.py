@@ -7,8 +7,9 @@ percent, stands for the flow. The page
 
 1. moves the heater in steps and records what the sensor shows,
 2. identifies (28) from the record,
-3. tunes a PI controller by SIMC's rule and a Smith predictor from the result,
-4. and runs both on the twin, beside the PI tuning that courses with this lab hand out.
+3. tunes a PI controller by SIMC's rule and a Smith predictor from the result, and tells the
+   network for every plant a step test of it,
+4. and runs them on the twin, beside the PI tuning that courses with this lab hand out.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ import tclab  # type: ignore[import-untyped, unused-ignore]
 from numpy.typing import NDArray
 from rich.console import Console
 
-from agents import PIController, SmithPredictor
+from agents import Controller, PIController
+from benchmarks.controllers.engineered import nn_smith
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import Model, Options
@@ -101,7 +103,7 @@ def model_of(log: Log) -> Model:
     return identify(log, known)
 
 
-def controllers(model: Model) -> dict[str, PIController]:
+def controllers(model: Model) -> dict[str, Controller]:
     """Return those that are tuned from the model, and the course's."""
     parameters = Parameters(**plant_arguments(model))
     course = PIController(
@@ -109,20 +111,24 @@ def controllers(model: Model) -> dict[str, PIController]:
     )
     tuned = recommended(model, parameters)
     found = {name: each.controller for name, each in tuned.items() if each.controller}
-    return {**found, "PI, course": course}
+    return {**found, "nn-smith": nn_smith(parameters), "PI, course": course}
 
 
-def run(controller: PIController | SmithPredictor, seed: int = 1) -> NDArray[np.float64]:
-    """Return set point, temperature and heater, from the operating point, a row a sample."""
+def run(controller: Controller, seed: int = 1) -> NDArray[np.float64]:
+    """Return set point, temperature and heater, from the operating point, a row a sample.
+
+    As in the environment, row k holds the heater from k on, and what comes of it at k + 1.
+    """
     twin = Twin(seed)
     controller.reset()
-    rows = []
-    for setpoint in np.repeat(SETPOINTS, EACH):
-        temperature = twin.temperature()
-        controller.act([0.0, 0.0, 0.0, setpoint - temperature])  # it reads the error alone
+    setpoints = np.repeat(SETPOINTS, EACH)
+    rows, temperature = [], twin.temperature()
+    for setpoint, following in zip(setpoints, [*setpoints[1:], setpoints[-1]], strict=True):
+        controller.act([setpoint, 0.0, 0.0, setpoint - temperature])
         command = float(np.clip(controller.command, -HEATER, 100.0 - HEATER))
-        rows.append((setpoint, temperature, command))
         twin.step(command)
+        temperature = twin.temperature()
+        rows.append((following, temperature, command))
     return np.array(rows)
 
 
