@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, sparse
+from scipy import linalg, optimize, sparse
 
 from benchmarks.limits.unknown import Unknown
 from benchmarks.loop.linear import Course
 
 Array = NDArray[np.float64]
 
-# Solvers, in the order in which they are tried. The first is the fastest; it gives up on some
-# plants, above all where a zero of B lies outside the unit circle and A is fast.
-ATTEMPTS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("highs-ds", {}),
-    ("highs-ds", {"presolve": False}),
-    ("highs-ipm", {}),
-    ("highs-ipm", {"presolve": False}),
-    ("highs-ds", {"presolve": False, "primal_feasibility_tolerance": 1e-6}),
-)
-TIME_LIMIT = 60.0  # s, of each of them
+Rows = list[list[Any]]  # of blocks of the matrix of equations
+Way = Callable[..., tuple[Array | None, str]]
+
+NOTHING = 1e-9  # of the largest response: what is smaller is left out
+SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)  # with presolve or not
+TIME_LIMIT = 30.0  # s, of each attempt
 
 
 class NotSolvedError(RuntimeError):
-    """No solver has found the optimum of a linear programme; the message says why."""
+    """The optimum of a linear programme was not found; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ def plan(
     Raises
     ------
     NotSolvedError
-        If all solvers fail or take too long.
+        If all attempts fail or take too long.
     """
     samples = len(setpoint)
     output, flow = np.zeros(samples), np.zeros(samples)
@@ -185,23 +183,67 @@ def _solve(
         right.append(first)
         cost += [price * ones] * 2
         bounds += [_bounds(zeros, np.inf * ones)] * 2
-    problem = {
-        "A_eq": sparse.vstack([sparse.hstack(row) for row in rows]).tocsc(),
-        "b_eq": np.concatenate(right),
-        "bounds": np.concatenate(bounds),
-    }
-    for method, more in ATTEMPTS:
-        options = {**more, "time_limit": TIME_LIMIT}
-        solved = optimize.linprog(
-            np.concatenate(cost), **problem, method=method, options=options
-        )
-        if solved.success:
-            found: Array = solved.x
+    programme = rows, right, cost, bounds
+    ways: list[Way] = [_as_recursion, _as_response]
+    if np.any(np.abs(np.roots(course.beta[start])) > 1.0):
+        ways.reverse()
+    attempts = list(itertools.product(ways, SOLVERS))
+    why = ""
+    for way, (method, presolve) in attempts:
+        options = {"time_limit": TIME_LIMIT, "presolve": presolve}
+        found, why = way(*programme, {"method": method, "options": options})
+        if found is not None:
             return found
     raise NotSolvedError(
-        f"the linear programme of {n} samples was not solved by any of {len(ATTEMPTS)} "
-        f"methods: {solved.message}"
+        f"the linear programme of {n} samples was not solved in any of {len(attempts)} ways: "
+        f"{why}"
     )
+
+
+def _as_recursion(
+    rows: Rows,
+    right: list[Array],
+    cost: list[Array],
+    bounds: list[Array],
+    solver: dict[str, Any],
+) -> tuple[Array | None, str]:
+    """Solve with the outputs among the unknowns: sparse, and fast where A is slow.
+
+    Where a zero of B lies outside the unit circle, the flow that belongs to an output grows
+    without end: solvers that try outputs at will fail, or end at what is not the optimum.
+    """
+    solved = optimize.linprog(
+        np.concatenate(cost),
+        A_eq=sparse.vstack([sparse.hstack(row) for row in rows]).tocsc(),
+        b_eq=np.concatenate(right),
+        bounds=np.concatenate(bounds),
+        **solver,
+    )
+    return (solved.x if solved.success else None), solved.message
+
+
+def _as_response(
+    rows: Rows,
+    right: list[Array],
+    cost: list[Array],
+    bounds: list[Array],
+    solver: dict[str, Any],
+) -> tuple[Array | None, str]:
+    """Solve for the flows alone, with each output the sum of what the flows do to it."""
+    A, B = rows[0][0].toarray(), -rows[0][1].toarray()
+    alone, G = (
+        linalg.solve_triangular(A, right[0], lower=True),
+        linalg.solve_triangular(A, B, lower=True),
+    )
+    G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
+    second = [sparse.csr_array(G), *rows[1][2:]]
+    solved, why = _as_recursion(
+        [second, *(row[1:] for row in rows[2:])],
+        [right[1] - alone, *right[2:]], cost[1:], bounds[1:], solver,
+    )  # fmt: skip
+    if solved is None:
+        return None, why
+    return np.concatenate([alone + G @ solved[: len(alone)], solved]), why
 
 
 def _lagged(coefficients: Array, samples: int, lag: int) -> sparse.sparray:
