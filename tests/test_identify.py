@@ -17,6 +17,7 @@ from agents import PIController
 from benchmarks.identify import log as log_module
 from benchmarks.identify.__main__ import main
 from benchmarks.identify.armax import Orders, Rows
+from benchmarks.identify.cleaning import without_noise_of_held_flow
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Columns, Log, read_log
 from benchmarks.identify.margins import margins
@@ -223,6 +224,26 @@ class TestRealLogs:
         zone = model.estimates["dead_zone"]
         assert zone.low <= 5.0 <= zone.high
         assert model.plant.gain == pytest.approx(whole.plant.gain, rel=0.02)
+
+    def test_small_steps_are_told_from_the_noise_of_a_flow_meter(self):
+        generator = np.random.default_rng(716)
+        flow = np.repeat([0.0, 3.0, 3.3, -2.0, -2.4, 1.0, 5.0, 4.8], 60)
+        noisy = flow + generator.normal(0.0, 0.1, len(flow))
+        cleaned = without_noise_of_held_flow(Log(noisy, flow, 8.0))
+        assert np.abs(cleaned.flow - flow).max() < 0.1
+        assert cleaned.flow_error == pytest.approx(0.1 / np.sqrt(60), rel=0.2)
+        # What only wanders is not held, and stays as it is.
+        wander = np.cumsum(noisy - flow)
+        assert without_noise_of_held_flow(Log(wander, flow, 8.0)).flow is wander
+
+    def test_walk_that_no_criterion_asks_for_is_allowed_for(self):
+        # The noise is as slow as the walk. Without a walk, the gain's interval ends at -0.92.
+        plant = {"delay": 18, "dead_zone": 6.7971, "noise_variance": 0.253856,
+                 "gain_factor": 1.3164, "time_constant_factor": 1.5111}  # fmt: skip
+        model = identify(synthetic_log(plant, 1200, 101_000_002, "drift"))
+        assert model.noise["disturbance_walk_variance"] == 0.0
+        gain = model.estimates["gain"]
+        assert gain.low < 1.3164 * -0.6825 < gain.high < -0.3
 
     def test_base_line_that_wanders_is_the_plant_s_disturbance(self):
         log = recorded(noise=0.01)

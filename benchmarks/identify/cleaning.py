@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +14,9 @@ from benchmarks.identify.log import Log
 
 SPIKE = 8.0  # robust deviations that a sample must stick out from its neighbours
 MOST_SPIKES = 0.03  # share of the rows
-STEP = 8.0  # deviations of its noise, from which a change of a held flow is a step
-SHORTEST_HOLD = 5  # samples
+JUMP = 8.0  # deviations of its noise, from which a change of a held flow is surely a step
+STEP = 5.0  # standard errors, from which a difference of means is one
+SHORTEST_HOLD = 10  # samples
 RATES = range(2, 61)  # rows for each temperature
 
 
@@ -54,23 +57,46 @@ def without_noise_of_held_flow(log: Log) -> Log:
     spread = 1.4826 * float(np.median(np.abs(known))) / np.sqrt(2.0) if len(known) else 0.0
     if spread == 0.0:  # it stands still in most samples
         return log
-    steps = np.flatnonzero(~(np.abs(moves) < STEP * spread)) + 1
+    steps = _steps(flow, spread)
     holds = np.split(flow, steps)
-    long = sum(len(hold) for hold in holds if len(hold) >= SHORTEST_HOLD)
+    long = [len(hold) for hold in holds if len(hold) >= SHORTEST_HOLD]
     means = np.concatenate([np.full(len(hold), hold.mean()) for hold in holds])
     left = flow - means
     left = left[np.isfinite(left)]
-    if len(steps) < 3 or long < 0.9 * len(flow) or len(left) < 2 or not left.any():
+    if len(steps) < 3 or sum(long) < 0.9 * len(flow) or len(left) < 2 or not left.any():
         return log
     # What a controller or a hand does is not white; what a transmitter adds is.
     together = np.corrcoef(left[1:], left[:-1])[0, 1]
     if abs(together) > 0.2 or np.std(left) > 0.25 * np.nanstd(flow):
         return log
+    noise = float(np.std(left))
     note = (
-        f"The flow is held for stretches and has noise of {np.std(left):.2g} t/h, which is "
+        f"The flow is held for stretches and has noise of {noise:.2g} t/h, which is "
         "taken as the flow meter's: the means of the stretches are used."
     )
-    return replace(log, flow=means, notes=[*log.notes, note])
+    error = noise / math.sqrt(float(np.median(long)))
+    return replace(log, flow=means, flow_error=error, notes=[*log.notes, note])
+
+
+def _steps(flow: Array, spread: float) -> list[int]:
+    """Return where a flow with white noise steps.
+
+    By binary segmentation (A. J. Scott and M. Knott, Biometrics 30, 1974, 507-512): a stretch
+    is parted where the means before and after differ most for their errors, until none do.
+    """
+    moves = np.diff(flow)
+    found = (np.flatnonzero(~(np.abs(moves) < JUMP * spread)) + 1).tolist()
+    open_ones = list(itertools.pairwise([0, *found, len(flow)]))
+    while open_ones:
+        start, stop = open_ones.pop()
+        part, before = flow[start:stop], np.arange(1, stop - start)
+        sums = np.cumsum(part - part.mean())[:-1]
+        scores = np.abs(sums) / np.sqrt(before * before[::-1] / len(part))
+        if len(scores) and scores.max() > STEP * spread:
+            place = start + 1 + int(scores.argmax())
+            found.append(place)
+            open_ones += [(start, place), (place, stop)]
+    return sorted(found)
 
 
 def protrusion(log: Log) -> Array:

@@ -50,6 +50,8 @@ class Log:
         What the user should know about the log.
     disturbances
         Other inputs that were measured, from the times of their rows on, by their columns.
+    flow_error
+        Standard error of the flow, t/h.
     """
 
     flow: Array
@@ -57,6 +59,7 @@ class Log:
     sampling_interval: float
     notes: list[str] = field(default_factory=list)
     disturbances: dict[str, Array] = field(default_factory=dict)
+    flow_error: float = 0.0
 
 
 @dataclass(frozen=True)

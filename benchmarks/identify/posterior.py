@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
-from benchmarks.identify.armax import Array
+from benchmarks.identify.armax import Array, Orders
 from benchmarks.identify.likelihood import MOST_GAPS, Candidate, Gap, Likelihood, Place
 from benchmarks.identify.model import CONFIDENCE, Interval
 from benchmarks.loop.linear import LinearModel
 
 ENDS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # of the posterior, where an interval ends
+ENDS_OF_ERRORS = float(stats.norm.ppf(ENDS[1]))  # standard errors
 NEAR = 25.0  # of deviances: what is further off has no probability worth a mention
 AS_GOOD = 8.0  # of Akaike's criterion: orders that are no further behind count the same
 MOST_FITS = 8  # of orders, at as many delays
+WALKS = [0.0, *np.geomspace(0.001, 0.512, 10)]  # of the root of C' from 1, where a walk shows
 PLACES, DRAWS_EACH = 60, 6  # drawn: orders with a delay and a dead zone, and coefficients
 
 
@@ -58,7 +61,9 @@ class Posterior:
         # for a part of the delay, and a log tells little of it.
         likeliest, weights = self._weights(entries), self._weights(entries, possible=True)
         self.delay = _of_delay(places, likeliest, weights)
-        self.dead_zone = _of_dead_zone([place.gap for place in places], weights)
+        self.dead_zone = _of_dead_zone(
+            [place.gap for place in places], weights, ENDS_OF_ERRORS * likelihood.log.flow_error
+        )
         self.chosen = self._choose(entries, likeliest)
         generator = np.random.default_rng(0)
         self.draws = self._draw(entries, weights, generator)
@@ -175,19 +180,57 @@ class Posterior:
     ) -> list[LinearModel]:
         points = (np.arange(PLACES) + generator.random()) / PLACES
         picked = np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
+        walks: dict[Candidate, tuple[list[tuple[Orders, Array]], Array]] = {}
         draws = []
         for i, times in zip(*np.unique(picked, return_counts=True), strict=True):
             _, fit, place = entries[i]
-            found = self._likelihood.linear(place, fit.orders, fit.solution.c)
-            size = len(found.solution.linear)
-            covariance = self.covariance(found)[:size, :size]
-            draws += [
-                self._linear(found, linear)
-                for linear in generator.multivariate_normal(
-                    found.solution.linear, covariance, times * DRAWS_EACH, method="eigh"
-                )
-            ]
+            if fit not in walks:
+                walks[fit] = self._walks(fit)
+            likely, shares = walks[fit]
+            counts = generator.multinomial(times * DRAWS_EACH, shares)
+            for (orders, c), count in zip(likely, counts, strict=True):
+                if not count:
+                    continue
+                found = self._likelihood.linear(place, orders, c)
+                size = len(found.solution.linear)
+                covariance = self.covariance(found)[:size, :size]
+                draws += [
+                    self._linear(found, linear)
+                    for linear in generator.multivariate_normal(
+                        found.solution.linear, covariance, count, method="eigh"
+                    )
+                ]
         return draws
+
+    def _walks(self, fit: Candidate) -> tuple[list[tuple[Orders, Array]], Array]:
+        """Return orders and C' for random walks of all sizes, and their probabilities.
+
+        A walk that no criterion asks for may still move the base line, above all where the
+        noise is slow as well. Its size is the root of C' nearest 1: there the walk is none. The
+        probability beforehand is a half for that, and the rest is even over the logarithm of
+        the root's distance from 1. The coefficients of A, B and the levels are integrated over.
+        """
+        rest = np.roots([1.0, *fit.solution.c])
+        if fit.orders.walk:
+            rest = np.delete(rest, np.argmax(rest.real - 9.0 * (rest.imag != 0.0)))
+        c = np.atleast_1d(np.real(np.poly(rest)))
+        orders = replace(fit.orders, walk=True)
+        target, columns = self._likelihood.regressors(fit.place, orders)
+        both = np.column_stack([columns, target])
+        rows = self._likelihood.rows
+        found, scores = [], []
+        for distance in WALKS:
+            of_walk = np.convolve(c, [1.0, distance - 1.0])[1:]
+            white = rows.whitened(both, of_walk, walk=True)[rows.counts]
+            sizes = np.abs(np.diag(np.linalg.qr(white, mode="r")))
+            sizes = np.maximum(sizes, 1e-300)
+            freedom = len(white) - len(sizes) + 1
+            scores.append(-freedom * math.log(sizes[-1]) - float(np.log(sizes[:-1]).sum()))
+            found.append((orders, of_walk))
+        found[0] = replace(orders, walk=False), c[1:]
+        shares = np.exp(np.array(scores) - max(scores))
+        shares[0] *= len(WALKS) - 1
+        return found, shares / shares.sum()
 
     def _linear(self, fit: Candidate, linear: Array) -> LinearModel:
         a, b = fit.orders.a, fit.orders.b
@@ -270,8 +313,11 @@ def _of_delay(places: list[Place], likeliest: Array, weights: Array) -> Interval
     return Interval(value, min(low, value), max(high, value))
 
 
-def _of_dead_zone(places: list[Gap], weights: Array) -> Interval:
-    """Return the dead zone: its posterior is spread evenly within each gap."""
+def _of_dead_zone(places: list[Gap], weights: Array, slack: float) -> Interval:
+    """Return the dead zone: its posterior is spread evenly within each gap.
+
+    The commands at both ends of a gap may be off by `slack`, t/h.
+    """
     shares: dict[Gap, float] = {}
     for gap, weight in zip(places, weights, strict=True):
         shares[gap] = shares.get(gap, 0.0) + float(weight)
@@ -287,8 +333,8 @@ def _of_dead_zone(places: list[Gap], weights: Array) -> Interval:
         return gaps[-1], gaps[-1].high
 
     # The likelihood is the same all over a gap: the interval takes gaps as a whole.
-    low = at(ENDS[0])[0].low
-    high = at(ENDS[1])[0].high
+    low = max(at(ENDS[0])[0].low - slack, 0.0)
+    high = at(ENDS[1])[0].high + slack
     if gaps[0].low == 0.0 and shares[gaps[0]] > 0.5:
         return Interval(0.0, 0.0, high)  # every command has had an effect
     return Interval(at(0.5)[1], low, high)

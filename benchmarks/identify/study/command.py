@@ -22,9 +22,9 @@ from scipy import signal
 from benchmarks.controllers.engineered import simc_pi
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
-from benchmarks.identify.model import CannotTellError
+from benchmarks.identify.model import CannotTellError, Options
 from benchmarks.identify.simulation import explained, of_impulse_response
-from benchmarks.identify.study.options import Options
+from benchmarks.identify.study import options
 from benchmarks.lib.command_line import out_folder
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import share
@@ -38,6 +38,7 @@ NOISE = 0.02, 0.5  # R of the logs, degC^2
 HELD = 30, 120  # samples between two steps of the flow
 LEVELS = -10.0, 10.0  # of the flow, t/h
 LONG, SHORT = (15.0, 40.0), (5.0, 15.0)  # samples, time constants of second order
+DATA_SHEET = Options(operating_flow=0.0, u_min=LEVELS[0], u_max=LEVELS[1])  # of the actuator
 METER = 0.1  # t/h, of the noise of a flow meter
 DRIFT = 0.05  # degC, of each step of a random walk of the base line
 KINDS = {
@@ -140,7 +141,7 @@ def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict
     log = synthetic_log(plant, samples, seed, kind)
     began = time.process_time()
     try:
-        model = identify(log)
+        model = identify(log, DATA_SHEET)
     except CannotTellError as error:
         return {"seconds": time.process_time() - began, "refused": str(error)}
     result: dict[str, Any] = {"seconds": time.process_time() - began, "refused": ""}
@@ -189,7 +190,7 @@ def narmax(log: Log) -> tuple[float, float, float]:
     return float(codes[flows].min() - 2001), gain, share_of_last
 
 
-def execute(options: Options, console: Console) -> str:
+def execute(options: options.Options, console: Console) -> str:
     """Run the study and print its tables."""
     out = out_folder(options.out)
     tasks: dict[str, Callable[[], Any]] = {}
