@@ -9,6 +9,7 @@ few = st.floats(-0.3, 0.3)
 tails = st.lists(few, max_size=3).map(lambda tail: [1.0, *tail])
 levels = st.floats(-100, 100)
 BY_CHECK = {
+    checks.number: few,
     checks.samples: st.integers(0, 30),
     checks.duration: st.integers(1, 100),
     checks.not_negative: st.floats(0, 4),

@@ -12,6 +12,7 @@ from benchmarks.controllers import engineered
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.step_test import step_test
 from benchmarks.identify.margins import margins
+from benchmarks.limits import __main__ as limits
 from benchmarks.limits import frontier, least_possible
 from benchmarks.loop import linear
 from benchmarks.loop.linear import Coefficients, LinearModel, course, nominal
@@ -91,14 +92,26 @@ ANALYSES = {
 }
 
 
+@pytest.fixture
+def nonlinear_span(monkeypatch):
+    """As if the span were declared as more than (28) and (29)."""
+    span = replace(ARGUMENTS["temperature_span"], linear=False)
+    monkeypatch.setattr(linear, "ARGUMENTS", {**ARGUMENTS, "temperature_span": span})
+
+
+@pytest.mark.usefixtures("nonlinear_span")
+def test_the_command_for_bounds_says_that_a_plant_is_not_linear(capsys):
+    with pytest.raises(SystemExit) as ended:
+        limits.main(["--set", "temperature_span=49"])
+    assert ended.value.code == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "temperature_span=49: temperature_span must be 50.0" in printed.err
+
+
+@pytest.mark.usefixtures("nonlinear_span")
 @pytest.mark.parametrize("analysis", ANALYSES)
-def test_every_analysis_refuses_an_argument_that_is_not_declared_linear(analysis, monkeypatch):
-    # As if the span were declared as more than (28) and (29).
-    declared = {
-        **ARGUMENTS,
-        "temperature_span": replace(ARGUMENTS["temperature_span"], linear=False),
-    }
-    monkeypatch.setattr(linear, "ARGUMENTS", declared)
+def test_every_analysis_refuses_an_argument_that_is_not_declared_linear(analysis):
     ANALYSES[analysis]()
     with pytest.raises(ValueError, match=r"^temperature_span must be 50\.0 .* got 49\.0"):
         ANALYSES[analysis](temperature_span=49.0)

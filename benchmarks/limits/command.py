@@ -12,15 +12,16 @@ from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import UsageError, out_folder
+from benchmarks.lib.command_line import UsageError, blame, out_folder
 from benchmarks.lib.statistics import bootstrap
 from benchmarks.lib.tables import on_screen
 from benchmarks.limits import packaged
 from benchmarks.limits.bounds import CACHE, LeastPossible, least_possible
 from benchmarks.limits.options import Options
 from benchmarks.limits.verify import errors, verify
+from benchmarks.loop.linear import check_linear
 from benchmarks.loop.scenarios import SCENARIOS, scenarios_of
-from mptc_gym import PRESETS
+from mptc_gym import PRESETS, Parameters
 
 SAMPLES = 1200  # of an episode of a preset
 
@@ -53,6 +54,8 @@ def execute(options: Options, console: Console) -> str:
             raise SystemExit(1)
         return "No controller beats the bound that applies to it, beyond its interval."
     if plant.arguments:
+        with blame(plant.name):
+            check_linear(Parameters(**plant.arguments))
         cases = scenarios_of(plant.name, plant.arguments)
         console.print(f"{plant.name}, mean |e| in °C:")
         console.print(on_screen(bounds({n: c.arguments for n, c in cases.items()}, options)))
@@ -82,8 +85,8 @@ def bounds(cases: Mapping[str, Mapping[str, Any]], options: Options) -> pd.DataF
     for name, arguments in tqdm(cases.items(), unit="plant"):
         case: dict[str, Any] = {"samples": SAMPLES, "episodes": options.episodes}
         case["folder"] = options.cache or CACHE
-        found = {}
-        for kind in ("preview", "news", "reference"):
+        found = {"preview": least_possible(kind="preview", **case, **arguments)}
+        for kind in ("news", "reference"):
             # "news" is for random set points, "reference" for those that are held long enough.
             with suppress(ValueError):
                 found[kind] = least_possible(kind=kind, **case, **arguments)
