@@ -22,7 +22,10 @@ Array = NDArray[np.float64]
 
 # Time constants in the bank, as multiples of the step test's.
 TIME_CONSTANTS = (0.5, 0.7, 1.0, 1.4, 2.0)
-ZONE_SPREAD = 0.2  # how sure the told dead zone is: a share of the larger limit
+# Dead zones in the bank: what is added to the told one, and how sure that is, as shares of the
+# larger limit.
+ZONES = (-0.5, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
+ZONE_SPREAD = 0.2
 NOISE_SAMPLES = 30.0  # that the expected noise is worth
 GAINS = (0.3, 3.0)  # estimates stay between these multiples of the step test's gain
 # The prefilter (1 - 0.92 z^-1) / (1 - 0.6 z^-1) of what is compared: its zero makes the noise
@@ -112,7 +115,8 @@ class SelfTuningController(Controller):
     dead_zone
         The actuator's, as far as is known, t/h.
     dead_zones
-        Those that it may have, t/h. One alone is taken for granted.
+        Those that it may have, t/h. One alone is taken for granted. None for `dead_zone` and up
+        to seven around it.
     shortest_delay, longest_delay
         Delays that the plant may have, d in samples: an input shows after d + 1.
     closed_loop_time_constant
@@ -164,7 +168,7 @@ class SelfTuningController(Controller):
         time_constant: float,
         delay: float,
         dead_zone: float = 5.0,
-        dead_zones: Sequence[float] = (0.0, 2.0, 3.5, 5.0, 6.5, 8.0),
+        dead_zones: Sequence[float] | None = None,
         shortest_delay: int = 6,
         longest_delay: int = 36,
         closed_loop_time_constant: float = 0.15,
@@ -191,16 +195,13 @@ class SelfTuningController(Controller):
         self._forgetting = float(forgetting)
         shortest = check_count("shortest_delay", shortest_delay, 0)
         longest = check_count("longest_delay", longest_delay, shortest, MOST_DELAY)
-        if (
-            not isinstance(dead_zones, Sequence | np.ndarray)
-            or isinstance(dead_zones, str | bytes)
-            or not np.size(dead_zones)
-            or not np.ndim(dead_zones)
-        ):
-            raise ValueError(
-                f"dead_zones must be a list of one number or more, got {dead_zones!r}"
-            )
-        self._zones = np.array([check_number("dead_zones", zone, 0) for zone in dead_zones])
+        limit = max(abs(self.u_min), abs(self.u_max))
+        told_zone = check_number("dead_zone", dead_zone, 0)
+        if dead_zones is None:
+            zones = told_zone + limit * np.array(ZONES)
+            self._zones = zones[(zones == told_zone) | (zones >= 0.0) & (zones < limit)]
+        else:
+            self._zones = _checked_zones(dead_zones)
 
         # Responses without delay differ by dead zone and pole, models by delay, too: the
         # longest one first, as in the history of the responses.
@@ -211,8 +212,6 @@ class SelfTuningController(Controller):
         self._dead_zones = np.repeat(self._zones, len(TIME_CONSTANTS))
         self._fading = (self._poles ** self._delays[:, np.newaxis]).ravel()
         told_delay = check_number("delay", delay, 0) / self._interval - 1.0
-        told_zone = check_number("dead_zone", dead_zone, 0)
-        limit = max(abs(self.u_min), abs(self.u_max))
         off_delay = (self._delays - told_delay) / self._learning.delay_spread
         off_constant = np.log(constants / samples) / self._learning.time_constant_spread
         off_zone = (self._dead_zones - told_zone) / (ZONE_SPREAD * limit)
@@ -396,6 +395,14 @@ class SelfTuningController(Controller):
     def _by_model(self, values: Array) -> Array:
         """Return what there is of each model by loop, delay and response without delay."""
         return values.reshape(self._loops, len(self._delays), -1)
+
+
+def _checked_zones(zones: Sequence[float]) -> Array:
+    """Return dead zones as an array if they are a list of one number or more."""
+    sequence = isinstance(zones, Sequence | np.ndarray) and not isinstance(zones, str | bytes)
+    if not sequence or not np.size(zones) or not np.ndim(zones):
+        raise ValueError(f"dead_zones must be a list of one number or more, got {zones!r}")
+    return np.array([check_number("dead_zones", zone, 0) for zone in zones])
 
 
 def _dot(first: Array, second: Array) -> Array:

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from agents import SelfTuningController, SmithPredictor
+from agents import NeuralSelfTuningController, SelfTuningController, SmithPredictor
 from benchmarks.loop.rollout import make_plants, rollout
+from mptc_gym import evaluate
 
 STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
 # Steady-state gain of (28), degC per t/h, and 1 / (1 - p) samples of 8 s, p its slowest pole.
@@ -77,12 +78,28 @@ def test_it_finds_the_dead_zone_that_it_was_not_told():
     # 5 degC take 6.1 t/h here, which does not pass: the loop has to find it out.
     plant = {"dead_zone": 7.5, "gain_factor": 1.2, "noise_variance": 0.05, "runs": 3}
     knowing, told = (
-        SelfTuningController(**STEP_TEST, dead_zones=zones)
-        for zones in ((0.0, 2.0, 3.5, 5.0, 6.5, 8.0), (5.0,))
+        SelfTuningController(**STEP_TEST, dead_zones=zones) for zones in (None, (5.0,))
     )
     ours, theirs = (mean_error(control(each, **plant), 600) for each in (knowing, told))
     assert (knowing.estimates["dead_zone"] >= 6.5).all()
     assert ours < theirs
+
+
+def test_it_reckons_with_the_dead_zone_that_it_is_told():
+    controller = SelfTuningController(**{**STEP_TEST, "dead_zone": 7.3})
+    control(controller, dead_zone=7.3, noise_variance=0.05)
+    assert controller.estimates["dead_zone"] == [7.3]
+
+
+@pytest.mark.parametrize(
+    ("told", "dead_zone", "setpoint"), [(7.0, 7.0, 5.2), (5.0, 5.8, 4.4), (5.0, 6.0, 4.4)]
+)
+def test_the_network_does_not_hunt_beside_a_dead_zone(told, dead_zone, setpoint):
+    controller = NeuralSelfTuningController(**{**STEP_TEST, "dead_zone": told})
+    found = evaluate(
+        controller, episodes=2, max_episode_steps=600, dead_zone=dead_zone, setpoint=setpoint
+    )
+    assert found.travel < 80.0
 
 
 def test_ten_thousand_quiet_samples_teach_nothing():
