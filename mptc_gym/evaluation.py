@@ -303,6 +303,7 @@ def _parameters(single: gymnasium.Env[Any, Any]) -> Parameters:
 def _check_fit(policy: Any, single: gymnasium.Env[Any, Any], parameters: Parameters) -> None:
     """Refuse an environment that does not show what a policy reads, or reads what it means."""
     shape, own = single.observation_space.shape, getattr(policy, "observation_space", None)
+    normaliser_of(policy)
     if own is not None and own.shape != shape:
         raise ValueError(
             f"env must have observations of shape {own.shape}, as policy reads them, got "
@@ -345,6 +346,40 @@ def trained_on(policy: Any) -> EnvSpec | None:
         spec: EnvSpec | None = policy.get_env().get_attr("spec")[0]
         return spec
     return None
+
+
+def normaliser_of(policy: Any) -> Callable[[NDArray[Any]], NDArray[Any]] | None:
+    """Return what normalises the observations of a policy as in its training.
+
+    Returns
+    -------
+    callable or None
+        None if it was trained without, or with one of rewards alone.
+
+    Raises
+    ------
+    ValueError
+        If its statistics are lost.
+    """
+    live = getattr(policy, "get_vec_normalize_env", lambda: None)()
+    if live is not None:
+        normalise: Callable[[NDArray[Any]], NDArray[Any]] = live.normalize_obs
+        return normalise
+    space = getattr(policy, "observation_space", None)
+    kept = getattr(space, "normalised", None)
+    if kept is None:
+        # A model that learns on policy has these where, and only where, it is normalised.
+        on_policy = hasattr(policy, "rollout_buffer")
+        originals = getattr(policy, "_last_original_obs", None)
+        if on_policy and originals is not None and not hasattr(space, "trained_on"):
+            raise ValueError(
+                "policy must come with the statistics of the VecNormalize that it was trained "
+                "in: save it by mptc_gym.sb3.save"
+            )
+        return None
+    mean, deviation = np.array(kept["mean"]), np.sqrt(np.array(kept["var"]) + kept["epsilon"])
+    most = kept["clip_obs"]
+    return lambda seen: np.clip((seen - mean) / deviation, -most, most).astype(np.float32)
 
 
 def action_wrappers(spec: EnvSpec) -> list[WrapperSpec]:
@@ -412,13 +447,13 @@ def acting(policy: Any) -> Act:
 def _predicting(policy: Any) -> Act:
     """Return how a policy in the form of Stable-Baselines3 acts, from the start of episodes."""
     known = inspect.signature(policy.predict).parameters
-    normaliser = getattr(policy, "get_vec_normalize_env", lambda: None)()
+    normalise = normaliser_of(policy)
     state, begins = None, True
 
     def act(observations: NDArray[np.float32]) -> Any:
         nonlocal state, begins
-        if normaliser is not None:
-            observations = normaliser.normalize_obs(observations)
+        if normalise is not None:
+            observations = normalise(observations)
         offered = {
             "state": state,
             "episode_start": np.full(len(observations), begins),

@@ -12,6 +12,7 @@ It needs `pip install "mptc_gym[sb3]"`.
 
 from __future__ import annotations
 
+import copy
 import itertools
 import json
 import os
@@ -27,6 +28,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env.base_vec_env import (
     VecEnv,
     VecEnvIndices,
@@ -157,7 +159,7 @@ class GymnasiumVecEnv(VecEnv):
         self.spec = spec
         super().__init__(sum(sizes), observation_space, action_space)
         if spec is not None:
-            _remember(self, spec)
+            observation_space.trained_on = spec.to_json()  # type: ignore[attr-defined]
         self._began = time.time()
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, np.int64)
@@ -229,6 +231,10 @@ class GymnasiumVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of each environment's batch."""
+        if attr_name == "render_mode" and hasattr(self, "spec"):
+            # Asked by a wrapper that is put around these: a model may see something else then,
+            # so that it does not know how it was trained from its space, but by `save` alone.
+            vars(self.observation_space).pop("trained_on", None)
         if attr_name == "spec" and self.spec is not None:
             return [self.spec for _ in self._get_indices(indices)]
         of_each = [batch for batch in self.batches for _ in range(batch.num_envs)]
@@ -261,18 +267,11 @@ def _joined(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _remember(model: Any, spec: EnvSpec) -> None:
-    """Have a model know how it was trained.
-
-    Models save their observation space with all its attributes, whoever calls `save`.
-    """
-    model.observation_space.trained_on = spec.to_json()
-
-
 def save(model: BaseAlgorithm, path: str | Path) -> None:
     """Save a model with the spec of what it was trained on, whole or not at all.
 
-    A model that was trained on `make_vec_env` does so by its own `save`.
+    A model that was trained on `make_vec_env`, in no other wrapper, does so by its own `save`.
+    This one also saves the statistics of `VecNormalize`.
 
     Parameters
     ----------
@@ -289,16 +288,33 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     spec = trained_on(model)
     if spec is None:
         reject("model", model, "trained on make_vec_env or on environments that have a spec")
-    if model.get_vec_normalize_env() is not None:
-        reject("model", model, "trained without VecNormalize, whose numbers no zip holds")
-    _remember(model, spec)
     path = Path(path)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.zip")
+    # Models save their space with all its attributes.
+    space: Any = model.observation_space
+    model.observation_space = copy.deepcopy(space)
+    vars(model.observation_space).update(trained_on=spec.to_json(), **_statistics(model))
     try:
         model.save(partial)
         partial.replace(path)
     finally:
+        model.observation_space = space
         partial.unlink(missing_ok=True)
+
+
+def _statistics(model: BaseAlgorithm) -> dict[str, Any]:
+    """Return what a model has to know of its VecNormalize, in a form for JSON."""
+    normaliser = model.get_vec_normalize_env()
+    if normaliser is None or not normaliser.norm_obs:
+        return {}
+    rms = cast("RunningMeanStd", normaliser.obs_rms)
+    kept = {
+        "mean": rms.mean.tolist(),
+        "var": rms.var.tolist(),
+        "epsilon": normaliser.epsilon,
+        "clip_obs": normaliser.clip_obs,
+    }
+    return {"normalised": kept}
 
 
 def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any) -> EnvSpec:

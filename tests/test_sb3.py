@@ -9,7 +9,7 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import SyncVectorEnv
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -304,17 +304,40 @@ class TestHowItWasTrained:
         with pytest.raises(ValueError, match=r"none\.zip cannot be read: No such file"):
             spec_of(tmp_path / "none.zip")
 
-    def test_running_statistics_are_refused(self, tmp_path):
-        model = model_of(VecNormalize(make_vec_env("MiddlePoint-v0", 2)))
-        with pytest.raises(ValueError, match="trained without VecNormalize"):
-            save(model, tmp_path / "model.zip")
-        # At hand, the model is judged with them.
-        model.learn(64)
-        plain = PPO("MlpPolicy", make_vec_env("MiddlePoint-v0", 2), device="cpu")
-        plain.policy.load_state_dict(model.policy.state_dict())
-        assert not np.array_equal(
-            evaluate(model, episodes=2, dead_zone=0.0).travels,
-            evaluate(plain, episodes=2, dead_zone=0.0).travels,
+    @pytest.mark.parametrize("algorithm", [PPO, SAC])
+    def test_running_statistics_are_kept_by_save_and_missed_otherwise(
+        self, algorithm, tmp_path
+    ):
+        plants = make_vec_env("MiddlePoint-v0", 2, wrapper=VELOCITY, **TRAINING)
+        plants = VecNormalize(plants)
+        short = {"learning_starts": 8}
+        if algorithm is PPO:
+            short = {"n_steps": 32, "batch_size": 32}
+        model = algorithm("MlpPolicy", plants, device="cpu", seed=0, **short).learn(64)
+        expected = evaluate(model, spec_of(model), episodes=2)
+        save(model, tmp_path / "whole.zip")
+        model.save(tmp_path / "plain.zip")
+        loaded = algorithm.load(tmp_path / "whole.zip", device="cpu")
+        spec = spec_of(tmp_path / "whole.zip")
+        found = evaluate(loaded, spec, episodes=2)
+        np.testing.assert_array_equal(found.errors, expected.errors)
+        # They matter.
+        del loaded.observation_space.normalised
+        assert not np.array_equal(evaluate(loaded, spec, episodes=2).errors, expected.errors)
+        with pytest.raises(ValueError, match="policy must be one that knows how it was"):
+            spec_of(tmp_path / "plain.zip")
+        if algorithm is PPO:
+            with pytest.raises(ValueError, match="the statistics of the VecNormalize"):
+                evaluate(PPO.load(tmp_path / "plain.zip", device="cpu"), spec)
+
+    def test_rewards_alone_may_be_normalised(self, tmp_path):
+        plants = make_vec_env("MiddlePoint-v0", 2, wrapper=VELOCITY, **TRAINING)
+        model = model_of(VecNormalize(plants, norm_obs=False)).learn(64)
+        save(model, tmp_path / "model.zip")
+        loaded = PPO.load(tmp_path / "model.zip", device="cpu")
+        np.testing.assert_array_equal(
+            evaluate(loaded, spec_of(loaded), episodes=2).errors,
+            evaluate(model, spec_of(model), episodes=2).errors,
         )
 
 
