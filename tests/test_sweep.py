@@ -192,7 +192,7 @@ class TestFindings:
                         {
                             "agent": agent, "plant": plant, "run": run, "gain_drift": drift,
                             "late": late + 2.0 * better, "mae": late, "ratio": late,
-                            "oscillates": plant == 0, "travel": 10.0, "useless": False,
+                            "oscillates": plant == 0, "total_variation": 10.0, "useless": False,
                             "delay": 18,
                         }
                     )  # fmt: skip

@@ -80,9 +80,8 @@ QUESTIONS = (
     ),
     (
         "What does adaptation buy?",
-        "The network trained on many plants adapts by what it remembers, the self-tuning "
-        "controller by identification. The Smith predictor and the network trained through "
-        "the plant are made for the nominal plant.",
+        "The self-tuning controllers identify the plant while they control it. The Smith "
+        "predictor and the network behind a model are told the nominal plant.",
         ADAPTING,
         "drift_adapting.png",
     ),
@@ -153,7 +152,7 @@ def _overview(runs: pd.DataFrame) -> pd.DataFrame:
                 "controller": label(agent),
                 "ratio, median": f"{ratio.median():.3f}",
                 "ratio, 90 %": f"{ratio.quantile(0.9):.3f}",
-                "travel (t/h)": f"{group['travel'].median():,.0f}",
+                "travel (t/h)": f"{group['total_variation'].median():,.0f}",
                 "oscillates (%)": f"{100 * group['oscillates'].mean():.1f}",
                 "useless (%)": f"{100 * group['useless'].mean():.1f}",
             }

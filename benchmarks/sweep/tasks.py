@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from benchmarks.controllers.records import Factory
 from benchmarks.limits import least_possible, steady_stretches
 from benchmarks.loop.designs import Arguments
-from benchmarks.loop.metrics import mean_error, travel
+from benchmarks.loop.metrics import measure
 from benchmarks.loop.rollout import make_plants, rollout
+from mptc_gym import Parameters
 
 SETPOINT: Arguments = {"setpoint": "square", "setpoint_period": 600}
 
@@ -51,20 +52,19 @@ def agent_task(
     Returns
     -------
     dict of list
-        Of each run: `mae`, mean |e|; `late`, the same over the second half; `swing`, the
-        standard deviation of the error on the steady stretches, all in degC; and `travel`, the
-        total variation of the applied flow, t/h.
+        Of each run, every measure of `METRICS`; `late`, the mean |e| of its second half; and
+        `swing`, the standard deviation of the error on the steady stretches, both in degC.
     """
     controller = factory.in_service({**nominal, **SETPOINT}, runs, seed)
-    plants = make_plants(runs, samples, **factory.arguments({**plant, **SETPOINT}))
+    case = {**plant, **SETPOINT}
+    plants = make_plants(runs, samples, **factory.arguments(case))
     trajectory = rollout(plants, controller, samples, seed)
     error = trajectory.setpoint - trajectory.output
     steady = steady_stretches(trajectory.setpoint[:, 0])
     measures = {
-        "mae": mean_error(trajectory),
+        **measure(trajectory, Parameters(**case)),
         "late": np.abs(trajectory.error[samples // 2 :]).mean(axis=0),
         "swing": _swing(error, steady),
-        "travel": travel(trajectory),
     }
     return {name: values.tolist() for name, values in measures.items()}
 
