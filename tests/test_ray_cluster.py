@@ -35,7 +35,6 @@ pytestmark = [
         not sys.platform.startswith("linux"), reason="Ray's clusters are Linux's"
     ),
     pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed"),
-    pytest.mark.xdist_group("ray"),  # one process starts one cluster for all of them
 ]
 
 
