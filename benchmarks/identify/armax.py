@@ -211,7 +211,8 @@ class Rows:
         left = self.whitened(target, solution.c, walk=walk) - white @ solution.linear
         slopes = self._later(self.whitened(left, solution.c), len(solution.c))
         jacobian = np.hstack([white, slopes])[self.counts]
-        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+        scale = np.linalg.norm(jacobian, axis=0)
+        scale[scale == 0.0] = 1.0  # of a flow that never leaves a dead zone
         information = (jacobian / scale).T @ (jacobian / scale)
         variance = solution.square / max(len(self) - jacobian.shape[1], 1)
         spread: Array = variance * linalg.pinvh(information) / np.outer(scale, scale)

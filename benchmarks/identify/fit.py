@@ -28,7 +28,7 @@ from benchmarks.identify.noise import in_the_environment
 from benchmarks.identify.posterior import Posterior
 from benchmarks.loop.linear import LinearModel
 
-SECOND = np.array([-0.8])  # C of a second time constant, to begin with
+OWN_LAGS = [np.array([-pole]) for pole in (0.6, 0.75, 0.85, 0.92, 0.96)]  # C of them
 FIRST_ORDERS = Orders(2, 1, 2)  # to look for the delay with, before the orders are known
 TO_FORESEE = Orders(2, 6, 2)  # so that a fast response is not taken for a spike
 OF_A, OF_B, OF_C = (1, 2, 3), (1, 2, 3, 6, 12), (0, 1, 3)
@@ -191,10 +191,12 @@ def _fits(likelihood: Likelihood) -> list[Candidate]:
     lags, found = [], by_criterion()
     for b in (1, 2):
         orders = Orders(2, b, 1)
-        place = likelihood.scan(orders, SECOND, [found[0].place.gap])[0]
-        lags.append(likelihood.fit(place, orders, SECOND))
-    found = [fit for fit in found if not fit.walks_nowhere] or found
-    return [*found, *(fit for fit in lags if fit.has_own_lag)]
+        tried = []
+        for c in OWN_LAGS:
+            place = likelihood.scan(orders, c, [found[0].place.gap])[0]
+            tried.append(likelihood.linear(place, orders, c))
+        lags.append(min(tried, key=lambda fit: fit.deviance))
+    return [*([fit for fit in found if not fit.walks_nowhere] or found), *lags]
 
 
 def _tried(likelihood: Likelihood, fits: list[Candidate]) -> tuple[list[Candidate], HeldOut]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +23,7 @@ BRIDGE = 10  # missing temperatures in a row that are filled in, for the noise t
 SHORTEST = 30  # rows of a stretch without a gap
 OWN_LAG = -0.3  # the C of first order, below which it cancels a time constant
 STILL = 0.99  # the root of C', above which it cancels the random walk
+Whiten = Callable[[Array], Array]
 OF_KNOWN = 4  # coefficients of a known disturbance
 
 
@@ -250,12 +252,10 @@ class Likelihood:
     ) -> list[Place]:
         """Return the deviance of every delay and gap with a given C, the best first."""
         delays = delays or range(self.longest_delay + 1)
-        target, columns = self.fixed(orders)
+        others = self._projection(*self.fixed(orders), orders, c)
         found = []
         for gap in gaps:
-            deviances = self._deviances(
-                target, columns, self.applied(gap), delays, orders.b, orders, c
-            )
+            deviances = self._deviances(self.applied(gap), delays, orders.b, others)
             found += [
                 Place(float(deviance), delay, gap)
                 for delay, deviance in zip(delays, deviances, strict=True)
@@ -268,31 +268,37 @@ class Likelihood:
         for i, known in enumerate(self.known):
             target, columns = self.fixed(orders, but=i)
             columns = np.hstack([columns, self.rows.lagged(self.applied(place.gap), lags)])
+            others = self._projection(target, columns, orders, c)
             deviances = self._deviances(
-                target, columns, np.nan_to_num(known),
-                range(self.longest_delay + 1), OF_KNOWN, orders, c,
-            )  # fmt: skip
+                np.nan_to_num(known), range(self.longest_delay + 1), OF_KNOWN, others
+            )
             self.lags[i] = int(np.argmin(deviances))
 
+    def _projection(
+        self, target: Array, columns: Array, orders: Orders, c: Array
+    ) -> tuple[Array, Whiten]:
+        """Return what columns leave of the target, whitened, and how to treat others alike."""
+        rows = self.rows
+
+        def whiten(values: Array) -> Array:
+            return rows.whitened(values, c, walk=orders.walk)[rows.counts]
+
+        white = whiten(np.column_stack([target, columns]))
+        basis, _ = np.linalg.qr(white[:, 1:])
+
+        def left(values: Array) -> Array:
+            result: Array = values - basis @ (basis.T @ values)
+            return result
+
+        return left(white[:, 0]), lambda values: left(whiten(values))
+
     def _deviances(
-        self,
-        target: Array,
-        columns: Array,
-        signal: Array,
-        delays: range,
-        length: int,
-        orders: Orders,
-        c: Array,
+        self, signal: Array, delays: range, length: int, others: tuple[Array, Whiten]
     ) -> Array:
         """Return the deviance with `length` coefficients of a signal, for every delay."""
-        rows = self.rows
-        lags = rows.lagged(signal, range(delays[0] + 1, delays[-1] + 1 + length))
-        white = rows.whitened(np.column_stack([target, columns]), c, walk=orders.walk)
-        inputs = rows.whitened(lags, c, walk=orders.walk)[rows.counts]
-        basis, _ = np.linalg.qr(white[rows.counts, 1:])
-        left = white[rows.counts, 0]
-        left = left - basis @ (basis.T @ left)
-        inputs = inputs - basis @ (basis.T @ inputs)
+        left, treated = others
+        lags = range(delays[0] + 1, delays[-1] + 1 + length)
+        inputs = treated(self.rows.lagged(signal, lags))
         gram, moments = inputs.T @ inputs, inputs.T @ left
         ridge = 1e-10 * max(float(np.trace(gram)) / len(gram), 1e-300)
         places = np.arange(len(delays))[:, np.newaxis] + np.arange(length)
@@ -301,7 +307,10 @@ class Likelihood:
         shares = sliding_window_view(moments, length)
         solved = np.linalg.solve(blocks, shares[:, :, np.newaxis])[:, :, 0]
         squares = float(left @ left) - np.sum(shares * solved, axis=1)
-        return np.array([self.deviance(float(square)) for square in squares])
+        count = len(self.rows)
+        least = max(count * self.resolution, 1e-300)
+        deviances: Array = count * np.log(np.maximum(squares, least))
+        return deviances
 
     def parts(self, fit: Candidate) -> tuple[Array, Array, Array, Array]:
         """Return A with its 1, B, the B of each known disturbance, and the levels."""

@@ -60,7 +60,7 @@ class Posterior:
         # all orders that are about as good the same weight: a second time constant may stand
         # for a part of the delay, and a log tells little of it.
         likeliest, weights = self._weights(entries), self._weights(entries, possible=True)
-        self.delay = _of_delay(places, likeliest, weights)
+        self.delay = _of_delay(places, likeliest, self._of_short_b(entries, likeliest, weights))
         self.dead_zone = _of_dead_zone(
             [place.gap for place in places], weights, ENDS_OF_ERRORS * likelihood.log.flow_error
         )
@@ -100,6 +100,16 @@ class Posterior:
                 places = likelihood.scan(fit.orders, refit.solution.c, gaps, around)
                 found += [Entry(i, refit, place) for place in places]
         return found
+
+    def _of_short_b(self, entries: list[Entry], likeliest: Array, weights: Array) -> Array:
+        """Return the probabilities of places by orders whose B is not longer than it need be.
+
+        A B with more coefficients may begin with some that are nearly 0: its delay is not when
+        the response begins.
+        """
+        lengths = np.array([entry.fit.orders.b for entry in entries])
+        short = weights * (lengths <= lengths[np.argmax(likeliest)])
+        return short / short.sum()
 
     def _weights(self, entries: list[Entry], *, possible: bool = False) -> Array:
         """Return the probabilities of places."""
@@ -306,10 +316,11 @@ def _of_delay(places: list[Place], likeliest: Array, weights: Array) -> Interval
     near = np.abs(tried[:, np.newaxis] - tried) <= 1
     # Of equal ones, the delay that is itself the likelier.
     value = float(tried[np.lexsort((shares, (near @ shares).round(6)))[-1]])
-    sums = np.cumsum(of_interval)
-    low, high = (
-        float(tried[min(int(np.searchsorted(sums, share)), len(tried) - 1)]) for share in ENDS
-    )
+    # Of whole samples, the fewest in a row that have the probability.
+    sums = np.concatenate([[0.0], np.cumsum(of_interval)])
+    first, last = np.nonzero(sums[1:] - sums[:-1, np.newaxis] >= CONFIDENCE - 1e-9)
+    best = np.lexsort((sums[first] - sums[last + 1], tried[last] - tried[first]))[0]
+    low, high = float(tried[first[best]]), float(tried[last[best]])
     return Interval(value, min(low, value), max(high, value))
 
 
@@ -323,18 +334,15 @@ def _of_dead_zone(places: list[Gap], weights: Array, slack: float) -> Interval:
         shares[gap] = shares.get(gap, 0.0) + float(weight)
     gaps = sorted(shares)
 
-    def at(probability: float) -> tuple[Gap, float]:
+    def at(probability: float) -> float:
         below = 0.0
         for gap in gaps:
             if below + shares[gap] >= probability:
-                inside = gap.width * (probability - below) / shares[gap]
-                return gap, gap.low + inside
+                return gap.low + gap.width * (probability - below) / shares[gap]
             below += shares[gap]
-        return gaps[-1], gaps[-1].high
+        return gaps[-1].high
 
-    # The likelihood is the same all over a gap: the interval takes gaps as a whole.
-    low = max(at(ENDS[0])[0].low - slack, 0.0)
-    high = at(ENDS[1])[0].high + slack
+    low, high = max(at(ENDS[0]) - slack, 0.0), at(ENDS[1]) + slack
     if gaps[0].low == 0.0 and shares[gaps[0]] > 0.5:
         return Interval(0.0, 0.0, high)  # every command has had an effect
-    return Interval(at(0.5)[1], low, high)
+    return Interval(at(0.5), low, high)

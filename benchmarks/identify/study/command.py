@@ -24,7 +24,7 @@ from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError, Options
 from benchmarks.identify.simulation import explained, of_impulse_response
-from benchmarks.identify.study import options
+from benchmarks.identify.study import loops, options
 from benchmarks.lib.command_line import out_folder
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import share
@@ -202,14 +202,18 @@ def execute(options: options.Options, console: Console) -> str:
             seed = options.seed * 1_000_000 + i
             tasks[f"{kind} {i}"] = partial(task, plant, options.samples, seed, kind)
             plants.append((kind, plant))
+    for i in range(options.plants or 0):
+        tasks[f"plant {i}"] = partial(loops.task, i, options.seed)
     key = fingerprint(
         "benchmarks.identify.study.command",
+        "benchmarks.identify.study.loops",
         samples=options.samples,
         seed=options.seed,
         logs=options.logs,
     )
     results = options.fan_out.open().run(tasks, out / "tasks" / key, title="logs")
     found = list(results.values())
+    found, of_loops = found[: len(plants)], found[len(plants) :]
     by_kind = {
         kind: [each for (own, _), each in zip(plants, found, strict=True) if own == kind]
         for kind in KINDS
@@ -224,6 +228,8 @@ def execute(options: options.Options, console: Console) -> str:
     )
     tables = [table(by_kind), beside_rivals(by_kind)]
     text = [each.to_markdown(index=False, disable_numparse=True) for each in tables]
+    if of_loops:
+        closing = f"{loops.counted(of_loops)}\n\n{closing}"
     write_text(out / "identify_study.md", "\n\n".join([*text, f"{closing}\n"]))
     for each in tables:
         console.print(on_screen(each))
@@ -277,9 +283,11 @@ def table(by_kind: dict[str, list[dict[str, Any]]]) -> pd.DataFrame:
                 if (each["refused"] and "covers" not in question)
                 or (not each["refused"] and (name != "dead_zone" or each[name][0] >= TELLING))
             ]
-            counted = share(np.array(flags, dtype=np.bool_))
-            low, high = 100 * counted.low, 100 * counted.high
-            row[kind] = f"{100 * counted.value:.0f} % [{low:.0f}, {high:.0f}]"
+            row[kind] = ""
+            if flags:
+                counted = share(np.array(flags, dtype=np.bool_))
+                low, high = 100 * counted.low, 100 * counted.high
+                row[kind] = f"{100 * counted.value:.0f} % [{low:.0f}, {high:.0f}]"
         rows.append(row)
     refused = {kind: str(sum(bool(each["refused"]) for each in found))
                for kind, found in by_kind.items()}  # fmt: skip

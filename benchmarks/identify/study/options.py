@@ -15,6 +15,8 @@ class Options:
 
     logs: Runs = 60
     """Logs of a kind, each of its plant."""
+    plants: Runs | None = None
+    """Random plants besides, on which the recommended loops are tried."""
     samples: Runs = 1200
     """Rows of a log."""
     seed: Seed = 1
