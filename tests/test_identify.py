@@ -17,7 +17,7 @@ from agents import PIController
 from benchmarks.identify import log as log_module
 from benchmarks.identify.__main__ import main
 from benchmarks.identify.armax import Orders, Rows
-from benchmarks.identify.cleaning import without_noise_of_held_flow
+from benchmarks.identify.cleaning import without_noise_of_held_flow, without_standstill
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Columns, Log, read_log
 from benchmarks.identify.margins import margins
@@ -210,11 +210,30 @@ class TestRealLogs:
         assert any(note.startswith("4 spikes of the temperature") for note in model.notes)
         assert model.estimates["gain"].value == pytest.approx(whole.plant.gain, rel=0.02)
 
+    def test_jumps_of_the_sensor_are_subtracted(self, good):
+        log, whole = good
+        jumped = log.temperature + np.where(np.arange(1200) < 700, 0.0, 40.0)
+        model = identify(Log(log.flow, jumped, 8.0))
+        assert any("At sample 701 the temperature jumps by 39.8" in note for note in model.notes)
+        assert model.estimates["gain"].value == pytest.approx(whole.plant.gain, rel=0.1)
+
+    def test_sensor_that_is_stuck_is_left_out(self, good):
+        log, whole = good
+        stuck = np.where(np.arange(1200) < 800, log.temperature, log.temperature[800])
+        model = identify(Log(log.flow, stuck, 8.0))
+        assert any("In 399 rows the temperature stands still" in note for note in model.notes)
+        assert model.estimates["gain"].value == pytest.approx(whole.plant.gain, rel=0.2)
+        coarse = replace(
+            log, temperature=np.round(log.temperature)
+        )  # of which rows stand still
+        assert without_standstill(coarse) is coarse
+
     def test_fast_response_is_no_spike(self):
         generator = np.random.default_rng(710)
         flow = np.repeat(generator.uniform(-5, 5, 150), 8)
         model = found_in(flow, signal.lfilter([0.0, 1.0, -0.8], [1.0], flow), generator)
         assert not any("spike" in note for note in model.notes)
+        assert not any("jump" in note for note in model.notes)
         assert model.held_out.model > 0.99
 
     def test_noise_of_a_flow_meter_is_taken_from_a_held_flow(self, good):
@@ -452,6 +471,12 @@ class TestPlant:
         np.testing.assert_allclose(
             ranges["time_constant_factor"], np.array(ends) / middle, rtol=1e-6
         )
+
+    def test_plant_that_the_environment_does_not_have_is_refused_with_advice(self, good):
+        _, model = good
+        huge = replace(model, noise={**model.noise, "noise_variance": 1e12})
+        with pytest.raises(CannotTellError, match=r"noise_variance .* --temperature-unit"):
+            plant_ranges(huge)
 
     def test_set_point_is_within_reach(self):
         model = identify(recorded(b=[b / 10.0 for b in PAPER.b], noise=1e-3))

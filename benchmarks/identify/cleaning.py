@@ -13,6 +13,7 @@ from benchmarks.identify.armax import Array, Flags
 from benchmarks.identify.log import Log
 
 SPIKE = 8.0  # robust deviations that a sample must stick out from its neighbours
+STANDSTILL = 20  # samples in a row with the same temperature, of one that else moves
 MOST_SPIKES = 0.03  # share of the rows
 JUMP = 8.0  # deviations of its noise, from which a change of a held flow is surely a step
 STEP = 5.0  # standard errors, from which a difference of means is one
@@ -97,6 +98,35 @@ def _steps(flow: Array, spread: float) -> list[int]:
             found.append(place)
             open_ones += [(start, place), (place, stop)]
     return sorted(found)
+
+
+def without_standstill(log: Log) -> Log:
+    """Return the log without temperatures of a sensor that was stuck, and moves elsewhere."""
+    temperature = log.temperature
+    ends = np.concatenate([[True], np.diff(temperature) != 0.0])
+    run = np.cumsum(ends) - 1
+    lengths = np.bincount(run)
+    still = lengths >= STANDSTILL
+    if not still.any() or still.all() or np.mean(lengths[~still] == 1) < 0.9:
+        return log  # a coarse sensor, or none that stood still
+    stuck = still[run] & ~ends  # the first of each may be right
+    note = (
+        f"In {int(stuck.sum())} rows the temperature stands still to the last digit, and moves "
+        "elsewhere: they are left out, as those of a sensor that was stuck."
+    )
+    return replace(
+        log, temperature=np.where(stuck, np.nan, temperature), notes=[*log.notes, note]
+    )
+
+
+def without_jump(log: Log, row: int, height: float) -> Log:
+    """Return the log with a jump taken from all later temperatures, and a note."""
+    note = (
+        f"At sample {row + 1} the temperature jumps by {height:.3g} °C, which no flow "
+        "explains: it is subtracted from there on. See whether the sensor was changed."
+    )
+    temperature = log.temperature - np.where(np.arange(len(log.flow)) >= row, height, 0.0)
+    return replace(log, temperature=temperature, notes=[*log.notes, note])
 
 
 def protrusion(log: Log) -> Array:

@@ -28,11 +28,14 @@ def check_excitation(command: Array, output: Array) -> None:
     if np.ptp(known) == 0.0:
         raise CannotTellError(
             f"the flow is constant, {known[0]:g} t/h from its operating point: nothing moves "
-            "that the temperature could answer"
+            "that the temperature could answer. Record it while the flow is moved in steps"
         )
     temperatures = output[np.isfinite(output)]
     if not len(temperatures) or np.ptp(temperatures) == 0.0:
-        raise CannotTellError("the temperature is constant: it answers nothing")
+        raise CannotTellError(
+            "the temperature is constant: it answers nothing. See whether the sensor works, or "
+            "name another column"
+        )
     share = _explained_by_feedback(command, output)
     if share > FOLLOWS:
         raise CannotTellError(

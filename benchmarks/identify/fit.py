@@ -13,7 +13,9 @@ from benchmarks.identify.cleaning import (
     at_one_rate,
     protrusion,
     without,
+    without_jump,
     without_noise_of_held_flow,
+    without_standstill,
 )
 from benchmarks.identify.likelihood import Candidate, Gap, Likelihood
 from benchmarks.identify.log import Log
@@ -28,7 +30,7 @@ from benchmarks.identify.noise import in_the_environment
 from benchmarks.identify.posterior import Posterior
 from benchmarks.loop.linear import LinearModel
 
-OWN_LAGS = [np.array([-pole]) for pole in (0.6, 0.75, 0.85, 0.92, 0.96)]  # C of them
+OWN_LAGS = 0.6, 0.75, 0.85, 0.92, 0.96  # poles of the plant that are not poles of the noise
 FIRST_ORDERS = Orders(2, 1, 2)  # to look for the delay with, before the orders are known
 TO_FORESEE = Orders(2, 6, 2)  # so that a fast response is not taken for a spike
 OF_A, OF_B, OF_C = (1, 2, 3), (1, 2, 3, 6, 12), (0, 1, 3)
@@ -39,6 +41,7 @@ WORSE = 1.2  # times the least share that is left open: what is more takes no pa
 WEAK = 100.0  # twice the log likelihood, below which a log may be the wrong way round
 CHANCE = 0.01  # that a flow without effect is taken for one with effect
 OUTLYING = 6.0  # robust deviations of prediction errors, from which a suspect is a spike
+JUMP, MOST_JUMPS = 24.0, 3  # robust deviations of a jump of the sensor; how many are mended
 PLAIN = 24.0  # deviations that a suspect without a prediction sticks out, to be a spike
 SLOW = 3.0  # time constants that a log should hold
 
@@ -68,7 +71,8 @@ def identify(log: Log, options: Options | None = None) -> Model:
         If the options do not fit to the log.
     """
     options = options or Options()
-    log = _cleaned(without_noise_of_held_flow(at_one_rate(log)), options)
+    log = without_noise_of_held_flow(at_one_rate(without_standstill(log)))
+    log = _without_jumps(_cleaned(log, options), options)
     longest_b = options.orders.b if options.orders else max(OF_B)
     likelihood = Likelihood(log, options, longest_b)
     fits = _fits(likelihood)
@@ -110,7 +114,7 @@ def identify(log: Log, options: Options | None = None) -> Model:
         orders=chosen.orders, sampling_interval=interval, errors=errors, held_out=held_out,
         notes=list(log.notes),
     )  # fmt: skip
-    model.notes.extend(_notes(model, options, len(log.flow)))
+    model.notes.extend(_notes(model, likelihood))
     return model
 
 
@@ -131,6 +135,28 @@ def _cleaned(log: Log, options: Options) -> Log:
     runs = np.cumsum(np.diff(found, prepend=False))
     outlying = np.unique(runs[found & outlying])
     return without(log, found & np.isin(runs, outlying))
+
+
+def _without_jumps(log: Log, options: Options) -> Log:
+    """Return a log without jumps of its sensor: moves that neither flow nor noise explain."""
+    for _ in range(MOST_JUMPS):
+        moves = np.diff(log.temperature, prepend=np.nan)
+        scale = 1.4826 * float(np.nanmedian(np.abs(moves))) if np.isfinite(moves).any() else 0.0
+        if scale == 0.0 or not np.nanmax(np.abs(moves)) > JUMP * scale:
+            return log
+        orders = replace(options.orders or TO_FORESEE, walk=True)
+        likelihood = Likelihood(log, options, orders.b)
+        c = np.zeros(0)
+        place = likelihood.scan(replace(orders, c=0), c, likelihood.gaps())[0]
+        errors = likelihood.errors(likelihood.fit(place, orders))
+        if not np.isfinite(errors).any():
+            return log
+        row = int(np.nanargmax(np.abs(errors)))
+        scale = 1.4826 * float(np.nanmedian(np.abs(errors)))
+        if not min(abs(errors[row]), abs(moves[row])) > JUMP * scale:
+            return log
+        log = without_jump(log, row, float(errors[row]))
+    return log
 
 
 def _first(likelihood: Likelihood) -> list[Candidate]:
@@ -192,9 +218,10 @@ def _fits(likelihood: Likelihood) -> list[Candidate]:
     for b in (1, 2):
         orders = Orders(2, b, 1)
         tried = []
-        for c in OWN_LAGS:
-            place = likelihood.scan(orders, c, [found[0].place.gap])[0]
-            tried.append(likelihood.linear(place, orders, c))
+        for pole in OWN_LAGS:
+            of_lag = np.array([-pole])
+            place = likelihood.scan(orders, of_lag, [found[0].place.gap])[0]
+            tried.append(likelihood.linear(place, orders, of_lag))
         lags.append(min(tried, key=lambda fit: fit.deviance))
     return [*([fit for fit in found if not fit.walks_nowhere] or found), *lags]
 
@@ -288,9 +315,10 @@ def _check_stable(a: Array) -> None:
         )
 
 
-def _notes(model: Model, options: Options, samples: int) -> list[str]:
+def _notes(model: Model, likelihood: Likelihood) -> list[str]:
     """Return what the user should know about the fit."""
     notes = []
+    longest, samples = likelihood.options.longest_delay, len(likelihood.output)
     gain, constant = model.estimates["gain"], model.estimates["time_constant"]
     walk = model.noise["disturbance_walk_variance"]
     if gain.value > 0:
@@ -298,12 +326,12 @@ def _notes(model: Model, options: Options, samples: int) -> list[str]:
             "The direction is unusual for a boiler: the temperature rises with the flow. "
             "If it should not, see whether the columns are swapped."
         )
-    if model.plant.delay >= options.longest_delay - 1:
+    if model.plant.delay >= longest - 1:
         notes.append(
-            f"The delay is as long as was looked for, {options.longest_delay} "
+            f"The delay is as long as was looked for, {longest} "
             "samples: try a longer --longest-delay, or a longer sampling interval."
         )
-    if walk:
+    if walk > likelihood.resolution:
         notes.append(
             f"The base line wanders by {np.sqrt(walk):.2g} °C a sample, as a random walk: "
             "`disturbance_walk_variance`. What the plant settles at is known less well."

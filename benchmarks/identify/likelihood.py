@@ -140,8 +140,8 @@ class Likelihood:
             raise CannotTellError(
                 f"the log is too short: {len(self.output)} rows leave {len(self.rows)} without "
                 f"a gap in the {options.longest_delay} samples before them, and at least "
-                f"{LEAST_SAMPLES} are needed. A shorter --longest-delay needs less, and a "
-                "--sampling-interval as long as the gaps does not meet them"
+                f"{LEAST_SAMPLES} are needed. A shorter --longest-delay needs less; where "
+                "many temperatures are missing, resample the log to longer steps"
             )
 
     def narrow(self, longest_delay: int, last: int | None = None) -> None:

@@ -124,7 +124,9 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) 
                 kept.popleft()
             progress.update(len(table))
     if clock.interval is None:
-        raise ValueError(f"{path} is too short: {read} rows tell no sampling interval")
+        raise ValueError(
+            f"{path} is too short: {read} rows, and hundreds are needed, while the flow moves"
+        )
     notes = list(clock.notes)
     if read > rows:
         notes.append(f"Of the {read:,} rows, the last {rows:,} are used (--rows).")
@@ -239,6 +241,7 @@ class _Layout:
             raise ValueError(
                 f"{self.path}, line {line + bad[0]}: {column.name} must be a number{date}, got "
                 f"{str(column.iloc[bad[0]])!r}"
+                + ("" if is_time else ". Leave the cell empty where it is not known")
             )
         return factor * values + offset
 
@@ -264,7 +267,8 @@ class _Clock:
         if len(back):
             raise ValueError(
                 f"line {line + back[0]}: the time must increase, and goes from "
-                f"{known[back[0]]:g} s by {steps[back[0]]:g} s"
+                f"{known[back[0]]:g} s by {steps[back[0]]:g} s. Sort the rows, and leave out "
+                "those that are there twice; or give --sampling-interval if the times are wrong"
             )
         if self.interval is None:
             self.interval = float(f"{np.median(steps):.6g}")
@@ -314,7 +318,10 @@ def _missing(columns: dict[str, Array]) -> list[str]:
         known = rows - count
         least = LEAST_TEMPERATURES if name == "temperature" else (1.0 - LEAST_KNOWN) * rows
         if count and known < min(least, rows):
-            raise ValueError(f"{count} of {rows} rows have no {name}: too many are missing")
+            raise ValueError(
+                f"{count} of {rows} rows have no {name}: too many are missing. Name another "
+                "column, or take the rows in which it is known"
+            )
     if not any(counts.values()):
         return []
     said = " and ".join(f"{count} {name}s" for name, count in counts.items() if count)

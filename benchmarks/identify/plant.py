@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.identify.armax import Array
 from benchmarks.identify.log import Log
-from benchmarks.identify.model import Interval, Model
+from benchmarks.identify.model import CannotTellError, Interval, Model
 from benchmarks.identify.simulation import held, response
 from benchmarks.loop.linear import LinearModel
 from mptc_gym import Parameters
@@ -84,7 +84,13 @@ def plant_ranges(model: Model) -> dict[str, Any]:
         if low < high:
             arguments["time_constant_factor"] = [low, max(high, 1.0)]
     ranges: dict[str, Any] = _rounded(arguments)
-    Parameters(**ranges)
+    try:
+        Parameters(**ranges)
+    except ValueError as error:
+        raise CannotTellError(
+            f"the environment does not have such plants: {error}. See whether the units are "
+            "right (--flow-unit, --temperature-unit, --time-unit), or scale the columns"
+        ) from error
     return ranges
 
 

@@ -108,8 +108,9 @@ class Posterior:
         the response begins.
         """
         lengths = np.array([entry.fit.orders.b for entry in entries])
-        short = weights * (lengths <= lengths[np.argmax(likeliest)])
-        return short / short.sum()
+        short: Array = weights * (lengths <= lengths[np.argmax(likeliest)])
+        short /= short.sum()
+        return short
 
     def _weights(self, entries: list[Entry], *, possible: bool = False) -> Array:
         """Return the probabilities of places."""
