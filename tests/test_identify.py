@@ -214,7 +214,7 @@ class TestRealLogs:
         log, whole = good
         jumped = log.temperature + np.where(np.arange(1200) < 700, 0.0, 40.0)
         model = identify(Log(log.flow, jumped, 8.0))
-        assert any("At sample 701 the temperature jumps by 39.8" in note for note in model.notes)
+        assert any("sample 701 the temperature jumps by 39.8" in note for note in model.notes)
         assert model.estimates["gain"].value == pytest.approx(whole.plant.gain, rel=0.1)
 
     def test_sensor_that_is_stuck_is_left_out(self, good):
