@@ -518,15 +518,19 @@ def _run(
 
 def _checked(actions: Any, n: int, k: int) -> NDArray[Any]:
     """Return what a policy returned as an array, if the environments can take it."""
-    checked = np.asarray(actions)
+    try:
+        checked = np.asarray(actions)
+        finite = np.isfinite(checked)
+    except (TypeError, ValueError, RuntimeError):  # the last one: of tensors
+        reject("actions of policy", actions, "an array of numbers")
     if checked.shape != (n, 1):
         raise ValueError(
             f"policy must return actions of shape {(n, 1)} for {n} observations, got "
             f"{checked.shape}"
         )
-    if not np.isfinite(checked).all():
+    if not finite.all():
         raise ValueError(
-            f"policy must return finite actions, got {checked[~np.isfinite(checked)][0]} at "
+            f"policy must return finite actions, got {checked[~finite][0]} at "
             f"sample {k - 1} of an episode"
         )
     return checked

@@ -370,7 +370,9 @@ class ScoreCallback(BaseCallback):
     """Scores the policy while it is trained, without exploration, and keeps the best.
 
     The episodes are others than those of `mptc_gym.evaluate`, so that they may choose the
-    policy. The log gets `score/mean_error` and, where there is a bound, `score/score`.
+    policy. Where nothing is drawn, as in `MiddlePoint-v0`, all episodes are the same: choose by
+    another set point, such as `setpoint_period=500`. The log gets `score/mean_error` and, where
+    there is a bound, `score/score`.
 
     Parameters
     ----------

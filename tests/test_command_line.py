@@ -56,7 +56,7 @@ def main_of(name):
 
 
 def test_all_commands_are_found():
-    assert {"compare", "train.defaults", "identify.study"} <= set(COMMANDS)
+    assert {"compare", "identify.study"} <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

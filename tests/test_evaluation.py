@@ -207,6 +207,8 @@ class TestRefusals:
             (lambda seen: np.zeros(len(seen)), r"policy must return actions of shape \(4, 1\)"),
             (lambda seen: np.zeros((1, 1)), r"policy must return actions of shape \(4, 1\)"),
             (lambda seen: np.full((len(seen), 1), np.nan), "policy must return finite actions"),
+            (lambda seen: [["open"]] * len(seen), "actions of policy must be an array of numb"),
+            (lambda seen: [[0.0], 0.0], "actions of policy must be an array of numbers, got "),
             (3, "policy must be a function, or an object with predict or with act, got 3"),
         ],
     )

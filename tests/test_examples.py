@@ -1,5 +1,6 @@
 """The examples run, with little to learn from, and do what they say."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -13,14 +14,16 @@ import nbformat
 import numpy as np
 import pytest
 import torch
+import yaml
 from nbclient import NotebookClient
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import mptc_gym.sb3
 from benchmarks.datasets.history import arguments_of, record
 from benchmarks.examples import offline, ppo_torch, sb3
-from benchmarks.train.defaults import command as defaults
 from mptc_gym import evaluate
+from mptc_gym.sb3 import spec_of
 
 ROOT = Path(__file__).parent.parent
 
@@ -41,24 +44,27 @@ class TestSB3:
         page.write_text((ROOT / "benchmarks/examples/sb3.py").read_text(encoding="utf-8"))
         quick = (
             "import runpy, sys; sys.modules['benchmarks'] = sys.modules['agents'] = None; "
-            f"sys.argv = ['page', '--steps', '1']; runpy.run_path({str(page)!r}, "
-            "run_name='__main__')"
+            f"sys.argv = ['page', '--steps', '1', '--seed', '3', '--out', {str(tmp_path)!r}]; "
+            f"runpy.run_path({str(page)!r}, run_name='__main__')"
         )
         done = run("-c", quick)
         assert done.returncode == 0, done.stderr
-        assert done.stdout.startswith("MiddlePoint-v0: mean error ")
+        found = re.fullmatch(
+            r"seed 3, \d+ s: MiddlePoint-v0: mean error ([\d.]+) degC.*\n", done.stdout
+        )
+        kept = PPO.load(tmp_path / "ppo-3.zip", device="cpu")
+        assert f"{evaluate(kept, spec_of(kept)).mean_error:.3f}" == found[1]
 
-    def test_it_is_the_plant_of_the_study(self):
-        plant, studied = sb3.make_plant(), defaults.CASES["ppo-velocity"]
-        other = studied.train_on()
-        assert plant.action_space == other.action_space
-        trained_on = sb3.make_plant(**sb3.SET_POINTS)
-        assert trained_on.unwrapped.parameters == other.unwrapped.parameters
-        for k, action in enumerate((0.3, -1.0, 0.5)):
-            if k == 0:
-                trained_on.reset(seed=1), other.reset(seed=1)
-            one, two = (each.step(np.array([action])) for each in (trained_on, other))
-            assert one[4] == two[4]
+    def test_a_policy_rests_where_nothing_moves_and_there_alone(self):
+        model = sb3.make_model(0).learn(1)
+        rest = np.repeat([[4.3, 0.0, -0.7], [-5.5, 0.0, 0.9]], [3, 3, 20], axis=1)
+        assert not model.predict(rest, deterministic=True)[0].any()
+        for moved in (rest + 0.1 * (np.arange(26) == place) for place in (3, 4, 6, 25)):
+            there = model.predict(moved, deterministic=True)[0]
+            assert there.all()
+            np.testing.assert_allclose(
+                model.predict(-moved, deterministic=True)[0], -there, atol=1e-6
+            )
 
 
 def test_stable_baselines3_learns_with_the_lines_of_the_page():
@@ -73,6 +79,34 @@ def test_stable_baselines3_learns_with_the_lines_of_the_page():
         model.learn(1)
         assert model.num_timesteps == 8 * model.n_envs
         assert not torch.equal(before, weights(model.policy))
+
+
+@pytest.mark.parametrize("algorithm", [PPO, SAC])
+def test_settings_for_rl_zoo_make_a_model_that_learns(algorithm):
+    file = ROOT / f"benchmarks/examples/rl_zoo/{algorithm.__name__.lower()}.yml"
+    text = file.read_text(encoding="utf-8")
+    (settings,) = yaml.safe_load(text).values()
+    (wrapper,) = settings.pop("env_wrapper")
+    ((path, arguments),) = wrapper.items()
+    module, _, name = path.rpartition(".")
+    wrapped = getattr(importlib.import_module(module), name)
+    plant, n, _ = (settings.pop(key) for key in ("env_kwargs", "n_envs", "n_timesteps"))
+    plants = DummyVecEnv(
+        [lambda: wrapped(gymnasium.make("MiddlePoint-v0", **plant), **arguments)] * n
+    )
+    # As the Zoo reads them.
+    settings["policy_kwargs"] = eval(settings["policy_kwargs"])
+    if isinstance(rate := settings["learning_rate"], str):
+        kind, initial = rate.split("_")
+        assert kind == "lin"
+        settings["learning_rate"] = lambda left: max(left, 0.0) * float(initial)
+    quick = {"n_epochs": 1} if algorithm is PPO else {"learning_starts": n}
+    model = algorithm(env=plants, device="cpu", seed=0, **{**settings, **quick})
+    before = weights(model.policy)
+    model.learn(2 * 64 * n)  # two updates of PPO: the last one has no learning rate left
+    assert not torch.equal(before, weights(model.policy))
+    assert f"--algo {file.stem} " in text
+    assert file.name in text
 
 
 class TestPPOInPyTorch:

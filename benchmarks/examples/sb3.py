@@ -1,49 +1,93 @@
-"""PPO of Stable-Baselines3, all its settings at their defaults, learns to control one plant.
+"""PPO of Stable-Baselines3 learns to control the plant in a quarter of a minute, on one core.
 
-`python benchmarks/examples/sb3.py` trains for 300,000 samples, which takes some minutes, and
-prints the score of the policy on a square wave between +5 and -5 degC, which it has not met:
-0 is a valve left alone, 1 the least possible error.
+`python benchmarks/examples/sb3.py` trains, keeps the policy in `ppo-0.zip`, and prints its
+score on a square wave that it has not met: 0 is a valve left alone, 1 the least possible error.
 
 This is one file to copy. What makes it work:
 
-- the action changes the flow (`IncrementalAction`), and the dead zone is undone on the way;
-- the observation holds the past 20 actions, so nothing is hidden in the delay;
-- set points are random, and the reward is the absolute error.
+- 64 plants are stepped at once, with random set points; the reward is the absolute error.
+- The action changes the flow (`IncrementalAction`), and the dead zone is undone on the way.
+- The policy sees errors and the moves of the flow, not their levels, and has no biases. So it
+  rests where the error is 0 and nothing moves, and nowhere else: no offset has to be unlearnt.
 """
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
+import time
+from pathlib import Path
 
-import gymnasium
 import torch
+from gymnasium.spaces import Box
 from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import Tensor, nn
 
 from mptc_gym import evaluate
-from mptc_gym.wrappers import IncrementalAction
+from mptc_gym.sb3 import make_vec_env, spec_of
 
-SET_POINTS = {"setpoint": "random", "setpoint_amplitude": 6.0}
+SETPOINTS, ERRORS, ACTIONS = 3, 3, 20  # in the observation: two actions more than the delay
 
 
-def make_plant(**arguments: Any) -> gymnasium.Env[Any, Any]:
-    """Make the plant as the policy sees it."""
-    plant = gymnasium.make("MiddlePoint-v0", action_window=20, reward="absolute", **arguments)
-    return IncrementalAction(plant, max_move=0.4, undo_dead_zone=True)
+class Moves(BaseFeaturesExtractor):
+    """Shows the error, how it has changed, and how the flow has moved, newest first."""
+
+    def __init__(self, space: Box) -> None:
+        super().__init__(space, features_dim=ERRORS + ACTIONS - 1)
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Return the inputs of the networks, of about 1 in size."""
+        _, errors, actions = observations.split([SETPOINTS, ERRORS, ACTIONS], dim=1)
+        return torch.cat([errors[:, :1], -0.5 * errors.diff(), -2.0 * actions.diff()], dim=1)
+
+
+def make_model(seed: int) -> PPO:
+    """Return a model that has learnt nothing yet."""
+    plants = make_vec_env(
+        "MiddlePoint-v0",
+        64,
+        wrapper={"max_move": 1.0, "undo_dead_zone": True},
+        setpoint_window=SETPOINTS,
+        error_window=ERRORS,
+        action_window=ACTIONS,
+        setpoint="random",
+        setpoint_amplitude=6.0,
+        reward="absolute",
+        error_scale=50.0,  # returns of about 1, which are soon learnt
+    )
+    model = PPO(
+        "MlpPolicy",
+        plants,
+        n_steps=64,
+        batch_size=512,
+        learning_rate=lambda left: 2e-3 * max(left, 0.05),
+        gamma=0.97,
+        gae_lambda=1.0,
+        policy_kwargs={"features_extractor_class": Moves, "log_std_init": -2.0},
+        seed=seed,
+        device="cpu",
+    )
+    for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net):
+        if isinstance(layer, nn.Linear):
+            nn.init.zeros_(layer.bias)
+            layer.bias.requires_grad_(False)
+    return model
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Train, and print how good the policy is."""
-    parser = argparse.ArgumentParser(description="PPO of Stable-Baselines3 on one plant.")
-    parser.add_argument("--steps", type=int, default=300_000, help="samples of experience")
-    parser.add_argument("--seed", type=int, default=0, help="of policy, exploration and plant")
+    """Train, keep the policy, and print how good it is."""
+    parser = argparse.ArgumentParser(description="PPO of Stable-Baselines3 on 64 plants.")
+    parser.add_argument("--steps", type=int, default=200_000, help="samples of experience")
+    parser.add_argument("--seed", type=int, default=0, help="of policy, exploration and plants")
+    parser.add_argument("--out", type=Path, default=Path(), help="folder of the policy")
     options = parser.parse_args(arguments)
 
     torch.set_num_threads(1)  # the networks are too small for more
-    plant = make_plant(**SET_POINTS)
-    model = PPO("MlpPolicy", plant, seed=options.seed, device="cpu")
-    model.learn(options.steps)
-    print(evaluate(model, make_plant))
+    began = time.process_time()
+    model = make_model(options.seed).learn(options.steps)
+    seconds = time.process_time() - began
+    model.save(options.out / f"ppo-{options.seed}.zip")
+    print(f"seed {options.seed}, {seconds:.0f} s: {evaluate(model, spec_of(model))}")
 
 
 if __name__ == "__main__":

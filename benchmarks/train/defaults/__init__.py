@@ -1,1 +1,0 @@
-"""How far do default settings get? `python -m benchmarks.train.defaults`."""
