@@ -118,16 +118,6 @@ def check_limits(u_min: Any, u_max: Any) -> tuple[float, float]:
     return low, high
 
 
-def check_batch(before: tuple[int, ...], now: tuple[int, ...]) -> None:
-    """Refuse observations of another batch than since `reset`, with a ValueError."""
-    if now != before:
-        shapes = before, now
-        was, given = (f"a batch of {each[0]}" if each else "one loop" for each in shapes)
-        raise ValueError(
-            f"observation must be of {was}, as those before it, until reset; got {given}"
-        )
-
-
 class Controller(ABC):
     """A controller of one loop, or of a batch of loops side by side.
 
@@ -154,6 +144,7 @@ class Controller(ABC):
     """
 
     _advice = ""  # in the error that observations of a wrong shape bring
+    _remembers = True  # what has been; otherwise each batch may be of another size
 
     def __init__(
         self, *, n_obs: int, u_min: float, u_max: float, dead_zone: float = 0.0
@@ -162,10 +153,12 @@ class Controller(ABC):
         self.u_min, self.u_max = check_limits(u_min, u_max)
         self.dead_zone = check_number("dead_zone", dead_zone, 0)
         self.command: Values = np.float64(0.0)
+        self._loops_before: tuple[int, ...] | None = None  # () or (batch,), since `reset`
 
     def reset(self) -> None:
         """Forget the episode. What was learnt stays."""
         self.command = np.float64(0.0)
+        self._loops_before = None
 
     def act(self, observation: ArrayLike) -> NDArray[np.float32]:
         """Return the action for an observation.
@@ -185,18 +178,28 @@ class Controller(ABC):
         Raises
         ------
         ValueError
-            If the observation has another shape, or a value that is no finite number. The
-            controller is unchanged then.
+            If the observation has another shape, or another batch than those before it since
+            `reset`, or a value that is no finite number. The controller is unchanged then.
         """
         values = check_numbers("observation", observation)
-        if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs:
+        if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs or not len(values):
             raise ValueError(
                 f"observation must have shape (n_obs,) or (batch, n_obs), n_obs at least "
                 f"{self.n_obs}, got {values.shape}{self._advice}"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")
+        now, before = values.shape[:-1], self._loops_before
+        if now != before and before is not None:
+            was, given = (
+                f"a batch of {each[0]}" if each else "one loop" for each in (before, now)
+            )
+            raise ValueError(
+                f"observation must be of {was}, as those before it, until reset; got {given}"
+            )
         self.command = self._control(values)
+        if self._remembers:
+            self._loops_before = now
         return action_from_command(self.command, self.u_min, self.u_max, self.dead_zone)
 
     @abstractmethod

@@ -13,7 +13,6 @@ from agents.controller import (
     PAPER_WINDOWS,
     Controller,
     Values,
-    check_batch,
     check_count,
     check_number,
     check_positive,
@@ -149,7 +148,6 @@ class NeuralSmithPredictor(Controller):
             self._flows = np.zeros((len(self._b), n))
             self._off = np.zeros(n)
             self._k = 0
-        check_batch(self._flows.shape[1:], (n,))
         if self._k % self._every == 0:
             self._last = self._decide(self._law, rows)
         self._k += 1

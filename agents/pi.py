@@ -11,7 +11,6 @@ from agents.controller import (
     PAPER_WINDOWS,
     Controller,
     Values,
-    check_batch,
     check_count,
     check_flag,
     check_number,
@@ -133,7 +132,6 @@ class PIController(Controller):
         error: Values = observation[..., self.error_index]
         if self._sum is None:
             self._sum = np.zeros_like(error)
-        check_batch(np.shape(self._sum), np.shape(error))
         total = self._sum + error
         command = -self.kp * error - self.ki * total  # Section 5
         if self.anti_windup:

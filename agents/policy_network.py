@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from agents.controller import (
     Controller,
     Values,
-    check_batch,
     check_count,
     check_limits,
     check_number,
@@ -172,6 +171,7 @@ class PolicyNetwork(Controller):
         self.activation, self.output = activation, output
         self.output_scale = check_number("output_scale", output_scale)
         self.increments = increments
+        self._remembers = increments is not None
         self.provenance = dict(provenance or {})
         self.input_scale = _finite("input_scale", input_scale, (self.n_obs,))
         nothing = np.zeros(self.n_obs)
@@ -273,7 +273,6 @@ class PolicyNetwork(Controller):
     def _move(self, output: Values, increments: Increments) -> Values:
         """Move the valve, and return its flow, t/h."""
         before = np.zeros_like(output) if self._position is None else self._position
-        check_batch(np.shape(before), np.shape(output))
         position = np.clip(before + increments.max_move * output, -1.0, 1.0)
         self._position = position
         edge = increments.dead_zone

@@ -12,7 +12,6 @@ from agents.controller import (
     PAPER_WINDOWS,
     Controller,
     Values,
-    check_batch,
     check_count,
     check_number,
     check_positive,
@@ -247,7 +246,6 @@ class SelfTuningController(Controller):
         rows = np.atleast_2d(observation)
         if not self._loops:
             self._start(len(rows))
-        check_batch((self._loops,), (len(rows),))
         setpoint = rows[:, self.setpoint_index]
         output = setpoint - rows[:, self.error_index]
         filtered = (

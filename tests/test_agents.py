@@ -1,5 +1,6 @@
 """The controllers: equations by hand and by automatic differentiation, batches, files."""
 
+import inspect
 from functools import partial
 
 import gymnasium
@@ -8,14 +9,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+import agents
 from agents import (
     Controller,
     DirectNNController,
-    NeuralSelfTuningController,
-    NeuralSmithPredictor,
     PIController,
     PolicyNetwork,
-    SelfTuningController,
     SmithPredictor,
     Weights,
 )
@@ -105,30 +104,19 @@ class TestPI:
         assert controller.command == pytest.approx(-2.2 * 5 - 0.3 * 500)
         assert action[0] < -10  # beyond the actuator's range, as printed
 
-    def test_batch_equals_singles(self, rng):
-        observations = rng.normal(size=(30, 5, 6)).astype(np.float32)
-        batch, singles = PIController(), [PIController() for _ in range(5)]
-        for observation in observations:
-            alone = [c.act(row) for c, row in zip(singles, observation, strict=True)]
-            assert np.array_equal(batch.act(observation), alone)
 
-    def test_batch_size_is_fixed_until_reset(self):
-        controller = PIController()
-        controller.act(np.zeros((3, 6)))
-        with pytest.raises(ValueError, match="until reset"):
-            controller.act(np.zeros((1, 6)))
-        controller.reset()
-        controller.act(np.zeros((1, 6)))
-
-
-PLANT = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of first order, nearly
+# Of first order, nearly. Each controller is told what it has to be told.
+PLANT = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
+TOLD = {**PLANT, "closed_loop_time_constant": 80.0}
+NEEDS = {
+    name: {p.name for p in inspect.signature(each).parameters.values() if p.default is p.empty}
+    for name, each in vars(agents).items()
+    if isinstance(each, type) and issubclass(each, Controller) and each is not Controller
+}
 MAKERS = {
-    "PI": PIController,
-    "NN": DirectNNController,
-    "Smith": partial(SmithPredictor, **PLANT, closed_loop_time_constant=80.0),
-    "self-tuning": partial(SelfTuningController, **PLANT),
-    "NN, told": partial(NeuralSmithPredictor, **PLANT),
-    "NN, self-tuning": partial(NeuralSelfTuningController, **PLANT),
+    name: partial(getattr(agents, name), **{argument: TOLD[argument] for argument in needed})
+    for name, needed in NEEDS.items()
+    if needed <= set(TOLD)
 }
 
 
@@ -176,6 +164,17 @@ class TestEveryController:
     def test_it_reads_no_more_than_it_needs(self, make):
         longer = np.r_[np.arange(6.0), 99.0, -99.0]
         assert np.array_equal(make().act(longer), make().act(np.arange(6.0)))
+
+    def test_the_number_of_loops_is_fixed_until_reset(self, make):
+        controller = make(num_envs=3) if make.func is DirectNNController else make()
+        controller.act(np.zeros((3, 6)))
+        with pytest.raises(ValueError, match="observation must"):
+            controller.act(np.zeros((2, 6)))
+        controller.reset()
+        controller.act(np.zeros((3, 6)))
+        controller.reset()
+        with pytest.raises(ValueError, match="observation must"):
+            controller.act(np.zeros((0, 6)))
 
     def test_reset_forgets_the_episode(self, make, rng):
         observations = rng.normal(size=(60, 6))
@@ -487,13 +486,6 @@ class TestSmithPredictor:
         controller = self.smith(dead_zone=7.0)
         controller.kp, controller.ki = 7.0, 0.0  # u = -7 at e = 1
         assert np.float64(controller.act([0.0, 0, 0, 1.0])[0]) * 10.0 <= -7.0
-
-    def test_batch_equals_singles(self, rng):
-        observations = rng.normal(size=(40, 3, 6)).astype(np.float32)
-        batch, singles = self.smith(), [self.smith() for _ in range(3)]
-        for observation in observations:
-            alone = [c.act(row) for c, row in zip(singles, observation, strict=True)]
-            assert np.array_equal(batch.act(observation), alone)
 
     @pytest.mark.parametrize(
         ("name", "value"), [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)]

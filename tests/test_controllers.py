@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
+from agents import DirectNNController
 from benchmarks.controllers import pretrained
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.own import own_factory
@@ -17,7 +18,7 @@ from benchmarks.loop.scenarios import Scenario
 from benchmarks.sweep.tasks import agent_task
 from benchmarks.train.ppo import PolicyRequest
 from benchmarks.watch import rivals
-from mptc_gym import IDS, PRESETS, evaluate
+from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from mptc_gym.sb3 import make_vec_env, spec_of
 
@@ -55,6 +56,50 @@ def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, mo
             assert np.all(np.array(found) < 0.7 * IDLE), (way, found)
     if factory.learns:  # in a sweep it has learnt before, on this plant
         assert np.mean(ways["sweep"]) < 0.9 * np.mean(ways["compare"])
+
+
+@pytest.fixture
+def run(factory):
+    """Run plants with a limit that is nearer on one side, and set points beyond it."""
+
+    def run(runs, seed, sign=1.0, again=False):
+        limits = {"u_min": -6.0, "u_max": 10.0} if sign > 0 else {"u_min": -10.0, "u_max": 6.0}
+        plant = {**limits, "b": [sign * b for b in Parameters().b], "noise_variance": 0.1}
+        plants = make_plants(
+            runs, 700, **factory.arguments({**plant, "setpoint_amplitude": 6.0})
+        )
+        controller = factory(plant, runs, seed)
+        if again:
+            rollout(plants, controller, 700, seed + 50)
+        return rollout(plants, controller, 700, seed)
+
+    return run
+
+
+def test_a_batch_does_what_its_members_do_alone(entry, run):
+    batch = run(3, 5)
+    # Where a network has learnt, its noise then was that of its place in the batch.
+    for i in range(1 if entry.name == "nn-frozen" else 3):
+        # Matrix products differ in their last digit by the number of rows.
+        np.testing.assert_allclose(run(1, 5 + i).command[:, 0], batch.command[:, i], atol=1e-3)
+
+
+def test_an_episode_leaves_nothing_behind_but_what_is_learnt(entry, factory, run):
+    same = np.array_equal(run(2, 5).command, run(2, 5, again=True).command)
+    assert same is not factory.learns
+
+
+def test_a_mirrored_plant_gets_the_mirrored_flow(entry, factory, run):
+    # Policies trained on the paper's plant are not told another; initial weights are random.
+    if not entry.told or entry.name.startswith("nn-frozen") or factory.learns:
+        assert "direction" in entry.cost.prior_knowledge or not entry.told
+        return
+    ours, theirs = run(2, 3), run(2, 3, sign=-1.0)
+    # Actions have 24 bits, which limits the agreement.
+    np.testing.assert_allclose(theirs.command, -ours.command, atol=1e-2)
+    np.testing.assert_allclose(theirs.output, ours.output, atol=1e-3)
+    if entry.name != "nothing":
+        assert (ours.command > 9.99).any()  # the limits, and anti-windup, had a part
 
 
 @pytest.mark.parametrize(
@@ -191,3 +236,14 @@ class TestSavedPolicies:
     def test_what_is_refused(self, location, complaint, zips):
         with pytest.raises(UsageError, match=f"^--agent: .*{complaint}"):
             chosen([], [f"mine={location.format(zips)}"])
+
+
+def test_the_network_learns_either_direction_and_fails_with_the_wrong_one():
+    plant = {"b": [-b for b in Parameters().b]}
+    late = {}
+    for direction in (-1, 1):
+        controller = DirectNNController(direction=direction, num_envs=8)
+        run = rollout(make_plants(8, 1200, **plant), controller, 1200, seed=0)
+        late[direction] = np.median(np.abs(run.error[600:]).mean(axis=0))
+    assert late[1] < 4.0  # with no control it is 5
+    assert late[-1] > 6.0  # the wrong way round it drives the error up

@@ -1,16 +1,18 @@
 """The robustness study: its plants, its tasks, and what it makes of them."""
 
+import inspect
 import json
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from agents import self_tuning
 from benchmarks.controllers.engineered import simc_pi
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop import designs
-from benchmarks.loop.designs import SPANS, grid, random_design
+from benchmarks.loop.designs import SPANS, WIDE, grid, random_design
 from benchmarks.sweep import command, report, tasks
 from benchmarks.sweep.__main__ import main
 from benchmarks.sweep.options import Options
@@ -34,9 +36,10 @@ class TestDesigns:
             assert reach > 5.0
             Parameters(**plant)
 
-    def test_a_random_design_fills_its_spans_and_half_of_it_drifts(self):
-        plants = random_design(100, 0, 600)
-        for name, (low, high) in SPANS.items():
+    @pytest.mark.parametrize("spans", [SPANS, WIDE], ids=["random", "wide"])
+    def test_a_random_design_fills_its_spans_and_half_of_it_drifts(self, spans):
+        plants = random_design(100, 0, 600, spans)
+        for name, (low, high) in spans.items():
             values = np.array([plant[name] for plant in plants])
             assert values.min() >= low
             assert values.max() <= high
@@ -46,10 +49,24 @@ class TestDesigns:
         for plant in plants[50:]:
             for name in ("gain", "time_constant"):
                 end = plant[f"{name}_factor"] * plant[f"{name}_drift"]
-                low, high = SPANS[f"{name}_factor"]
+                low, high = spans[f"{name}_factor"]
                 assert low - 1e-6 <= end <= high + 1e-6
             assert plant["drift_samples"] == 600
         assert all(Parameters(**plant).delay == plant["delay"] for plant in plants)
+
+    def test_a_wide_design_lies_beyond_the_spans_which_are_those_of_the_self_tuning_bank(self):
+        plants = random_design(200, 0, 600, WIDE)
+        beyond = [
+            any(not low <= plant[name] <= high for name, (low, high) in SPANS.items())
+            for plant in plants
+        ]
+        assert 0.9 < np.mean(beyond) < 1.0
+        given = inspect.signature(self_tuning.SelfTuningController).parameters
+        delays = given["shortest_delay"].default, given["longest_delay"].default
+        constants, zones = self_tuning.TIME_CONSTANTS, 5.0 + 10.0 * np.array(self_tuning.ZONES)
+        assert delays == SPANS["delay"]
+        assert (min(constants), max(constants)) == SPANS["time_constant_factor"]
+        assert (zones.min(), zones.max()) == SPANS["dead_zone"]
 
     def test_a_seed_gives_a_design(self):
         assert random_design(20, 3, 600) == random_design(20, 3, 600)

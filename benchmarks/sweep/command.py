@@ -20,12 +20,13 @@ from benchmarks.lib.options import flat
 from benchmarks.lib.report import provenance_line, write_report
 from benchmarks.lib.storage import commit, versions, write_json
 from benchmarks.lib.tables import on_screen, write_csv
-from benchmarks.loop.designs import Arguments, grid, random_design
+from benchmarks.loop.designs import SPANS, WIDE, Arguments, grid, random_design
 from benchmarks.sweep.options import Options
 from benchmarks.sweep.report import report, table
 from benchmarks.sweep.tasks import agent_task, limit_task
 
 SEED = 0  # of a plant's first run
+SPANS_OF = {"random": SPANS, "wide": WIDE}
 NOTHING = "nothing"  # the controller that sets the scale
 
 
@@ -38,10 +39,9 @@ def execute(options: Options, console: Console) -> str:
     training = options.controllers.training()
     known = {NOTHING: ROSTER[NOTHING], **controllers}
     members = {name: entry.members(training) for name, entry in known.items()}
+    drawn = options.plants, options.design_seed, options.samples
     differing = (
-        grid()
-        if options.design == "grid"
-        else random_design(options.plants, options.design_seed, options.samples)
+        grid() if options.design == "grid" else random_design(*drawn, SPANS_OF[options.design])
     )
     plants = [{**nominal, **plant} for plant in differing]
     began = time.perf_counter()

@@ -23,13 +23,13 @@ class Options:
     others differ from it in what the design says.
     """
 
-    design: Literal["grid", "random"] = "grid"
+    design: Literal["grid", "random", "wide"] = "grid"
     """grid: 20 delays by 10 gains; random: plants that differ in everything, half of which
-    drift."""
+    drift; wide: the same, most of them beyond what random draws from."""
     plants: Runs = 200
-    """Plants of a random design."""
+    """Plants of a random or wide design."""
     design_seed: Seed = 0
-    """Seed that the plants of a random design are drawn with."""
+    """Seed that the plants of a random or wide design are drawn with."""
     runs: Runs = 20
     """Runs of a controller on a plant."""
     samples: Runs = 1200

@@ -103,7 +103,7 @@ def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
     out
         Where to write the maps.
     design
-        "grid" or "random".
+        "grid", "random" or "wide".
     """
     sections = [
         Section(
