@@ -112,6 +112,8 @@ class TestFit:
         assert model.operating_temperature == pytest.approx(385.0, abs=0.5)
         by_itself = identify(shifted, Options(find_dead_zone=False))
         assert by_itself.operating_flow == shifted.flow[0]
+        assert any("say --operating-flow" in note for note in by_itself.notes)
+        assert not any("say --operating-flow" in note for note in model.notes)
 
     def test_dead_zone_is_known_up_to_the_gap_between_commands(self):
         # Magnitudes 3 and 7 only: the dead zone may be anything from 3 to 7, with 95 % of the

@@ -331,6 +331,11 @@ def _notes(model: Model, likelihood: Likelihood) -> list[str]:
             f"The delay is as long as was looked for, {longest} "
             "samples: try a longer --longest-delay, or a longer sampling interval."
         )
+    if likelihood.options.operating_flow is None and likelihood.operating_flow:
+        notes.append(
+            f"The operating point is taken at the log's first flow, {model.operating_flow:g} "
+            "t/h, and a dead zone would lie around it: say --operating-flow if it is elsewhere."
+        )
     if walk > likelihood.resolution:
         notes.append(
             f"The base line wanders by {np.sqrt(walk):.2g} °C a sample, as a random walk: "

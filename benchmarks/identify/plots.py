@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.controllers.step_test import StepTest
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import simulation, step_band
-from benchmarks.identify.tuning import Reduced
 from benchmarks.lib.drawing import COLOURS, STYLE, save
 
 Array = NDArray[np.float64]
@@ -83,7 +83,7 @@ def plot_residuals(model: Model, path: Path) -> None:
         save(figure, path)
 
 
-def plot_step(model: Model, tested: Reduced, path: Path) -> None:
+def plot_step(model: Model, tested: StepTest, path: Path) -> None:
     """Draw the step response with its band, and the first-order model of it."""
     length = tested.delay + 6.0 * tested.time_constant
     samples = min(int(np.ceil(length / model.sampling_interval)), LONGEST) + 1

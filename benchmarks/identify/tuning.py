@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import integrate
 
 from agents import PIController, SmithPredictor
+from benchmarks.controllers.step_test import StepTest
 from benchmarks.identify.armax import Array
 from benchmarks.identify.margins import Margins, margins
 from benchmarks.identify.model import Model
@@ -23,15 +24,6 @@ MOST_SENSITIVE = 2.0  # Ms of a loop that is recommended
 SHARE = 0.95  # of the plants that the log leaves possible
 SLOWER = 1.25  # by which a closed loop is slowed at a time
 SLOWEST = 60  # times at most
-
-
-@dataclass(frozen=True)
-class Reduced:
-    """A model of first order with delay: gain in degC per t/h, times in s."""
-
-    gain: float
-    time_constant: float
-    delay: float
 
 
 @dataclass(frozen=True)
@@ -56,7 +48,7 @@ class Recommended:
     slowed: float
 
 
-def reduced(plant: LinearModel, interval: float) -> Reduced:
+def reduced(plant: LinearModel, interval: float) -> StepTest:
     """Return a model of first order with delay that has the plant's whole response.
 
     By areas (K. J. Astrom and T. Hagglund, "PID Controllers", 2nd edition, 1995, section 2.4):
@@ -77,10 +69,11 @@ def reduced(plant: LinearModel, interval: float) -> Reduced:
     area = float(np.interp(total, np.arange(samples), under))
     constant = min(max(math.e * area, 0.2), max(total, 0.2))
     delay = max(total - constant, 0.0) + 1.0
-    return Reduced(
+    return StepTest(
         float(f"{plant.gain:.4g}"),
         float(f"{constant * interval:.3g}"),
         float(f"{delay * interval:.3g}"),
+        interval,
     )
 
 
@@ -96,17 +89,17 @@ def recommended(model: Model, parameters: Parameters) -> dict[str, Recommended]:
 
     def pi(slowed: float) -> PIController:
         return PIController.simc(
-            gain=step.gain, time_constant=step.time_constant, delay=step.delay,
-            closed_loop_time_constant=slowed * step.delay, sampling_interval=interval, **limits,
-        )  # fmt: skip
+            **asdict(step), closed_loop_time_constant=slowed * step.delay, **limits
+        )
 
     def smith(slowed: float) -> SmithPredictor:
         wanted = slowed * max(step.time_constant / 2.0, interval)
         return SmithPredictor(
-            gain=step.gain, time_constant=step.time_constant, delay=step.delay,
-            closed_loop_time_constant=float(f"{wanted:.3g}"), sampling_interval=interval,
-            dead_zone=model.estimates["dead_zone"].value, **limits,
-        )  # fmt: skip
+            **asdict(step),
+            closed_loop_time_constant=float(f"{wanted:.3g}"),
+            dead_zone=model.estimates["dead_zone"].value,
+            **limits,
+        )
 
     stable = [p for p in model.possible if np.max(np.abs(p.poles), initial=0.0) < 1.0]
     # A plant that settles in the log is stable; if most of what is possible is not, it did not.
