@@ -146,6 +146,9 @@ class TestSweep:
             run_sweep(tmp_path / out, *first, "--samples", 650)
         ours, theirs = (pd.read_csv(tmp_path / name / "runs.csv") for name in ("one", "two"))
         pd.testing.assert_frame_equal(ours, theirs)
+        run_sweep(tmp_path / "one", *first, "--design", "wide")
+        wide = pd.read_csv(tmp_path / "one" / "runs.csv")["delay"].unique()
+        assert wide.tolist() == [plant["delay"] for plant in random_design(2, 0, 700, WIDE)]
 
     def test_everything_that_shapes_a_task_is_in_the_key(self):
         common = {
