@@ -7,6 +7,7 @@ from numbers import Integral, Real
 from typing import Any, Final, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 # The largest number that an argument takes. Beyond it, float32 observations and squares lose
 # their meaning.
@@ -18,6 +19,7 @@ MOST_PLANTS: Final = 10_000_000  # of one environment
 MOST_NUMBERS: Final = 1_000_000_000  # that the plants of one environment keep together
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
+_FLOAT64 = np.dtype(np.float64)  # quicker to pass on than the type
 _SHOWN = 80  # characters of a value that an error message shows
 
 Number = float | Sequence[float]  # or a range, [low, high]
@@ -35,12 +37,42 @@ def shortened(value: object) -> str:
         text = repr(value)
     except ValueError:  # Python writes no integers of more than some thousand digits
         return "a number of thousands of digits"
-    if len(text) <= _SHOWN:
-        return text
     size = f" ({len(value)} elements)" if isinstance(value, list | tuple) else ""
     if hasattr(value, "shape"):  # an array or a tensor, which is written in several lines
         text, size = " ".join(text.split()), f" (shape {tuple(value.shape)})"
+    if len(text) <= _SHOWN:
+        return text
     return f"{text[:_SHOWN]}...{size}"
+
+
+def reject_action(action: object) -> NoReturn:
+    """Raise the ValueError that says what the action of one plant must be."""
+    reject("action", action, "one finite number, shape (1,)")
+
+
+def one_action(action: Any) -> float:
+    """Return the action of one plant, finite or not."""
+    try:
+        value = action.item() if hasattr(action, "item") else np.asarray(action).item()
+        return float(value - 0.0)  # text is no number, even where float() reads one
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
+        reject_action(action)
+
+
+def many_actions(actions: Any, num_envs: int) -> NDArray[np.float64]:
+    """Return the actions of many plants, finite or not, in a new array, shape (num_envs,)."""
+    given: NDArray[Any]
+    try:
+        given = np.asarray(actions)
+        if given.dtype == object:
+            given = np.array((given - 0.0).tolist())
+        # Text is no number, even where NumPy reads one.
+        given = given.astype(_FLOAT64, casting="same_kind")
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
+        given = np.empty(0)
+    if given.shape != (num_envs, 1):
+        reject("actions", actions, f"numbers, shape ({num_envs}, 1)")
+    return given.ravel()
 
 
 def plain(value: Any) -> Any:

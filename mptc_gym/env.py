@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym import rendering
-from mptc_gym.checks import shortened
+from mptc_gym.checks import one_action, reject_action
 from mptc_gym.parameters import Parameters, argument_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.ranges import Ranges
@@ -310,7 +310,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         try:
             a = float(action.item() - 0.0)  # text is no number, even where float() reads one
         except (AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
-            a = _scalar(action)
+            a = one_action(action)
         shown = a if -1.0 <= a <= 1.0 else _beyond_the_box(a)
         if not self._ahead:
             self._look_ahead()
@@ -415,18 +415,7 @@ def _limited(value: float, limit: float) -> float:
     return max(-limit, min(limit, value))  # in this order, NaN gives a limit
 
 
-def _scalar(action: Any) -> float:
-    try:
-        return float(np.asarray(action).item() - 0.0)
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
-        raise _bad_action(action) from None
-
-
 def _beyond_the_box(action: float) -> float:
     if not math.isfinite(action):
-        raise _bad_action(action)
+        reject_action(action)
     return _limited(action, 1.0)
-
-
-def _bad_action(action: Any) -> ValueError:
-    return ValueError(f"action must be one finite number, shape (1,), got {shortened(action)}")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mptc_gym import rendering
 from mptc_gym.batch import BatchEnv, Infos, Mask
-from mptc_gym.checks import is_count, reject
+from mptc_gym.checks import is_count, many_actions, reject
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import PlantNumbers, spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
@@ -32,7 +32,6 @@ from mptc_gym.signals import (
 
 Observations = NDArray[np.float32]  # shape (num_envs, observation_size)
 
-_FLOAT64 = np.dtype(np.float64)  # quicker to pass on than the type
 NOISE_BYTES = 1 << 27  # of a block of noise, unless a single sample of all plants takes more
 STEPS_PER_SHIFT = 64  # steps until the window of the observations is moved back
 
@@ -121,6 +120,7 @@ class MiddlePointVectorEnv(BatchEnv):
         self._actions = np.zeros(num_envs)  # the last ones
         # Arrays instead of numbers, as in `PlantBatch`.
         self._zeros = np.zeros(num_envs)
+        self._faint = np.full(num_envs, 1e-150)  # so that no sum of finite actions overflows
         self._everyone, self._nobody = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
         span = parameters.temperature_span
         self._span = np.full(num_envs, -span), np.full(num_envs, span), span * span
@@ -290,22 +290,10 @@ class MiddlePointVectorEnv(BatchEnv):
         return [None if s is None else int(s) for s in seeds]
 
     def _checked_actions(self, actions: Any) -> Values:
-        given: NDArray[Any]
-        try:
-            given = np.asarray(actions)
-            if given.dtype == object:
-                given = np.array((given - 0.0).tolist())
-            # Text is no number, even where NumPy reads one. The array is a new one.
-            given = given.astype(_FLOAT64, casting="same_kind")
-        except (TypeError, ValueError, OverflowError):
-            given = np.empty(0)
-        if given.shape != (self.num_envs, 1):
-            reject("actions", actions, f"numbers, shape ({self.num_envs}, 1)")
-        a = given.ravel()
+        a = many_actions(actions, self.num_envs)
         if self._ended is not None:
             a[self._ended] = 0.0
-        # One call tells that all are finite, unless some are huge.
-        if not a.dot(a) < math.inf and not np.isfinite(a).all():
+        if not math.isfinite(a.dot(self._faint)):  # in one call, whatever their number
             reject("actions", actions, "finite")
         return a
 

@@ -188,7 +188,6 @@ def test_any_numbers_are_actions(library, actions):
     assert_equal(envs.step(actions), twin.step(library.array([[1.0], [0.0]])))
 
 
-@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
 def test_huge_actions_are_taken(library):
     envs = library.make()
     envs.reset(seed=0)

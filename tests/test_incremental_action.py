@@ -175,6 +175,19 @@ def test_numpy_scalars_are_taken():
         wrapped.step(np.ones(wrapped.action_space.shape, np.float32))
 
 
+def test_tensors_are_actions_but_those_with_a_graph_are_refused_for_many():
+    torch = pytest.importorskip("torch", reason="the action is a tensor")
+    env, envs = make(), many.IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2))
+    env.reset(seed=0), envs.reset(seed=0)
+    assert env.step(torch.ones(1, requires_grad=True))[4]["command"] == pytest.approx(4.0)
+    assert envs.step(torch.ones(2, 1))[4]["command"] == pytest.approx([4.0, 4.0])
+    for each in (envs, envs.unwrapped):
+        with pytest.raises(ValueError, match="actions must be numbers"):
+            each.step(torch.ones(2, 1, requires_grad=True))
+    with pytest.raises(ValueError, match="options must be a dict or None"):
+        envs.reset(options=[True, False])
+
+
 def test_many_plants_in_pytorch_are_refused():
     torch_env = pytest.importorskip("mptc_gym.torch_env", reason="it is what is refused")
     with pytest.raises(ValueError, match="in NumPy"):

@@ -17,7 +17,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym.checks import is_number, reject
+from mptc_gym.checks import is_number, one_action, reject, reject_action
 from mptc_gym.parameters import Parameters
 from mptc_gym.plant import action_from_command, float32_action
 
@@ -119,13 +119,9 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         """Move the wanted flow by an action, shape (1,), and return the absolute action."""
         if self._flow is None:
             raise ResetNeeded("call reset before step")
-        try:
-            # Text is no number, even where float() reads one.
-            move = float(np.asarray(action).item() - 0.0)
-        except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
-            move = math.nan
+        move = one_action(action)
         if not math.isfinite(move):
-            reject("action", action, "one finite number, shape (1,)")
+            reject_action(action)
         actuator = self._actuator
         flow = self._flow + actuator.move * max(-1.0, min(1.0, move))
         self._flow = max(actuator.u_min, min(actuator.u_max, flow))

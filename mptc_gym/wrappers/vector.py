@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mptc_gym.checks import reject
+from mptc_gym.checks import many_actions, reject
 from mptc_gym.parameters import Parameters
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import NUMBERS, Actuator, check_arguments
@@ -71,7 +72,7 @@ class IncrementalAction(VectorActionWrapper):
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
         """Reset all environments, or those of `reset_mask`, and their wanted flows to 0."""
         # Looked at first, as Gymnasium's own environments take it out of the options.
-        mask = None if options is None else options.get("reset_mask")
+        mask = options.get("reset_mask") if isinstance(options, Mapping) else None
         observations, infos = self.env.reset(seed=seed, options=options)
         self._restart(np.ones(self.num_envs, np.bool_) if mask is None else mask, infos)
         return observations, infos
@@ -94,15 +95,7 @@ class IncrementalAction(VectorActionWrapper):
 
     def _moved(self, flows: NDArray[np.float64], actions: Any) -> NDArray[np.float64]:
         """Return the wanted flows after these actions."""
-        try:
-            moves = np.array(actions)
-            # Text is no number, even where NumPy reads one.
-            moves = moves.astype(np.float64, casting="same_kind")
-        except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
-            moves = np.empty(0)
-        if moves.shape != (self.num_envs, 1):
-            reject("actions", actions, f"numbers, shape ({self.num_envs}, 1)")
-        moves = moves[:, 0]
+        moves = many_actions(actions, self.num_envs)
         moves[self._ended] = 0.0  # ignored
         if not np.isfinite(moves).all():
             reject("actions", actions, "finite")
