@@ -56,6 +56,7 @@ class PredictiveController:
         self._u_min, self._u_max = numbers.u_min, numbers.u_max
         self._dead_zone = numbers.dead_zone
         self._load = _Load.of(numbers)
+        self._drifts = parameters.drifts
         # The state: y(k), y(k-1), ...; xi(k), xi(k-1), ...; the steps of the load and its walk.
         self._n_y = max(len(parameters.a) - 1, 1)
         self._size = self._n_y + len(parameters.c) - 1 + 2
@@ -74,7 +75,7 @@ class PredictiveController:
         self._covariance = np.zeros((n, self._size, self._size))
         # u(k-1), u(k-2), ..., after a 0 that stands for inputs to come.
         self._inputs = np.zeros((n, 1 + int(self._delay.max()) + len(self._p.b)))
-        self._plan = np.zeros((n, HORIZON))
+        self._plan = np.zeros((HORIZON, n))
         self._models = {0: self._made(0)}  # by age, samples
 
     def act(self, observation: Array) -> NDArray[np.float32]:
@@ -86,19 +87,18 @@ class PredictiveController:
         model = self._model(self._k)
         free = np.take_along_axis(self._predict(), self._reached, axis=1)
         target = np.einsum("ni,nij->nj", setpoint[:, np.newaxis] - free, model.G)
-        start = np.column_stack([self._plan[:, 1:], self._plan[:, -1]])
+        start = np.vstack([self._plan[1:], self._plan[-1:]])
         plan = self._optimise(model.Q, target, start)
-        inside = np.abs(plan[:, 0]) < self._dead_zone
+        inside = np.abs(plan[0]) < self._dead_zone
         if inside.any():
-            edge = np.copysign(self._dead_zone, plan[:, 0]).clip(self._u_min, self._u_max)
+            edge = np.copysign(self._dead_zone, plan[0]).clip(self._u_min, self._u_max)
             plans = [
                 self._optimise(model.Q, target, plan, first)
                 for first in (np.zeros_like(edge), edge)
             ]
-            costs = [_cost(model.Q, target, p) for p in plans]
-            best = np.where((costs[0] <= costs[1])[:, np.newaxis], *plans)
-            plan = np.where(inside[:, np.newaxis], best, plan)
-        applied = plan[:, 0]
+            costs = [_cost(model.Q, target, np.ascontiguousarray(p.T)) for p in plans]
+            plan = np.where(inside, np.where(costs[0] <= costs[1], *plans), plan)
+        applied = plan[0]
         self._plan = plan
         self._inputs[:, 2:] = self._inputs[:, 1:-1].copy()
         self._inputs[:, 1] = applied
@@ -146,15 +146,18 @@ class PredictiveController:
         c, n_y = self._p.c, self._n_y
         past = self._shows.clip(0)
         moved = self._inputs[np.arange(self._num_envs)[:, np.newaxis, np.newaxis], past]
+        ahead = range(self._k + 1, self._k + 1 + moved.shape[1])
+        models = [self._model(k) for k in ahead]
+        moved *= np.stack([model.beta for model in models], axis=1)
         outputs = [self._state[:, i] for i in range(n_y - 1, -1, -1)]
         xi = self._state[:, n_y:-2]
         steps, walk = self._state[:, -2], self._state[:, -1]
-        for i in range(moved.shape[1]):
-            k = self._k + 1 + i
-            model = self._model(k)
+        for i, (k, model, flow) in enumerate(
+            zip(ahead, models, moved.sum(axis=2).T, strict=True)
+        ):
             if k % LOAD_INTERVAL == 0:
                 steps = steps * self._load.stays
-            output = (moved[:, i] * model.beta).sum(axis=1) + model.load * (steps + walk)
+            output = flow + model.load * (steps + walk)
             for j in range(len(self._p.a) - 1):
                 output = output + model.alpha[:, j] * outputs[-1 - j]
             for j in range(i + 1, len(c)):
@@ -164,7 +167,7 @@ class PredictiveController:
 
     def _model(self, k: int) -> _Model:
         """Return the plant's coefficients for the step to sample k."""
-        age = k // DRIFT_INTERVAL * DRIFT_INTERVAL if self._p.drifts else 0
+        age = k // DRIFT_INTERVAL * DRIFT_INTERVAL if self._drifts else 0
         if age not in self._models:
             self._models[age] = self._made(age)
         return self._models[age]
@@ -175,16 +178,21 @@ class PredictiveController:
     def _optimise(
         self, Q: Array, target: Array, start: Array, first: Array | None = None
     ) -> Array:
-        """Minimise u Q u / 2 - target u within the limits, one coordinate after the other."""
+        """Minimise u Q u / 2 - target u within the limits, one coordinate after the other.
+
+        A plan has a row for each command here, shape (HORIZON, runs).
+        """
         plan = start.copy()
         if first is not None:
-            plan[:, 0] = first
+            plan[0] = first
+        rows = np.ascontiguousarray(Q.transpose(1, 2, 0))
+        targets = np.ascontiguousarray(target.T)
         for _ in range(SWEEPS):
             before = plan.copy()
             for i in range(0 if first is None else 1, HORIZON):
-                slope = target[:, i] - (plan * Q[:, i]).sum(axis=1)
-                step = slope / Q[:, i, i]
-                plan[:, i] = (plan[:, i] + step).clip(self._u_min, self._u_max)
+                slope = targets[i] - np.add.reduce(plan * rows[i])
+                best = np.maximum(plan[i] + slope / rows[i, i], self._u_min)
+                np.minimum(best, self._u_max, out=plan[i])
             if np.abs(plan - before).max() < TOLERANCE:
                 break
         return plan
