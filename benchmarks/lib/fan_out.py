@@ -146,6 +146,7 @@ class FanOut:
         ----------
         tasks
             As those of `run`, but what they return need only be such that it can be pickled.
+            Tasks that cannot be pickled themselves run in this process, after the others.
 
         Raises
         ------
@@ -177,7 +178,8 @@ class FanOut:
 
     def _local(self, tasks: Tasks) -> Iterator[Answer]:
         """Run tasks on this machine, those again whose worker is lost."""
-        missing = dict(tasks)
+        missing = {key: task for key, task in tasks.items() if self.jobs == 1 or _travels(task)}
+        stays = tasks.keys() - missing.keys()
         losses: Counter[str] = Counter()
         while missing:
             suspect = next((key for key in missing if losses[key] >= LOSSES), None)
@@ -197,6 +199,8 @@ class FanOut:
                     continue
                 del missing[suspect]
                 yield suspect, None, f"{lost}\nIts worker was lost each time.", True
+        for key in stays:
+            yield *_answer(key, tasks[key], os.getpid()), False
 
     def _answers(self, tasks: Tasks, started: list[str]) -> Iterator[tuple[str, Any, str]]:
         """Run tasks, yield their answers as they come, and note which were handed out."""
@@ -211,13 +215,24 @@ class FanOut:
 
         # With one process joblib would use this one, which no task is to bring down.
         processes = 1 if self.jobs == 1 else max(2, min(self.jobs, len(tasks)))
-        parallel = joblib.Parallel(
-            processes,
-            backend="loky",
-            return_as="generator_unordered",
-            batch_size=1,  # a lost worker takes along no more than it must
-        )
+        with joblib.parallel_config("loky", inner_max_num_threads=1):
+            parallel = joblib.Parallel(
+                processes,
+                return_as="generator_unordered",
+                batch_size=1,  # a lost worker takes along no more than it must
+            )
         yield from parallel(handed_out())
+
+
+def _travels(task: Callable[[], Any]) -> bool:
+    """Whether a task can be sent to another process: a user's controller may not be such."""
+    from joblib.externals.loky.backend.reduction import dumps
+
+    try:
+        dumps(task)
+    except Exception:
+        return False
+    return True
 
 
 def _as_json(task: Callable[[], Any]) -> str:

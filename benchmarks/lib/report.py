@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import base64
 import html
+import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,11 @@ table { border-collapse: collapse; font-size: 0.9rem; }
 th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd; }
 th:first-child, td:first-child { text-align: left; }
 .table { overflow-x: auto; }
+.interval { display: block; color: #777; font-size: 0.75em; white-space: nowrap; }
 img { max-width: 100%; margin-top: 1.5rem; }
 .made { color: #666; font-size: 0.85rem; overflow-wrap: anywhere; }
 """
+_INTERVAL = re.compile(r" (\([^()]* to [^()]*\)|\[[^][]*, [^][]*\])")
 
 
 @dataclass(frozen=True)
@@ -70,13 +73,28 @@ def write_report(folder: Path, title: str, sections: Sequence[Section], made: st
     write_text(folder / "report.html", _html(folder, title, sections, made))
 
 
+def markdown_table(table: pd.DataFrame) -> str:
+    """Return a table of text in Markdown, with names as they are, whatever stands in them."""
+    rows = [
+        [_plain(str(text)).replace("|", r"\|") for text in row]
+        for row in [table.columns, *table.itertuples(index=False)]
+    ]
+    shown = pd.DataFrame(rows[1:], columns=rows[0])
+    return str(shown.to_markdown(index=False, disable_numparse=True))
+
+
+def _plain(text: str) -> str:
+    """Return a text that Markdown does not take for HTML."""
+    return text.replace("&", "&amp;").replace("<", "&lt;")
+
+
 def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
-    parts = [f"# {title}", made]
+    parts = [f"# {_plain(title)}", _plain(made)]
     for section in sections:
-        parts += [f"## {section.title}", *section.text]
+        parts += [f"## {_plain(section.title)}", *map(_plain, section.text)]
         if section.table is not None:
-            parts.append(section.table.to_markdown(index=False, disable_numparse=True))
-        parts += [f"![{section.title}]({picture})" for picture in section.pictures]
+            parts.append(markdown_table(section.table))
+        parts += [f"![{_plain(section.title)}]({picture})" for picture in section.pictures]
     return "\n\n".join([*parts, ""])
 
 
@@ -92,10 +110,23 @@ def _html(folder: Path, title: str, sections: Sequence[Section], made: str) -> s
         parts.append(f"<h2>{html.escape(section.title)}</h2>")
         parts += [f"<p>{html.escape(paragraph)}</p>" for paragraph in section.text]
         if section.table is not None:
-            table = section.table.to_html(index=False, border=0)
-            parts.append(f'<div class="table">{table}</div>')
+            parts.append(f'<div class="table">{_html_table(section.table)}</div>')
         for picture in section.pictures:
             data = base64.b64encode((folder / picture).read_bytes()).decode()
             alternative = html.escape(f"{section.title}: {picture}")
             parts.append(f'<img alt="{alternative}" src="data:image/png;base64,{data}">')
     return "\n".join([*parts, "</body></html>", ""])
+
+
+def _html_table(table: pd.DataFrame) -> str:
+    """Return a table in HTML, with intervals small and below their numbers."""
+
+    def row(tag: str, texts: Iterable[object]) -> str:
+        cells = [
+            _INTERVAL.sub(r'<span class="interval">\1</span>', html.escape(str(text)))
+            for text in texts
+        ]
+        return f"<tr>{''.join(f'<{tag}>{cell}</{tag}>' for cell in cells)}</tr>"
+
+    body = "".join(row("td", each) for each in table.itertuples(index=False))
+    return f"<table><thead>{row('th', table.columns)}</thead><tbody>{body}</tbody></table>"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -34,10 +35,42 @@ class Estimate:
     high: float
     runs: int
 
+    def __format__(self, form: str) -> str:
+        """Return `value (low to high)`; the value alone if nothing was random.
+
+        An interval that reaches to infinity is that of a single run.
+        """
+        value, low, high = (format(end, form) for end in (self.value, self.low, self.high))
+        if math.isinf(self.high):
+            return f"{value} (one run)"
+        return value if low == high else f"{value} ({low} to {high})"
+
 
 def exact(value: float) -> Estimate:
     """Return the estimate of a value that is not random: one run, an interval of no width."""
     return Estimate(float(value), float(value), float(value), 1)
+
+
+def student(values: ArrayLike) -> Estimate:
+    """Estimate a mean over runs, with Student's interval.
+
+    Parameters
+    ----------
+    values
+        Shape (runs,).
+
+    Returns
+    -------
+    Estimate
+        Its interval has no width where there is one run, or all are the same.
+    """
+    numbers = np.asarray(values, dtype=np.float64)
+    mean, runs = float(numbers.mean()), len(numbers)
+    if runs < 2 or np.ptp(numbers) == 0.0:
+        return Estimate(mean, mean, mean, runs)
+    error = float(numbers.std(ddof=1)) / math.sqrt(runs)
+    half = float(stats.t.ppf(ENDS[1], runs - 1)) * error
+    return Estimate(mean, mean - half, mean + half, runs)
 
 
 def quantile(values: ArrayLike, probability: float) -> Estimate:

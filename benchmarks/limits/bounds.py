@@ -33,10 +33,9 @@ from typing import Any
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 from benchmarks.lib.fingerprint import fingerprint
-from benchmarks.lib.statistics import CONFIDENCE
+from benchmarks.lib.statistics import Estimate, student
 from benchmarks.lib.storage import ROOT, seal, unseal, write_text
 from benchmarks.limits.news import News
 from benchmarks.limits.programme import Plan, plan
@@ -60,13 +59,13 @@ PRICES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # of travel, for the frontier
 
 
 @dataclass(frozen=True)
-class LeastPossible:
-    """The least possible mean |e| of a case, with a 95 % interval over drawn episodes.
+class LeastPossible(Estimate):
+    """The least possible mean |e| of a case, degC, with a 95 % interval over drawn episodes.
 
     Attributes
     ----------
-    value, low, high
-        degC. The ends are `value` where nothing is drawn.
+    value, low, high, runs
+        As those of `Estimate`. The ends are `value` where nothing is drawn.
     kind
         One of `KINDS`.
     idle, idle_low, idle_high
@@ -78,9 +77,6 @@ class LeastPossible:
         Of the first episode.
     """
 
-    value: float
-    low: float
-    high: float
     kind: str
     idle: float
     idle_low: float
@@ -177,8 +173,16 @@ def least_possible(
     cases, idle = _draw(parameters, samples, episodes, seed)
     # The same on every machine, as solvers differ in later digits.
     values = [round(case.least(kind) / samples, DIGITS) for case in cases]
-    value, low, high = _interval(values)
-    found = LeastPossible(value, low, high, kind, *_interval(idle), tuple(values), seed)
+    least, left_alone = student(values), student(idle)
+    found = LeastPossible(
+        **vars(least),
+        kind=kind,
+        idle=left_alone.value,
+        idle_low=left_alone.low,
+        idle_high=left_alone.high,
+        episodes=tuple(values),
+        seed=seed,
+    )
     if file is not None:
         write_text(file, seal(asdict(found)))
     return found
@@ -314,17 +318,6 @@ def _case(parameters: Parameters, numbers: PlantNumbers[float], setpoint: Array)
     beyond = int(numbers.delay) + len(parameters.b) + TAIL
     longer = course(parameters, numbers, len(setpoint) + beyond)
     return _Case(parameters, longer, unknown(longer), setpoint)
-
-
-def _interval(values: ArrayLike) -> tuple[float, float, float]:
-    """Return the mean and its interval, that of Student."""
-    numbers = np.asarray(values, dtype=np.float64)
-    mean = float(numbers.mean())
-    if len(numbers) < 2 or np.ptp(numbers) == 0.0:
-        return mean, mean, mean
-    error = numbers.std(ddof=1) / np.sqrt(len(numbers))
-    half = float(stats.t.ppf((1.0 + CONFIDENCE) / 2.0, len(numbers) - 1) * error)
-    return mean, mean - half, mean + half
 
 
 def _key(parameters: Parameters, samples: int, kind: str, episodes: int, seed: int) -> str:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from rich.console import Console
-from tqdm import tqdm
 
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import UsageError, blame, out_folder
-from benchmarks.lib.statistics import bootstrap
+from benchmarks.lib.statistics import Estimate, bootstrap
 from benchmarks.lib.tables import on_screen
 from benchmarks.limits import packaged
-from benchmarks.limits.bounds import CACHE, LeastPossible, least_possible
+from benchmarks.limits.bounds import CACHE, least_possible
 from benchmarks.limits.options import Options
 from benchmarks.limits.verify import errors, verify
 from benchmarks.loop.linear import check_linear
@@ -24,6 +24,7 @@ from benchmarks.loop.scenarios import SCENARIOS, scenarios_of
 from mptc_gym import PRESETS, Parameters
 
 SAMPLES = 1200  # of an episode of a preset
+KINDS = {"preview": "with preview", "news": "without preview", "reference": "reference"}
 
 NOTE = (
     "With preview: no controller does better on average, even one that knows the set point "
@@ -53,64 +54,60 @@ def execute(options: Options, console: Console) -> str:
             console.print(f"Beaten beyond the interval: {'; '.join(beaten)}.")
             raise SystemExit(1)
         return "No controller beats the bound that applies to it, beyond its interval."
+    cases = PRESETS
     if plant.arguments:
         with blame(plant.name):
             check_linear(Parameters(**plant.arguments))
-        cases = scenarios_of(plant.name, plant.arguments)
-        console.print(f"{plant.name}, mean |e| in °C:")
-        console.print(on_screen(bounds({n: c.arguments for n, c in cases.items()}, options)))
-        return NOTE
-    console.print("The scenarios of `python -m benchmarks.compare`, °C:")
-    console.print(on_screen(scenarios(cache)))
-    console.print("The presets, mean |e| in °C:")
-    console.print(on_screen(bounds(PRESETS, options)))
+        scenarios = scenarios_of(plant.name, plant.arguments)
+        cases = {name: scenario.arguments for name, scenario in scenarios.items()}
+    # Those whose plants are drawn take the longest, and begin first.
+    first = sorted(cases, key=lambda name: not Parameters(**cases[name]).ranges)
+    tasks: dict[str, Callable[[], Any]] = {
+        name: partial(
+            bounds, name, cases[name], folder=cache, episodes=options.episodes, mpc=options.mpc
+        )
+        for name in first
+    }
+    compared = {} if plant.arguments else {f"scenario {name}": name for name in SCENARIOS}
+    tasks |= {key: partial(bounds_of_scenario, name, cache) for key, name in compared.items()}
+    rows = options.fan_out.open().run(tasks, title="bounds")
+    if compared:
+        console.print("The scenarios of `python -m benchmarks.compare`, °C:")
+        console.print(on_screen(pd.DataFrame([rows[key] for key in compared])))
+    console.print(f"{plant.name if plant.arguments else 'The presets'}, mean |e| in °C:")
+    console.print(on_screen(pd.DataFrame([rows[name] for name in cases])))
     return NOTE
 
 
-def scenarios(cache: Path) -> pd.DataFrame:
-    """Return the table of the scenarios."""
-    rows = []
-    for name, scenario in tqdm(SCENARIOS.items(), unit="scenario"):
-        case = {"samples": scenario.samples, "folder": cache, **scenario.arguments}
-        row = {"scenario": name}
-        for kind, title in (("preview", "with preview"), ("reference", "reference")):
-            row[title] = f"{least_possible(kind=kind, **case).value:.4f}"
-        rows.append(row)
-    return pd.DataFrame(rows)
+def bounds_of_scenario(name: str, cache: Path) -> dict[str, str]:
+    """Return a row of the table of scenarios."""
+    scenario = SCENARIOS[name]
+    row = {"scenario": name}
+    for kind in ("preview", "reference"):
+        least = least_possible(
+            kind=kind, samples=scenario.samples, folder=cache, **scenario.arguments
+        )
+        row[KINDS[kind]] = f"{least.value:.4f}"
+    return row
 
 
-def bounds(cases: Mapping[str, Mapping[str, Any]], options: Options) -> pd.DataFrame:
-    """Return the table of plants by name, with MPC's errors if `--mpc` asks for them."""
-    rows = []
-    for name, arguments in tqdm(cases.items(), unit="plant"):
-        case: dict[str, Any] = {"samples": SAMPLES, "episodes": options.episodes}
-        case["folder"] = options.cache or CACHE
-        found = {"preview": least_possible(kind="preview", **case, **arguments)}
-        for kind in ("news", "reference"):
-            # "news" is for random set points, "reference" for those that are held long enough.
-            with suppress(ValueError):
-                found[kind] = least_possible(kind=kind, **case, **arguments)
-        idle = found["preview"]
-        row = {
-            "plant": name,
-            "valve left alone": _cell(idle.idle, idle.idle_low, idle.idle_high),
-            "with preview": _shown(found["preview"]),
-            "without preview": _shown(found["news"]) if "news" in found else "",
-            "reference": _shown(found["reference"]) if "reference" in found else "",
-        }
-        if options.mpc:
-            (mpc,) = ROSTER["mpc"].members()
-            error = bootstrap(errors(mpc, options.mpc, SAMPLES, **arguments), 0)
-            row["MPC"] = _cell(error.value, error.low, error.high)
-        rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def _shown(least: LeastPossible) -> str:
-    return _cell(least.value, least.low, least.high)
-
-
-def _cell(value: float, low: float, high: float) -> str:
-    if f"{low:.3f}" == f"{high:.3f}":
-        return f"{value:.3f}"
-    return f"{value:.3f} ({low:.3f} to {high:.3f})"
+def bounds(
+    name: str, arguments: Mapping[str, Any], *, folder: Path, episodes: int, mpc: int | None
+) -> dict[str, str]:
+    """Return a row of the table of plants, with the error of so many runs of MPC, if any."""
+    found = {}
+    for kind in KINDS:
+        # "news" is for random set points, "reference" for those that are held long enough.
+        with suppress(ValueError):
+            found[kind] = least_possible(
+                kind=kind, samples=SAMPLES, episodes=episodes, folder=folder, **arguments
+            )
+    of = found["preview"]
+    idle = Estimate(of.idle, of.idle_low, of.idle_high, of.runs)
+    row = {"plant": name, "valve left alone": f"{idle:.3f}"}
+    for kind, title in KINDS.items():
+        row[title] = f"{found[kind]:.3f}" if kind in found else ""
+    if mpc:
+        (predictive,) = ROSTER["mpc"].members()
+        row["MPC"] = f"{bootstrap(errors(predictive, mpc, SAMPLES, **arguments), 0):.3f}"
+    return row

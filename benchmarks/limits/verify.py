@@ -16,6 +16,7 @@ from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import fingerprint
+from benchmarks.lib.statistics import student
 from benchmarks.limits.bounds import LeastPossible, least_possible
 from benchmarks.loop.linear import nominal
 from benchmarks.loop.metrics import mean_error
@@ -104,8 +105,7 @@ def beats(found: Array, least: LeastPossible) -> bool:
     """
     paired = len(least.episodes) == len(found)
     difference = found - (np.array(least.episodes) if paired else least.value)
-    error = difference.std(ddof=1) / np.sqrt(len(found)) if len(found) > 1 else 0.0
-    return bool(difference.mean() + 1.96 * error < -1e-6 * least.value)
+    return student(difference).high < -1e-6 * least.value
 
 
 def verify(
