@@ -4,23 +4,34 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Mapping, Sequence
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
+from benchmarks.compare import report
 from benchmarks.compare.comparison import Comparison
 from benchmarks.compare.estimates import scale_of
 from benchmarks.compare.options import COMPARED, RUNS, Options
+from benchmarks.compare.record import Record
 from benchmarks.controllers.options import chosen
-from benchmarks.controllers.records import Factory
+from benchmarks.controllers.records import Factory, provenances
 from benchmarks.lib import command_line
+from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.options import flat
+from benchmarks.lib.report import Section
+from benchmarks.lib.storage import commit, versions
 from benchmarks.lib.tables import on_screen
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
+from mptc_gym.evaluation import SEED
 
 OUT = Path("results/compare")
 LONGEST = 60  # characters of a folder's name
+PAUSE = 2.0  # s between two times that the runs so far are written
 
 
 def execute(options: Options, console: Console) -> str:
@@ -47,21 +58,51 @@ def execute(options: Options, console: Console) -> str:
         [f"{options.runs}-runs"] if options.runs != RUNS else [],
     )
     out = command_line.out_folder(out)
-    recorded = {**flat(options), "agents": list(controllers)}
-    comparison = Comparison([scenarios[name] for name in names], options.runs, out, recorded)
-    try:
-        for name, entry in controllers.items():
-            comparison.run(entry, members[name])
-    except BaseException:  # Ctrl-C, too
-        comparison.finish(complete=False)
-        raise
-    report = comparison.finish(complete=True)
+    comparison = Comparison({name: scenarios[name] for name in names}, members, options.runs)
+    record = Record(out, _origin(comparison, flat(options)))
 
-    for section in report[:2]:
-        console.print(section.title, *section.text, sep="\n")
+    def write(fan_out: FanOut, *, complete: bool) -> list[Section]:
+        return report.write(comparison, controllers, record, fan_out, complete=complete)
+
+    try:
+        comparison.run(training.fan_out, _now_and_then(comparison, record))
+    except BaseException:  # Ctrl-C, too
+        write(FanOut(jobs=1), complete=False)
+        raise
+    for section in write(FanOut(options.controllers.fan_out.jobs), complete=True)[:3]:
+        console.print(*filter(None, [section.title, *section.text]), sep="\n")
         if section.table is not None:
             console.print(on_screen(section.table))
     return f"The report, tables, data and plots are in {out}/"
+
+
+def _origin(comparison: Comparison, options: dict[str, Any]) -> dict[str, Any]:
+    """Return what the results come from."""
+    return {
+        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "options": {**options, "agents": list(comparison.controllers)},
+        "seeds": list(range(SEED, SEED + comparison.count)),
+        "scenarios": {
+            name: {"samples": each.samples, "arguments": each.arguments}
+            for name, each in comparison.scenarios.items()
+        },
+        "versions": versions(),
+        "commit": commit(),
+        "policies": provenances(comparison.controllers),
+    }
+
+
+def _now_and_then(comparison: Comparison, record: Record) -> Callable[[], None]:
+    """Return what writes the runs, but not more often than every few seconds."""
+    written = -math.inf
+
+    def write() -> None:
+        nonlocal written
+        if time.monotonic() - written >= PAUSE:
+            record.write_runs(comparison.runs, complete=False)
+            written = time.monotonic()
+
+    return write
 
 
 def _try_out(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -9,16 +10,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from scipy import stats
 
+from benchmarks.controllers.roster import label
 from benchmarks.lib.statistics import (
-    CONFIDENCE,
     Estimate,
     bootstrap,
     improvement,
     interquartile_mean,
     stratified,
+    student,
 )
 from benchmarks.lib.tables import groups
 from benchmarks.limits import LeastPossible, frontier, is_random, least_possible
@@ -121,7 +121,9 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) ->
                 "preview": scale.preview.value,
                 **_ends("mean", mean),
             }
-            row["student_high"] = _student_high(values.mean(axis=0), drawn=scale.drawn)
+            by_run = values.mean(axis=0)
+            one = scale.drawn and len(by_run) == 1
+            row["student_high"] = math.inf if one else student(by_run).high
             iqm = bootstrap(values, BOOTSTRAP, interquartile_mean)
             row |= _ends("interquartile_mean", iqm)
             row |= {f"ratio{end}": row[f"mean{end}"] / limit for end in ("", "_low", "_high")}
@@ -161,15 +163,56 @@ def _ends(name: str, found: Estimate) -> dict[str, float]:
     return {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
 
 
-def _student_high(values: NDArray[np.float64], *, drawn: bool) -> float:
-    """Return the upper end of Student's 95 % interval of the mean; infinite for one run."""
-    if not drawn:
-        return float(values.mean())
-    if len(values) < 2:
-        return math.inf
-    error = float(values.std(ddof=1)) / math.sqrt(len(values))
-    quantile = float(stats.t.ppf((1.0 + CONFIDENCE) / 2.0, len(values) - 1))
-    return float(values.mean()) + quantile * error
+def standing(runs: pd.DataFrame, scales: Mapping[str, Scale], scored: pd.DataFrame) -> str:
+    """Say in two sentences who is best at what valve travel, and who cannot be told apart.
+
+    Parameters
+    ----------
+    runs
+        One row a run, with `scenario`, `agent`, `policy`, `seed`, `mae` and `total_variation`.
+    scales
+        The least possible errors of each scenario.
+    scored
+        As `scores` returns them.
+    """
+    ranked = scored.sort_values("score", ascending=False, kind="stable")
+    agents = list(ranked["agent"])
+    travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
+
+    def at(agent: str) -> str:
+        (score,) = ranked.loc[ranked["agent"] == agent, "score"]
+        return f"{score:.3f} at {travels[agent].mean():,.0f} t/h"
+
+    best = f"{label(agents[0])} is best, with a score of {at(agents[0])} of valve travel a run"
+    if len(agents) == 1:
+        return f"{label(agents[0])} has a score of {at(agents[0])} of valve travel a run."
+    best += f"; {label(agents[1])} follows with {at(agents[1])}."
+    if any(scale.drawn for scale in scales.values()) and runs["seed"].nunique() == 1:
+        return f"{best} One run of each does not tell them apart."
+    near = [pair for pair in itertools.pairwise(agents) if _alike(runs, scales, *pair)]
+    if not near:
+        return f"{best} The runs tell all of them apart, at 95 %."
+    pairs = "; ".join(f"{label(one)} and {label(other)}" for one, other in near)
+    return f"{best} Not to be told apart, at 95 %: {pairs}."
+
+
+def _alike(runs: pd.DataFrame, scales: Mapping[str, Scale], one: str, other: str) -> bool:
+    """Whether the mean scores of two controllers do not differ beyond their interval."""
+    tables = []
+    for scenario, cases in groups(runs, "scenario"):
+        errors = [
+            cases[cases["agent"] == agent]
+            .pivot_table(index="policy", columns="seed", values="mae")
+            .to_numpy()
+            for agent in (one, other)
+        ]
+        if not all(each.size for each in errors):
+            continue  # after an interruption
+        # Policies are drawn of the one that has more of them.
+        many, few = sorted(map(scales[scenario].least.score, errors), key=len, reverse=True)
+        tables.append(many - few.mean(axis=0))
+    difference = stratified(tables, BOOTSTRAP, np.mean)
+    return difference.low <= 0.0 <= difference.high
 
 
 def beaten(estimates: pd.DataFrame, bound: str = "limit") -> pd.DataFrame:

@@ -84,12 +84,15 @@ def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
         shades = colours(list(estimates["agent"].unique()))
         for axes, (_, rows) in zip(panels, groups(estimates, "scenario"), strict=True):
             for place, (_, row) in enumerate(rows.iterrows()):
-                ends = [[row["mean"] - row["mean_low"]], [row["mean_high"] - row["mean"]]]
+                low, high = row["mean"] - row["mean_low"], row["mean_high"] - row["mean"]
+                ends = [[low], [high]] if math.isfinite(high) else None
                 colour = shades[row["agent"]]
                 axes.errorbar(row["mean"], place, xerr=ends, fmt="o", capsize=3, color=colour)
             axes.set_yticks(range(len(rows)), [label(agent) for agent in rows["agent"]])
             axes.invert_yaxis()
-            limit, worst = rows["limit"].iloc[0], rows["mean_high"].max()
+            highest = rows[["mean", "mean_high"]].to_numpy()
+            # The end of an interval may be infinite.
+            limit, worst = rows["limit"].iloc[0], highest[np.isfinite(highest)].max()
             # A little to the left of it, so that a point on the limit is whole.
             axes.axvline(limit, color="0.4", linewidth=1)
             axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
@@ -170,6 +173,8 @@ def plot_travel(
                     label=label(agent),
                 )  # fmt: skip
             limit, travels = limits[name], moving["total_variation"]
+            if moving.empty:
+                continue
             across = np.geomspace(0.7 * travels.min(), 1.4 * travels.max(), 200)
             if frontiers[name]:
                 travel, error = np.transpose(frontiers[name][::-1])

@@ -10,6 +10,7 @@ import pandas as pd
 
 from benchmarks.compare.estimates import Scale
 from benchmarks.controllers.roster import label
+from benchmarks.lib.statistics import Estimate
 from benchmarks.lib.tables import PERCENTILES, percentiles
 from benchmarks.loop.metrics import METRICS
 from benchmarks.loop.rollout import Trajectory
@@ -79,7 +80,8 @@ def mae_table(summary: pd.DataFrame) -> pd.DataFrame:
 
 def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
     """Return the mean errors as multiples of the least possible error, and what that is."""
-    table = _by_agent(estimates, estimates.apply(_format_ends, axis=1, name="ratio"))
+    shown = estimates.apply(lambda row: f"{_ends(row, 'ratio'):.2f}", axis=1)
+    table = _by_agent(estimates, shown)
     rows = [
         {"agent": "least possible (°C)"}
         | {
@@ -99,7 +101,7 @@ def score_table(scores: pd.DataFrame) -> pd.DataFrame:
     ]
     cells = {
         "agent": scores["agent"].map(label),
-        "score": scores.apply(_format_ends, axis=1, name="score"),
+        "score": scores.apply(lambda row: f"{_ends(row, 'score'):.3f}", axis=1),
     }
     return pd.DataFrame(cells | {name: scores[name].map("{:.2f}".format) for name in scenarios})
 
@@ -110,16 +112,15 @@ def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
 
     def cell(row: pd.Series) -> str:
         better = f"{100 * row['improvement']:.0f} %"
-        return f"{_format_ends(row, 'difference', '+.3f')}; {better}"
+        return f"{_ends(row, 'difference'):+.3f}; {better}"
 
     return _by_agent(others, others.apply(cell, axis=1))
 
 
-def _format_ends(row: pd.Series, name: str, form: str = ".2f") -> str:
-    value, low, high = (format(row[n], form) for n in (name, f"{name}_low", f"{name}_high"))
-    if math.isinf(row[f"{name}_high"]):
-        return f"{value} (one run)"
-    return value if low == high else f"{value} ({low} to {high})"
+def _ends(row: pd.Series, name: str) -> Estimate:
+    """Return an estimate that stands in a row with its interval."""
+    value, low, high = (float(row[n]) for n in (name, f"{name}_low", f"{name}_high"))
+    return Estimate(value, low, high, 1)
 
 
 def _by_agent(rows: pd.DataFrame, cells: pd.Series) -> pd.DataFrame:

@@ -37,7 +37,7 @@ class Section:
     Attributes
     ----------
     title
-        Its heading.
+        Its heading; "" for none.
     text
         What there is to say, in paragraphs.
     table
@@ -77,7 +77,7 @@ def markdown_table(table: pd.DataFrame) -> str:
     """Return a table of text in Markdown, with names as they are, whatever stands in them."""
     rows = [
         [_plain(str(text)).replace("|", r"\|") for text in row]
-        for row in [table.columns, *table.itertuples(index=False)]
+        for row in (tuple(table.columns), *table.itertuples(index=False, name=None))
     ]
     shown = pd.DataFrame(rows[1:], columns=rows[0])
     return str(shown.to_markdown(index=False, disable_numparse=True))
@@ -89,13 +89,14 @@ def _plain(text: str) -> str:
 
 
 def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
-    parts = [f"# {_plain(title)}", _plain(made)]
+    parts = [f"# {_plain(title)}"]
     for section in sections:
-        parts += [f"## {_plain(section.title)}", *map(_plain, section.text)]
+        parts += [f"## {_plain(section.title)}"] * bool(section.title)
+        parts += map(_plain, section.text)
         if section.table is not None:
             parts.append(markdown_table(section.table))
         parts += [f"![{_plain(section.title)}]({picture})" for picture in section.pictures]
-    return "\n\n".join([*parts, ""])
+    return "\n\n".join([*parts, _plain(made), ""])
 
 
 def _html(folder: Path, title: str, sections: Sequence[Section], made: str) -> str:
@@ -104,10 +105,9 @@ def _html(folder: Path, title: str, sections: Sequence[Section], made: str) -> s
         f'<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<style>{_STYLE}</style></head><body><h1>{html.escape(title)}</h1>",
-        f'<p class="made">{html.escape(made)}</p>',
     ]
     for section in sections:
-        parts.append(f"<h2>{html.escape(section.title)}</h2>")
+        parts += [f"<h2>{html.escape(section.title)}</h2>"] * bool(section.title)
         parts += [f"<p>{html.escape(paragraph)}</p>" for paragraph in section.text]
         if section.table is not None:
             parts.append(f'<div class="table">{_html_table(section.table)}</div>')
@@ -115,6 +115,7 @@ def _html(folder: Path, title: str, sections: Sequence[Section], made: str) -> s
             data = base64.b64encode((folder / picture).read_bytes()).decode()
             alternative = html.escape(f"{section.title}: {picture}")
             parts.append(f'<img alt="{alternative}" src="data:image/png;base64,{data}">')
+    parts.append(f'<p class="made">{html.escape(made)}</p>')
     return "\n".join([*parts, "</body></html>", ""])
 
 

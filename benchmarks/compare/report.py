@@ -1,0 +1,250 @@
+"""The report of a comparison: its tables and pictures, those of most interest first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import cast
+
+import pandas as pd
+
+from benchmarks.compare import plots, tables
+from benchmarks.compare.comparison import TWICE, Comparison
+from benchmarks.compare.estimates import estimate, scale_of, scores, standing, verdict
+from benchmarks.compare.record import Record
+from benchmarks.controllers.records import Factory, RosterEntry
+from benchmarks.controllers.roster import label
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.report import Section, provenance_line, write_report
+from benchmarks.lib.storage import NotWrittenError
+
+BOUNDS_TEXT = (
+    "The least possible error marked * supposes that each change of the set point finds the "
+    "plant settled and is not foreseen; of random set points it supposes that their law is "
+    "known. With preview of the whole set point, no controller that reads the transmitter, and "
+    "not the true output, does better than the second row says."
+)
+SCORE_TEXT = (
+    "The first column is the interquartile mean over all scenarios and runs, with its 95 % "
+    "interval; the others are means. Below 0, doing nothing is better."
+)
+LIMITS_CAPTION = (
+    "A point is the mean over all runs, a bar its 95 % interval. Each axis begins at the least "
+    "possible error, the vertical line."
+)
+TRAVEL_CAPTION = (
+    "A point is the median run of a controller: its error against the distance that it moves "
+    "the valve. Down and left is better. The line is the least possible error for a given "
+    "travel, the dashed one for any travel."
+)
+RUNS_CAPTION = (
+    "A point is one run. It shows what the NN makes of unlucky initial weights, and PPO of an "
+    "unlucky training."
+)
+RESPONSES_CAPTION = (
+    "A line is the median over all runs at each sample, a band the 10th to 90th percentile. "
+    "The grey band is the dead zone."
+)
+COSTS_TEXT = (
+    "First and second run: mean error on the square wave, the second time with what was learnt "
+    "the first time. Most controllers learn nothing in a run, and do the same twice. Training: "
+    "of one policy, the median. Runs: all scenarios, including what is measured."
+)
+METRICS_TEXT = (
+    "Overshoot and settling time are left out where there is noise: it crosses every band."
+)
+
+
+def write(
+    comparison: Comparison,
+    entries: Mapping[str, RosterEntry],
+    record: Record,
+    fan_out: FanOut,
+    *,
+    complete: bool,
+) -> list[Section]:
+    """Write the report of all that has finished, with its tables and pictures.
+
+    Parameters
+    ----------
+    comparison
+        What has been run.
+    entries
+        Its controllers.
+    record
+        Where to write.
+    fan_out
+        Where estimates are made and pictures drawn.
+    complete
+        Whether all has finished.
+
+    Returns
+    -------
+    list of Section
+        What stands in the report; nothing if nothing has finished. A picture that cannot be
+        drawn is a sentence in it.
+    """
+    if not comparison.cases:
+        return []
+    record.write_runs(comparison.runs, complete=False)
+    runs, names = comparison.runs, comparison.names
+    for name in names:  # after an interruption not all may be known
+        if name not in comparison.scales:
+            scale = scale_of(comparison.scenarios[name], comparison.count)
+            comparison.scales[name] = scale
+    scales = {name: comparison.scales[name] for name in names}
+    summary = tables.summarise(runs)
+    curves = _curves(comparison.controllers)
+    responses = {name: comparison.responses(name) for name in names}
+    shown = [agent for agent in comparison.agents if entries[agent].drawn] or comparison.agents
+    tasks: dict[str, Callable[[], object]] = {}
+    for name in names:
+        rows, path = responses[name], record.path(f"{name}.png")
+        drawn, scenario = rows[rows["agent"].isin(shown)], comparison.scenarios[name]
+        tasks[path.name] = partial(_draw, plots.plot_responses, drawn, scenario, path)
+        tasks[f"estimates, {name}"] = partial(
+            estimate, runs[runs["scenario"] == name], scales, comparison.agents[0]
+        )
+    for agent in comparison.agents:
+        tasks[f"score, {agent}"] = partial(scores, runs[runs["agent"] == agent], scales)
+    limits = {name: scale.least.value for name, scale in scales.items()}
+    frontiers = {name: comparison.frontiers.get(name, []) for name in names}
+    pictures = {
+        "travel.png": partial(_draw, plots.plot_travel, summary, limits, frontiers),
+        "runs.png": partial(_draw, plots.plot_runs, runs),
+    }
+    if not curves.empty:
+        record.write_table("learning.csv", curves)
+        pictures["learning.png"] = partial(_draw, plots.plot_learning, curves)
+    tasks |= {name: partial(draw, record.path(name)) for name, draw in pictures.items()}
+    found = dict(fan_out.stream(tasks))
+    estimates = _together(found[f"estimates, {name}"] for name in names)
+    scored = _together(found[f"score, {agent}"] for agent in comparison.agents)
+    found["limits.png"] = _draw(plots.plot_limits, estimates, record.path("limits.png"))
+    record.write_table("summary.csv", summary)
+    record.write_table("estimates.csv", estimates)
+    for name in names:
+        record.write_table(f"{name}.csv", responses[name])
+    sections = [
+        _with_pictures(section, found)
+        for section in _sections(comparison, entries, summary, estimates, scored)
+    ]
+    for page in ("report.md", "report.html"):
+        record.path(page)
+    title = "Comparison of controllers"
+    write_report(record.folder, title, sections, provenance_line("compare", record.origin))
+    record.write_runs(runs, complete=complete)
+    return sections
+
+
+def _together(parts: Iterable[object]) -> pd.DataFrame:
+    return pd.concat([cast("pd.DataFrame", part) for part in parts], ignore_index=True)
+
+
+def _draw(plot: Callable[..., None], *arguments: object) -> str:
+    """Draw a picture, and return what went wrong: it costs no report."""
+    try:
+        plot(*arguments)
+    except NotWrittenError:
+        raise
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+def _with_pictures(section: Section, faults: Mapping[str, object]) -> Section:
+    """Return a section whose pictures that are not there are sentences."""
+    missing = [name for name in section.pictures if faults[name]]
+    sentences = [f"{name} could not be drawn ({faults[name]})." for name in missing]
+    pictures = [name for name in section.pictures if name not in missing]
+    return replace(section, text=[*section.text, *sentences], pictures=pictures)
+
+
+def _curves(controllers: Mapping[str, Sequence[Factory]]) -> pd.DataFrame:
+    """Return the learning curves of all members that have one."""
+    curves = [
+        pd.DataFrame(member.curve).assign(agent=name, policy=number)
+        for name, members in controllers.items()
+        for number, member in enumerate(members)
+        if member.curve
+    ]
+    return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
+
+
+def _sections(
+    comparison: Comparison,
+    entries: Mapping[str, RosterEntry],
+    summary: pd.DataFrame,
+    estimates: pd.DataFrame,
+    scored: pd.DataFrame,
+) -> list[Section]:
+    """Return the report, the parts of most interest first."""
+    names, reference = comparison.names, comparison.agents[0]
+    scales = {name: comparison.scales[name] for name in names}
+    titles = [(name, comparison.scenarios[name].title) for name in names]
+    sections = [
+        Section("", [standing(comparison.runs, scales, scored)]),
+        Section(
+            "Score: 0 for leaving the valve alone, 1 for the least possible error",
+            [SCORE_TEXT, f"The picture: {titles[0][1]}. {RESPONSES_CAPTION}"],
+            tables.score_table(scored),
+            [f"{names[0]}.png"],
+        ),
+        Section(
+            "Mean absolute error as a multiple of the least possible error, with its 95 % "
+            "interval",
+            [verdict(estimates), BOUNDS_TEXT, LIMITS_CAPTION],
+            tables.ratio_table(estimates, scales),
+            ["limits.png"],
+        ),
+        Section("Error against valve travel", [TRAVEL_CAPTION], pictures=["travel.png"]),
+        Section("What each controller costs", [COSTS_TEXT], _costs(comparison, entries)),
+        Section("Every run", [RUNS_CAPTION], pictures=["runs.png"]),
+        Section(
+            "Mean absolute error (°C): median (10th to 90th percentile) of "
+            f"{comparison.count} runs, the same noise for all",
+            table=tables.mae_table(summary),
+        ),
+        Section(
+            "Other measures: median (10th to 90th percentile)",
+            [METRICS_TEXT],
+            tables.metrics_table(summary, comparison.scenarios),
+        ),
+        Section(
+            "Scenarios",
+            table=pd.DataFrame(titles, columns=["scenario", "what it is"]),
+            pictures=[f"{name}.png" for name in names[1:]],
+        ),
+    ]
+    if any(member.curve for each in comparison.controllers.values() for member in each):
+        sections.append(Section("Training", pictures=["learning.png"]))
+    if len(comparison.agents) > 1:
+        title = f"Difference to {label(reference)} (°C), 95 % interval"
+        text = ["And the share of runs in which the error is smaller, in the same noise."]
+        sections.insert(4, Section(title, text, tables.paired_table(estimates)))
+    return sections
+
+
+def _costs(comparison: Comparison, entries: Mapping[str, RosterEntry]) -> pd.DataFrame:
+    rows = []
+    for name in comparison.agents:
+        members = comparison.controllers[name]
+        cost = members[0].cost or entries[name].cost
+        cases = [case for (_, agent), case in comparison.cases.items() if agent == name]
+        curves = [member.curve for member in members if member.curve]
+        training = pd.Series([curve[-1]["seconds"] for curve in curves]).median()
+        twice = comparison.cases.get((TWICE, name))
+        rows.append(
+            {
+                "agent": entries[name].label,
+                "prior knowledge": cost.prior_knowledge,
+                "parameters": cost.parameters,
+                "samples before": cost.samples,
+                "training (s)": "" if pd.isna(training) else f"{training:.0f}",
+                "runs (s)": f"{sum(case.seconds for case in cases):.1f}",
+                "first run": f"{twice.runs['mae'].mean():.3f}" if twice else "",
+                "second run": f"{twice.again:.3f}" if twice else "",
+            }
+        )
+    return pd.DataFrame(rows)
