@@ -17,9 +17,17 @@ import pandas as pd
 import pytest
 
 from agents import DirectNNController, PIController
-from benchmarks.compare import comparison
+from benchmarks.compare import command, comparison, plots, report
+from benchmarks.compare import tables as compare_tables
 from benchmarks.compare.__main__ import main
-from benchmarks.compare.estimates import beaten, estimate, scale_of, verdict
+from benchmarks.compare.estimates import (
+    beaten,
+    estimate,
+    scale_of,
+    scores,
+    standing,
+    verdict,
+)
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage, tables
 from benchmarks.lib.report import Section, write_report
@@ -115,7 +123,7 @@ class TestTables:
         assert values == {"median": 3.0, "p10": 2.0, "p90": np.inf}
 
     def test_not_settled_is_written_in_words(self):
-        table = comparison.tables.for_csv(pd.DataFrame({"a": ["x", "y"], "s": [1.5, np.inf]}))
+        table = compare_tables.for_csv(pd.DataFrame({"a": ["x", "y"], "s": [1.5, np.inf]}))
         assert table.to_csv(index=False) == "a,s\nx,1.5\ny,not settled\n"
 
 
@@ -170,6 +178,24 @@ class TestEstimates:
         runs = some_runs(a=[[2.0] * 3], b=[[0.1] * 3]).assign(scenario="square")
         assert "bound of every controller" in verdict(estimate(runs, scales, "a"))
 
+    def test_who_is_best_and_who_cannot_be_told_apart(self):
+        scales = {"constant-noise": scale_of(SCENARIOS["constant-noise"], 40)}
+        limit = scales["constant-noise"].least.value
+        noise = np.random.default_rng(0).normal(0, 0.05, (3, 40))
+        runs = some_runs(
+            a=[limit + 0.9 + noise[0]], b=[limit + 0.1 + noise[1]], c=[limit + 0.1 + noise[2]]
+        ).assign(scenario="constant-noise", total_variation=12.0)
+        text = standing(runs, scales, scores(runs, scales))
+        assert re.fullmatch(
+            r"[bc] is best, with a score of 0.97\d at 12 t/h of valve travel a run; "
+            r"[bc] follows with 0.97\d at 12 t/h. "
+            r"Not to be told apart, at 95 %: (b and c|c and b)\.", text
+        )  # fmt: skip
+        alone = runs[(runs["agent"] != "c")]
+        assert standing(alone, scales, scores(alone, scales)).endswith(
+            "The runs tell all of them apart, at 95 %."
+        )
+
     def test_no_controller_does(self, tmp_path):
         # All runs of all controllers but PPO, which is trained elsewhere.
         run_compare(tmp_path / "out", "--agents", *FIXED, "--runs", 20)
@@ -185,17 +211,20 @@ class TestEstimates:
 class TestReport:
     def test_pages(self, tmp_path):
         (tmp_path / "picture.png").write_bytes(b"\x89PNG")
-        table = pd.DataFrame({"name": ["a < b"], "value": ["1.0"]})
+        table = pd.DataFrame({"name": ["a < b|c"], "value": ["1.0 (0.9 to 1.1)"]})
         sections = [Section("First", ["Some text."], table, ["picture.png"]), Section("Second")]
         write_report(tmp_path, "Title", sections, "made today")
         page = (tmp_path / "report.md").read_text()
-        assert page.startswith("# Title\n\nmade today\n\n## First\n\nSome text.\n\n| name")
+        assert page.startswith("# Title\n\n## First\n\nSome text.\n\n| name")
+        assert page.endswith("\n\nmade today\n")
         assert "![First](picture.png)" in page
         html = (tmp_path / "report.html").read_text()
-        assert "a &lt; b" in html
+        assert "a &lt; b|c" in html
+        assert r"| a &lt; b\|c | 1.0 (0.9 to 1.1) |" in page
         assert 'name="viewport"' in html
         assert "made today" in html
         assert 'src="data:image/png;base64,iVBORw=="' in html
+        assert '<td>1.0<span class="interval">(0.9 to 1.1)</span></td>' in html
         assert "http" not in html  # nothing is fetched
 
 
@@ -340,6 +369,8 @@ class TestStorage:
 
 def run_compare(out, *options):
     policies = out.parent / "policies"
+    # In this process, unless an option says otherwise.
+    options = ("--jobs", 1, *options)
     return main(["--out", str(out), "--kept", str(policies), *map(str, options)])
 
 
@@ -370,11 +401,14 @@ class TestCompare:
         limit = least_possible(samples=600, kind="reference", setpoint=5.0).value
         page, screen = (out / "report.md").read_text(), capsys.readouterr().out
         for shown in (page, (out / "report.html").read_text(), screen):
-            assert f"{nn.median():.3f}" in shown
             assert f"{limit:.3f}" in shown
             assert f"{pi['mae'].iloc[0] / limit:.2f}" in shown
             assert "No controller comes below" in shown
+        assert f"{nn.median():.3f}" in page
         assert "not settled" in page
+        # Who is best, and at what travel of the valve, comes first.
+        assert page.splitlines()[2].startswith("NN is best, with a score of 0.")
+        assert "t/h of valve travel a run; PI follows with 0." in page.splitlines()[2]
 
         provenance = json.loads((out / "provenance.json").read_text())
         assert provenance["complete"] is True
@@ -396,6 +430,48 @@ class TestCompare:
         assert (tmp_path / "one/runs.csv").read_text() == (
             tmp_path / "two/runs.csv"
         ).read_text()
+
+    def test_the_count_of_cores_changes_no_number(self, tmp_path, monkeypatch):
+        (tmp_path / "locked.py").write_text(
+            "import threading\n"
+            "from agents import PIController\n"
+            "class Factory:\n"
+            "    lock = None\n"
+            "    def __init__(self): self.lock = threading.Lock()  # which cannot be pickled\n"
+            "    def __call__(self): return PIController(kp=1.0, ki=0.02)\n"
+            "    __module__ = 'locked'\n"
+            "make = Factory()\n"
+        )
+        monkeypatch.syspath_prepend(tmp_path)
+        options = (
+            "--agents", "nn", "pi", "--agent", "mine=locked:make", "--runs", 2,
+            "--scenarios", "constant-noise", "constant",
+        )  # fmt: skip
+        for jobs in (1, 2):
+            assert run_compare(tmp_path / str(jobs), *options, "--jobs", jobs) == 0
+        for name in ("runs.csv", "summary.csv", "estimates.csv", "constant-noise.csv"):
+            one, two = ((tmp_path / str(jobs) / name).read_bytes() for jobs in (1, 2))
+            assert one == two
+            assert b"mine" in one
+
+    def test_a_picture_that_cannot_be_drawn_is_a_sentence(self, tmp_path, monkeypatch):
+        def fails(*arguments):
+            raise ValueError("Axis limits cannot be NaN or Inf")
+
+        monkeypatch.setattr(plots, "plot_travel", fails)
+        options = ("--agents", "pi", "--scenarios", "constant", "--runs", 1)
+        assert run_compare(tmp_path / "out", *options) == 0
+        page = (tmp_path / "out/report.md").read_text()
+        assert "travel.png could not be drawn (ValueError: Axis limits cannot be" in page
+        assert "(travel.png)" not in page
+
+    @pytest.mark.parametrize("agents", [("pi", "pi-simc"), ("nothing",)])
+    def test_one_run_in_noise_is_drawn(self, agents, tmp_path):
+        options = ("--agents", *agents, "--scenarios", "constant-noise", "--runs", 1)
+        assert run_compare(tmp_path / "out", *options) == 0
+        page = (tmp_path / "out/report.md").read_text()
+        assert "could not be drawn" not in page
+        assert "(one run)" in page
 
     def test_a_row_of_the_presets_is_what_evaluate_says(self, tmp_path):
         quick = [agent for agent in FIXED if agent != "mpc"]
@@ -547,10 +623,12 @@ class TestCompare:
         assert (out / "report.md").exists()
         assert (out / "square.png").exists()
 
-    def test_what_ran_before_a_failing_controller_is_kept(self, tmp_path, monkeypatch):
+    def test_what_ran_beside_a_failing_controller_is_kept(self, tmp_path, monkeypatch, capsys):
         out = tmp_path / "out"
-        with pytest.raises(ZeroDivisionError):
-            self.run_and_stop(out, monkeypatch, ZeroDivisionError, after=3)
+        assert self.run_and_stop(out, monkeypatch, ZeroDivisionError, after=3) == 1
+        shown = capsys.readouterr().out
+        assert "nn, constant: ZeroDivisionError" in shown
+        assert "nn, square: ZeroDivisionError" in shown
         assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
         assert (out / "report.md").exists()
@@ -564,6 +642,7 @@ class TestCompare:
             return rollout(*arguments)
 
         monkeypatch.setattr(comparison, "rollout", watched)
+        monkeypatch.setattr(command, "PAUSE", 0.0)
         scenarios = ("constant", "square", "constant-noise")
         run_compare(tmp_path / "out", "--agents", "pi", "--runs", 2, "--scenarios", *scenarios)
         assert saved == [0, 2, 2, 4]  # the square wave is run twice
@@ -576,7 +655,7 @@ class TestCompare:
         def interrupted(*arguments):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(comparison, "write_report", interrupted)
+        monkeypatch.setattr(report, "write_report", interrupted)
         assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=3) == 130
         assert "Interrupted" in capsys.readouterr().out
         assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
@@ -678,7 +757,7 @@ class TestCompare:
         done = subprocess.run(
             command, cwd=ROOT, env=odd, capture_output=True, text=True, check=True
         )
-        assert "1.61" in done.stdout
+        assert "0.709" in done.stdout
         assert "(?C)" in done.stdout
         assert (tmp_path / "out/report.md").exists()
 
@@ -690,15 +769,15 @@ def test_a_long_legend_leaves_the_responses_their_room(tmp_path, monkeypatch):
         figure.draw_without_rendering()
         widths.extend(axes.get_position().width for axes in figure.axes)
 
-    monkeypatch.setattr(comparison.plots, "save", measure_width)
+    monkeypatch.setattr(plots, "save", measure_width)
     runs = rollout(make_plants(1, 40, setpoint=5.0), PIController(), 40, seed=0)
     responses = pd.concat(
         [
-            comparison.tables.summarise_responses(runs, SCENARIOS["constant"], name)
+            compare_tables.summarise_responses(runs, SCENARIOS["constant"], name)
             for name in ROSTER
         ]
     )
-    comparison.plots.plot_responses(responses, SCENARIOS["constant"], tmp_path / "x.png")
+    plots.plot_responses(responses, SCENARIOS["constant"], tmp_path / "x.png")
     assert min(widths) > 0.7
 
 
@@ -728,7 +807,7 @@ class TestOtherPlants:
 
     def test_a_part_goes_to_a_folder_of_its_own(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
-        options = ["--agents", "pi", "--scenarios", "constant", "--runs", "1"]
+        options = ["--agents", "pi", "--scenarios", "constant", "--runs", "1", "--jobs", "1"]
         assert main([*options, "--set", "delay=30"]) == 0
         (folder,) = (tmp_path / "results").iterdir()
         assert folder.name == "compare-pi-constant-delay-30-1-runs"

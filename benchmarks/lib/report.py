@@ -96,7 +96,7 @@ def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
         if section.table is not None:
             parts.append(markdown_table(section.table))
         parts += [f"![{_plain(section.title)}]({picture})" for picture in section.pictures]
-    return "\n\n".join([*parts, _plain(made), ""])
+    return "\n\n".join([*parts, _plain(made)]) + "\n"
 
 
 def _html(folder: Path, title: str, sections: Sequence[Section], made: str) -> str:
