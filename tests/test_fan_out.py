@@ -251,7 +251,7 @@ class TestNodes:
         assert top == {"agents", "benchmarks", "mptc_gym", "mine.py"}
         files = [path for path in there.rglob("*") if path.is_file()]
         assert {path.suffix for path in files} <= {
-            ".py", ".npz", ".csv", ".ipynb", ".json", ".txt", ".typed"
+            ".py", ".npz", ".csv", ".ipynb", ".json", ".txt", ".typed", ".yml"
         }  # fmt: skip
         assert sum(path.stat().st_size for path in files) < 2e6
 
