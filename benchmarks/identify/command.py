@@ -51,7 +51,7 @@ def execute(options: Options, console: Console) -> str:
             ),
         )
         plant, ranges = plant_arguments(model), plant_ranges(model)
-        sections = report(log, model, out)
+        sections = report(model, out)
     except ValueError as error:
         raise UsageError(str(error)) from error
     write_json(out / "plant.json", plant)

@@ -80,7 +80,7 @@ def identify(log: Log, options: Options | None = None) -> Model:
     fits, held_out = _tried(likelihood, fits)
     posterior = Posterior(likelihood, fits)
     chosen = posterior.chosen
-    a, b, of_known, levels = likelihood.parts(chosen)
+    a, b, of_known = likelihood.parts(chosen)
     _check_stable(a)
     interval = log.sampling_interval
     estimates = {
@@ -96,23 +96,18 @@ def identify(log: Log, options: Options | None = None) -> Model:
     errors[likelihood.rows.counted] = chosen.solution.errors
     plant = LinearModel(a.tolist(), b.tolist(), c, chosen.place.delay, interval)
     known = tuple(
-        Known(name, float(values[np.isfinite(values)][0]), lag, tuple(each.tolist()))
-        for (name, values), lag, each in zip(
-            log.disturbances.items(), likelihood.lags, of_known, strict=True
-        )
+        Known(name, lag, tuple(each.tolist()))
+        for name, lag, each in zip(log.disturbances, likelihood.lags, of_known, strict=True)
     )
-    level = likelihood.level
-    if chosen.orders.walk:
-        level += _level(likelihood, chosen)
-    else:
-        level += float(levels[0]) / float(a.sum())
+    simulated = likelihood.simulated(chosen)
+    level = float(np.nanmean(log.temperature - simulated))
     model = Model(
         plant=plant, noise=noise, known=known,
         estimates=estimates, possible=posterior.draws,
         u_min=likelihood.u_min, u_max=likelihood.u_max,
         operating_flow=likelihood.operating_flow, operating_temperature=level,
         orders=chosen.orders, sampling_interval=interval, errors=errors, held_out=held_out,
-        notes=list(log.notes),
+        log=log, simulated=level + simulated, notes=list(log.notes),
     )  # fmt: skip
     model.notes.extend(_notes(model, likelihood))
     return model
@@ -266,11 +261,6 @@ def _tried(likelihood: Likelihood, fits: list[Candidate]) -> tuple[list[Candidat
     near = [fit for fit in kinds.values() if fit is not good[0][0]]
     found = simulation.explained(likelihood.output, impulse, last)
     return [good[0][0], *near], HeldOut(float(good[0][1]), float(found))
-
-
-def _level(likelihood: Likelihood, fit: Candidate) -> float:
-    """Return the mean of what the simulation leaves, degC."""
-    return float(np.nanmean(likelihood.output - likelihood.simulated(fit)))
 
 
 def _check_answer(likelihood: Likelihood, best: Candidate, log: Log) -> None:

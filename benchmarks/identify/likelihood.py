@@ -312,12 +312,12 @@ class Likelihood:
         deviances: Array = count * np.log(np.maximum(squares, least))
         return deviances
 
-    def parts(self, fit: Candidate) -> tuple[Array, Array, Array, Array]:
-        """Return A with its 1, B, the B of each known disturbance, and the levels."""
+    def parts(self, fit: Candidate) -> tuple[Array, Array, Array]:
+        """Return A with its 1, B, and the B of each known disturbance."""
         a, b, linear = fit.orders.a, fit.orders.b, fit.solution.linear
         end = a + b + OF_KNOWN * len(self.known)
         known = linear[a + b : end].reshape(-1, OF_KNOWN)
-        return np.concatenate([[1.0], linear[:a]]), linear[a : a + b], known, linear[end:]
+        return np.concatenate([[1.0], linear[:a]]), linear[a : a + b], known
 
     def errors(self, fit: Candidate) -> Array:
         """Return the prediction errors of all rows, of the bridged ones too; NaN elsewhere."""
@@ -329,7 +329,7 @@ class Likelihood:
 
     def simulated(self, fit: Candidate) -> Array:
         """Return what flow and known disturbances do to the temperature, degC."""
-        a, b, of_known, _ = self.parts(fit)
+        a, b, of_known = self.parts(fit)
         flow = held(np.where(np.isfinite(self.command), self.applied(fit.place.gap), np.nan))
         total = response(a.tolist(), b.tolist(), fit.place.delay, flow)
         for values, lag, each in zip(self.known, self.lags, of_known, strict=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from benchmarks.identify.armax import Array, Orders
+from benchmarks.identify.log import Log
 from benchmarks.loop.linear import LinearModel
 
 CONFIDENCE = 0.95  # of all intervals
@@ -58,8 +59,6 @@ class Known:
     ----------
     name
         Column of the log.
-    operating
-        What is subtracted from it.
     delay
         d, samples.
     b
@@ -67,7 +66,6 @@ class Known:
     """
 
     name: str
-    operating: float
     delay: int
     b: tuple[float, ...]
 
@@ -114,6 +112,10 @@ class Model:
         The prediction errors xi, one a row of the log, NaN where they are not known, degC.
     held_out
         How good simulations are.
+    log
+        What was fitted: the log, mended.
+    simulated
+        What the model makes of flow and known disturbances alone, degC.
     notes
         What the user should know about the fit.
     """
@@ -131,4 +133,6 @@ class Model:
     sampling_interval: float
     errors: Array
     held_out: HeldOut
+    log: Log
+    simulated: Array
     notes: list[str] = field(default_factory=list)

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.identify.armax import Array
-from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError, Interval, Model
-from benchmarks.identify.simulation import held, response
 from benchmarks.loop.linear import LinearModel
 from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
@@ -107,17 +105,6 @@ def _factors(interval: Interval) -> list[float]:
     """Return the ends of an interval as multiples of its value, around 1."""
     low, high = sorted((interval.low / interval.value, interval.high / interval.value))
     return [max(low, 1.0 / LARGEST_FACTOR), min(high, LARGEST_FACTOR)]
-
-
-def simulation(model: Model, log: Log) -> Array:
-    """Return the temperature that the model gives for flow and known disturbances, degC."""
-    flow = np.clip(held(log.flow) - model.operating_flow, model.u_min, model.u_max)
-    flow = np.where(np.abs(flow) < model.estimates["dead_zone"].value, 0.0, flow)
-    total = response(model.plant.a, model.plant.b, model.plant.delay, flow)
-    for known in model.known:
-        moved = held(log.disturbances[known.name]) - known.operating
-        total = total + response(model.plant.a, known.b, known.delay, moved)
-    return total + model.operating_temperature
 
 
 def settling(plant: LinearModel) -> int:

@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.controllers.step_test import StepTest
-from benchmarks.identify.log import Log
 from benchmarks.identify.model import Model
-from benchmarks.identify.plant import simulation, step_band
+from benchmarks.identify.plant import step_band
 from benchmarks.lib.drawing import COLOURS, STYLE, save
 
 Array = NDArray[np.float64]
@@ -31,8 +30,9 @@ def autocorrelation(errors: Array, lags: int = LAGS) -> Array:
     return result
 
 
-def plot_log(log: Log, model: Model, path: Path) -> None:
+def plot_log(model: Model, path: Path) -> None:
     """Draw what was recorded, and what the model makes of the flow alone."""
+    log = model.log
     stop = min(len(log.flow), SHOWN)
     minutes = np.arange(stop) * log.sampling_interval / 60.0
     with mpl.rc_context(STYLE):
@@ -41,7 +41,7 @@ def plot_log(log: Log, model: Model, path: Path) -> None:
         above.plot(minutes, log.temperature[:stop], color="0.5", linewidth=1, label="recorded")
         above.plot(
             minutes,
-            simulation(model, log)[:stop],
+            model.simulated[:stop],
             color=COLOURS[1],
             label="model, without noise",
         )

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.identify import plots
-from benchmarks.identify.log import Log
 from benchmarks.identify.margins import Loop, Margins, plot_margins
 from benchmarks.identify.model import Interval, Model
 from benchmarks.identify.plant import plant_arguments
@@ -34,13 +33,11 @@ LONGEST = 6_000  # samples of a run, for which the bounds are computed
 POOR, BEHIND = 0.5, 0.1  # share that a model explains, absolutely and behind its rival's
 
 
-def report(log: Log, model: Model, out: Path) -> list[Section]:
+def report(model: Model, out: Path) -> list[Section]:
     """Draw the pictures, and return what there is to say.
 
     Parameters
     ----------
-    log
-        What was recorded.
     model
         What was found.
     out
@@ -49,7 +46,7 @@ def report(log: Log, model: Model, out: Path) -> list[Section]:
     arguments = plant_arguments(model)
     parameters = Parameters(**arguments)
     step = reduced(model.plant, model.sampling_interval)
-    plots.plot_log(log, model, out / "log.png")
+    plots.plot_log(model, out / "log.png")
     plots.plot_residuals(model, out / "residuals.png")
     plots.plot_step(model, step, out / "step.png")
     sections = [
