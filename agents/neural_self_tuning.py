@@ -51,7 +51,7 @@ class NeuralSelfTuningController(SelfTuningController):
     _residual: Array  # the last one, degC, (loops,)
 
     def __init__(
-        self, *, network: LawNetwork | None = None, forgetting: float = 0.998, **told: Any
+        self, *, network: LawNetwork | None = None, forgetting: float = 0.999, **told: Any
     ) -> None:
         super().__init__(forgetting=forgetting, **told)
         self._network = LawNetwork.load() if network is None else network
