@@ -346,7 +346,7 @@ class TestNews:
     def test_no_controller_beats_it_and_it_is_tighter_than_that_with_preview(self):
         arguments = {"setpoint": "random", "dead_zone": 0.0}
         kinds = {
-            kind: least_possible(samples=900, kind=kind, episodes=25, folder=None, **arguments)
+            kind: least_possible(samples=600, kind=kind, episodes=15, folder=None, **arguments)
             for kind in ("preview", "news", "reference")
         }
         found = errors(MPC, 10, 600, **arguments)
@@ -519,7 +519,7 @@ class TestPredictiveController:
 
     @pytest.mark.parametrize("name", ["square-noise", "constant-noise"])
     def test_it_comes_near_the_limit_with_noise_and_does_not_beat_it(self, name):
-        scenario, runs = SCENARIOS[name], 200
+        scenario, runs = SCENARIOS[name], 60
         case = {"samples": scenario.samples, **scenario.arguments}
         least = least_possible(kind="reference", **case).value
         found = mean_error(run_mpc(runs, seed=77, **case))
@@ -586,7 +586,7 @@ def test_bad_options_are_named(options, complaint, capsys):
 
 
 def test_command(capsys, tmp_path):
-    assert main(["--episodes", "2", "--cache", str(tmp_path)]) == 0
+    assert main(["--episodes", "1", "--jobs", "1", "--cache", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     for name in (*SCENARIOS, *PRESETS):
         assert name in shown

@@ -84,6 +84,14 @@ class TestScore:
         assert first["noise"] != other["noise"]
 
 
+@pytest.fixture
+def short(monkeypatch):
+    """Make the runs short, so that a score takes no time."""
+    scenarios = [(replace(scenario, samples=60), 0) for scenario, _ in tune.SCENARIOS]
+    monkeypatch.setattr(objective, "SCENARIOS", scenarios)
+
+
+@pytest.mark.usefixtures("short")
 class TestSearch:
     @pytest.mark.parametrize("controller", ["nn", "pi"])
     def test_files(self, controller, tmp_path, capsys):
@@ -133,7 +141,9 @@ class TestSearch:
             )
             assert whole == halves
 
-    def test_side_by_side_is_one_after_the_other(self, tmp_path):
+    def test_side_by_side_is_one_after_the_other(self, tmp_path, monkeypatch):
+        # Other processes have the scenarios as they are.
+        monkeypatch.setattr(objective, "SCENARIOS", tune.SCENARIOS)
         for jobs in (1, 2):
             run_tune(tmp_path / str(jobs), jobs=jobs)
         for name in ("pi.csv", "pi.md"):
@@ -178,9 +188,6 @@ class TestSearch:
             return network
 
         monkeypatch.setattr(ppo_training, "train", train)
-        monkeypatch.setattr(
-            objective, "SCENARIOS", [(replace(s, samples=60), 0) for s, _ in tune.SCENARIOS]
-        )
         assert run_tune(tmp_path, "ppo", trials=2) == 0
         search = [ppo.TUNING_SEED + i for i in range(2)]
         final = [ppo.FINAL_SEED + i for i in range(4)]
@@ -190,10 +197,8 @@ class TestSearch:
 
 
 @pytest.fixture
-def search(tmp_path, monkeypatch):
+def search(tmp_path, short):
     """Return a function that begins a search, or goes on with it, to a number of trials."""
-    short = [(replace(scenario, samples=30), 0) for scenario, _ in tune.SCENARIOS]
-    monkeypatch.setattr(objective, "SCENARIOS", short)
 
     def go(trials):
         search = tune.Search(ROSTER["pi"], 1, tmp_path, FanOut(1))
