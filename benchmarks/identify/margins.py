@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
-from scipy import optimize
 
 from benchmarks.lib.drawing import STYLE, colours, save
 from benchmarks.loop.linear import nominal
@@ -140,46 +139,26 @@ def margins(controller: Linear, parameters: Parameters) -> Margins:
     frequency = loop.frequencies()
     values = loop.response(frequency)
 
-    def at(w: float) -> complex:
-        return complex(loop.response(np.array([w]))[0])
-
-    gain = math.inf
-    for w in _crossings(frequency, values.imag, lambda w: at(w).imag):
-        real = at(w).real
-        if -1.0 < real < 0.0:
-            gain = min(gain, -1.0 / real)
-    end = values[-1].real  # at Nyquist's frequency L is real, without a change of sign
-    if -1.0 < end < 0.0:
-        gain = min(gain, -1.0 / end)
-    phase = delay = math.inf
-    for w in _crossings(frequency, np.abs(values) - 1.0, lambda w: abs(at(w)) - 1.0):
-        left = (math.atan2(at(w).imag, at(w).real) + math.pi) % (2.0 * math.pi)
-        phase = min(phase, math.degrees(min(left, 2.0 * math.pi - left)))
-        delay = min(delay, left / w)
-    return Margins(gain, phase, delay, _largest_sensitivity(loop, frequency, values))
-
-
-def _crossings(frequency: Array, values: Array, exact: Callable[[float], float]) -> list[float]:
-    """Return the frequencies at which values change their sign."""
-    changes = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
-    found = []
-    for i in changes:
-        low, high = float(frequency[i]), float(frequency[i + 1])
-        if exact(low) * exact(high) < 0.0:
-            found.append(float(optimize.brentq(exact, low, high, xtol=1e-14, rtol=1e-12)))
-    return found
-
-
-def _largest_sensitivity(loop: Loop, frequency: Array, values: Complex) -> float:
-    distance = np.abs(1.0 + values)
-    i = int(np.argmin(distance))
-    low, high = frequency[max(i - 1, 0)], frequency[min(i + 1, len(frequency) - 1)]
-    nearest = optimize.minimize_scalar(
-        lambda w: float(np.abs(1.0 + loop.response(np.array([w])))[0]),
-        bounds=(low, high),
-        method="bounded",
+    at = loop.response(_crossings(frequency, values.imag)).real
+    at = np.append(at, values[-1].real)  # at Nyquist's frequency L is real, too
+    gains = -1.0 / at[(at > -1.0) & (at < 0.0)]
+    of_one = _crossings(frequency, np.abs(values) - 1.0)
+    left = (np.angle(loop.response(of_one)) + math.pi) % (2.0 * math.pi)
+    phases = np.degrees(np.minimum(left, 2.0 * math.pi - left))
+    return Margins(
+        float(gains.min(initial=math.inf)),
+        float(phases.min(initial=math.inf)),
+        float((left / of_one).min(initial=math.inf)),
+        float(1.0 / np.abs(1.0 + values).min()),
     )
-    return 1.0 / min(float(nearest.fun), float(distance[i]))
+
+
+def _crossings(frequency: Array, values: Array) -> Array:
+    """Return the frequencies at which values change their sign, by lines in between."""
+    i = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
+    share = values[i] / (values[i] - values[i + 1])
+    result: Array = frequency[i] + share * (frequency[i + 1] - frequency[i])
+    return result
 
 
 def plot_margins(loops: Mapping[str, Loop], path: Path) -> None:
