@@ -239,6 +239,10 @@ class TestRealLogs:
         assert not any("spike" in note for note in model.notes)
         assert not any("jump" in note for note in model.notes)
         assert model.held_out.model > 0.99
+        held = np.repeat(generator.uniform(-5, 5, 20), 60)
+        bent = held + 0.8 * np.maximum(held, 0.0)  # moves that no linear plant explains
+        model = found_in(held, signal.lfilter([0.0, 1.0], [1.0], bent), generator)
+        assert not any("jump" in note for note in model.notes)
 
     def test_noise_of_a_flow_meter_is_taken_from_a_held_flow(self, good):
         log, whole = good
