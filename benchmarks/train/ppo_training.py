@@ -16,7 +16,6 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
@@ -123,21 +122,6 @@ class FixedFeatures(BaseFeaturesExtractor):
         return observations @ self.matrix.T
 
 
-class OddPolicy(ActorCriticPolicy):
-    """A policy whose mean is an odd function: the plant is the same upside down.
-
-    It has no biases. So where error, flow and set point have the other sign, the mean has it,
-    too, and what is learnt at +5 degC is known at -5 degC.
-    """
-
-    def _build(self, lr_schedule: Any) -> None:
-        super()._build(lr_schedule)
-        for layer in (*self.mlp_extractor.policy_net, self.action_net):
-            if isinstance(layer, nn.Linear):
-                nn.init.zeros_(layer.bias)
-                layer.bias.requires_grad_(False)
-
-
 def begin(arguments: PPOArguments, plants: VecEnv | None = None, *, start: int = 0) -> PPO:
     """Make a model that has learnt nothing yet.
 
@@ -173,7 +157,7 @@ def begin(arguments: PPOArguments, plants: VecEnv | None = None, *, start: int =
     seeds = np.random.SeedSequence([arguments.seed, start]).generate_state(2)
     model_seed, plants_seed = (int(seed) for seed in seeds)
     model = PPO(
-        OddPolicy,
+        "MlpPolicy",
         plants,
         # The last update comes when no progress remains; it is not to be in vain.
         learning_rate=lambda remaining: arguments.learning_rate * max(remaining, 0.05),
@@ -191,6 +175,12 @@ def begin(arguments: PPOArguments, plants: VecEnv | None = None, *, start: int =
         seed=model_seed,
         device="cpu",
     )
+    # Without biases the mean is an odd function, as the plant is the same upside down: what is
+    # learnt at +5 degC is known at -5 degC.
+    for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net):
+        if isinstance(layer, nn.Linear):
+            nn.init.zeros_(layer.bias)
+            layer.bias.requires_grad_(False)
     plants.seed(TRAINING_SEEDS + plants_seed)
     return model
 
