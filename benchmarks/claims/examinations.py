@@ -5,13 +5,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from agents.pi import SEARCHED_GAINS
 from benchmarks.claims.runs import (
@@ -66,6 +65,15 @@ class Results:
         """Note a number; `at_least` or `at_most` make it part of the verdict."""
         self.findings.append(Finding(quantity, estimate, unit, at_least, at_most))
 
+    def ask_share(
+        self, quantity: str, found: NDArray[np.bool_] | Estimate, *, often: bool = False
+    ) -> None:
+        """Note in which share of the draws something is found; `often` asks for `OFTEN`."""
+        of = found if isinstance(found, Estimate) else share(found)
+        in_percent = Estimate(100 * of.value, 100 * of.low, 100 * of.high, of.runs)
+        at_least = 100 * OFTEN if often else -math.inf
+        self.ask(quantity, in_percent, "% of draws", at_least=at_least)
+
 
 @dataclass(frozen=True)
 class Claim:
@@ -92,16 +100,6 @@ class Claim:
         )
 
 
-def percent(estimate: Estimate) -> Estimate:
-    """Turn a share into a percentage."""
-    return replace(
-        estimate,
-        value=100 * estimate.value,
-        low=100 * estimate.low,
-        high=100 * estimate.high,
-    )
-
-
 def ratio(errors: NDArray[np.float64], reference: NDArray[np.float64]) -> Estimate:
     """Return the median ratio of the mean errors of two controllers in the same runs."""
     ratios = errors / reference
@@ -121,16 +119,13 @@ def convergence(batch: Batch) -> Results:
 
         batch.run(network, samples, record, **arguments)
         times[name] = converged_at(np.array(weights))
-        soon = share(times[name] <= SOON)
-        results.ask(
-            f"weights converged within {SOON} samples, {name}", percent(soon), "% of draws",
-            at_least=100 * OFTEN,
-        )  # fmt: skip
+        soon = f"weights converged within {SOON} samples, {name}"
+        results.ask_share(soon, times[name] <= SOON, often=True)
         for p in (0.1, 0.5, 0.9):
             quantity = f"time until the weights have converged, {name}, {p:.0%} of draws"
             results.ask(quantity, quantile(times[name], p), "samples")
-        never = percent(share(np.isinf(times[name])))
-        results.ask(f"weights not converged when the run ends, {name}", never, "% of draws")
+        never = f"weights not converged when the run ends, {name}"
+        results.ask_share(never, np.isinf(times[name]))
     results.tables["convergence"] = pd.DataFrame(times)
     return results
 
@@ -141,10 +136,8 @@ def dead_zone(batch: Batch) -> Results:
     for name, arguments, samples in SETPOINTS:
         small = batch.run_nn(samples, **arguments)
         large = batch.run_nn(samples, **arguments, dead_zone=7.0)
-        results.ask(
-            f"settled when the run ends, dead zone 7 t/h, {name}",
-            percent(share(settled(large))), "% of draws", at_least=100 * OFTEN,
-        )  # fmt: skip
+        at_the_end = f"settled when the run ends, dead zone 7 t/h, {name}"
+        results.ask_share(at_the_end, settled(large), often=True)
         results.ask(
             f"mean error at dead zone 7 t/h, as a multiple of that at 5 t/h, {name}",
             ratio(mean_error(large), mean_error(small)), at_least=1 + MUCH,
@@ -172,10 +165,8 @@ def noise(batch: Batch) -> Results:
         ratio(error.std(axis=0), idle.output[steady].std(axis=0)), at_most=1 + MUCH,
     )  # fmt: skip
     square = batch.run_nn(samples, **SQUARE, **NOISY)
-    results.ask(
-        "mean error below that of doing nothing, square wave",
-        percent(share(mean_error(square) < 5.0)), "% of draws", at_least=100 * OFTEN,
-    )  # fmt: skip
+    below = mean_error(square) < 5.0
+    results.ask_share("mean error below that of doing nothing, square wave", below, often=True)
     results.ask("mean error, square wave", median(mean_error(square)), "°C")
     results.ask(
         "standard deviation of y without control", median(idle.output[steady].std(axis=0)), "°C"
@@ -200,8 +191,7 @@ def pi_gains(batch: Batch) -> Results:
         ("square wave, R = 0.5 °C²", NOISY),
     ):  # fmt: skip
         errors = {
-            gain: mean_error(batch.run_pi(gain, KI, samples, **arguments))
-            for gain in tqdm(gains, desc=f"lower Kp, {name}", leave=False)
+            gain: mean_error(batch.run_pi(gain, KI, samples, **arguments)) for gain in gains
         }
         rows += [
             {"setpoint": name, "kp": gain, "mean_error": float(np.median(error))}
@@ -264,8 +254,7 @@ def versus_pi(gains: tuple[float, float]) -> Callable[[Batch], Results]:
                     f"mean error of the NN as a multiple of the PI's, {case}", ratio(nn, pi),
                     at_most=1 - MUCH,
                 )  # fmt: skip
-                better = percent(share(nn < pi))
-                results.ask(f"the NN is better, {case}", better, "% of draws")
+                results.ask_share(f"the NN is better, {case}", nn < pi)
         nn = mean_error(batch.run_nn(1200, dead_zone=7.0))
         pi = mean_error(batch.run_pi(*gains, 1200, dead_zone=7.0))
         results.ask("the same ratio, square wave, dead zone 7 t/h", ratio(nn, pi))
@@ -280,17 +269,11 @@ def direction(batch: Batch) -> Results:
     runs = batch.run(batch.network(direction=1), 600, **CONSTANT)
     beyond = np.abs(runs.output) > 0.9 * reachable()
     when = np.where(beyond.any(axis=0), np.argmax(beyond, axis=0), np.inf)
-    results.ask(
-        f"y beyond 90 % of what the flow can do, either way, within {SOON} samples",
-        percent(share(when <= SOON)), "% of draws", at_least=100 * OFTEN,
-    )  # fmt: skip
-    results.ask(
-        "the same when the run ends, after 600 samples", percent(share(beyond[-1])),
-        "% of draws", at_least=100 * OFTEN,
-    )  # fmt: skip
-    results.ask(
-        "the same, on the wrong side", percent(share(runs.output[-1] < 0)), "% of draws"
-    )
+    soon = f"y beyond 90 % of what the flow can do, either way, within {SOON} samples"
+    results.ask_share(soon, when <= SOON, often=True)
+    late = "the same when the run ends, after 600 samples"
+    results.ask_share(late, beyond[-1], often=True)
+    results.ask_share("the same, on the wrong side", runs.output[-1] < 0)
     for p in (0.1, 0.5, 0.9):
         results.ask(
             f"time until y is beyond it, {p:.0%} of draws", quantile(when, p), "samples"
@@ -341,10 +324,8 @@ def node_failure(batch: Batch) -> Results:
             error[nodes] = mean_error(after)
             case = f"{nodes} nodes, one stuck at {stuck_at}, {GAINS[slower]}"
             if stuck_at == 0:
-                ready = percent(share(settled(before)))
-                results.ask(f"settled before the failure, {case}", ready, "% of draws")
-            again = percent(share(settled(after)))
-            results.ask(f"settled 600 samples after the failure, {case}", again, "% of draws")
+                results.ask_share(f"settled before the failure, {case}", settled(before))
+            results.ask_share(f"settled 600 samples after the failure, {case}", settled(after))
             results.ask(f"mean error in these samples, {case}", median(error[nodes]), "°C")
             if nodes > 3:
                 results.ask(
@@ -379,10 +360,8 @@ def changing_plant(batch: Batch) -> Results:
             at_most=1 - NOTABLE if plant else math.inf,
         )  # fmt: skip
         results.ask(f"mean error of frozen weights, {name}", median(error[False]), "°C")
-        results.ask(
-            f"frozen weights do no better than no control, {name}",
-            percent(share(error[False] >= 5.0)), "% of draws",
-        )  # fmt: skip
+        useless = f"frozen weights do no better than no control, {name}"
+        results.ask_share(useless, error[False] >= 5.0)
     return results
 
 
@@ -402,7 +381,7 @@ def other_plants(batch: Batch) -> Results:
         for name, (gains, _) in families.items()
         for time_constant, gain, delay in itertools.product(time_constants, gains, delays)
     ]
-    for row in tqdm(rows, desc="other plants", leave=False):
+    for row in rows:
         plant = {
             "delay": row["delay"],
             "gain_factor": row["gain"],
@@ -418,10 +397,8 @@ def other_plants(batch: Batch) -> Results:
     def ask(text: str, of: Iterable[dict[str, Any]]) -> None:
         worst = min(of, key=lambda row: row["settled"].value)
         where = ", ".join(f"{name.replace('_', ' ')} {worst[name]:g}" for name in nominal)
-        results.ask(
-            f"settled within 1,200 samples, the worst of {text} ({where})",
-            percent(worst["settled"]), "% of draws", at_least=100 * OFTEN,
-        )  # fmt: skip
+        quantity = f"settled within 1,200 samples, the worst of {text} ({where})"
+        results.ask_share(quantity, worst["settled"], often=True)
 
     for name, text in (
         ("delay", "delays from 9 to 36"),
@@ -433,9 +410,9 @@ def other_plants(batch: Batch) -> Results:
         for family in families if name == "gain" else list(families)[:1]:
             ask(f"{text}, {family}", [row for row in alone if row["setpoint"] == family])
     for family in families:
-        cells = [row for row in rows if row["setpoint"] == family]
-        ask(f"all {len(cells)} combinations, {family}", cells)
-        works = [row["settled"].value >= OFTEN for row in cells]
+        those = [row for row in rows if row["setpoint"] == family]
+        ask(f"all {len(those)} combinations, {family}", those)
+        works = [row["settled"].value >= OFTEN for row in those]
         results.ask(
             f"combinations in which at least {OFTEN:.0%} of draws settle, {family}",
             exact(100 * float(np.mean(works))), "%",

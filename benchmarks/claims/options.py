@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.lib.options import Folder, Names, Runs, options
+from benchmarks.lib.options import FanOutOptions, Folder, Names, Runs, options
 
 
 @options
@@ -20,4 +20,5 @@ class Options:
     """Claims to test (default: all)."""
     runs: Runs = 1000
     """Runs of each case."""
+    fan_out: FanOutOptions = field(default_factory=FanOutOptions)
     out: Folder = Path("results/claims")
