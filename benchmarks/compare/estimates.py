@@ -121,9 +121,11 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) ->
                 "preview": scale.preview.value,
                 **_ends("mean", mean),
             }
-            by_run = values.mean(axis=0)
-            one = scale.drawn and len(by_run) == 1
-            row["student_high"] = math.inf if one else student(by_run).high
+            by_run = student(values.mean(axis=0))
+            if scale.drawn:
+                row["student_high"] = by_run.high if by_run.runs > 1 else math.inf
+            else:
+                row["student_high"] = by_run.value
             iqm = bootstrap(values, BOOTSTRAP, interquartile_mean)
             row |= _ends("interquartile_mean", iqm)
             row |= {f"ratio{end}": row[f"mean{end}"] / limit for end in ("", "_low", "_high")}
