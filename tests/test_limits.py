@@ -10,8 +10,9 @@ from scipy import linalg, optimize, signal
 
 from agents import PIController
 from benchmarks.controllers.mpc import PredictiveController
+from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.statistics import interquartile_mean, stratified
-from benchmarks.limits import bounds, frontier, least_possible, programme
+from benchmarks.limits import bounds, frontier, least_possible, programme, verify
 from benchmarks.limits.__main__ import main
 from benchmarks.limits.news import News
 from benchmarks.limits.programme import plan
@@ -591,6 +592,14 @@ def test_command(capsys, tmp_path):
     for name in (*SCENARIOS, *PRESETS):
         assert name in shown
     assert "0.9114" in shown
+
+
+def test_controllers_are_held_against_theorems(tmp_path, monkeypatch):
+    # One that counts samples comes below the reference, which is no bound.
+    monkeypatch.setattr(verify, "controllers", lambda: {"counting": COUNTING})
+    table, beaten = verify.verify(1, tmp_path, FanOut(1), ["square, held 20"])
+    assert float(table["counting"][0]) < 5.9  # the reference: 5.997
+    assert (table["kind"][0], beaten) == ("preview", [])
 
 
 class TestOtherDynamics:
