@@ -65,7 +65,8 @@ class Argument:
         """Return its row in a Markdown table of arguments."""
         default = repr(self.default).replace("'", '"')
         star = "" if self.draw is None else "*"
-        return f"| `{name}` | {default}{star} | {self.unit} | {self.meaning} |"
+        unit = f", {self.unit}" if self.unit else ""
+        return f"| `{name}` | {default}{star} | {self.meaning}{unit} |"
 
 
 def _argument(
@@ -112,15 +113,14 @@ class PlantNumbers(Generic[Value]):
         0.0,
         checks.not_negative,
         "degC^2",
-        "variance of the transmitter's white noise, which the observation shows and the reward "
-        "does not",
+        "variance of the transmitter's white noise, which observations show and rewards do not",
         draw=5,
     )
     disturbance_amplitude: Value = _linear(
         0.0,
         checks.not_negative,
         "degC",
-        "largest level of the steps of the load disturbance, up or down",
+        "largest level of the load disturbance's steps, up or down",
         draw=6,
     )
     disturbance_interval: Value = _linear(
@@ -134,21 +134,21 @@ class PlantNumbers(Generic[Value]):
         0.0,
         checks.not_negative,
         "degC^2",
-        "variance that the random walk of the load disturbance adds in each sample",
+        "variance that the load disturbance's random walk adds a sample",
         draw=8,
     )
     gain_factor: Value = _linear(
         1.0,
         checks.positive,
         "",
-        "steady-state gain, as a multiple of the gain that `a` and `b` have",
+        "steady-state gain, as a multiple of that of `a` and `b`",
         draw=9,
     )
     time_constant_factor: Value = _linear(
         1.0,
         checks.positive,
         "",
-        "dominant time constant, as a multiple of the one that `a` has",
+        "dominant time constant, as a multiple of that of `a`",
         draw=10,
     )
     gain_drift: Value = _linear(
@@ -200,8 +200,8 @@ class Parameters(PlantNumbers[Number]):
         (1.0, -0.45181, -0.47546),
         checks.polynomial,
         "",
-        "coefficients of A in (28), from z^0 on; the first is 1. A may be unstable, and y may "
-        "then grow beyond all floats",
+        "coefficients of A in (28), from z^0 on; the first is 1. If A is unstable, y may grow "
+        "beyond all floats",
     )
     b: Sequence[float] = _linear(
         (-0.04560, -0.00404),
@@ -226,8 +226,8 @@ class Parameters(PlantNumbers[Number]):
         "square",
         checks.setpoint,
         "degC",
-        '"square", "random", a number (constant), or a list with a number for each sample, of '
-        "which the last one is held. [-5, 5] is a list of two samples, not a range",
+        '"square", "random", a number (constant), or a list with a number for each sample, the '
+        "last one held: [-5, 5] is two samples, not a range",
     )
     setpoint_amplitude: float = _linear(
         5.0,
@@ -435,7 +435,7 @@ PLANT_NUMBERS: Final = _places_of_draws()
 def argument_table() -> str:
     """Return a Markdown table of all arguments but `render_mode`."""
     rows = (argument.row(name) for name, argument in ARGUMENTS.items())
-    return "\n".join(["| Argument | Default | Unit | Meaning |", "|---|---|---|---|", *rows])
+    return "\n".join(["| Argument | Default | Meaning, unit |", "|---|---|---|", *rows])
 
 
 def spelt_out(function: Callable[..., Any]) -> inspect.Signature:
