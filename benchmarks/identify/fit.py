@@ -274,7 +274,8 @@ def _check_answer(likelihood: Likelihood, best: Candidate, log: Log) -> None:
         raise CannotTellError(
             "the direction is unusual: the flow answers the temperature rather than the "
             "temperature the flow. The two columns seem to be swapped; name them with "
-            "--flow and --temperature"
+            "--flow and --temperature. If they are not, the flow has too little effect to be "
+            "told from noise: move it further, or move the set point of a closed loop more"
         )
     # As many delays and dead zones have been tried, the best of them gains by chance.
     tried = (longest + 1) * len(likelihood.gaps())
