@@ -106,29 +106,29 @@ class Comparison:
             At the end, if a controller raised an exception; all others have finished.
         """
         tasks: dict[str, Callable[[], Any]] = {}
-        places: dict[str, tuple[dict[Any, Any], Any]] = {}  # where each result is kept
-
-        def add(name: str, task: Callable[[], Any], kept: dict[Any, Any], key: Any) -> None:
-            tasks[name], places[name] = task, (kept, key)
-
+        keep: dict[str, Callable[[Any], object]] = {}
         # The bounds of drawn plants are the longest tasks of all.
-        for name, each in self.scenarios.items():
-            if name not in self.scales:
-                add(f"bounds, {name}", partial(scale_of, each, self.count), self.scales, name)
+        for each in sorted(
+            self.scenarios.values(), key=lambda each: not each.parameters.ranges
+        ):
+            name = f"bounds, {each.name}"
+            tasks[name] = partial(scale_of, each, self.count)
+            keep[name] = partial(self.scales.__setitem__, each.name)
         long = [agent for agent in LONG if agent in self.controllers]
         for agent in dict.fromkeys([*long, *self.controllers]):
-            for name, each in self.scenarios.items():
-                members = self.controllers[agent]
-                task = partial(run_case, each, agent, members, self.count)
-                add(f"{agent}, {name}", task, self.cases, (name, agent))
-        for name, each in self.scenarios.items():
-            add(f"frontier, {name}", partial(travel_frontier, each), self.frontiers, name)
+            for each in self.scenarios.values():
+                name, members = f"{agent}, {each.name}", self.controllers[agent]
+                tasks[name] = partial(run_case, each, agent, members, self.count)
+                keep[name] = partial(self.cases.__setitem__, (each.name, agent))
+        for each in self.scenarios.values():
+            name = f"frontier, {each.name}"
+            tasks[name] = partial(travel_frontier, each)
+            keep[name] = partial(self.frontiers.__setitem__, each.name)
         with tqdm(total=len(tasks), desc="compare", unit="task") as bar:
             for name, result in fan_out.stream(tasks):
-                kept, key = places[name]
-                kept[key] = result
+                keep[name](result)
                 bar.update()
-                if kept is self.cases:
+                if isinstance(result, Case):
                     finished()
 
     @property
