@@ -27,7 +27,7 @@ th:first-child, td:first-child { text-align: left; }
 img { max-width: 100%; margin-top: 1.5rem; }
 .made { color: #666; font-size: 0.85rem; overflow-wrap: anywhere; }
 """
-_INTERVAL = re.compile(r" (\([^()]* to [^()]*\)|\[[^][]*, [^][]*\])")
+_INTERVAL = re.compile(r" (\([^()]* to [^()]*\))")
 
 
 @dataclass(frozen=True)

@@ -178,15 +178,7 @@ def bootstrap(
     ValueError
         If there is no value, or one that is not finite.
     """
-    table = np.atleast_2d(np.asarray(values, dtype=np.float64))
-    if table.ndim != 2 or not table.size or not np.isfinite(table).all():
-        raise ValueError(f"values must be finite, one for each run, got {values!r}")
-    value = float(statistic(table.reshape(1, -1), axis=-1)[0])
-    if np.all(table == table.flat[0]):  # nothing was random
-        return Estimate(value, value, value, table.size)
-    drawn = statistic(_resampled(table, np.random.default_rng(seed)), axis=-1)
-    low, high = np.quantile(drawn, ENDS)
-    return Estimate(value, float(low), float(high), table.size)
+    return stratified([values], seed, statistic)
 
 
 def _resampled(
@@ -250,15 +242,16 @@ def stratified(
         If there is no task, the shapes differ, or a value is not finite.
     """
     arrays = [np.atleast_2d(np.asarray(table, dtype=np.float64)) for table in tables]
-    if not arrays or len({array.shape for array in arrays}) > 1 or arrays[0].ndim != 2:
+    of_one_shape = len({array.shape for array in arrays}) == 1 and arrays[0].ndim == 2
+    if not (of_one_shape and arrays[0].size and np.isfinite(arrays).all()):
         raise ValueError(
-            f"tables must be of one shape, got {[array.shape for array in arrays]}"
+            f"values must be finite, one for each run, and as many in each task, got {tables!r}"
         )
-    if not arrays[0].size or not np.isfinite(arrays).all():
-        raise ValueError(f"tables must hold finite values, got {tables!r}")
-    generator = np.random.default_rng(seed)
-    drawn = [_resampled(array, generator) for array in arrays]
     together = np.concatenate([array.ravel() for array in arrays])
     value = float(statistic(together[np.newaxis], axis=-1)[0])
-    low, high = np.quantile(statistic(np.hstack(drawn), axis=-1), ENDS)
+    if all(np.all(array == array.flat[0]) for array in arrays):  # nothing was random
+        return Estimate(value, value, value, together.size)
+    generator = np.random.default_rng(seed)
+    drawn = statistic(np.hstack([_resampled(array, generator) for array in arrays]), axis=-1)
+    low, high = np.quantile(drawn, ENDS)
     return Estimate(value, float(low), float(high), together.size)

@@ -12,7 +12,7 @@ import pandas as pd
 
 from benchmarks.controllers.roster import label
 from benchmarks.lib.report import Section
-from benchmarks.lib.statistics import Estimate, bootstrap, improvement
+from benchmarks.lib.statistics import bootstrap, improvement
 from benchmarks.lib.tables import groups
 from benchmarks.loop.designs import Arguments
 from benchmarks.sweep import maps
@@ -88,7 +88,7 @@ QUESTIONS = (
 )
 DIFFERENCES_TEXT = (
     "Differences of the mean error (°C), run by run in the same noise, with 95 % intervals "
-    "over plants and runs: below 0 the first of the two is better. In parentheses: the share "
+    "over plants and runs: below 0 the first of the two is better. At the end: the share "
     "of runs in which it is."
 )
 
@@ -180,13 +180,7 @@ def _differences(
             if len(ours) > 1:
                 difference = bootstrap(ours - theirs, SEED)
                 better = improvement(ours, theirs, SEED)
-                row[" - ".join(map(label, pair))] = _cell(difference, better)
+                shown = f"{difference:+.3f}; {100 * better.value:.0f} %"
+                row[" - ".join(map(label, pair))] = shown
         rows.append(row)
     return pd.DataFrame(rows).fillna("")
-
-
-def _cell(difference: Estimate, better: Estimate) -> str:
-    return (
-        f"{difference.value:+.3f} [{difference.low:+.3f}, {difference.high:+.3f}] "
-        f"({100 * better.value:.0f} %)"
-    )
