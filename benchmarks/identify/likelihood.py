@@ -8,7 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy import ndimage
 
 from benchmarks.identify.armax import Array, Flags, Orders, Rows, Solution
 from benchmarks.identify.excitation import LEAST_SAMPLES, check_excitation
@@ -150,7 +152,8 @@ class Likelihood:
         order_a = 3 if self.options.orders is None else self.options.orders.a
         reach = longest_delay + self.longest_b
         missing = ~np.isfinite(self.output)
-        self.filled = _interpolated(self.output)
+        filled = pd.Series(self.output).interpolate(limit_direction="both").fillna(0.0)
+        self.filled = np.asarray(filled, np.float64)
         bridged = missing & ~_runs(missing, BRIDGE + 1)
         temperatures = _all_of_last(~missing | bridged, order_a + 1)
         flows = _all_of_last(np.isfinite(self.command), reach)
@@ -370,23 +373,9 @@ def _limits(command: Array, options: Options) -> tuple[float, float]:
 
 def _all_of_last(flags: Flags, count: int) -> Flags:
     """Return where the last `count` flags, its own included, are all true."""
-    unset = np.concatenate([[0], np.cumsum(~flags)])
-    ends = np.arange(1, len(flags) + 1)
-    result: Flags = unset[ends] == unset[np.maximum(ends - count, 0)]
-    return result
+    return np.asarray(pd.Series(flags).rolling(count, min_periods=1).min(), np.bool_)
 
 
 def _runs(flags: Flags, least: int) -> Flags:
     """Return where flags are true in runs of at least this length."""
-    changes = np.flatnonzero(np.diff(flags)) + 1
-    result = np.zeros(len(flags), bool)
-    for start, stop in itertools.pairwise([0, *changes.tolist(), len(flags)]):
-        result[start:stop] = flags[start : start + 1].all() and stop - start >= least
-    return result
-
-
-def _interpolated(values: Array) -> Array:
-    known = np.flatnonzero(np.isfinite(values))
-    if not len(known):
-        return np.zeros(len(values))
-    return np.asarray(np.interp(np.arange(len(values)), known, values[known]))
+    return np.asarray(ndimage.binary_opening(flags, np.ones(least)))

@@ -330,20 +330,13 @@ def _of_dead_zone(places: list[Gap], weights: Array, slack: float) -> Interval:
 
     The commands at both ends of a gap may be off by `slack`, t/h.
     """
-    shares: dict[Gap, float] = {}
-    for gap, weight in zip(places, weights, strict=True):
-        shares[gap] = shares.get(gap, 0.0) + float(weight)
-    gaps = sorted(shares)
-
-    def at(probability: float) -> float:
-        below = 0.0
-        for gap in gaps:
-            if below + shares[gap] >= probability:
-                return gap.low + gap.width * (probability - below) / shares[gap]
-            below += shares[gap]
-        return gaps[-1].high
-
-    low, high = max(at(ENDS[0]) - slack, 0.0), at(ENDS[1]) + slack
-    if gaps[0].low == 0.0 and shares[gaps[0]] > 0.5:
+    each = np.array([(gap.low, gap.high) for gap in places])
+    gaps, member = np.unique(each, axis=0, return_inverse=True)
+    shares = np.bincount(member.ravel(), weights)
+    sums = np.cumsum(shares)
+    below = np.column_stack([sums - shares, sums]).ravel()
+    low, middle, high = np.interp([ENDS[0], 0.5, ENDS[1]], below, gaps.ravel()).tolist()
+    low, high = max(low - slack, 0.0), high + slack
+    if gaps[0, 0] == 0.0 and shares[0] > 0.5:
         return Interval(0.0, 0.0, high)  # every command has had an effect
-    return Interval(at(0.5), low, high)
+    return Interval(middle, low, high)

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.identify import plots
-from benchmarks.identify.margins import Loop, Margins, plot_margins
+from benchmarks.identify.margins import Loop, plot_margins
 from benchmarks.identify.model import Interval, Model
 from benchmarks.identify.plant import plant_arguments
 from benchmarks.identify.tuning import Recommended, recommended, reduced
@@ -165,19 +165,6 @@ def _residuals(model: Model) -> Section:
     )
 
 
-HEADINGS = ("gain margin", "phase margin (°)", "delay margin (s)", "Ms")
-
-
-def shown(found: Margins) -> tuple[str, ...]:
-    """Return margins as cells of a table, under `HEADINGS`."""
-    return (
-        f"{found.gain:.2f}",
-        f"{found.phase:.1f}",
-        f"{found.delay:.0f}",
-        f"{found.sensitivity:.2f}",
-    )
-
-
 def _controllers(tuned: dict[str, Recommended], parameters: Parameters, out: Path) -> Section:
     text, rows, loops = [], [], {}
     for name, each in tuned.items():
@@ -195,7 +182,11 @@ def _controllers(tuned: dict[str, Recommended], parameters: Parameters, out: Pat
             )
         loops[name] = Loop.of(each.controller, parameters)
         kp, ki = f"{each.controller.kp:.4g}", f"{each.controller.ki:.4g}"
-        rows.append((name, kp, ki, *shown(each.margins), f"{each.worst:.2f}"))
+        found = each.margins
+        rows.append((
+            name, kp, ki, f"{found.gain:.2f}", f"{found.phase:.1f}", f"{found.delay:.0f}",
+            f"{found.sensitivity:.2f}", f"{each.worst:.2f}",
+        ))  # fmt: skip
     text.append(
         "u = -Kp e - Ki (sum of e). By rule, SIMC's PI has its closed-loop time constant at "
         "the delay, the Smith predictor at half the plant's time constant. The margins are "
@@ -204,8 +195,10 @@ def _controllers(tuned: dict[str, Recommended], parameters: Parameters, out: Pat
         "most that the loop amplifies a disturbance; the last column has what 95 % of the "
         "possible plants stay below."
     )
-    columns = ["controller", "Kp (t/h per °C)", "Ki (t/h per °C and sample)", *HEADINGS,
-               "Ms, 95 %"]  # fmt: skip
+    columns = [
+        "controller", "Kp (t/h per °C)", "Ki (t/h per °C and sample)", "gain margin",
+        "phase margin (°)", "delay margin (s)", "Ms", "Ms, 95 %",
+    ]  # fmt: skip
     if loops:
         plot_margins(loops, out / "margins.png")
     return Section(

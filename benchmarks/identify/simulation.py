@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 from scipy import signal
 
 from benchmarks.identify.armax import Array, Flags
@@ -16,10 +17,7 @@ RIDGES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the penalty that is chosen fr
 
 def held(values: Array) -> Array:
     """Return values with the last known one in place of those that are not known."""
-    known = np.flatnonzero(np.isfinite(values))
-    places = np.searchsorted(known, np.arange(len(values)), "right") - 1
-    filled: Array = values[known[np.maximum(places, 0)]]
-    return filled
+    return np.asarray(pd.Series(values).ffill().bfill(), np.float64)
 
 
 def response(a: Sequence[float], b: Sequence[float], delay: int, flow: Array) -> Array:
