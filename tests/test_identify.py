@@ -626,6 +626,7 @@ class TestLog:
         [
             ("16,broken,1.0", "line 4: flow must be a number, got 'broken'"),
             ("16,1.0,inf", "line 4: temperature must be a number, got 'inf'"),
+            ("16,1.0,4e300", "line 4: temperature must be a number, got '4e.300'"),
             ("16,1.0,1.2.3", "line 4: temperature must be a number, got '1.2.3'"),
             ("soon,1.0,1.0", "line 4: time must be a number, or a date"),
             (",1.0,1.0", "line 4: time must be a number, or a date"),
@@ -644,6 +645,10 @@ class TestLog:
     def test_other_faults_are_named(self, written, tmp_path):
         with pytest.raises(ValueError, match="is empty"):
             read_log(written(""))
+        heading = written("time,flow,temperature\n")
+        for columns in (Columns(), Columns(sampling_interval=8.0)):
+            with pytest.raises(ValueError, match="too short: 0 rows"):
+                read_log(heading, columns)
         with pytest.raises(ValueError, match="cannot be read: No such file"):
             read_log(tmp_path / "none.csv")
         with pytest.raises(ValueError, match=r"unit of 'flow' must be one of .* got 'gpm'"):
