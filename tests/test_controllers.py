@@ -40,6 +40,14 @@ def factory(entry, tmp_path, monkeypatch):
     return entry.members(PolicyRequest(folder=tmp_path, policies=1))[0]
 
 
+def test_who_does_not_learn_does_the_same_in_a_second_run(factory):
+    plant = {"noise_variance": 0.5, "delay": 9}
+    controller = factory(plant, 2, 0)
+    plants = make_plants(2, 250, **factory.arguments(plant))
+    first, second = (rollout(plants, controller, 250, 0).command for _ in range(2))
+    assert np.array_equal(first, second) is not factory.learns
+
+
 def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, monkeypatch):
     plant = OTHER if entry.told else ACTUATOR
     monkeypatch.setattr(type(entry), "members", lambda *_: [factory])

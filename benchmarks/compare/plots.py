@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, NullLocator
 
 from benchmarks.controllers.roster import label
 from benchmarks.lib.drawing import COLOURS, STYLE, colours, save
@@ -191,7 +191,7 @@ def plot_travel(
             axes.set_ylim(0.9 * min(limit, moving["mae"].min()), 1.1 * moving["mae"].max())
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axes.xaxis.set_major_formatter("{x:g}")
-            axes.xaxis.set_minor_formatter("")
+            axes.xaxis.set_minor_locator(NullLocator())
             axes.set_xlabel("valve travel (t/h)")
             axes.set_ylabel("mean |e| (°C)")
         shown = [axes.get_legend_handles_labels() for axes in panels]

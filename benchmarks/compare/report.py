@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import cast
+from typing import Any
 
 import pandas as pd
 
-from benchmarks.compare import plots, tables
+from benchmarks.compare import tables
 from benchmarks.compare.comparison import TWICE, Comparison
 from benchmarks.compare.estimates import estimate, scale_of, scores, standing, verdict
 from benchmarks.compare.record import Record
@@ -96,38 +96,39 @@ def write(
     scales = {name: comparison.scales[name] for name in names}
     summary = tables.summarise(runs)
     curves = _curves(comparison.controllers)
-    responses = {name: comparison.responses(name) for name in names}
-    shown = [agent for agent in comparison.agents if entries[agent].drawn] or comparison.agents
-    tasks: dict[str, Callable[[], object]] = {}
-    for name in names:
-        rows, path = responses[name], record.path(f"{name}.png")
-        drawn, scenario = rows[rows["agent"].isin(shown)], comparison.scenarios[name]
-        tasks[path.name] = partial(_draw, plots.plot_responses, drawn, scenario, path)
-        tasks[f"estimates, {name}"] = partial(
-            estimate, runs[runs["scenario"] == name], scales, comparison.agents[0]
-        )
-    for agent in comparison.agents:
-        tasks[f"score, {agent}"] = partial(scores, runs[runs["agent"] == agent], scales)
-    limits = {name: scale.least.value for name, scale in scales.items()}
-    frontiers = {name: comparison.frontiers.get(name, []) for name in names}
-    pictures = {
-        "travel.png": partial(_draw, plots.plot_travel, summary, limits, frontiers),
-        "runs.png": partial(_draw, plots.plot_runs, runs),
+    first = comparison.agents[0]
+    of_scenarios: dict[str, Callable[[], Any]] = {
+        name: partial(estimate, runs[runs["scenario"] == name], scales, first) for name in names
     }
-    if not curves.empty:
-        record.write_table("learning.csv", curves)
-        pictures["learning.png"] = partial(_draw, plots.plot_learning, curves)
-    tasks |= {name: partial(draw, record.path(name)) for name, draw in pictures.items()}
-    found = dict(fan_out.stream(tasks))
-    estimates = _together(found[f"estimates, {name}"] for name in names)
-    scored = _together(found[f"score, {agent}"] for agent in comparison.agents)
-    found["limits.png"] = _draw(plots.plot_limits, estimates, record.path("limits.png"))
+    of_agents = {
+        agent: partial(scores, runs[runs["agent"] == agent], scales)
+        for agent in comparison.agents
+    }
+    made = dict(fan_out.stream(of_scenarios | of_agents))
+    estimates = pd.concat([made[name] for name in names], ignore_index=True)
+    scored = pd.concat([made[agent] for agent in comparison.agents], ignore_index=True)
     record.write_table("summary.csv", summary)
     record.write_table("estimates.csv", estimates)
+    limits = {name: scale.least.value for name, scale in scales.items()}
+    frontiers = {name: comparison.frontiers.get(name, []) for name in names}
+    pictures: dict[str, tuple[Any, ...]] = {
+        "travel.png": ("travel", summary, limits, frontiers),
+        "limits.png": ("limits", estimates),
+        "runs.png": ("runs", runs),
+    }
+    shown = [agent for agent in comparison.agents if entries[agent].drawn] or comparison.agents
     for name in names:
-        record.write_table(f"{name}.csv", responses[name])
+        rows, scenario = comparison.responses(name), comparison.scenarios[name]
+        record.write_table(f"{name}.csv", rows)
+        drawn = rows[rows["agent"].isin(shown)]
+        pictures[f"{name}.png"] = ("responses", drawn, scenario)
+    if not curves.empty:
+        record.write_table("learning.csv", curves)
+        pictures["learning.png"] = ("learning", curves)
+    draw = {name: partial(_draw, *what, record.path(name)) for name, what in pictures.items()}
+    faults = dict(fan_out.stream(draw))
     sections = [
-        _with_pictures(section, found)
+        _with_pictures(section, faults)
         for section in _sections(comparison, entries, summary, estimates, scored)
     ]
     for page in ("report.md", "report.html"):
@@ -138,14 +139,12 @@ def write(
     return sections
 
 
-def _together(parts: Iterable[object]) -> pd.DataFrame:
-    return pd.concat([cast("pd.DataFrame", part) for part in parts], ignore_index=True)
-
-
-def _draw(plot: Callable[..., None], *arguments: object) -> str:
+def _draw(kind: str, *arguments: Any) -> str:
     """Draw a picture, and return what went wrong: it costs no report."""
+    from benchmarks.compare import plots  # here: Matplotlib is loaded where pictures are drawn
+
     try:
-        plot(*arguments)
+        getattr(plots, f"plot_{kind}")(*arguments)
     except NotWrittenError:
         raise
     except Exception as error:
