@@ -111,6 +111,12 @@ def test_a_plant_that_cannot_be_compared_is_refused_before_any_run(given, compla
     assert complaint in capsys.readouterr().err
 
 
+def test_a_device_that_there_is_not_is_named(capsys):
+    with pytest.raises(SystemExit):
+        main_of("speed")(["--device", "toaster"])
+    assert "--device: device must be one that PyTorch can use" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "package", "extra"),
     [

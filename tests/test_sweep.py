@@ -139,7 +139,8 @@ class TestSweep:
         assert {file: file.stat().st_mtime_ns for file in saved} == saved
         pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "runs.csv"), runs)
 
-    def test_tasks_of_other_options_are_not_taken(self, tmp_path):
+    def test_tasks_of_other_options_are_not_taken(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(command, "report", lambda *_: [])  # which takes its time to draw
         first = ["--design", "random", "--plants", 2, "--agents", "pi-simc"]
         run_sweep(tmp_path / "one", *first)
         for out in ("one", "two"):
@@ -173,6 +174,18 @@ class TestSweep:
             (10, 1.0), (20, 1.0), (10, 1.2), (20, 1.2),
         }  # fmt: skip
         assert (tmp_path / "map.png").stat().st_size > 1000
+
+    def test_a_nominal_plant_with_a_list(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(command, "report", lambda *_: [])
+        given = ["--set", "b=[-0.03,-0.02,-0.01]", "--plants", 2]
+        assert run_sweep(tmp_path, "--design", "random", *given, "--agents", "pi") == 0
+        assert len(pd.read_csv(tmp_path / "runs.csv")) == 4
+
+    def test_a_nominal_plant_that_no_design_fits_is_named(self, tmp_path, capsys):
+        with pytest.raises(SystemExit):
+            run_sweep(tmp_path / "out", "--design", "random", "--set", "a=[1]")
+        assert "--design random: time_constant_factor" in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
 
     def test_unknown_controller(self, tmp_path, capsys):
         with pytest.raises(SystemExit):

@@ -27,6 +27,7 @@ from torch import nn
 from tqdm import tqdm
 
 from agents import DirectNNController
+from benchmarks.lib.command_line import blame
 from benchmarks.lib.tables import on_screen
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.speed.options import Options
@@ -89,6 +90,8 @@ def execute(options: Options, console: Console) -> str:
         console.print(title, on_screen(table), sep="\n")
 
     if options.device is not None:
+        with blame("--device"):
+            MiddlePointTorchEnv(1, device=options.device)
         show(f"Steps a second on {options.device}", on_device(options.device, rounds))
         return f"Medians of {rounds} rounds."
     cases = [_single(name, *made) for name, made in SINGLE.items()]

@@ -14,7 +14,7 @@ from rich.console import Console
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.records import Factory, provenances
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import out_folder
+from benchmarks.lib.command_line import blame, out_folder
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.options import flat
 from benchmarks.lib.report import provenance_line, write_report
@@ -24,6 +24,7 @@ from benchmarks.loop.designs import SPANS, WIDE, Arguments, grid, random_design
 from benchmarks.sweep.options import Options
 from benchmarks.sweep.report import report, table
 from benchmarks.sweep.tasks import agent_task, limit_task
+from mptc_gym import Parameters
 
 SEED = 0  # of a plant's first run
 SPANS_OF = {"random": SPANS, "wide": WIDE}
@@ -34,16 +35,19 @@ def execute(options: Options, console: Console) -> str:
     """Run the sweep and write what it finds."""
     controllers = chosen(options.agents, options.controllers.agent)
     nominal = options.plant.chosen().arguments
-    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    out = out_folder(options.out or Path(f"results/sweep-{options.design}"))
-    training = options.controllers.training()
-    known = {NOTHING: ROSTER[NOTHING], **controllers}
-    members = {name: entry.members(training) for name, entry in known.items()}
     drawn = options.plants, options.design_seed, options.samples
     differing = (
         grid() if options.design == "grid" else random_design(*drawn, SPANS_OF[options.design])
     )
     plants = [{**nominal, **plant} for plant in differing]
+    for plant in plants:
+        with blame(f"--design {options.design}"):
+            Parameters(**plant)
+    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    out = out_folder(options.out or Path(f"results/sweep-{options.design}"))
+    training = options.controllers.training()
+    known = {NOTHING: ROSTER[NOTHING], **controllers}
+    members = {name: entry.members(training) for name, entry in known.items()}
     began = time.perf_counter()
     results = training.fan_out.run(
         _limit_tasks(plants, options),
@@ -59,7 +63,7 @@ def execute(options: Options, console: Console) -> str:
         )
     seconds = time.perf_counter() - began
 
-    runs = table(plants, list(controllers), results)
+    runs = table(differing, list(controllers), results)
     sections = report(runs, out, options.design)
     write_csv(out / "runs.csv", runs)
     origin = {

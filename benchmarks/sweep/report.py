@@ -45,7 +45,7 @@ def table(
     Parameters
     ----------
     plants
-        Of the sweep.
+        What each plant of the sweep differs in from the nominal one.
     agents
         The controllers.
     results

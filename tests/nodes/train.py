@@ -9,7 +9,7 @@ from benchmarks.train.command import trained
 from benchmarks.train.through_plant import Training
 
 SMALL = Training(steps=3, plants=4, samples=60, choosing=4, adding=3)
-TRAININGS = [replace(SMALL, seed=seed) for seed in range(2)]
+TRAININGS = [replace(SMALL, seed=1)]
 
 if __name__ == "__main__":
     trained(TRAININGS, Path(sys.argv[1]), FanOut(backend="ray"), here=False)
