@@ -25,12 +25,12 @@ COMMAND: Colour = (40, 40, 40)
 DEAD_ZONE: Colour = (228, 228, 228)
 IN_TRANSIT: Colour = (214, 234, 248)
 LIMIT: Colour = (130, 130, 130)
+FAINT: Colour = (95, 100, 108)  # of words that are no names
 _STILL_TO_COME: Colour = (150, 210, 192)  # a lighter APPLIED
 _PAGE: Colour = (243, 244, 246)
 _PANEL: Colour = (255, 255, 255)
 _GRID: Colour = (232, 233, 236)
 _FRAME: Colour = (160, 164, 170)
-_FAINT: Colour = (95, 100, 108)
 _INK: Colour = (25, 28, 32)
 
 _LEFT, _RIGHT = 72, 842  # of both panels; what is right of them is for the lines' names
@@ -100,7 +100,7 @@ def show(record: Record, fps: float) -> None:
         pygame.display.set_caption("MiddlePoint-v0")
     screen.blit(draw(record), (0, 0))
     pygame.event.pump()
-    _clock().tick(fps)
+    clock().tick(fps)
     pygame.display.flip()
 
 
@@ -110,7 +110,8 @@ def close_window() -> None:
 
 
 @cache
-def _clock() -> pygame.time.Clock:
+def clock() -> pygame.time.Clock:
+    """Return what makes a window wait."""
     return pygame.time.Clock()
 
 
@@ -162,7 +163,7 @@ def _header(surface: pygame.Surface, record: Record) -> None:
     pygame.draw.line(surface, _FRAME, (0, 66), (SIZE[0], 66))
     for i, (name, value) in enumerate(record.readings.items()):
         x = 24 + 156 * i
-        _write(surface, name, _SMALL, _FAINT, topleft=(x, 12))
+        _write(surface, name, _SMALL, FAINT, topleft=(x, 12))
         for character in value:  # one by one: what changes is made of pictures that are kept
             image = _words(character, _LARGE, colours.get(name, _INK))
             surface.blit(image, (x, 32))
@@ -239,7 +240,7 @@ def _ground(surface: pygame.Surface, panel: Panel, title: str) -> None:
     for value in panel.axis.ticks():
         y = panel.y(value)
         pygame.draw.line(surface, _GRID, (_LEFT, y), (_RIGHT, y))
-        _write(surface, f"{value:.6g}", _SMALL, _FAINT, midright=(_LEFT - 8, y))
+        _write(surface, f"{value:.6g}", _SMALL, FAINT, midright=(_LEFT - 8, y))
     upright = pygame.transform.rotate(_words(title, _SMALL, _INK), 90)
     surface.blit(upright, upright.get_rect(center=(13, (panel.top + panel.bottom) // 2)))
 
@@ -254,10 +255,10 @@ def _edge(surface: pygame.Surface, panel: Panel) -> None:
 def _bracket(surface: pygame.Surface, panel: Panel, left: float, right: float) -> None:
     """Say, above the panel, what is on its way."""
     y = panel.top - 5
-    pygame.draw.line(surface, _FAINT, (left, y), (right, y))
+    pygame.draw.line(surface, FAINT, (left, y), (right, y))
     for x in (left, right):
-        pygame.draw.line(surface, _FAINT, (x, y - 3), (x, y + 3))
-    words = _words("in transit", _SMALL, _FAINT)
+        pygame.draw.line(surface, FAINT, (x, y - 3), (x, y + 3))
+    words = _words("in transit", _SMALL, FAINT)
     place = words.get_rect(midbottom=_pixel(((left + right) / 2, y - 4)))
     surface.blit(words, place.clamp(pygame.Rect(_LEFT, 0, SIZE[0] - _LEFT, SIZE[1])))
 
@@ -268,7 +269,7 @@ def _time_axis(surface: pygame.Surface, panel: Panel) -> None:
     for minute in record.minutes.ticks():
         x, y = panel.x(minute * per_minute), panel.bottom
         pygame.draw.line(surface, _FRAME, (x, y), (x, y + 5))
-        _write(surface, f"{minute:.6g}", _SMALL, _FAINT, midtop=(x, y + 9))
+        _write(surface, f"{minute:.6g}", _SMALL, FAINT, midtop=(x, y + 9))
     _write(surface, "time, min", _SMALL, _INK, topleft=(_RIGHT + 24, panel.bottom + 9))
 
 
@@ -276,12 +277,12 @@ def _legend(surface: pygame.Surface, has_dead_zone: bool) -> None:
     """Say what shade and dots mean, below the panels, where no line is drawn over it."""
     x, y = _LEFT, SIZE[1] - 10
     _dotted(surface, x, x + 28, y)
-    _write(surface, "limits", _SMALL, _FAINT, midleft=(x + 36, y))
+    _write(surface, "limits", _SMALL, FAINT, midleft=(x + 36, y))
     if has_dead_zone:
         x += 104
         surface.fill(DEAD_ZONE, (x, y - 5, 28, 10))
         pygame.draw.rect(surface, _FRAME, (x, y - 5, 28, 10), 1)
-        _write(surface, "dead zone", _SMALL, _FAINT, midleft=(x + 36, y))
+        _write(surface, "dead zone", _SMALL, FAINT, midleft=(x + 36, y))
 
 
 def _dotted(surface: pygame.Surface, left: int, right: int, y: float) -> None:

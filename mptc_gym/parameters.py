@@ -415,7 +415,7 @@ class Parameters(PlantNumbers[Number]):
         return max(abs(float(level)) for level in levels)
 
 
-def _places_of_draws() -> Mapping[str, int]:
+def places_of_draws() -> Mapping[str, int]:
     """Return which draw each plant number takes, once it is sure that no two take the same."""
     places = {each.name: each.metadata["argument"].draw for each in fields(PlantNumbers)}
     if len(set(places.values())) < len(places) or not set(places.values()) <= set(range(DRAWS)):
@@ -428,7 +428,7 @@ ARGUMENTS: Final[Mapping[str, Argument]] = MappingProxyType(
 )
 """What is declared of each argument, by name."""
 
-PLANT_NUMBERS: Final = _places_of_draws()
+PLANT_NUMBERS: Final = places_of_draws()
 """The arguments that can be a range, by name, and which draw of a reset each takes."""
 
 

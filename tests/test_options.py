@@ -60,7 +60,7 @@ class TestDeclarations:
         )
         monkeypatch.setattr(parameters, "PlantNumbers", faulty)
         with pytest.raises(TypeError, match="a draw of its own below 32"):
-            parameters._places_of_draws()
+            parameters.places_of_draws()
 
     def test_the_page_has_the_table_of_arguments(self):
         # If this fails, put in what mptc_gym.parameters.argument_table() returns now.
