@@ -64,7 +64,7 @@ def many_actions(actions: Any, num_envs: int) -> NDArray[np.float64]:
     given: NDArray[Any]
     try:
         given = np.asarray(actions)
-        if given.dtype == object:
+        if given.dtype.hasobject:
             given = np.array((given - 0.0).tolist())
         # Text is no number, even where NumPy reads one.
         given = given.astype(_FLOAT64, casting="same_kind")
