@@ -412,6 +412,8 @@ class ScoreCallback(BaseCallback):
         self.every = count("every", every, 1, 10**12)
         self.episodes = count("episodes", episodes, 2, MOST_PLANTS)
         self.path = None if path is None else Path(path)
+        if self.path is not None and self.path.is_dir():
+            reject("path", path, "the name of a zip, not a folder")
         self.scores: list[tuple[int, Evaluation]] = []
         self.best: Evaluation | None = None
         self._env, self._arguments = env, arguments

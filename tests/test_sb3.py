@@ -369,9 +369,11 @@ class TestScoreCallback:
         assert "score/mean_error" in logged
         assert "score/score" in logged
 
-    def test_it_refuses_what_it_cannot_judge(self):
+    def test_it_refuses_what_it_cannot_judge(self, tmp_path):
         with pytest.raises(ValueError, match="every must be an integer from 1"):
             ScoreCallback(every=0)
+        with pytest.raises(ValueError, match="path must be the name of a zip"):
+            ScoreCallback(path=tmp_path)
         env = MiddlePointEnv()  # made without a spec
         with pytest.raises(ValueError, match="policy must be one that knows how"):
             model_of(env).learn(32, callback=ScoreCallback())
