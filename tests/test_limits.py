@@ -179,6 +179,17 @@ class TestProgramme:
         setpoint = np.where(k % 600 < 300, 17.0, -17.0)
         assert 8.5 < found.value <= np.abs(setpoint - y)[1:].mean() < 9.5
 
+    def test_outputs_that_no_solver_bears_as_unknowns_are_what_the_flow_does(self):
+        # With the outputs among the unknowns, HiGHS fails with each of its methods.
+        a, b = [1.0, 0.234, -0.008, -0.003], [-1.858, 5.988, 6.153]
+        setpoint = np.where(np.arange(1200) % 600 < 300, 15.75, -15.75)
+        found = best_plan(setpoint, a=a, b=b, delay=11, dead_zone=0.0, u_min=0.0, u_max=2.42)
+        assert 0.0 <= found.flow.min() <= found.flow.max() <= 2.42
+        response = signal.lfilter([0.0] * 12 + b, a, found.flow)
+        np.testing.assert_allclose(found.output, response, atol=1e-6)
+        # At -15.75, no flow of the one sign is better than none; at 15.75, one is nearly right.
+        assert 0.5 * 15.75 < found.error.mean() < 0.52 * 15.75
+
     def test_what_cannot_be_solved_is_said(self, monkeypatch):
         given_up = optimize.OptimizeResult(success=False, message="Time limit reached")
         monkeypatch.setattr(optimize, "linprog", lambda *_, **__: given_up)
