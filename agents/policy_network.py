@@ -41,16 +41,11 @@ def _tanh(x: Array) -> Array:
     return np.tanh(x)
 
 
-def _linear(x: Array) -> Array:
-    return x
-
-
 ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
     "elu": _elu,
     "relu": _relu,
     "tanh": _tanh,
 }
-OUTPUTS: Final[Mapping[str, Callable[[Array], Array]]] = {"linear": _linear, "tanh": _tanh}
 
 
 @dataclass(frozen=True)
@@ -80,10 +75,8 @@ class PolicyNetwork(Controller):
     """A feed-forward network from the latest observation to an action.
 
     The observation is multiplied by `input_scale` and goes through the layers. The activation
-    follows each of them but the last, which gives one number z. The output is
-    `output_scale` * z or `output_scale` * tanh(z), plus what `direct` adds, limited to [-1, 1].
-    It is the action, or with `increments` the velocity of the valve. All is computed in
-    float64.
+    follows each of them but the last, which gives one number, limited to [-1, 1]. It is the
+    action, or with `increments` the velocity of the valve. All is computed in float64.
 
     Parameters
     ----------
@@ -97,14 +90,6 @@ class PolicyNetwork(Controller):
         Factor of each element of the observation; shape (n_obs,).
     activation
         "elu", "relu" or "tanh".
-    output
-        "linear" or "tanh".
-    output_scale
-        See above. With "tanh", a scale above 1 lets the network reach the limits.
-    direct
-        Weights of a linear path from the observation, before it is scaled, to the output; shape
-        (n_obs,). It can hold what is known of the plant, such as the flow that holds a set
-        point. 0 without.
     increments
         The velocity form, if the network was trained in it.
     provenance
@@ -134,9 +119,6 @@ class PolicyNetwork(Controller):
         observation: Mapping[str, int],
         input_scale: ArrayLike,
         activation: str = "elu",
-        output: str = "linear",
-        output_scale: float = 1.0,
-        direct: ArrayLike | None = None,
         increments: Increments | None = None,
         provenance: Mapping[str, Any] | None = None,
         u_min: float = -10.0,
@@ -166,16 +148,11 @@ class PolicyNetwork(Controller):
             )
         if not isinstance(activation, str) or activation not in ACTIVATIONS:
             raise ValueError(f"activation must be one of {[*ACTIVATIONS]}, got {activation!r}")
-        if not isinstance(output, str) or output not in OUTPUTS:
-            raise ValueError(f"output must be one of {[*OUTPUTS]}, got {output!r}")
-        self.activation, self.output = activation, output
-        self.output_scale = check_number("output_scale", output_scale)
+        self.activation = activation
         self.increments = increments
         self._remembers = increments is not None
         self.provenance = dict(provenance or {})
         self.input_scale = _finite("input_scale", input_scale, (self.n_obs,))
-        nothing = np.zeros(self.n_obs)
-        self.direct = _finite("direct", nothing if direct is None else direct, (self.n_obs,))
         self.layers = _checked(layers, self.n_obs)
         self._position: Values | None = None  # of the valve, in velocity form
 
@@ -206,9 +183,6 @@ class PolicyNetwork(Controller):
                         observation=about["observation"],
                         input_scale=file["input_scale"],
                         activation=about["activation"],
-                        output=about["output"],
-                        output_scale=about["output_scale"],
-                        direct=file["direct"],
                         increments=None if increments is None else Increments(**increments),
                         provenance=about["provenance"],
                         u_min=u_min,
@@ -226,15 +200,12 @@ class PolicyNetwork(Controller):
             "layers": len(self.layers),
             "observation": self.observation,
             "activation": self.activation,
-            "output": self.output,
-            "output_scale": self.output_scale,
             "increments": None if self.increments is None else asdict(self.increments),
             "provenance": self.provenance,
         }
         arrays: dict[str, Any] = {
             "about": np.array(json.dumps(about)),
             "input_scale": self.input_scale,
-            "direct": self.direct,
         }
         for i, (W, b) in enumerate(self.layers):
             arrays |= {f"W{i}": W, f"b{i}": b}
@@ -262,9 +233,7 @@ class PolicyNetwork(Controller):
         *hidden, (last_W, last_b) = self.layers
         for W, b in hidden:
             x = ACTIVATIONS[self.activation](x @ W.T + b)
-        z = x @ last_W[0] + last_b[0]
-        output = self.output_scale * OUTPUTS[self.output](z) + observation @ self.direct
-        output = np.clip(output, -1.0, 1.0)
+        output = np.clip(x @ last_W[0] + last_b[0], -1.0, 1.0)
         if self.increments is None:
             command: Values = self.u_min + (output + 1.0) * (self.u_max - self.u_min) / 2.0
             return command
