@@ -6,8 +6,7 @@ import hashlib
 import itertools
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from datetime import datetime, timezone
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,8 @@ from benchmarks.controllers.records import Factory, provenances
 from benchmarks.lib import command_line
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.options import flat
-from benchmarks.lib.report import Section
-from benchmarks.lib.storage import commit, versions
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.report import Section, show
+from benchmarks.lib.storage import origin
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
 from mptc_gym.evaluation import SEED
 
@@ -65,44 +63,30 @@ def execute(options: Options, console: Console) -> str:
         return report.write(comparison, controllers, record, fan_out, complete=complete)
 
     try:
-        comparison.run(training.fan_out, _now_and_then(comparison, record))
+        written = -math.inf
+        for _ in comparison.run(training.fan_out):
+            if time.monotonic() - written >= PAUSE:
+                record.write_runs(comparison.runs, complete=False)
+                written = time.monotonic()
     except BaseException:  # Ctrl-C, too
         write(FanOut(jobs=1), complete=False)
         raise
-    for section in write(FanOut(options.controllers.fan_out.jobs), complete=True)[:3]:
-        console.print(*filter(None, [section.title, *section.text]), sep="\n")
-        if section.table is not None:
-            console.print(on_screen(section.table))
+    show(write(FanOut(options.controllers.fan_out.jobs), complete=True)[:3], console)
     return f"The report, tables, data and plots are in {out}/"
 
 
 def _origin(comparison: Comparison, options: dict[str, Any]) -> dict[str, Any]:
     """Return what the results come from."""
     return {
-        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        **origin(),
         "options": {**options, "agents": list(comparison.controllers)},
         "seeds": list(range(SEED, SEED + comparison.count)),
         "scenarios": {
             name: {"samples": each.samples, "arguments": each.arguments}
             for name, each in comparison.scenarios.items()
         },
-        "versions": versions(),
-        "commit": commit(),
         "policies": provenances(comparison.controllers),
     }
-
-
-def _now_and_then(comparison: Comparison, record: Record) -> Callable[[], None]:
-    """Return what writes the runs, but not more often than every few seconds."""
-    written = -math.inf
-
-    def write() -> None:
-        nonlocal written
-        if time.monotonic() - written >= PAUSE:
-            record.write_runs(comparison.runs, complete=False)
-            written = time.monotonic()
-
-    return write
 
 
 def _try_out(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -102,8 +102,8 @@ class Comparison:
     scales: dict[str, Scale] = field(default_factory=dict)
     frontiers: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
 
-    def run(self, fan_out: FanOut, finished: Callable[[], object]) -> None:
-        """Run all that is missing, and call `finished` after each case.
+    def run(self, fan_out: FanOut) -> Iterator[Case]:
+        """Run all, and yield each case when it has finished.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class Comparison:
                 keep[name](result)
                 bar.update()
                 if isinstance(result, Case):
-                    finished()
+                    yield result
 
     @property
     def agents(self) -> list[str]:

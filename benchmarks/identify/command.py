@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from datetime import datetime, timezone
 
 from rich.console import Console
 
@@ -18,14 +17,13 @@ from benchmarks.identify.options import Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import report
 from benchmarks.lib.command_line import UsageError, out_folder
-from benchmarks.lib.report import provenance_line, write_report
-from benchmarks.lib.storage import commit, versions, write_json
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.report import provenance_line, show, write_report
+from benchmarks.lib.storage import origin, write_json
 
 
 def execute(options: Options, console: Console) -> str:
     """Identify a plant and write what was found."""
-    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    made = origin()
     began = time.process_time()
     out = out_folder(options.out)
     if options.orders and min(options.orders[:2]) < 1:
@@ -56,13 +54,9 @@ def execute(options: Options, console: Console) -> str:
         raise UsageError(str(error)) from error
     write_json(out / "plant.json", plant)
     write_json(out / "ranges.json", ranges)
-    origin = {"started": started, "commit": commit(), "versions": versions()}
     write_report(out, f"The plant of {options.log.name}", sections,
-                 provenance_line("identify", origin))  # fmt: skip
-    for section in sections:
-        console.print(section.title, *section.text, sep="\n")
-        if section.table is not None:
-            console.print(on_screen(section.table))
+                 provenance_line("identify", made))  # fmt: skip
+    show(sections, console)
     seconds = time.process_time() - began
     return (
         f"{seconds:.1f} s of processor time. The plant, the ranges and the report are in {out}/"

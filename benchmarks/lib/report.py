@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from rich.console import Console
 
 from benchmarks.lib.storage import write_text
+from benchmarks.lib.tables import on_screen
 
 _STYLE = """
 body { font-family: sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem;
@@ -65,6 +67,14 @@ def provenance_line(command: str, origin: Mapping[str, Any]) -> str:
     called = sys.argv[1:] if command in sys.argv[0] else []
     line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])
     return f"{origin['started']}, commit {origin['commit'][:12]}: {line}"
+
+
+def show(sections: Sequence[Section], console: Console) -> None:
+    """Print sections, without their pictures."""
+    for section in sections:
+        console.print(*filter(None, [section.title, *section.text]), sep="\n")
+        if section.table is not None:
+            console.print(on_screen(section.table))
 
 
 def write_report(folder: Path, title: str, sections: Sequence[Section], made: str) -> None:

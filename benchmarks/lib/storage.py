@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -140,6 +141,12 @@ def versions() -> dict[str, str]:
         with suppress(metadata.PackageNotFoundError):
             found[package] = metadata.version(package)
     return found
+
+
+def origin() -> dict[str, Any]:
+    """Return where results come from that are made now."""
+    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return {"started": started, "versions": versions(), "commit": commit()}
 
 
 def commit() -> str:

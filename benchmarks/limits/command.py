@@ -45,7 +45,7 @@ def execute(options: Options, console: Console) -> str:
         raise UsageError("--verify: goes without --mpc, --plant, --preset and --set")
     cache = out_folder(options.cache or CACHE, "--cache")
     if options.package:
-        packaged.write(cache)
+        packaged.write(cache, options.fan_out.open())
         return f"Written to {packaged.PLACE}"
     if options.verify:
         table, beaten = verify(options.runs, cache, options.fan_out.open())

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.storage import ROOT, commit, versions, write_json
 from benchmarks.limits.bounds import least_possible
@@ -21,21 +21,24 @@ CASES = PRESETS | {
 }
 
 
-def write(cache: Path, place: Path = PLACE) -> None:
+def write(cache: Path, fan_out: FanOut, place: Path = PLACE) -> None:
     """Write the least possible error of each case, episode by episode where they differ.
 
     Parameters
     ----------
     cache
         Where bounds are kept once they are known.
+    fan_out
+        Where they are computed.
     place
         The file.
     """
     case: dict[str, Any] = {"samples": SAMPLES, "seed": SEED, "episodes": EPISODES + MORE}
-    cases = {}
-    for name, arguments in tqdm(CASES.items(), unit="case"):
-        found = least_possible(folder=cache, **case, **arguments)
-        cases[name] = {"arguments": arguments, "kind": found.kind, "least": found.episodes}
+    tasks = {
+        name: partial(_least, {**case, **arguments}, cache) for name, arguments in CASES.items()
+    }
+    found = fan_out.run(tasks, title="bounds")
+    cases = {name: {"arguments": arguments, **found[name]} for name, arguments in CASES.items()}
     about = {
         "command": "python -m benchmarks.limits --package",
         "commit": commit(),
@@ -44,3 +47,8 @@ def write(cache: Path, place: Path = PLACE) -> None:
         "unit": "degC, mean of |e(k)| over k = 1 to samples",
     }
     write_json(place, {**about, **case, "cases": cases})
+
+
+def _least(case: dict[str, Any], cache: Path) -> dict[str, Any]:
+    found = least_possible(folder=cache, **case)
+    return {"kind": found.kind, "least": found.episodes}

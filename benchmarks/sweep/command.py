@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,9 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import blame, out_folder
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.options import flat
-from benchmarks.lib.report import provenance_line, write_report
-from benchmarks.lib.storage import commit, versions, write_json
-from benchmarks.lib.tables import on_screen, write_csv
+from benchmarks.lib.report import provenance_line, show, write_report
+from benchmarks.lib.storage import origin, write_json
+from benchmarks.lib.tables import write_csv
 from benchmarks.loop.designs import SPANS, WIDE, Arguments, grid, random_design
 from benchmarks.sweep.options import Options
 from benchmarks.sweep.report import report, table
@@ -43,7 +42,7 @@ def execute(options: Options, console: Console) -> str:
     for plant in plants:
         with blame(f"--design {options.design}"):
             Parameters(**plant)
-    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    made = origin()
     out = out_folder(options.out or Path(f"results/sweep-{options.design}"))
     training = options.controllers.training()
     known = {NOTHING: ROSTER[NOTHING], **controllers}
@@ -66,21 +65,11 @@ def execute(options: Options, console: Console) -> str:
     runs = table(differing, list(controllers), results)
     sections = report(runs, out, options.design)
     write_csv(out / "runs.csv", runs)
-    origin = {
-        "started": started,
-        "seconds": round(seconds, 1),
-        "options": flat(options),
-        "policies": provenances(members),
-        "versions": versions(),
-        "commit": commit(),
-    }
-    write_json(out / "provenance.json", origin)
+    about = {"seconds": round(seconds, 1), "options": flat(options)}
+    write_json(out / "provenance.json", {**made, **about, "policies": provenances(members)})
     title = "Controllers on plants that they were not made for"
-    write_report(out, title, sections, provenance_line("sweep", origin))
-    for section in sections:
-        console.print(section.title, *section.text, sep="\n")
-        if section.table is not None:
-            console.print(on_screen(section.table))
+    write_report(out, title, sections, provenance_line("sweep", made))
+    show(sections, console)
     return f"{len(results)} tasks in {seconds:.0f} s. The report, data and maps are in {out}/"
 
 
