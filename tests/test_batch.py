@@ -107,7 +107,13 @@ def test_unknown_argument_is_refused(library):
         library.make(deadzone=5.0)
 
 
-@pytest.mark.parametrize("seed", [-1, 1.5, True, "12", b"12", np.array(3.0), [1], [1, 2, "3"]])
+BAD_SEEDS = [
+    -1, 1.5, True, "12", b"12", np.array(3.0), np.array(3), [1], [1, 2, 3], [1, -2], [1, 1.5],
+    [1, "2"],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", BAD_SEEDS, ids=repr)
 def test_bad_seed_changes_nothing(library, seed):
     envs, twin = library.make(**NOISY), library.make(**NOISY)
     envs.reset(seed=0), twin.reset(seed=0)

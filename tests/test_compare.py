@@ -507,18 +507,8 @@ class TestCompare:
             ppo.PPOArguments, "__init__", _with_defaults(ppo.PPOArguments.__init__, SMALL)
         )
         monkeypatch.setattr(ppo, "POLICIES", 2)
-        options = (
-            "--agents",
-            "ppo",
-            "--scenarios",
-            "constant",
-            "--runs",
-            1,
-            "--training-steps",
-            256,
-            "--jobs",
-            1,
-        )
+        options = ("--agents", "ppo", "--scenarios", "constant", "--runs", 1)
+        options += ("--training-steps", 256)
         assert run_compare(tmp_path / "one", *options) == 0
         curve = pd.read_csv(tmp_path / "one/learning.csv")
         assert curve.groupby("policy")["steps"].max().to_dict() == {0: 256, 1: 256}

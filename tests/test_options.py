@@ -255,15 +255,6 @@ class TestRanges:
         np.testing.assert_array_equal(*both)
         assert np.all(both[0] != 0.0)
 
-    def test_the_vector_environment_draws_a_plant_each(self):
-        envs = gymnasium.make_vec("MiddlePoint-v0", 50, delay=[3, 6], gain_factor=[0.5, 1.5])
-        _, infos = envs.reset(seed=0)
-        assert set(infos["delay"]) == {3, 4, 5, 6}
-        assert len(np.unique(infos["gain_factor"])) == 50
-        assert infos["_delay"].all()
-        *_, infos = envs.step(np.zeros((50, 1), np.float32))
-        assert "delay" not in infos
-
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
