@@ -27,7 +27,8 @@ BOUNDS_TEXT = (
 )
 SCORE_TEXT = (
     "The first column is the interquartile mean over all scenarios and runs, with its 95 % "
-    "interval; the others are means. Below 0, doing nothing is better."
+    "interval; the others are means. Below 0, doing nothing is better. The valve travel above "
+    "is that of the median run, as a mean over the scenarios."
 )
 LIMITS_CAPTION = (
     "A point is the mean over all runs, a bar its 95 % interval. Each axis begins at the least "
@@ -52,7 +53,8 @@ COSTS_TEXT = (
     "of one policy, the median. Runs: all scenarios, including what is measured."
 )
 METRICS_TEXT = (
-    "Overshoot and settling time are left out where there is noise: it crosses every band."
+    "The noise is the same for all. Overshoot and settling time are left out where there is "
+    "noise: it crosses every band."
 )
 
 
@@ -201,12 +203,7 @@ def _sections(
         Section("What each controller costs", [COSTS_TEXT], _costs(comparison, entries)),
         Section("Every run", [RUNS_CAPTION], pictures=["runs.png"]),
         Section(
-            "Mean absolute error (°C): median (10th to 90th percentile) of "
-            f"{comparison.count} runs, the same noise for all",
-            table=tables.mae_table(summary),
-        ),
-        Section(
-            "Other measures: median (10th to 90th percentile)",
+            f"All measures: median (10th to 90th percentile) of {comparison.count} runs",
             [METRICS_TEXT],
             tables.metrics_table(summary, comparison.scenarios),
         ),

@@ -72,12 +72,6 @@ def format_cell(row: pd.Series) -> str:
     return median if p10 == p90 else f"{median} ({p10} to {p90})"
 
 
-def mae_table(summary: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean absolute errors: a row for each agent, a column for each scenario."""
-    rows = summary[summary["metric"] == "mae"]
-    return _by_agent(rows, rows.apply(format_cell, axis=1))
-
-
 def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
     """Return the mean errors as multiples of the least possible error, and what that is."""
     shown = estimates.apply(lambda row: f"{_ends(row, 'ratio'):.2f}", axis=1)
@@ -131,12 +125,12 @@ def _by_agent(rows: pd.DataFrame, cells: pd.Series) -> pd.DataFrame:
 
 
 def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> pd.DataFrame:
-    """Return all other metrics: a row for each scenario and agent, a column for each metric."""
+    """Return all metrics: a row for each scenario and agent, a column for each metric."""
     rows = []
-    others = summary[summary["metric"] != "mae"].sort_values(
+    in_order = summary.sort_values(
         "scenario", key=lambda names: names.map(list(scenarios).index), kind="stable"
     )
-    for (scenario, agent), group in others.groupby(["scenario", "agent"], sort=False):
+    for (scenario, agent), group in in_order.groupby(["scenario", "agent"], sort=False):
         noisy = scenarios[str(scenario)].parameters.range_of("noise_variance")[1] > 0.0
         cells = {
             METRICS[row["metric"]]: (
