@@ -418,7 +418,7 @@ def test_help_shows_every_argument():
     assert all(f"`{name}`" in documented for name in names)
     lines = [line.strip() for line in documented.splitlines()]
     assert all(row in lines for row in mptc_gym.parameters.argument_table().splitlines())
-    assert "| `delay` | 18* | samples | transport delay d of the plant (28) |" in lines
+    assert "| `delay` | 18* | transport delay d of the plant (28), samples |" in lines
 
 
 @pytest.mark.parametrize(

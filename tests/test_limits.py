@@ -519,7 +519,7 @@ def test_stratified_bootstrap():
     assert 0.2 < (found.high - found.low) / (4 * 0.1 / np.sqrt(160)) < 2.0
     assert stratified(tables, 0).value == pytest.approx(interquartile_mean(np.array(tables)))
     assert stratified(tables, 0) == stratified(tables, 0)
-    with pytest.raises(ValueError, match="tables must be of one shape"):
+    with pytest.raises(ValueError, match="as many in each task"):
         stratified([tables[0], tables[1][:, 1:]], 0)
 
 
