@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pandas as pd
 from rich.console import Console
-from tqdm import tqdm
 
 from benchmarks.claims import verdicts
 from benchmarks.claims.claims import CLAIMS
@@ -35,12 +34,10 @@ def execute(options: Options, console: Console) -> str:
     examined: dict[str, Results] = {}
     entries: list[verdicts.Entry] = []
     try:
-        with tqdm(total=len(tasks), desc="claims", unit="claim") as bar:
-            for name, results in options.fan_out.open().stream(tasks):
-                examined[name] = results
-                entries = [CLAIMS[n].entry(examined[n]) for n in chosen if n in examined]
-                write(options.out, entries, results.tables, called)
-                bar.update()
+        for name, results in options.fan_out.open().stream(tasks, "claims"):
+            examined[name] = results
+            entries = [CLAIMS[n].entry(examined[n]) for n in chosen if n in examined]
+            write(options.out, entries, results.tables, called)
     finally:
         if entries:
             overview = verdicts.overview(entries)

@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 
 import pandas as pd
-from tqdm import tqdm
 
 from benchmarks.compare import tables
 from benchmarks.compare.estimates import Scale, scale_of, travel_frontier
@@ -129,12 +128,10 @@ class Comparison:
             name = f"frontier, {each.name}"
             tasks[name] = partial(travel_frontier, each)
             keep[name] = partial(self.frontiers.__setitem__, each.name)
-        with tqdm(total=len(tasks), desc="compare", unit="task") as bar:
-            for name, result in fan_out.stream(tasks):
-                keep[name](result)
-                bar.update()
-                if isinstance(result, Case):
-                    yield result
+        for name, result in fan_out.stream(tasks, "compare"):
+            keep[name](result)
+            if isinstance(result, Case):
+                yield result
 
     @property
     def agents(self) -> list[str]:

@@ -121,25 +121,20 @@ class FanOut:
         TasksFailedError
             At the end, if tasks raised an exception or lost their worker again and again.
         """
-        from tqdm import tqdm
-
         results = {} if folder is None else _saved(tasks, folder)
         missing = {
             key: partial(_as_json, task) for key, task in tasks.items() if key not in results
         }
-        bar = tqdm(total=len(tasks), initial=len(results), desc=title, disable=not progress)
-        with bar:
-            try:
-                for key, text in self.stream(missing):
-                    results[key] = json.loads(text)
-                    if folder is not None:
-                        write_text(_file(folder, key), seal(results[key]))
-                    bar.update()
-            except TasksFailedError as error:
-                raise TasksFailedError(error.errors, len(tasks)) from None
+        try:
+            for key, text in self.stream(missing, title if progress else "", len(results)):
+                results[key] = json.loads(text)
+                if folder is not None:
+                    write_text(_file(folder, key), seal(results[key]))
+        except TasksFailedError as error:
+            raise TasksFailedError(error.errors, len(tasks)) from None
         return {key: results[key] for key in tasks}
 
-    def stream(self, tasks: Tasks) -> Iterator[tuple[str, Any]]:
+    def stream(self, tasks: Tasks, title: str = "", done: int = 0) -> Iterator[tuple[str, Any]]:
         """Run tasks, and yield each name and result as they come.
 
         Parameters
@@ -147,12 +142,19 @@ class FanOut:
         tasks
             As those of `run`, but what they return need only be such that it can be pickled.
             Tasks that cannot be pickled themselves run in this process, after the others.
+        title
+            Stands before a progress bar; "" for none.
+        done
+            How many tasks have been done before.
 
         Raises
         ------
         TasksFailedError
             At the end, if tasks raised an exception or lost their worker again and again.
         """
+        from tqdm import tqdm
+
+        bar = tqdm(total=done + len(tasks), initial=done, desc=title, disable=not title)
         errors: dict[str, str] = {}
         answered: set[str] = set()
         blamed = 0
@@ -161,15 +163,17 @@ class FanOut:
             if self._cluster
             else self._local(tasks)
         )
-        for key, result, error, lost in answers:
-            answered.add(key)
-            if not error:
-                yield key, result
-                continue
-            errors[key] = error
-            blamed += lost
-            if blamed == GIVE_UP:
-                break
+        with bar:
+            for key, result, error, lost in answers:
+                answered.add(key)
+                if not error:
+                    bar.update()
+                    yield key, result
+                    continue
+                errors[key] = error
+                blamed += lost
+                if blamed == GIVE_UP:
+                    break
         for key in tasks.keys() - answered:
             errors[key] = "Not run: too many lost their worker."
         if errors:
