@@ -210,7 +210,9 @@ def test_examples_of_the_readme_run(example, monkeypatch, tmp_path):
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
         assert main([*re.findall(r"middlepoint/[\w/-]+", example), "--episodes", "2"]) == 0
     # A short time will do to see that it runs.
-    exec(re.sub(r"\d+_000", "1", example).replace("samples=1200", "samples=100"), {})
+    exec(
+        re.sub(r"\d+_000", "1", example).replace("samples=1200", "samples=100, episodes=5"), {}
+    )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
