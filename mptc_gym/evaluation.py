@@ -42,6 +42,7 @@ SAMPLES: Final = 1200
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
 # Arguments that change what an agent sees or is paid, and not what it can come to.
 _NO_MATTER: Final = *WINDOWS, "reward", "error_scale", "move_weight"
+_ACTING: Final = "a function, or an object with predict or with act"
 _BATCH: Final = 100  # episodes that run side by side
 _RESAMPLES: Final = 2000  # of the bootstrap
 _NATIVE: Final[tuple[list[Any], ...]] = (
@@ -174,6 +175,7 @@ def evaluate(
     make = _maker(env, arguments)
     single = make()
     parameters = _parameters(single)
+    _check_scale(single)
     with closing(single):
         _check_fit(policy, single, parameters)
         name = single.spec.id if single.spec else type(single.unwrapped).__name__
@@ -300,6 +302,17 @@ def _parameters(single: gymnasium.Env[Any, Any]) -> Parameters:
     return inner.parameters
 
 
+def _check_scale(single: gymnasium.Env[Any, Any]) -> None:
+    """Refuse an environment whose observations would be scaled otherwise than in training."""
+    while isinstance(single, gymnasium.Wrapper):
+        if isinstance(single, wrappers.NormalizeObservation):
+            raise ValueError(
+                "env must not be in NormalizeObservation, whose statistics would begin anew: "
+                "train in VecNormalize and save by mptc_gym.sb3.save, or scale by fixed numbers"
+            )
+        single = single.env
+
+
 def _check_fit(policy: Any, single: gymnasium.Env[Any, Any], parameters: Parameters) -> None:
     """Refuse an environment that does not show what a policy reads, or reads what it means."""
     shape, own = single.observation_space.shape, getattr(policy, "observation_space", None)
@@ -307,7 +320,8 @@ def _check_fit(policy: Any, single: gymnasium.Env[Any, Any], parameters: Paramet
     if own is not None and own.shape != shape:
         raise ValueError(
             f"env must have observations of shape {own.shape}, as policy reads them, got "
-            f"{shape}: give it the windows of the training, such as action_window=20"
+            f"{shape}: give it the windows of the training, such as action_window=20, or take "
+            "mptc_gym.sb3.spec_of(policy)"
         )
     wanted, place = getattr(policy, "observation", {}), getattr(policy, "error_index", None)
     if place is not None:
@@ -431,6 +445,8 @@ def _side_by_side(
 
 def acting(policy: Any) -> Act:
     """Bring a policy to the start of a batch of episodes, and return how it acts in it."""
+    if isinstance(policy, type):
+        reject("policy", policy, f"{_ACTING}, not a class")
     if callable(getattr(policy, "predict", None)):
         return _predicting(policy)
     if callable(getattr(policy, "act", None)):
@@ -439,7 +455,7 @@ def acting(policy: Any) -> Act:
         act: Act = policy.act
         return act
     if not callable(policy):
-        reject("policy", policy, "a function, or an object with predict or with act")
+        reject("policy", policy, _ACTING)
     function: Act = policy
     return function
 

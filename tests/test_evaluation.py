@@ -210,6 +210,7 @@ class TestRefusals:
             (lambda seen: [["open"]] * len(seen), "actions of policy must be an array of numb"),
             (lambda seen: [[0.0], 0.0], "actions of policy must be an array of numbers, got "),
             (3, "policy must be a function, or an object with predict or with act, got 3"),
+            (PIController, "policy must be a function, or an object .* with act, not a class"),
         ],
     )
     def test_policies(self, policy, message):
@@ -224,6 +225,12 @@ class TestRefusals:
             ("CartPole-v1", "env must be a MiddlePointEnv, in wrappers or not, got .*CartPole"),
             (7, "env must be an id, an EnvSpec or a function that makes an environment, got 7"),
             (lambda: None, "env must be a MiddlePointEnv, in wrappers or not, got None"),
+            (
+                lambda: gymnasium.wrappers.NormalizeObservation(
+                    gymnasium.make("MiddlePoint-v0")
+                ),
+                "env must not be in NormalizeObservation, whose statistics would begin anew",
+            ),
         ],
     )
     def test_environments(self, env, message):

@@ -1,6 +1,7 @@
 """Identification: known plants are found again, and a log that cannot tell is refused."""
 
 import json
+import re
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from benchmarks.identify.log import Columns, Log, read_log
 from benchmarks.identify.margins import margins
 from benchmarks.identify.model import CannotTellError, HeldOut, Interval, Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
-from benchmarks.identify.report import fault, headline
+from benchmarks.identify.report import fault, headline, report
 from benchmarks.identify.study.command import (
     KINDS,
     beside_rivals,
@@ -283,11 +284,14 @@ class TestRealLogs:
         gain = model.estimates["gain"]
         assert gain.low <= -0.6825 <= gain.high
 
-    def test_white_noise_is_the_transmitter_s(self):
+    def test_white_noise_is_the_transmitter_s(self, tmp_path):
         log = recorded(noise=1e-4)
         white = np.random.default_rng(713).normal(0.0, 0.3, 1200)
-        found = plant_arguments(identify(Log(log.flow, log.temperature + white, 8.0)))
-        assert found["measurement_noise_variance"] == pytest.approx(0.09, rel=0.3)
+        model = identify(Log(log.flow, log.temperature + white, 8.0))
+        found = plant_arguments(model)["measurement_noise_variance"]
+        assert found == pytest.approx(0.09, rel=0.3)
+        # The table's noise variance is not that of `plant.json` then.
+        assert "`plant.json` splits it" in report(model, tmp_path)[0].text[-1]
 
     def test_response_that_is_over_in_ten_samples_with_a_slow_tail(self):
         generator = np.random.default_rng(714)
@@ -541,10 +545,10 @@ class TestLog:
             table = table.map(lambda value: f"{value!r}".replace(".", ","))
         self.same(read_log(written(table.to_csv(index=False, **options))), recorded(400))
 
-    def test_dates(self, written):
-        dates = pd.date_range("2026-01-31T12:00:00", periods=400, freq="8s").strftime(
-            "%Y-%m-%dT%H:%M:%S"
-        )
+    @pytest.mark.parametrize("form", ["%Y-%m-%dT%H:%M:%S", "%d.%m.%Y %H:%M:%S"])
+    def test_dates(self, written, form):
+        # Over the end of a month; a month that was taken for the day would go backwards.
+        dates = pd.date_range("2026-01-31T23:50:00", periods=400, freq="8s").strftime(form)
         self.same(read_log(written(time=dates)), recorded(400))
 
     def test_sampling_interval_in_place_of_times(self, written):
@@ -567,6 +571,10 @@ class TestLog:
         np.testing.assert_allclose(log.flow, plain["flow"])
         np.testing.assert_allclose(log.temperature, plain["temperature"], atol=1e-9)
         assert log.sampling_interval == pytest.approx(8.0)
+
+    def test_percent_is_said(self, written):
+        path = written(self.table().rename(columns={"flow": "flow [%]"}).to_csv(index=False))
+        assert read_log(path).notes == ["The flow is in %: read % wherever t/h is said."]
 
     def test_missing_rows_and_numbers_are_gaps(self, written):
         table = self.table().drop(index=[100, 101, 102])
@@ -680,6 +688,13 @@ class TestCommand:
         for word in ("gain margin", "least possible", "autocorrelations", "operating point"):
             assert word in text
         assert (out / "report.html").read_text().count("data:image/png") == 4
+        first = (out / "report.md").read_text().split("## ")[1]
+        kp, time = re.search(
+            r"Recommended: PI, SIMC .* Kp = (\S+) .* of (\S+) s", first
+        ).groups()
+        row = next(line for line in text.splitlines() if line.startswith("| PI, SIMC"))
+        assert row.split("|")[2].strip() == kp
+        assert float(time) == pytest.approx(161.0, rel=0.1)  # SIMC's: the time constant
         assert "time constant" in capsys.readouterr().out
 
     def test_reason_is_said(self, written, tmp_path, capsys):

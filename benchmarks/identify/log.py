@@ -25,6 +25,7 @@ TEMPERATURE_UNITS: Units = dict.fromkeys(("degC", "°C", "C"), (1.0, 0.0))
 TEMPERATURE_UNITS |= {"K": (1.0, -273.15)}
 TEMPERATURE_UNITS |= dict.fromkeys(("degF", "°F", "F"), (5 / 9, -160 / 9))
 
+DAY_FIRST = r"^(\d\d)\.(\d\d)\.(\d{4})\b"
 CHUNK = 200_000  # rows that are read at once
 MOST_ROWS = 20_000  # that are kept by default, the latest
 PROGRESS_AFTER = 1.0  # s
@@ -128,7 +129,7 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) 
         raise ValueError(
             f"{path} is too short: {read} rows, and hundreds are needed, while the flow moves"
         )
-    notes = list(clock.notes)
+    notes = [*layout.notes, *clock.notes]
     if read > rows:
         notes.append(f"Of the {read:,} rows, the last {rows:,} are used (--rows).")
     found = dict(zip(layout.names, np.concatenate(kept)[-rows:].T, strict=True))
@@ -176,6 +177,11 @@ class _Layout:
             name: _scale(name, units, unit, default, option)
             for name, (_, units, unit, default, option) in zip(found, wanted, strict=True)
         }
+        self.notes = (
+            ["The flow is in %: read % wherever t/h is said."]
+            if _unit(found[0], columns.flow_unit, "t/h") == "%"
+            else []
+        )
         self._time = found.pop() if columns.sampling_interval is None else None
         self.names = found
 
@@ -229,7 +235,9 @@ class _Layout:
         numbers = column
         if not pd.api.types.is_numeric_dtype(column):
             if is_time:
-                dates = pd.to_datetime(column, errors="coerce", format="ISO8601", utc=True)
+                # Where points are between the numbers, the day comes first.
+                iso = column.astype(str).str.replace(DAY_FIRST, r"\3-\2-\1", regex=True)
+                dates = pd.to_datetime(iso, errors="coerce", format="ISO8601", utc=True)
                 if dates.notna().all():
                     since = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
                     return np.asarray(since, np.float64)
@@ -238,7 +246,11 @@ class _Layout:
         allowed = column.isna().to_numpy() & (not is_time)
         bad = np.flatnonzero(~(np.abs(values) < LARGEST) & ~allowed)
         if len(bad):
-            date = ", or a date such as 2026-01-31T12:00:00" if is_time else ""
+            date = (
+                ", or a date such as 2026-01-31T12:00:00 or 31.01.2026 12:00:00"
+                if is_time
+                else ""
+            )
             raise ValueError(
                 f"{self.path}, line {line + bad[0]}: {column.name} must be a number{date}, got "
                 f"{str(column.iloc[bad[0]])!r}"
@@ -302,14 +314,19 @@ def _scale(
 ) -> tuple[float, float]:
     if not units:
         return 1.0, 0.0
-    bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", name)
-    unit = given or (bracket.group(1) if bracket else default)
+    unit = _unit(name, given, default)
     if unit not in units:
         raise ValueError(
             f"the unit of {name!r} must be one of {', '.join(units)}, got {unit!r}. Say it "
             f"with --{option}-unit"
         )
     return units[unit]
+
+
+def _unit(name: str, given: str | None, default: str) -> str:
+    """Return the unit that an option or a heading's brackets say."""
+    bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", name)
+    return given or (bracket.group(1) if bracket else default)
 
 
 def _missing(columns: dict[str, Array]) -> list[str]:

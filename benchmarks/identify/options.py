@@ -38,7 +38,7 @@ class Options:
     """The log, a CSV file."""
     out: Folder = Path("results/identify")
     time: str = "time"
-    """Column of the times: numbers, or dates as ISO 8601."""
+    """Column of the times: numbers, or dates."""
     flow: str = "flow"
     """Column of the flow."""
     temperature: str = "temperature"

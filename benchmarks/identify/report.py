@@ -49,8 +49,9 @@ def report(model: Model, out: Path) -> list[Section]:
     plots.plot_log(model, out / "log.png")
     plots.plot_residuals(model, out / "residuals.png")
     plots.plot_step(model, step, out / "step.png")
+    tuned = {} if fault(model) else recommended(model, parameters)
     sections = [
-        _found(model),
+        _found(model, tuned),
         Section(
             "The log and the model",
             ["The model is given the flow alone, over the whole log."],
@@ -70,7 +71,6 @@ def report(model: Model, out: Path) -> list[Section]:
     ]
     if fault(model):
         return sections
-    tuned = recommended(model, parameters)
     sections.append(_controllers(tuned, parameters, out))
     if any(each.controller for each in tuned.values()):
         sections.append(_on_the_plant(tuned, arguments))
@@ -108,9 +108,15 @@ def headline(model: Model) -> str:
     ).strip()
 
 
-def _found(model: Model) -> Section:
+def _found(model: Model, tuned: dict[str, Recommended]) -> Section:
     text = [
         headline(model),
+        *(
+            f"Recommended: {name} with Kp = {controller.kp:.4g} t/h per °C and an integral "
+            f"time of {controller.kp / controller.ki * model.sampling_interval:.3g} s."
+            for name, each in tuned.items()
+            if (controller := each.controller)
+        ),
         *model.notes,
         "All numbers are deviations from the operating point: a flow of "
         f"{model.operating_flow:g} t/h, at which the temperature is "
@@ -135,6 +141,10 @@ def _found(model: Model) -> Section:
         for name, variance in model.noise.items()
         if variance and name != "noise_variance"
     ]
+    if len(rows) > len(model.estimates):
+        text.append(
+            "Noise variance and C are those of all noise together; `plant.json` splits it."
+        )
     return Section(
         "What the log shows", text, pd.DataFrame(rows, columns=["", "value", "95 %", "unit"])
     )
