@@ -6,16 +6,21 @@ import re
 import sys
 from pathlib import Path
 
-import pandas as pd
-from rich.console import Console
-
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.commands import sentence
 
 MAP = Path(__file__).with_name("README.md")
 
 
 def main() -> int:
     """Print the map: the table of questions at the top of the page beside this file."""
+    try:
+        import pandas as pd
+        from rich.console import Console
+
+        from benchmarks.lib.tables import on_screen
+    except ImportError as error:
+        print(f"python -m benchmarks: error: {sentence(error)}", file=sys.stderr)
+        return 2
     lines = [
         line for line in MAP.read_text(encoding="utf-8").splitlines() if line.startswith("|")
     ]

@@ -340,7 +340,7 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
     if trained is None:
         reject(
             "policy",
-            policy if isinstance(policy, str | Path) else type(policy).__name__,
+            str(policy) if isinstance(policy, str | Path) else type(policy).__name__,
             "one that knows how it was trained: train it on mptc_gym.sb3.make_vec_env, or save "
             "it by mptc_gym.sb3.save",
         )

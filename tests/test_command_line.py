@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("cyclopts", reason="the commands need the extra compare")
 
+from benchmarks.__main__ import main as show_map
 from benchmarks.lib import command_line
 from benchmarks.lib.options import read
 
@@ -132,6 +133,12 @@ def test_a_missing_package_is_named_with_its_extra(name, package, extra):
     assert done.returncode == 2
     assert f'{package} is not installed: pip install -e ".[{extra}]"' in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_the_map_names_a_missing_package(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    assert show_map() == 2
+    assert capsys.readouterr().err.startswith("python -m benchmarks: error: pandas is not inst")
 
 
 def test_a_controller_that_lacks_a_package_names_its_extra(tmp_path):

@@ -235,7 +235,8 @@ class TestSavedPolicies:
     @pytest.mark.parametrize(
         ("location", "complaint"),
         [
-            ("PPO:{}/bare.zip", "policy must be one that knows how it was trained"),
+            ("PPO:{}/bare.zip", "policy must be .* it was trained.* got '.*bare.zip'$"),
+            ("{}/velocity-0.zip", "must be ALGORITHM:FILE.zip, such as PPO:.*velocity-0.zip"),
             ("PPO:{}/none.zip", "there is no file .*none.zip"),
             ("SAC:{}/velocity-0.zip", "cannot be loaded as SAC"),
             ("PIO:{}/velocity-0.zip", "'PIO' is no algorithm of stable_baselines3"),

@@ -39,6 +39,8 @@ def policies(location: str) -> list[Factory]:
         trained.
     """
     algorithm, _, pattern = location.partition(":")
+    if not pattern:
+        raise ValueError(f"{location!r} must be ALGORITHM:FILE.zip, such as PPO:{location}")
     files = sorted(glob.glob(pattern))  # noqa: PTH207 (patterns of absolute paths, too)
     if not files:
         raise ValueError(f"{location!r}: there is no file {pattern}")
@@ -73,7 +75,7 @@ def _policy(algorithm: str, file: Path) -> Factory:
         },
         cost=Cost(
             parameters=f"{weights:,} weights a policy",
-            samples=f"{model.num_timesteps / 1e6:g} M a policy",
+            samples=f"{model.num_timesteps / 1e6:.3g} M a policy",
         ),
     )
 

@@ -68,7 +68,7 @@ def command(
             print("There is not enough memory for so many runs or samples.", file=sys.stderr)
             return 1
         except (UsageError, ImportError) as error:
-            print(f"python -m benchmarks.{name}: error: {_sentence(error)}", file=sys.stderr)
+            print(f"python -m benchmarks.{name}: error: {sentence(error)}", file=sys.stderr)
             raise SystemExit(2) from error
 
     return main
@@ -98,7 +98,7 @@ def _main(package: str, given: Sequence[str], width: int) -> int:
     return 0
 
 
-def _sentence(error: BaseException) -> str:
+def sentence(error: BaseException) -> str:
     """Return the message of an error, with the extra that has what could not be imported."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, ImportError):
