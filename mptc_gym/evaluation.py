@@ -104,8 +104,10 @@ class Evaluation:
         if self.interval is not None:
             low, high = self.interval
             parts[0] += f", {self.multiple:.2f} times the least possible"
-            parts.append(f"score {self.score:.3f} (95 % {low:.3f} to {high:.3f})")
-        parts += [f"valve travel {self.travel:.0f} t/h", f"{len(self.errors)} episodes"]
+            drawn = f" (95 % {low:.3f} to {high:.3f})" if low < high else ""
+            parts.append(f"score {self.score:.3f}{drawn}")
+        alike = ", all alike" if np.ptp(self.errors) == 0.0 else ""
+        parts += [f"valve travel {self.travel:.0f} t/h", f"{len(self.errors)} episodes{alike}"]
         return "; ".join([*parts, self.missing] if self.missing else parts)
 
     def __repr__(self) -> str:
@@ -167,8 +169,8 @@ def evaluate(
     --------
     >>> import mptc_gym, numpy as np
     >>> print(mptc_gym.evaluate(lambda observations: np.zeros((len(observations), 1))))
-    MiddlePoint-v0: mean error 5.000 degC, 5.49 times the least possible; score 0.000 \
-(95 % 0.000 to 0.000); valve travel 0 t/h; 100 episodes
+    MiddlePoint-v0: mean error 5.000 degC, 5.49 times the least possible; score 0.000; \
+valve travel 0 t/h; 100 episodes, all alike
     """
     episodes = count("episodes", episodes, 2, MOST_PLANTS)
     first = count("seed", seed, 0, 2**63)

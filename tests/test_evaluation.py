@@ -181,6 +181,8 @@ class TestEvaluate:
         assert f"score {found.score:.3f} (95 % " in str(found)
         assert "\n" not in str(found)
         assert len(repr(found)) < 80
+        same = str(evaluate(idle, episodes=2))  # an interval of no width would mean nothing
+        assert same.endswith("score 0.000; valve travel 0 t/h; 2 episodes, all alike")
         other = evaluate(PIController(), episodes=2, delay=[5, 9], setpoint="random")
         assert str(other).endswith(
             "python -m benchmarks.limits --set delay=[5,9] --set setpoint=random"

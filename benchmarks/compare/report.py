@@ -39,10 +39,7 @@ TRAVEL_CAPTION = (
     "the valve. Down and left is better. The line is the least possible error for a given "
     "travel, the dashed one for any travel."
 )
-RUNS_CAPTION = (
-    "A point is one run. It shows what the NN makes of unlucky initial weights, and PPO of an "
-    "unlucky training."
-)
+RUNS_CAPTION = "A point is one run: so unlucky initial weights and unlucky trainings show."
 RESPONSES_CAPTION = (
     "A line is the median over all runs at each sample, a band the 10th to 90th percentile. "
     "The grey band is the dead zone."
