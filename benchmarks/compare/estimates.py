@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -21,9 +21,11 @@ from benchmarks.lib.statistics import (
     student,
 )
 from benchmarks.lib.tables import groups
-from benchmarks.limits import LeastPossible, frontier, is_random, least_possible
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
+
+if TYPE_CHECKING:
+    from benchmarks.limits import LeastPossible
 
 BOOTSTRAP = 0  # seed of the bootstraps
 TOLERANCE = 1e-4  # relative error that a bound may have
@@ -54,6 +56,8 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
 
     The bounds of drawn plants and set points are the means over the episodes that are run.
     """
+    from benchmarks.limits import is_random, least_possible  # here: SciPy takes long to load
+
     case: dict[str, Any] = {
         "samples": scenario.samples,
         "episodes": min(runs, EPISODES),
@@ -68,6 +72,8 @@ def travel_frontier(scenario: Scenario) -> list[tuple[float, float]]:
 
     Between two points the bound is the straight line.
     """
+    from benchmarks.limits import frontier
+
     parameters = scenario.parameters
     if parameters.ranges or parameters.setpoint == "random":
         return []  # as many programmes as episodes: more than a picture is worth

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import scipy  # its modules are loaded when they are used
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 CONFIDENCE = 0.95
 ENDS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)  # quantiles where an interval ends
@@ -69,7 +69,7 @@ def student(values: ArrayLike) -> Estimate:
     if runs < 2 or np.ptp(numbers) == 0.0:
         return Estimate(mean, mean, mean, runs)
     error = float(numbers.std(ddof=1)) / math.sqrt(runs)
-    half = float(stats.t.ppf(ENDS[1], runs - 1)) * error
+    half = float(scipy.stats.t.ppf(ENDS[1], runs - 1)) * error
     return Estimate(mean, mean - half, mean + half, runs)
 
 
@@ -103,7 +103,7 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
     # Infinite values cannot be interpolated; the next higher value is taken instead.
     finite = bool(np.isfinite(ordered).all())
     method: Literal["linear", "higher"] = "linear" if finite else "higher"
-    interval = stats.quantile_test(ordered, p=probability).confidence_interval(CONFIDENCE)
+    interval = scipy.stats.quantile_test(ordered, p=probability).confidence_interval(CONFIDENCE)
     low = -np.inf if np.isnan(interval.low) else interval.low
     high = np.inf if np.isnan(interval.high) else interval.high
     value = np.quantile(ordered, probability, method=method)
@@ -137,13 +137,13 @@ def share(flags: ArrayLike) -> Estimate:
     if happened.ndim != 1 or not len(happened) or happened.dtype != np.bool_:
         raise ValueError(f"flags must be booleans, one for each run, got {flags!r}")
     count, runs = int(happened.sum()), len(happened)
-    interval = stats.binomtest(count, runs).proportion_ci(CONFIDENCE, method="wilson")
+    interval = scipy.stats.binomtest(count, runs).proportion_ci(CONFIDENCE, method="wilson")
     return Estimate(count / runs, float(interval.low), float(interval.high), runs)
 
 
 def interquartile_mean(values: ArrayLike, axis: int | None = None) -> Any:
     """Return the mean of the middle half, which outliers move less than the mean of all."""
-    return stats.trim_mean(values, 0.25, axis=axis)
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
 def bootstrap(
