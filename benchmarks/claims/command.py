@@ -16,7 +16,8 @@ from benchmarks.claims.options import Options
 from benchmarks.claims.plots import PLOTS
 from benchmarks.claims.runs import Batch
 from benchmarks.lib.command_line import known, out_folder
-from benchmarks.lib.storage import write_text
+from benchmarks.lib.report import provenance_line
+from benchmarks.lib.storage import origin, write_text
 from benchmarks.lib.tables import on_screen, write_csv
 
 LONGEST = "direction-only"  # to examine: it begins first
@@ -26,7 +27,7 @@ SEED = 0  # run i starts from the weights, and meets the noise, of seed SEED + i
 def execute(options: Options, console: Console) -> str:
     """Examine the claims and write the verdicts."""
     chosen = known("CLAIM", options.claims or list(CLAIMS), list(CLAIMS))
-    called = f"python -m benchmarks.claims --runs {options.runs}"
+    made = provenance_line("claims", origin())
     out_folder(options.out)
     batch = Batch(options.runs, SEED)
     first = sorted(chosen, key=lambda name: name != LONGEST)
@@ -37,7 +38,7 @@ def execute(options: Options, console: Console) -> str:
         for name, results in options.fan_out.open().stream(tasks, "claims"):
             examined[name] = results
             entries = [CLAIMS[n].entry(examined[n]) for n in chosen if n in examined]
-            write(options.out, entries, results.tables, called)
+            write(options.out, entries, results.tables, made)
     finally:
         if entries:
             overview = verdicts.overview(entries)
@@ -46,11 +47,11 @@ def execute(options: Options, console: Console) -> str:
 
 
 def write(
-    out: Path, entries: Sequence[verdicts.Entry], tables: dict[str, pd.DataFrame], called: str
+    out: Path, entries: Sequence[verdicts.Entry], tables: dict[str, pd.DataFrame], made: str
 ) -> None:
     """Write the verdicts so far, and the tables and pictures of the latest claim."""
     write_csv(out / "claims.csv", verdicts.table(entries))
-    write_text(out / "claims.md", verdicts.markdown(entries, called))
+    write_text(out / "claims.md", verdicts.markdown(entries, made))
     for name, table in tables.items():
         write_csv(out / f"{name}.csv", table)
         PLOTS[name](table, out / f"{name}.png")

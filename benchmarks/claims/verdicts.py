@@ -182,12 +182,13 @@ def _interval(estimate: Estimate) -> str:
     return f"{write_number(estimate.low)} to {write_number(estimate.high)}"
 
 
-def markdown(entries: Sequence[Entry], command: str) -> str:
-    """Return all verdicts as a Markdown page."""
+def markdown(entries: Sequence[Entry], made: str) -> str:
+    """Return all verdicts as a Markdown page, with a line on how they were made."""
     return "\n\n".join(
         [
             "# The paper's claims",
-            f"By `{command}`. Every number rests on independent draws of initial weights and "
+            made,
+            "Every number rests on independent draws of initial weights and "
             "noise. What a claim asks of a number counts as shown if the whole 95 % interval "
             "keeps it. A claim holds if all that it asks is shown, and in part if some is.",
             overview(entries).drop(columns="name").to_markdown(index=False),

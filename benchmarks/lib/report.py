@@ -65,8 +65,9 @@ def provenance_line(command: str, origin: Mapping[str, Any]) -> str:
         Holds `started` and `commit`.
     """
     called = sys.argv[1:] if command in sys.argv[0] else []
+    commit = origin["commit"]  # a hash of 40 digits, and "-dirty" perhaps
     line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])
-    return f"{origin['started']}, commit {origin['commit'][:12]}: {line}"
+    return f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}"
 
 
 def show(sections: Sequence[Section], console: Console) -> None:
