@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -165,6 +166,11 @@ def evaluate(
     TypeError
         If an argument of the environment is unknown.
 
+    Warns
+    -----
+    UserWarning
+        If the policy is a model that does not say how it was trained, and `env` is an id.
+
     Examples
     --------
     >>> import mptc_gym, numpy as np
@@ -180,6 +186,8 @@ valve travel 0 t/h; 100 episodes, all alike
     _check_scale(single)
     with closing(single):
         _check_fit(policy, single, parameters)
+        if isinstance(env, str) and hasattr(policy, "observation_space"):
+            _check_known(policy)
         name = single.spec.id if single.spec else type(single.unwrapped).__name__
         samples = (single.spec and single.spec.max_episode_steps) or SAMPLES
         batch = native_batch(single) or partial(_side_by_side, make)
@@ -347,6 +355,17 @@ def _check_fit(policy: Any, single: gymnasium.Env[Any, Any], parameters: Paramet
                 f"env must have the wrapper that policy was trained with, {missing[0].name}"
                 f"({missing[0].kwargs}): give it as an EnvSpec, see mptc_gym.sb3.spec_of"
             )
+
+
+def _check_known(policy: Any) -> None:
+    """Warn of a model that was trained nobody knows how."""
+    if trained_on(policy) is None:
+        warnings.warn(
+            "policy does not say how it was trained: its actions are taken for flows, not for "
+            "changes of the flow. Save it by mptc_gym.sb3.save, or give env as an EnvSpec with "
+            "the wrappers of its training",
+            stacklevel=3,
+        )
 
 
 def trained_on(policy: Any) -> EnvSpec | None:

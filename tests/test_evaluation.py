@@ -261,7 +261,9 @@ class TestRefusals:
             ValueError, match=r"shape \(26,\), as policy reads them, got \(6,\)"
         ):
             evaluate(Trained())
-        evaluate(Trained(), action_window=20, episodes=2)
+        with pytest.warns(UserWarning, match="does not say how it was trained"):
+            evaluate(Trained(), action_window=20, episodes=2)
+        evaluate(Trained(), wrapped().spec, episodes=2)  # who gives wrappers has thought of it
         network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
         with pytest.raises(
             ValueError,

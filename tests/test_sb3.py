@@ -298,6 +298,9 @@ class TestHowItWasTrained:
             ValueError, match="policy must be one that knows how it was trained"
         ):
             spec_of(PPO.load(tmp_path / "bare.zip", device="cpu"))
+        evaluate(model, episodes=2)  # it still has its environments
+        with pytest.warns(UserWarning, match="does not say how it was trained"):
+            evaluate(PPO.load(tmp_path / "bare.zip", device="cpu"), episodes=2)
         (tmp_path / "text.zip").write_text("no zip")
         with pytest.raises(ValueError, match=r"text\.zip must be a model"):
             spec_of(tmp_path / "text.zip")
