@@ -30,8 +30,8 @@ GROUPS = (  # of the plants that drift, with half-open intervals; each has a row
 # What is asked of two controllers at a time: whether the first makes the smaller error.
 LEARNING = (("nn", "pi-simc"), ("nn", "nn-frozen"), ("nn-frozen", "pi-simc"))
 ADAPTING = (
-    ("nn-self-tuning", "self-tuning"),
     ("nn-self-tuning", "nn-smith"),
+    ("nn-self-tuning", "self-tuning"),
     ("nn-smith", "smith"),
     ("self-tuning", "smith"),
 )
