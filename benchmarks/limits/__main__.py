@@ -4,7 +4,7 @@ import sys
 
 from benchmarks.lib.commands import command
 
-main = command("limits", width=150, interrupted="bounds that are known are kept.")
+main = command("limits", width=180, interrupted="bounds that are known are kept.")
 
 if __name__ == "__main__":
     sys.exit(main(None))
