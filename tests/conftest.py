@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Sequence
 from typing import Any
 
 # Before NumPy and PyTorch are loaded: the processes of the tests share the cores already.
@@ -35,3 +36,16 @@ def run(
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20261121)
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Return a function that runs a command, and returns with which words it refuses."""
+
+    def refused(main: Callable[[Sequence[str]], int], given: Sequence[object]) -> str:
+        with pytest.raises(SystemExit) as stop:
+            main([str(each) for each in given])
+        assert stop.value.code == 2
+        return capsys.readouterr().err
+
+    return refused

@@ -234,11 +234,6 @@ class TestCommand:
         assert "Interrupted" in capsys.readouterr().out
         assert set(pd.read_csv(tmp_path / "claims.csv")["claim"]) == {"direction"}
 
-    def test_an_unknown_claim(self, tmp_path, capsys):
-        with pytest.raises(SystemExit):
-            run_claims(tmp_path, "everything")
-        assert "no 'everything'" in capsys.readouterr().err
-
     @pytest.mark.parametrize("name", claims.CLAIMS)
     def test_every_claim_but_that_of_the_curves_can_be_tested(self, name):
         class Short(Batch):

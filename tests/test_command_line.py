@@ -86,36 +86,90 @@ def test_help_keeps_names_whole(capsys):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_an_unknown_option_is_named_in_one_line(name, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main_of(name)(["--nonsense"])
-    assert stop.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
+def test_an_unknown_option_is_named_in_one_line(name, refused):
+    (line,) = refused(main_of(name), ["--nonsense"]).splitlines()
     assert line.startswith(f"python -m benchmarks.{name}: error: ")
     assert "--nonsense" in line or "requires an argument" in line
 
 
-@pytest.mark.parametrize(
-    ("given", "complaint"),
-    [
-        ("u_min=5", "constant set point, u_min=5: there is nothing to gain: doing nothing"),
-        ("time_constant_factor=100", "square wave, time_constant_factor=100: there is nothing"),
-        ("delay=100000", "--set: delay must be an integer from 0 to 10,000, got 100000"),
-        ("delay=2000", "there is nothing to gain"),
-        ("render_mode=human", "--set: render_mode is not an argument of the plant"),
+LOG = ROOT / "benchmarks/identify/example.csv"
+REFUSED = {
+    "claims": [(["everything"], "no 'everything'")],
+    "compare": [
+        (["--agents", "nn", "pid"], "no 'pid'"),
+        (["--agents"], "no controller"),
+        (["--scenarios", "circle"], "no 'circle'"),
+        (["--scenarios", ""], "--scenarios"),
+        (["--runs", "0"], "must be an integer of at least 1, got '0'"),
+        (["--runs", "many"], "must be an integer of at least 1, got 'many'"),
+        (["--kept", __file__], "--kept: .* cannot be written to: it is no folder"),
+        (["--plant", "nowhere.json"], "nowhere.json"),
+        (["--set", "delay"], "ARGUMENT=VALUE"),
+        (["--set", "dely=3"], "'dely': did you mean 'delay'?"),
+        (["--set", "delay=-1"], "delay must be"),
+        (["--set", "delay=100000"], "--set: delay must be an integer from 0 to 10,000, got 10"),
+        (["--set", "delay=2000"], "there is nothing to gain"),
+        (["--set", "a=[1,-1.5]"], "--set: a must not have a root beyond the unit circle"),
+        (["--set", "a=[1,-1]", "--agents", "pi-simc"], "pi-simc on .*: a must be of a stable"),
+        (["--set", "u_min=5"], "constant set point, u_min=5: there is nothing to gain: doing"),
+        (["--set", "time_constant_factor=100"], "square wave, time_constant_factor=100: there"),
+        (["--set", "render_mode=human"], "--set: render_mode is not an argument of the plant"),
+        (["--agent", "PI=agents:PIController"], "'PI' is taken"),
+        (["--agent", "pi=agents:PIController"], "'pi' is taken"),
+        (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
+        (["--agent", "x=agents:Nothing"], "agents:Nothing"),
+        (["--agent", "x=.:y"], "'.:y' cannot be imported"),
+        (["--agent", "x=..a:y"], "'..a:y' cannot be imported"),
+        (["--agent", "x=tests.tasks:ObservesAList"], "observation of .* must be a dict"),
+        (["--agent", "x=tests.tasks:ObservesText"], "observation of .* must be a dict"),
     ],
-)  # fmt: skip
-def test_a_plant_that_cannot_be_compared_is_refused_before_any_run(given, complaint, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main_of("compare")(["--agents", "pi", "--runs", "1", "--set", given])
-    assert stop.value.code == 2
-    assert complaint in capsys.readouterr().err
+    "identify": [
+        ([LOG, "--orders", "0", "1", "0"], "--orders: A and B must have at least 1"),
+        ([LOG, "--orders", "2", "0", "2"], "--orders: A and B must have at least 1"),
+        ([LOG, "--u-min", "nan"], "--u-min: must be a finite number, got 'nan'"),
+        ([LOG, "--u-max", "full"], "--u-max: must be a finite number, got 'full'"),
+        ([LOG, "--operating-flow", "inf"], "--operating-flow: must be a finite number"),
+        ([LOG, "--operating-flow", "1e9"], "operating_flow must be near the flows of the log"),
+        ([LOG, "--sampling-interval", "0"], "--sampling-interval: must be a number above 0"),
+    ],
+    "limits": [
+        (["--cache", __file__], "--cache: "),
+        (["--verify", "--set", "delay=3"], "--verify: goes without"),
+        (["--verify", "--mpc", "3"], "--verify: goes without"),
+    ],
+    "speed": [
+        (["--rounds", "0"], "--rounds"),
+        (["--rounds", "many"], "--rounds"),
+        (["--device", "toaster"], "--device: device must be one that PyTorch can use"),
+    ],
+    "sweep": [
+        (["--agents", "nobody"], "no 'nobody'; there are nothing, nn"),
+        (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),
+    ],
+    "watch": [
+        (["--agent", "lqr"], "--agent: no 'lqr'; there are nothing, nn"),
+        (["--agent", "agents:Nobody"], "--agent.*Nobody"),
+        (["--scenario", "triangle"], "--scenario.*constant-noise"),
+        (["--video", "film.avi"], "--video.*.mp4 or .gif"),
+        (["--seed", "-1"], "--seed.*at least 0"),
+        (["--speed", "0"], "--speed.*at least 1"),
+        # Of a machine without a screen.
+        (["--agent", "you"], "--agent you: needs a screen"),
+        (["--agent", "you", "--video", "film.gif"], "--agent you: needs a screen"),
+    ],
+}  # fmt: skip
 
 
-def test_a_device_that_there_is_not_is_named(capsys):
-    with pytest.raises(SystemExit):
-        main_of("speed")(["--device", "toaster"])
-    assert "--device: device must be one that PyTorch can use" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("name", "given", "complaint"),
+    [(name, *each) for name in REFUSED for each in REFUSED[name]],
+)
+def test_what_does_not_fit_is_refused_before_anything_is_run_or_written(
+    name, given, complaint, refused, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert re.search(complaint, refused(main_of(name), given))
+    assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
 @pytest.mark.parametrize(

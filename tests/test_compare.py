@@ -270,24 +270,6 @@ class TestRollout:
         assert np.all(runs.output[:19] == 0.0)
         assert np.all(runs.output[19] == pytest.approx(0.456))  # ... and shows in row 19
 
-    def test_every_controller_meets_the_same_noise(self):
-        noises = [
-            rollout(make_plants(3, 30, noise_variance=0.5), agent, 30, seed=8).noise
-            for agent in (Constant(-1.0), PIController())
-        ]
-        np.testing.assert_array_equal(*noises)
-        assert not np.array_equal(noises[0][:, 0], noises[0][:, 1])
-
-    def test_the_controller_begins_afresh(self):
-        plants, agent = make_plants(1, 30, setpoint=5.0), PIController()
-        first, second = (rollout(plants, agent, 30, seed=0) for _ in range(2))
-        np.testing.assert_array_equal(first.command, second.command)
-
-    def test_runs_do_not_depend_on_how_many_there_are(self):
-        many = rollout(make_plants(3, 30, noise_variance=0.5), PIController(), 30, seed=8)
-        one = rollout(make_plants(1, 30, noise_variance=0.5), PIController(), 30, seed=10)
-        np.testing.assert_array_equal(many.output[:, 2], one.output[:, 0])
-
 
 class TestStorage:
     def test_a_failed_write_leaves_the_old_file(self, tmp_path):
@@ -695,42 +677,6 @@ class TestCompare:
         (out / "runs.csv").write_text("of an earlier run")
         assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=0) == 130
         assert (out / "runs.csv").read_text() == "of an earlier run"
-
-    @pytest.mark.parametrize(
-        ("options", "complaint"),
-        [
-            (["--agents", "nn", "pid"], "no 'pid'"),
-            (["--scenarios", "circle"], "no 'circle'"),
-            (["--runs", "0"], "must be an integer of at least 1, got '0'"),
-            (["--runs", "many"], "must be an integer of at least 1, got 'many'"),
-            (["--scenarios", ""], "--scenarios"),
-            (["--agents"], "no controller"),
-            (["--set", "delay=-1"], "delay must be"),
-            (["--set", "delay"], "ARGUMENT=VALUE"),
-            (["--set", "a=[1,-1.5]"], "--set: a must not have a root beyond the unit circle"),
-            (
-                ["--set", "a=[1,-1]", "--agents", "pi-simc"],
-                "pi-simc on .*: a must be of a stable",
-            ),
-            (["--kept", __file__], "--kept: .* cannot be written to: it is no folder"),
-            (["--set", "dely=3"], "'dely': did you mean 'delay'?"),
-            (["--plant", "nowhere.json"], "nowhere.json"),
-            (["--agent", "PI=agents:PIController"], "'PI' is taken"),
-            (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
-            (["--agent", "pi=agents:PIController"], "'pi' is taken"),
-            (["--agent", "x=agents:Nothing"], "agents:Nothing"),
-            (["--agent", "x=.:y"], "'.:y' cannot be imported"),
-            (["--agent", "x=..a:y"], "'..a:y' cannot be imported"),
-            (["--agent", "x=tests.tasks:ObservesAList"], "observation of .* must be a dict"),
-            (["--agent", "x=tests.tasks:ObservesText"], "observation of .* must be a dict"),
-        ],
-    )
-    def test_bad_options(self, options, complaint, capsys, tmp_path):
-        with pytest.raises(SystemExit) as stop:
-            run_compare(tmp_path / "out", *options)
-        assert stop.value.code == 2
-        assert re.search(complaint, capsys.readouterr().err)
-        assert not (tmp_path / "out").exists()
 
     def test_as_a_command(self, tmp_path):
         command = [sys.executable, "-m", "benchmarks.compare", "--agents", "pi", "--runs", "1"]

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from agents import DirectNNController
 from benchmarks.controllers import pretrained
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.own import own_factory
@@ -38,14 +37,6 @@ def factory(entry, tmp_path, monkeypatch):
     # PPO for many plants does not come with the project: here it is that for the paper's.
     monkeypatch.setattr(pretrained, "RANDOMISED", {})
     return entry.members(PolicyRequest(folder=tmp_path, policies=1))[0]
-
-
-def test_who_does_not_learn_does_the_same_in_a_second_run(factory):
-    plant = {"noise_variance": 0.5, "delay": 9}
-    controller = factory(plant, 2, 0)
-    plants = make_plants(2, 250, **factory.arguments(plant))
-    first, second = (rollout(plants, controller, 250, 0).command for _ in range(2))
-    assert np.array_equal(first, second) is not factory.learns
 
 
 def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, monkeypatch):
@@ -245,14 +236,3 @@ class TestSavedPolicies:
     def test_what_is_refused(self, location, complaint, zips):
         with pytest.raises(UsageError, match=f"^--agent: .*{complaint}"):
             chosen([], [f"mine={location.format(zips)}"])
-
-
-def test_the_network_learns_either_direction_and_fails_with_the_wrong_one():
-    plant = {"b": [-b for b in Parameters().b]}
-    late = {}
-    for direction in (-1, 1):
-        controller = DirectNNController(direction=direction, num_envs=8)
-        run = rollout(make_plants(8, 1200, **plant), controller, 1200, seed=0)
-        late[direction] = np.median(np.abs(run.error[600:]).mean(axis=0))
-    assert late[1] < 4.0  # with no control it is 5
-    assert late[-1] > 6.0  # the wrong way round it drives the error up

@@ -1,6 +1,5 @@
 """Offline data sets: what was logged can be replayed, and scored on an absolute scale."""
 
-import builtins
 import json
 import subprocess
 import sys
@@ -143,20 +142,6 @@ def test_writing_again_replaces_and_a_failure_changes_nothing(minari, monkeypatc
     assert main([name, "--episodes", "2"]) == 130
     assert minari.load_dataset(name).total_episodes == 3
     assert [path.name for path in tmp_path.iterdir()] == ["middlepoint"]
-
-
-def test_without_minari_it_says_what_to_install(monkeypatch, capsys):
-    real = builtins.__import__
-
-    def without(name, *rest, **named):
-        if name.partition(".")[0] == "minari":
-            raise ImportError("No module named 'minari'")
-        return real(name, *rest, **named)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(SystemExit):
-        main(["middlepoint/paper/pi-v0"])
-    assert 'pip install -e ".[data]"' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -705,25 +705,6 @@ class TestCommand:
         assert "the flow is constant" in capsys.readouterr().err
         assert not (tmp_path / "out" / "plant.json").exists()
 
-    @pytest.mark.parametrize(
-        ("options", "complaint"),
-        [
-            (["--orders", "0", "1", "0"], "--orders: A and B must have at least 1"),
-            (["--orders", "2", "0", "2"], "--orders: A and B must have at least 1"),
-            (["--u-min", "nan"], "--u-min: must be a finite number, got 'nan'"),
-            (["--u-max", "full"], "--u-max: must be a finite number, got 'full'"),
-            (["--operating-flow", "inf"], "--operating-flow: must be a finite number"),
-            (["--operating-flow", "1e9"], "operating_flow must be near the flows of the log"),
-            (["--sampling-interval", "0"], "--sampling-interval: must be a number above 0"),
-        ],
-    )
-    def test_bad_options_are_named(self, options, complaint, tmp_path, capsys):
-        with pytest.raises(SystemExit) as ended:
-            main([str(EXAMPLE), "--out", str(tmp_path), *options])
-        assert ended.value.code == 2
-        assert complaint in capsys.readouterr().err
-        assert not (tmp_path / "plant.json").exists()
-
 
 class TestStudy:
     def test_log_of_a_known_plant(self):

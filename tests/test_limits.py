@@ -584,21 +584,6 @@ class TestPredictiveController:
         assert np.abs(9.0 - runs.output[100:]).mean() < 0.2
 
 
-@pytest.mark.parametrize(
-    ("options", "complaint"),
-    [
-        (["--cache", __file__], "--cache: "),
-        (["--verify", "--set", "delay=3"], "--verify: goes without"),
-        (["--verify", "--mpc", "3"], "--verify: goes without"),
-    ],
-)
-def test_bad_options_are_named(options, complaint, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(options)
-    assert stop.value.code == 2
-    assert complaint in capsys.readouterr().err
-
-
 def test_command(capsys, tmp_path, monkeypatch):
     some = {name: PRESETS[name] for name in ("noisy", "hard")}
     monkeypatch.setattr(command, "PRESETS", some)

@@ -13,10 +13,8 @@ import pytest
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers import RecordVideo
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from moviepy import VideoFileClip
 
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, drawing, rendering
 from mptc_gym.parameters import Parameters
@@ -326,33 +324,6 @@ def test_fonts_outlive_another_s_end_of_pygame():
     pygame.init()
     new = rendering.frame(record((0.0, 9753.1, 0.0, 0.0)))  # ticks that no other test writes
     assert len(places(new[100:300, :72], drawing.FAINT, tolerance=60)[0]) > 100
-
-
-# MoviePy does with NumPy 2.5 what that has come to advise against.
-@pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning")
-def test_videos_can_be_recorded(tmp_path):
-    env = gymnasium.make("MiddlePoint-v0", render_mode="rgb_array", max_episode_steps=8)
-    env = RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda _: True)
-    list(frames(env, np.zeros(8)))
-    env.close()
-    (film,) = (tmp_path / "films").glob("*.mp4")
-    with VideoFileClip(str(film)) as clip:
-        assert clip.size == [960, 540]
-        assert clip.n_frames == 9
-
-
-def test_lists_of_frames():
-    env = gymnasium.make("MiddlePoint-v0", render_mode="rgb_array_list")
-    env.reset(seed=0)
-    env.step(UP)
-    assert [picture.shape for picture in env.render()] == [SHAPE] * 2
-
-
-def test_stable_baselines3_draws_all_of_its_environments():
-    util = pytest.importorskip("stable_baselines3.common.env_util", reason="it is not here")
-    envs = util.make_vec_env("MiddlePoint-v0", n_envs=2, seed=0)
-    envs.reset()
-    assert envs.render().shape == (2 * 540, 960, 3)
 
 
 anything = st.floats() | st.floats(-20, 20)

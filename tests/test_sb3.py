@@ -102,14 +102,6 @@ def test_training_ends_in_the_same_weights():
     assert not torch.equal(parameters_of(trained[0]), parameters_of(untrained))
 
 
-def test_infos_of_the_batch_are_at_hand():
-    ours, _ = make_both()
-    ours.reset()
-    assert ours.infos["output"].shape == (N,)
-    ours.step(np.ones((N, 1), np.float32))
-    assert list(ours.infos["command"]) == [10.0] * N
-
-
 def test_pictures_are_those_of_the_batch():
     envs = gymnasium.make_vec(
         "MiddlePoint-v0", 2, autoreset_mode="SameStep", render_mode="rgb_array"
@@ -226,12 +218,6 @@ class TestMakeVecEnv:
             found.append([(episode["r"], episode["l"]) for episode in episodes])
         assert len(found[0]) == 6
         np.testing.assert_allclose(found[0], found[1], atol=2e-6)
-
-    def test_they_are_logged(self):
-        plants = make_vec_env("MiddlePoint-v0", 2, max_episode_steps=16)
-        model = model_of(plants).learn(64)
-        assert len(model.ep_info_buffer) == 4
-        assert model.ep_info_buffer[0]["r"] == pytest.approx(-0.5 * 16)
 
     @pytest.mark.parametrize(
         ("arguments", "message"),

@@ -1,7 +1,5 @@
 """The speed benchmark: its arithmetic, and that it runs."""
 
-import pytest
-
 from benchmarks.speed import command as speed
 from benchmarks.speed.__main__ import main
 
@@ -42,13 +40,6 @@ def test_it_runs(monkeypatch, capsys):
         "Without not_installed: pip install",
     ):
         assert words in shown
-
-
-@pytest.mark.parametrize("rounds", ["0", "many"])
-def test_bad_rounds_are_named(rounds, capsys):
-    with pytest.raises(SystemExit):
-        main(["--rounds", rounds])
-    assert "--rounds" in capsys.readouterr().err
 
 
 def test_a_device_can_be_measured_alone(monkeypatch, capsys):

@@ -10,7 +10,7 @@ from benchmarks.controllers.step_test import StepTest, step_test
 from benchmarks.loop.linear import nominal
 from benchmarks.loop.metrics import reversals
 from benchmarks.loop.plants import read_plant
-from mptc_gym import PRESETS, Parameters
+from mptc_gym import Parameters
 
 
 def first_order(gain, time_constant, delay):
@@ -50,19 +50,6 @@ def test_model_is_close_to_the_response_of_a_plant_of_higher_order():
 def test_sampling_interval_scales_times():
     slow = step_test(Parameters(sampling_interval=80.0))
     assert (slow.time_constant, slow.delay) == (1610.0, 1520.0)
-
-
-def test_factors_are_those_of_the_plant_and_ranges_their_middle():
-    drawn = Parameters(gain_factor=[1.0, 2.0], time_constant_factor=[1.5, 2.5], delay=[10, 20])
-    found = step_test(drawn)
-    assert found.gain == pytest.approx(1.5 * -0.6825, rel=1e-3)
-    # 1 / (1 - pole) is doubled: 41.2 samples, whose time constant is 40.7 samples.
-    assert found.time_constant == pytest.approx(40.74 * 8.0, rel=0.01)
-    assert found.delay == 16 * 8.0
-
-
-def test_drift_and_disturbances_do_not_show():
-    assert step_test(Parameters(**PRESETS["fouling"])) == step_test(Parameters())
 
 
 @pytest.mark.parametrize(

@@ -181,17 +181,6 @@ class TestSweep:
         assert run_sweep(tmp_path, "--design", "random", *given, "--agents", "pi") == 0
         assert len(pd.read_csv(tmp_path / "runs.csv")) == 4
 
-    def test_a_nominal_plant_that_no_design_fits_is_named(self, tmp_path, capsys):
-        with pytest.raises(SystemExit):
-            run_sweep(tmp_path / "out", "--design", "random", "--set", "a=[1]")
-        assert "--design random: time_constant_factor" in capsys.readouterr().err
-        assert not (tmp_path / "out").exists()
-
-    def test_unknown_controller(self, tmp_path, capsys):
-        with pytest.raises(SystemExit):
-            main(["--agents", "nobody", "--out", str(tmp_path)])
-        assert "no 'nobody'; there are nothing, nn" in capsys.readouterr().err
-
     def test_a_failed_task_is_named_and_the_others_are_kept(
         self, tmp_path, capsys, monkeypatch
     ):

@@ -2,7 +2,9 @@
 
 import copy
 import pickle
+import time
 import tracemalloc
+from functools import partial
 from unittest.mock import patch
 
 import gymnasium
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import vector
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,6 +21,7 @@ from tests.arguments import valid_arguments
 
 NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
 MODES = [mode.value for mode in AutoresetMode]
+TONNES = np.float32(10.0)  # Gymnasium warns of a loss of precision with others
 
 
 def make_both(num_envs, mode, limit, **arguments):
@@ -153,6 +157,21 @@ def test_limits_of_minus_zero():
     native.reset(seed=0), sync.reset(seed=0)
     actions = np.array([[-2.0], [0.0]], np.float32)
     assert_equal(native.step(actions), sync.step(actions))
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        vector.RecordEpisodeStatistics, vector.NormalizeReward,
+        partial(vector.RescaleAction, min_action=-TONNES, max_action=TONNES),
+    ],
+)  # fmt: skip
+def test_gymnasium_s_wrappers_do_with_it_what_they_do_with_them(wrap, mode, rng, monkeypatch):
+    monkeypatch.setattr(time, "perf_counter", lambda: 0.0)  # which they tell, too
+    native, sync = (wrap(envs) for envs in make_both(3, mode, 20, **NOISY))
+    assert_equal(native.reset(seed=5), sync.reset(seed=5))
+    compare(native, sync, steps=70, rng=rng, partial_resets=0.0)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

@@ -150,25 +150,6 @@ def test_a_policy(monkeypatch, capsys):
     assert "PPO on square wave" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "named"),
-    [
-        ("--agent", "lqr", "no 'lqr'; there are nothing, nn"),
-        ("--agent", "agents:Nobody", "Nobody"),
-        ("--scenario", "triangle", "constant-noise"),
-        ("--video", "film.avi", ".mp4 or .gif"),
-        ("--seed", "-1", "at least 0"),
-        ("--speed", "0", "at least 1"),
-    ],
-)
-def test_bad_options_are_named(option, value, named, capsys):
-    with pytest.raises(SystemExit):
-        main([option, value])
-    shown = capsys.readouterr().err
-    assert option in shown
-    assert named in shown
-
-
 def post(kind, **about):
     pygame.event.post(pygame.event.Event(kind, **about))
 
@@ -354,10 +335,3 @@ def test_a_load_by_hand_is_a_load_of_the_plant_while_it_drifts():
         *_, infos = touched.step(np.array([[0.9]]))
         _, _, output = plant.step(0.9, noise=0.0, load=2.0)
         assert infos["output"][0] == pytest.approx(output, abs=1e-12)
-
-
-def test_your_hands_need_a_window(capsys):
-    for more in ([], ["--video", "film.gif"]):
-        with pytest.raises(SystemExit):
-            main(["--agent", "you", *more])
-        assert "--agent you: needs a screen" in capsys.readouterr().err
