@@ -43,9 +43,12 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """Return a function that runs a command, and returns with which words it refuses."""
 
     def refused(main: Callable[[Sequence[str]], int], given: Sequence[object]) -> str:
+        capsys.readouterr()  # what came before
         with pytest.raises(SystemExit) as stop:
             main([str(each) for each in given])
         assert stop.value.code == 2
-        return capsys.readouterr().err
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        return printed.err
 
     return refused

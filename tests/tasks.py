@@ -9,19 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-
-class ObservesAList:
-    """A factory of controllers whose observation is of no use."""
-
-    observation = ("output_window",)
-
-
-class ObservesText:
-    """A factory of controllers whose observation is of no use."""
-
-    observation = "output_window"
-
-
 Rows = list[dict[str, float]]
 
 

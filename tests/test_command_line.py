@@ -120,8 +120,6 @@ REFUSED = {
         (["--agent", "x=agents:Nothing"], "agents:Nothing"),
         (["--agent", "x=.:y"], "'.:y' cannot be imported"),
         (["--agent", "x=..a:y"], "'..a:y' cannot be imported"),
-        (["--agent", "x=tests.tasks:ObservesAList"], "observation of .* must be a dict"),
-        (["--agent", "x=tests.tasks:ObservesText"], "observation of .* must be a dict"),
     ],
     "identify": [
         ([LOG, "--orders", "0", "1", "0"], "--orders: A and B must have at least 1"),

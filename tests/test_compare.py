@@ -272,16 +272,23 @@ class TestRollout:
 
 
 class TestStorage:
-    def test_a_failed_write_leaves_the_old_file(self, tmp_path):
+    @pytest.mark.parametrize(
+        ("error", "raised"),
+        [
+            (KeyboardInterrupt(), KeyboardInterrupt),
+            (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), storage.NotWrittenError),
+        ],
+    )
+    def test_a_failed_write_leaves_the_old_file(self, error, raised, tmp_path):
         path = tmp_path / "file.txt"
         storage.write_text(path, "old")
 
         def write_half():
             with storage.replacing(path) as partial:
                 partial.write_text("half of the n")
-                raise KeyboardInterrupt
+                raise error
 
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(raised, match=r"file\.txt .* No space left|^$"):
             write_half()
         assert path.read_text() == "old"
         assert list(tmp_path.iterdir()) == [path]
@@ -291,21 +298,6 @@ class TestStorage:
         path.parent.write_text("in the way")
         with pytest.raises(storage.NotWrittenError, match=r"table\.csv could not be written"):
             storage.write_text(path, "new")
-
-    def test_a_full_disk_is_named_and_leaves_the_old_file(self, tmp_path, monkeypatch):
-        path = tmp_path / "file.txt"
-        storage.write_text(path, "old")
-
-        def full(self, text, encoding, newline):
-            with self.open("w", encoding=encoding, newline=newline) as file:
-                file.write(text[:3])
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-        monkeypatch.setattr(Path, "write_text", full)
-        with pytest.raises(storage.NotWrittenError, match=r"file\.txt .* No space left"):
-            storage.write_text(path, "new text")
-        assert path.read_text() == "old"
-        assert list(tmp_path.iterdir()) == [path]
 
     def test_a_file_that_is_open_elsewhere_for_a_moment(self, tmp_path, monkeypatch):
         # Windows refuses to replace it then.
@@ -579,24 +571,28 @@ class TestCompare:
             out, "--agents", "pi", "nn", "--scenarios", "constant", "square", "--runs", 1
         )
 
-    def test_an_interrupted_run_keeps_what_it_has(self, tmp_path, monkeypatch, capsys):
-        out = tmp_path / "out"
-        assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=2) == 130
-        assert "Interrupted" in capsys.readouterr().out
+    @staticmethod
+    def the_first_is_kept(out):
         assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
-        assert json.loads((out / "provenance.json").read_text())["complete"] is False
+        return json.loads((out / "provenance.json").read_text())["complete"] is False
+
+    @pytest.mark.parametrize(
+        ("error", "status", "said"),
+        [
+            (KeyboardInterrupt, 130, ["Interrupted"]),
+            (ZeroDivisionError, 1, [f"nn, {s}: ZeroDivision" for s in ("constant", "square")]),
+        ],
+    )
+    def test_a_run_that_is_stopped_and_one_that_fails_keep_what_they_have(
+        self, error, status, said, tmp_path, monkeypatch, capsys
+    ):
+        out = tmp_path / "out"
+        assert self.run_and_stop(out, monkeypatch, error, after=2) == status
+        shown = capsys.readouterr().out
+        assert all(words in shown for words in said)
+        assert self.the_first_is_kept(out)
         assert (out / "report.md").exists()
         assert (out / "square.png").exists()
-
-    def test_what_ran_beside_a_failing_controller_is_kept(self, tmp_path, monkeypatch, capsys):
-        out = tmp_path / "out"
-        assert self.run_and_stop(out, monkeypatch, ZeroDivisionError, after=2) == 1
-        shown = capsys.readouterr().out
-        assert "nn, constant: ZeroDivisionError" in shown
-        assert "nn, square: ZeroDivisionError" in shown
-        assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
-        assert json.loads((out / "provenance.json").read_text())["complete"] is False
-        assert (out / "report.md").exists()
 
     def test_every_case_is_saved_before_the_next_begins(self, tmp_path, monkeypatch):
         saved = []
@@ -623,8 +619,7 @@ class TestCompare:
         monkeypatch.setattr(report, "write_report", interrupted)
         assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=2) == 130
         assert "Interrupted" in capsys.readouterr().out
-        assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
-        assert json.loads((out / "provenance.json").read_text())["complete"] is False
+        assert self.the_first_is_kept(out)
 
     @pytest.mark.parametrize("text", ["", "null", "[]", '{"files": 3}', "{", "\0\0"])
     def test_damaged_provenance_is_named_and_written_anew(self, text, tmp_path, capsys):
@@ -638,22 +633,17 @@ class TestCompare:
         assert "may stay" in complaint
         assert json.loads((out / "provenance.json").read_text())["complete"] is True
 
-    def test_a_folder_that_cannot_be_written_to(self, tmp_path, monkeypatch, capsys):
+    def test_a_folder_that_cannot_be_written_to(self, tmp_path, monkeypatch, refused):
         (tmp_path / "file").write_text("in the way")
         monkeypatch.setattr(comparison, "rollout", None)  # nothing is run before
         for out in (tmp_path / "file", tmp_path / "file" / "below"):
-            with pytest.raises(SystemExit) as stop:
-                run_compare(out, "--agents", "pi", "--runs", 1)
-            assert stop.value.code == 2
-            assert f"--out: {out} cannot be written to" in capsys.readouterr().err
+            assert f"--out: {out} cannot be written to" in refused(main, ["--out", out])
 
         def read_only(dir):  # noqa: A002
             raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
         monkeypatch.setattr(storage.tempfile, "TemporaryFile", read_only)
-        with pytest.raises(SystemExit):
-            run_compare(tmp_path / "out", "--agents", "pi", "--runs", 1)
-        assert "Read-only file system" in capsys.readouterr().err
+        assert "Read-only file system" in refused(main, ["--out", tmp_path / "out"])
 
     @pytest.mark.parametrize("name", ["runs.csv", "limits.png", "report.html"])
     def test_a_disk_that_gets_full(self, name, tmp_path, monkeypatch, capsys):

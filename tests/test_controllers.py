@@ -158,6 +158,14 @@ class TestOwnControllers:
         [
             ("class Mine:\n    def act(self, o): return [[0.0]] * len(o)", "reset"),
             ("class Mine:\n    observation = 3", "observation of .* must be a dict"),
+            (
+                "class Mine:\n    observation = 'window'",
+                "observation of .* must be a dict",
+            ),
+            (
+                "class Mine:\n    observation = ['error_window']",
+                "observation of .* must be a d",
+            ),
             ("class Mine:\n    observation = {'dead_zone': 0.0}", "out of .* got 'dead_zone'"),
             (
                 "class Mine:\n    def reset(self): pass\n    def act(self, o): return 0.0",

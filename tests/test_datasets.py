@@ -151,18 +151,14 @@ def test_writing_again_replaces_and_a_failure_changes_nothing(minari, monkeypatc
         (["middlepoint/paper/mixed-v0", "--episodes", "3"], "episodes must be at least 4"),
     ],
 )
-def test_bad_options_are_named(arguments, named, minari, capsys):
-    with pytest.raises(SystemExit):
-        main(arguments)
-    assert named in capsys.readouterr().err
+def test_bad_options_are_named(arguments, named, minari, refused):
+    assert named in refused(main, arguments)
 
 
-def test_a_place_that_cannot_be_written_to_is_named(minari, tmp_path, monkeypatch, capsys):
+def test_a_place_that_cannot_be_written_to_is_named(minari, tmp_path, monkeypatch, refused):
     (tmp_path / "file").touch()
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "file"))
-    with pytest.raises(SystemExit):
-        main(["middlepoint/paper/pi-v0", "--episodes", "1"])
-    assert "MINARI_DATASETS_PATH: " in capsys.readouterr().err
+    assert "MINARI_DATASETS_PATH: " in refused(main, ["middlepoint/paper/pi-v0"])
 
 
 def test_bad_names_are_named():
