@@ -1,6 +1,7 @@
 """Behind the claims: verdicts on made-up numbers, detectors on known sequences."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,7 @@ from benchmarks.claims import command as claims
 from benchmarks.claims import examinations, verdicts
 from benchmarks.claims.__main__ import main
 from benchmarks.claims.runs import Batch, converged_at, fail_node
-from benchmarks.claims.verdicts import Entry, Finding, Verdict, verdict
+from benchmarks.claims.verdicts import Claim, Finding, Verdict, verdict
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.metrics import join, mean_error, settled, split
 from benchmarks.loop.rollout import Trajectory
@@ -62,15 +63,15 @@ class TestVerdicts:
         assert verdict(findings) is expected
 
     def test_verdicts_by_hand(self):
-        entries = [
-            Entry("good", "Section 1", "It is good", "By looking.", (GOOD, INFORMATION)),
-            Entry("none", "Section 2", "It cannot be", "Not at all.", ()),
-        ]
-        table = verdicts.table(entries)
+        nothing = examinations.nothing
+        good = Claim("good", "Section 1", "It is good", "By looking.", nothing)
+        none = Claim("none", "Section 2", "It cannot be", "Not at all.", nothing)
+        examined = [replace(good, findings=[GOOD, INFORMATION]), none]
+        table = verdicts.table(examined)
         assert list(table["claim"]) == ["good", "good", "none"]
         assert list(table["shown"])[:2] == ["yes", ""]
         assert list(table["criterion"])[:2] == ["at least 1", ""]
-        page = verdicts.markdown(entries, "a command")
+        page = verdicts.markdown(examined, "a command")
         assert "| It is good   | holds" in page
         assert "| It cannot be | cannot be tested from the text |" in page
         assert "| 1.500   | 1.000 to 2.000" in page
@@ -228,7 +229,7 @@ class TestCommand:
             raise KeyboardInterrupt
 
         interrupted = dict(claims.CLAIMS)
-        interrupted["noise"] = examinations.Claim("noise", "", "", "", stop)
+        interrupted["noise"] = Claim("noise", "", "", "", stop)
         monkeypatch.setattr(claims, "CLAIMS", interrupted)
         assert run_claims(tmp_path, "direction", "noise") == 130
         assert "Interrupted" in capsys.readouterr().out

@@ -20,9 +20,10 @@ from benchmarks.identify.__main__ import main
 from benchmarks.identify.armax import Orders, Rows
 from benchmarks.identify.cleaning import without_noise_of_held_flow, without_standstill
 from benchmarks.identify.fit import identify
-from benchmarks.identify.log import Columns, Log, read_log
+from benchmarks.identify.log import Log, read_log
 from benchmarks.identify.margins import margins
 from benchmarks.identify.model import CannotTellError, HeldOut, Interval, Options
+from benchmarks.identify.options import Columns
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import fault, headline, report
 from benchmarks.identify.study.command import (
@@ -187,7 +188,7 @@ class TestRealLogs:
     def test_heater_beside_another_one(self):
         # No one here made this plant. A plain impulse response of both heaters explains 97 %.
         log = read_log(TCLAB, Columns(flow="heater1", temperature="temperature1",
-                                      disturbances=("heater2",)))  # fmt: skip
+                                      disturbance=("heater2",)))  # fmt: skip
         model = identify(log)
         assert 0.95 < model.held_out.model < 1.0
         assert model.held_out.impulse_response > 0.95

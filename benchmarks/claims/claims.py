@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from benchmarks.claims import examinations as examine
-from benchmarks.claims.examinations import PAPER_PI, SEARCHED_PI, Claim
+from benchmarks.claims.examinations import PAPER_PI, SEARCHED_PI
 from benchmarks.claims.runs import hidden_nodes, longer_windows
+from benchmarks.claims.verdicts import Claim
 
 CLAIMS: dict[str, Claim] = {
     claim.name: claim

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +12,6 @@ from rich.console import Console
 
 from benchmarks.claims import verdicts
 from benchmarks.claims.claims import CLAIMS
-from benchmarks.claims.examinations import Results
 from benchmarks.claims.options import Options
 from benchmarks.claims.plots import PLOTS
 from benchmarks.claims.runs import Batch
@@ -32,26 +32,26 @@ def execute(options: Options, console: Console) -> str:
     batch = Batch(options.runs, SEED)
     first = sorted(chosen, key=lambda name: name != LONGEST)
     tasks = {name: partial(CLAIMS[name].examine, batch) for name in first}
-    examined: dict[str, Results] = {}
-    entries: list[verdicts.Entry] = []
+    examined: dict[str, verdicts.Claim] = {}
+    claims: list[verdicts.Claim] = []
     try:
         for name, results in options.fan_out.open().stream(tasks, "claims"):
-            examined[name] = results
-            entries = [CLAIMS[n].entry(examined[n]) for n in chosen if n in examined]
-            write(options.out, entries, results.tables, made)
+            examined[name] = replace(CLAIMS[name], findings=results.findings)
+            claims = [examined[n] for n in chosen if n in examined]
+            write(options.out, claims, results.tables, made)
     finally:
-        if entries:
-            overview = verdicts.overview(entries)
+        if claims:
+            overview = verdicts.overview(claims)
             console.print(on_screen(overview[["claim", "verdict"]]))
     return f"All numbers are in {options.out}/claims.md and claims.csv"
 
 
 def write(
-    out: Path, entries: Sequence[verdicts.Entry], tables: dict[str, pd.DataFrame], made: str
+    out: Path, claims: Sequence[verdicts.Claim], tables: dict[str, pd.DataFrame], made: str
 ) -> None:
     """Write the verdicts so far, and the tables and pictures of the latest claim."""
-    write_csv(out / "claims.csv", verdicts.table(entries))
-    write_text(out / "claims.md", verdicts.markdown(entries, made))
+    write_csv(out / "claims.csv", verdicts.table(claims))
+    write_text(out / "claims.md", verdicts.markdown(claims, made))
     for name, table in tables.items():
         write_csv(out / f"{name}.csv", table)
         PLOTS[name](table, out / f"{name}.png")

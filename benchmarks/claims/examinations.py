@@ -22,7 +22,7 @@ from benchmarks.claims.runs import (
     hidden_nodes,
     with_gains,
 )
-from benchmarks.claims.verdicts import Entry, Finding
+from benchmarks.claims.verdicts import Finding
 from benchmarks.lib.statistics import Estimate, exact, median, quantile, share
 from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.scenarios import SETPOINTS as CASES
@@ -73,31 +73,6 @@ class Results:
         in_percent = Estimate(100 * of.value, 100 * of.low, 100 * of.high, of.runs)
         at_least = 100 * OFTEN if often else -math.inf
         self.ask(quantity, in_percent, "% of draws", at_least=at_least)
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A claim of the paper and how it is examined.
-
-    Attributes
-    ----------
-    name, section, statement, method
-        As in `verdicts.Entry`.
-    examine
-        Runs what must be run.
-    """
-
-    name: str
-    section: str
-    statement: str
-    method: str
-    examine: Callable[[Batch], Results]
-
-    def entry(self, results: Results) -> Entry:
-        """Return what is kept."""
-        return Entry(
-            self.name, self.section, self.statement, self.method, tuple(results.findings)
-        )
 
 
 def ratio(errors: NDArray[np.float64], reference: NDArray[np.float64]) -> Estimate:

@@ -6,19 +6,16 @@ import itertools
 import math
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
-from benchmarks.lib.drawing import COLOURS, STYLE, colours, save
+from benchmarks.lib.drawing import COLOURS, colours, drawn
 from benchmarks.loop.metrics import METRICS
 
 
 def plot_convergence(times: pd.DataFrame, path: Path) -> None:
     """Draw which share of the networks has converged by when, one line for each set point."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9, 4))
+    with drawn(path, 9, 4) as figure:
         axes = figure.subplots()
         for name, colour in colours(list(times.columns)).items():
             finite = times[name].replace(math.inf, np.nan).dropna().sort_values()
@@ -30,13 +27,11 @@ def plot_convergence(times: pd.DataFrame, path: Path) -> None:
         axes.set_xlabel("samples since the start")
         axes.set_ylabel("weights have converged (% of draws)")
         axes.legend()
-        save(figure, path)
 
 
 def plot_pi_gains(errors: pd.DataFrame, path: Path) -> None:
     """Draw the mean error of PI controllers over Kp, one line for each case."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9, 4))
+    with drawn(path, 9, 4) as figure:
         axes = figure.subplots()
         for (name, rows), colour in zip(
             errors.groupby("setpoint", sort=False), COLOURS, strict=False
@@ -46,14 +41,12 @@ def plot_pi_gains(errors: pd.DataFrame, path: Path) -> None:
         axes.set_xlabel("Kp (t/h per °C), with the paper's Ki = 0.3")
         axes.set_ylabel(METRICS["mae"])
         axes.legend()
-        save(figure, path)
 
 
 def plot_other_plants(cells: pd.DataFrame, path: Path) -> None:
     """Draw maps of the share of networks that settle: over delay and gain, for each case."""
     cases, time_constants = cells["setpoint"].unique(), cells["time_constant"].unique()
-    with mpl.rc_context(STYLE | {"axes.grid": False}):
-        figure = Figure(figsize=(10, 2.8 * len(cases)))
+    with drawn(path, 10, 2.8 * len(cases), grid=False) as figure:
         panels = figure.subplots(len(cases), len(time_constants), sharex=True, squeeze=False)
         for (i, case), (j, constant) in itertools.product(
             enumerate(cases), enumerate(time_constants)
@@ -80,7 +73,6 @@ def plot_other_plants(cells: pd.DataFrame, path: Path) -> None:
         for axes in panels[:, 0]:
             axes.set_ylabel("gain (of the paper's)")
         figure.colorbar(image, ax=panels, label="settled (% of draws)")
-        save(figure, path)
 
 
 PLOTS = {

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
 from benchmarks.lib.statistics import Estimate
+
+if TYPE_CHECKING:
+    from benchmarks.claims.examinations import Results
+    from benchmarks.claims.runs import Batch
 
 
 class Verdict(str, Enum):
@@ -83,8 +88,8 @@ def verdict(findings: Iterable[Finding]) -> Verdict:
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A claim that has been examined.
+class Claim:
+    """A claim of the paper, how it is examined, and what came out.
 
     Attributes
     ----------
@@ -95,16 +100,19 @@ class Entry:
     statement
         The claim in a few words.
     method
-        How it was tested.
+        How it is tested.
+    examine
+        Runs what must be run.
     findings
-        What came out.
+        What came out, once it has been examined.
     """
 
     name: str
     section: str
     statement: str
     method: str
-    findings: tuple[Finding, ...]
+    examine: Callable[[Batch], Results]
+    findings: Sequence[Finding] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -112,17 +120,17 @@ class Entry:
         return verdict(self.findings)
 
 
-def table(entries: Sequence[Entry]) -> pd.DataFrame:
+def table(claims: Sequence[Claim]) -> pd.DataFrame:
     """Return one row for each finding, and one for a claim without any."""
     rows: list[dict[str, object]] = []
-    for entry in entries:
+    for claim in claims:
         about: dict[str, object] = {
-            "claim": entry.name,
-            "section": entry.section,
-            "statement": entry.statement,
-            "verdict": entry.verdict.value,
+            "claim": claim.name,
+            "section": claim.section,
+            "statement": claim.statement,
+            "verdict": claim.verdict.value,
         }
-        rows += [about | _row(finding) for finding in entry.findings] or [about]
+        rows += [about | _row(finding) for finding in claim.findings] or [about]
     frame = pd.DataFrame(rows)
     # Whole numbers, though a claim without findings has none.
     return frame.astype({"runs": "Int64"}) if "runs" in frame else frame
@@ -142,9 +150,9 @@ def _row(finding: Finding) -> dict[str, object]:
     }
 
 
-def overview(entries: Sequence[Entry]) -> pd.DataFrame:
+def overview(claims: Sequence[Claim]) -> pd.DataFrame:
     """Return the verdicts: one row for each claim."""
-    rows = [(entry.name, entry.statement, entry.verdict.value) for entry in entries]
+    rows = [(claim.name, claim.statement, claim.verdict.value) for claim in claims]
     return pd.DataFrame(rows, columns=["name", "claim", "verdict"])
 
 
@@ -156,7 +164,7 @@ def write_number(value: float) -> str:
     return f"{value:,.{digits}f}"
 
 
-def _section(entry: Entry) -> str:
+def _section(claim: Claim) -> str:
     rows = [
         {
             "measured": finding.quantity + (f" ({finding.unit})" if finding.unit else ""),
@@ -165,11 +173,11 @@ def _section(entry: Entry) -> str:
             "asked": finding.criterion,
             "shown": f"**{finding.shown}**" if finding.shown == "no" else finding.shown,
         }
-        for finding in entry.findings
+        for finding in claim.findings
     ]
     parts = [
-        f"## {entry.statement}: {entry.verdict.value}",
-        f"{entry.section}. {entry.method}",
+        f"## {claim.statement}: {claim.verdict.value}",
+        f"{claim.section}. {claim.method}",
     ]
     if rows:
         parts.append(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True))
@@ -182,7 +190,7 @@ def _interval(estimate: Estimate) -> str:
     return f"{write_number(estimate.low)} to {write_number(estimate.high)}"
 
 
-def markdown(entries: Sequence[Entry], made: str) -> str:
+def markdown(claims: Sequence[Claim], made: str) -> str:
     """Return all verdicts as a Markdown page, with a line on how they were made."""
     return "\n\n".join(
         [
@@ -191,8 +199,8 @@ def markdown(entries: Sequence[Entry], made: str) -> str:
             "Every number rests on independent draws of initial weights and "
             "noise. What a claim asks of a number counts as shown if the whole 95 % interval "
             "keeps it. A claim holds if all that it asks is shown, and in part if some is.",
-            overview(entries).drop(columns="name").to_markdown(index=False),
-            *(_section(entry) for entry in entries),
+            overview(claims).drop(columns="name").to_markdown(index=False),
+            *(_section(claim) for claim in claims),
             "",
         ]
     )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from benchmarks.controllers.roster import label
-from benchmarks.lib.drawing import COLOURS, STYLE, colours, save
+from benchmarks.lib.drawing import COLOURS, colours, drawn
 from benchmarks.lib.tables import groups
 from benchmarks.loop.metrics import METRICS
 from benchmarks.loop.scenarios import Scenario
@@ -36,8 +36,7 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
     """
     parameters = scenario.parameters
     palette = colours(list(responses["agent"].unique()))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9, 6))
+    with drawn(path, 9, 6) as figure:
         above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
         for agent, rows in groups(responses, "agent"):
             _band(above, rows, "output", palette[agent], label(agent))
@@ -60,7 +59,6 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
         below.set_ylabel("applied flow u_a (t/h)")
         below.set_xlabel("time (min)")
         below.set_xlim(0, minutes.max())
-        save(figure, path)
 
 
 def _band(axes: Axes, rows: pd.DataFrame, signal: str, colour: str, name: str) -> None:
@@ -79,8 +77,7 @@ def _band(axes: Axes, rows: pd.DataFrame, signal: str, colour: str, name: str) -
 
 def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
     """Draw the mean errors as points with 95 % intervals; each axis begins at the limit."""
-    with mpl.rc_context(STYLE):
-        figure, panels = _scenario_panels(estimates)
+    with _scenario_panels(path, estimates) as (_, panels):
         shades = colours(list(estimates["agent"].unique()))
         for axes, (_, rows) in zip(panels, groups(estimates, "scenario"), strict=True):
             for place, (_, row) in enumerate(rows.iterrows()):
@@ -97,14 +94,12 @@ def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
             axes.axvline(limit, color="0.4", linewidth=1)
             axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
             axes.set_xlabel("mean |e| (°C)")
-        save(figure, path)
 
 
 def plot_runs(runs: pd.DataFrame, path: Path) -> None:
     """Draw the mean error of every single run, so that no failure is averaged away."""
     generator = np.random.default_rng(0)  # scatters points that would hide each other
-    with mpl.rc_context(STYLE):
-        figure, panels = _scenario_panels(runs)
+    with _scenario_panels(path, runs) as (_, panels):
         shades = colours(list(runs["agent"].unique()))
         for axes, (_, cases) in zip(panels, groups(runs, "scenario"), strict=True):
             agents = list(cases["agent"].unique())
@@ -116,23 +111,24 @@ def plot_runs(runs: pd.DataFrame, path: Path) -> None:
             axes.invert_yaxis()
             axes.set_xlim(left=0)
             axes.set_xlabel("mean |e| of a run (°C)")
-        save(figure, path)
 
 
+@contextmanager
 def _scenario_panels(
-    rows: pd.DataFrame, height: float | None = None
-) -> tuple[Figure, list[Axes]]:
+    path: Path, rows: pd.DataFrame, height: float | None = None
+) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Give a figure with a panel for each scenario, and write it."""
     names = rows["scenario"].unique()
     columns = min(3, len(names))
     height = height or 1.2 + 0.28 * rows["agent"].nunique()
     lines = math.ceil(len(names) / columns)
-    figure = Figure(figsize=(4.2 * columns, height * lines))
-    panels = list(figure.subplots(lines, columns, squeeze=False).flat)
-    for axes, name in zip(panels, names, strict=False):
-        axes.set_title(name, loc="left")
-    for axes in panels[len(names) :]:
-        axes.set_visible(False)
-    return figure, panels[: len(names)]
+    with drawn(path, 4.2 * columns, height * lines) as figure:
+        panels = list(figure.subplots(lines, columns, squeeze=False).flat)
+        for axes, name in zip(panels, names, strict=False):
+            axes.set_title(name, loc="left")
+        for axes in panels[len(names) :]:
+            axes.set_visible(False)
+        yield figure, panels[: len(names)]
 
 
 def plot_travel(
@@ -157,8 +153,7 @@ def plot_travel(
     medians = summary.pivot_table(
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
-    with mpl.rc_context(STYLE):
-        figure, panels = _scenario_panels(medians, 3.0)
+    with _scenario_panels(path, medians, 3.0) as (figure, panels):
         agents = list(medians["agent"].unique())
         shades = colours(agents)
         # Not as many as hues, so that two of like colour have other marks.
@@ -198,7 +193,6 @@ def plot_travel(
         # Each once, although not every panel has all.
         entries = {name: handle for pair in shown for handle, name in zip(*pair, strict=True)}
         figure.legend(entries.values(), entries, loc="outside lower center", ncols=5)
-        save(figure, path)
 
 
 def plot_learning(curves: pd.DataFrame, path: Path) -> None:
@@ -209,8 +203,7 @@ def plot_learning(curves: pd.DataFrame, path: Path) -> None:
         "square_mae": "square wave, no noise",
     }
     agents = list(curves["agent"].unique())
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9, 4.5 * len(agents)))
+    with drawn(path, 9, 4.5 * len(agents)) as figure:
         panels = figure.subplots(len(agents), 1, squeeze=False)[:, 0]
         for axes, agent in zip(panels, agents, strict=True):
             policies = curves[curves["agent"] == agent].dropna(axis=1, how="all")
@@ -228,4 +221,3 @@ def plot_learning(curves: pd.DataFrame, path: Path) -> None:
             axes.set_title(f"{label(agent)}: a line a policy", loc="left")
         handles, names = panels[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=3)
-        save(figure, path)

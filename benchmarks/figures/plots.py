@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib as mpl
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from benchmarks.lib.drawing import COLOURS, STYLE, save
+from benchmarks.lib.drawing import COLOURS, drawn
 from mptc_gym import Parameters
 
 
@@ -50,9 +48,8 @@ def plot_figures(panels: Sequence[Panel], path: Path) -> None:
     axes_of = [(panel, signal) for panel in panels for signal in panel.signals]
     columns = min(2, len(panels))
     rows = math.ceil(len(axes_of) / columns)
-    with mpl.rc_context(STYLE):
-        size = (8, 3 * rows) if columns == 1 else (13, 2.4 * rows)
-        figure = Figure(figsize=size)
+    size = (8, 3 * rows) if columns == 1 else (13, 2.4 * rows)
+    with drawn(path, *size) as figure:
         grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
         for axes, (panel, signal) in zip(grid.flat, axes_of, strict=False):
             _draw_signal(axes, panel, signal)
@@ -62,7 +59,6 @@ def plot_figures(panels: Sequence[Panel], path: Path) -> None:
             axes.set_xlabel("time (min)")
         for axes in unused:
             axes.set_visible(False)
-        save(figure, path)
 
 
 def _draw_signal(axes: Axes, panel: Panel, signal: str) -> None:

@@ -8,10 +8,7 @@ from rich.console import Console
 
 from benchmarks.identify.armax import Orders
 from benchmarks.identify.fit import identify
-from benchmarks.identify.log import (
-    Columns,
-    read_log,
-)
+from benchmarks.identify.log import read_log
 from benchmarks.identify.model import Options as Settings
 from benchmarks.identify.options import Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
@@ -30,13 +27,8 @@ def execute(options: Options, console: Console) -> str:
         raise UsageError(
             f"--orders: A and B must have at least 1 coefficient, got {options.orders[:2]}"
         )
-    columns = Columns(
-        options.time, options.flow, options.temperature, options.sampling_interval,
-        options.time_unit, options.flow_unit, options.temperature_unit,
-        options.disturbance,
-    )  # fmt: skip
     try:
-        log = read_log(options.log, columns, options.rows)
+        log = read_log(options.log, options.columns, options.rows)
         model = identify(
             log,
             Settings(

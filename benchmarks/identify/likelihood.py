@@ -36,11 +36,6 @@ class Gap:
     low: float
     high: float
 
-    @property
-    def width(self) -> float:
-        """How far they are apart, t/h."""
-        return self.high - self.low
-
 
 @dataclass(frozen=True)
 class Place:
@@ -204,12 +199,16 @@ class Likelihood:
         fits = [self.fit(place, orders, each) for each in starts]
         return min(fits, key=lambda fit: fit.deviance)
 
+    def white(self, columns: Array, c: Array, orders: Orders) -> Array:
+        """Return columns whitened by C, in the rows that count."""
+        return self.rows.whitened(columns, c, walk=orders.walk)[self.rows.counts]
+
     def linear(self, place: Place, orders: Orders, c: Array) -> Candidate:
         """Return the fit with a given C."""
         target, columns = self.regressors(place, orders)
-        white = self.rows.whitened(np.column_stack([target, columns]), c, walk=orders.walk)
-        white = white[self.rows.counts]
-        linear = np.linalg.lstsq(white[:, 1:], white[:, 0], rcond=None)[0]
+        white = self.white(np.column_stack([target, columns]), c, orders)
+        found, *_ = np.linalg.lstsq(white[:, 1:], white[:, 0], rcond=None)
+        linear = found.astype(np.float64)
         errors = white[:, 0] - white[:, 1:] @ linear
         return self._candidate(orders, place, Solution(linear, c, errors))
 
@@ -281,19 +280,14 @@ class Likelihood:
         self, target: Array, columns: Array, orders: Orders, c: Array
     ) -> tuple[Array, Whiten]:
         """Return what columns leave of the target, whitened, and how to treat others alike."""
-        rows = self.rows
-
-        def whiten(values: Array) -> Array:
-            return rows.whitened(values, c, walk=orders.walk)[rows.counts]
-
-        white = whiten(np.column_stack([target, columns]))
+        white = self.white(np.column_stack([target, columns]), c, orders)
         basis, _ = np.linalg.qr(white[:, 1:])
 
         def left(values: Array) -> Array:
             result: Array = values - basis @ (basis.T @ values)
             return result
 
-        return left(white[:, 0]), lambda values: left(whiten(values))
+        return left(white[:, 0]), lambda values: left(self.white(values, c, orders))
 
     def _deviances(
         self, signal: Array, delays: range, length: int, others: tuple[Array, Whiten]

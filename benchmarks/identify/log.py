@@ -14,6 +14,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.identify.options import Columns
+
 Array = NDArray[np.float64]
 Units = dict[str, tuple[float, float]]
 
@@ -62,32 +64,6 @@ class Log:
     notes: list[str] = field(default_factory=list)
     disturbances: dict[str, Array] = field(default_factory=dict)
     flow_error: float = 0.0
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Where a log holds what, and in which units.
-
-    Attributes
-    ----------
-    time, flow, temperature
-        Names of columns.
-    sampling_interval
-        s, in place of the times; None to read them.
-    time_unit, flow_unit, temperature_unit
-        None for what the heading says in brackets, and s, t/h and degC if it says nothing.
-    disturbances
-        Names of columns.
-    """
-
-    time: str = "time"
-    flow: str = "flow"
-    temperature: str = "temperature"
-    sampling_interval: float | None = None
-    time_unit: str | None = None
-    flow_unit: str | None = None
-    temperature_unit: str | None = None
-    disturbances: tuple[str, ...] = ()
 
 
 def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) -> Log:
@@ -167,7 +143,7 @@ class _Layout:
             (columns.temperature, TEMPERATURE_UNITS, columns.temperature_unit, "degC",
              "temperature"),
         ]  # fmt: skip
-        wanted += [(each, {}, None, "", "disturbance") for each in columns.disturbances]
+        wanted += [(each, {}, None, "", "disturbance") for each in columns.disturbance]
         if columns.sampling_interval is None:
             wanted.append((columns.time, TIME_UNITS, columns.time_unit, "s", "time"))
         found = [self._find(name, names, option) for name, *_, option in wanted]

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
-from benchmarks.lib.drawing import STYLE, colours, save
+from benchmarks.lib.drawing import colours, drawn
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 
@@ -173,8 +171,7 @@ def plot_margins(loops: Mapping[str, Loop], path: Path) -> None:
     """
     palette = colours(list(loops))
     turn = np.linspace(0.0, 2.0 * math.pi, 200)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10, 4.2))
+    with drawn(path, 10, 4.2) as figure:
         plane, sensitivity = figure.subplots(1, 2)
         for name, loop in loops.items():
             frequency = loop.frequencies()
@@ -193,4 +190,3 @@ def plot_margins(loops: Mapping[str, Loop], path: Path) -> None:
         sensitivity.axhline(1.0, color="0.4", linewidth=1)
         sensitivity.set_ylim(bottom=0.02)
         sensitivity.set(xlabel="frequency (rad/s)", title="amplification of a disturbance |S|")
-        save(figure, path)

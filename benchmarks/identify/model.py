@@ -8,8 +8,6 @@ from benchmarks.identify.armax import Array, Orders
 from benchmarks.identify.log import Log
 from benchmarks.loop.linear import LinearModel
 
-CONFIDENCE = 0.95  # of all intervals
-
 
 class CannotTellError(ValueError):
     """The log does not hold what is asked of it; the message says why."""

@@ -27,16 +27,9 @@ def _unit(what: str, units: str) -> Parameter:
 
 @options
 @dataclass(frozen=True, kw_only=True)
-class Options:
-    """Fit the plant's equations to a recorded log, and tune controllers for it.
+class Columns:
+    """Where a log holds what, and in which units."""
 
-    The log is a table with a heading; a row holds the temperature at its time and the flow that
-    is commanded from that time on.
-    """
-
-    log: Path = field(kw_only=False)
-    """The log, a CSV file."""
-    out: Folder = Path("results/identify")
     time: str = "time"
     """Column of the times: numbers, or dates."""
     flow: str = "flow"
@@ -52,6 +45,21 @@ class Options:
     temperature_unit: Annotated[str | None, _unit("temperature", "degC °C C K degF °F F")] = (
         None
     )
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Fit the plant's equations to a recorded log, and tune controllers for it.
+
+    The log is a table with a heading; a row holds the temperature at its time and the flow that
+    is commanded from that time on.
+    """
+
+    log: Path = field(kw_only=False)
+    """The log, a CSV file."""
+    out: Folder = Path("results/identify")
+    columns: Columns = field(default_factory=Columns)
     rows: Count = 20_000
     """Of a longer log, the last rows are fitted, so many."""
     longest_delay: Count = 60

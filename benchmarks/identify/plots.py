@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.controllers.step_test import StepTest
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import step_band
-from benchmarks.lib.drawing import COLOURS, STYLE, save
+from benchmarks.lib.drawing import COLOURS, drawn
 
 Array = NDArray[np.float64]
 
@@ -35,16 +33,11 @@ def plot_log(model: Model, path: Path) -> None:
     log = model.log
     stop = min(len(log.flow), SHOWN)
     minutes = np.arange(stop) * log.sampling_interval / 60.0
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10, 6))
+    with drawn(path, 10, 6) as figure:
         above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
         above.plot(minutes, log.temperature[:stop], color="0.5", linewidth=1, label="recorded")
-        above.plot(
-            minutes,
-            model.simulated[:stop],
-            color=COLOURS[1],
-            label="model, without noise",
-        )
+        simulated = model.simulated[:stop]
+        above.plot(minutes, simulated, color=COLOURS[1], label="model, without noise")
         above.set_ylabel("temperature (°C)")
         above.margins(y=0.15)  # room for the legend
         above.legend(loc="upper right", ncols=2)
@@ -59,7 +52,6 @@ def plot_log(model: Model, path: Path) -> None:
             below.legend(loc="upper right")
         below.set_ylabel("flow (t/h)")
         below.set_xlabel("time (min)")
-        save(figure, path)
 
 
 def plot_residuals(model: Model, path: Path) -> None:
@@ -68,8 +60,7 @@ def plot_residuals(model: Model, path: Path) -> None:
     correlation = autocorrelation(model.errors)
     chance = 1.96 / np.sqrt(known.sum())
     minutes = np.arange(len(model.errors)) * model.sampling_interval / 60.0
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10, 3.6))
+    with drawn(path, 10, 3.6) as figure:
         left, right = figure.subplots(1, 2)
         left.plot(minutes[:SHOWN], model.errors[:SHOWN], color=COLOURS[0], linewidth=0.6)
         left.set(xlabel="time (min)", ylabel="prediction error (°C)")
@@ -80,7 +71,6 @@ def plot_residuals(model: Model, path: Path) -> None:
         )
         right.set(xlabel="lag (samples)", ylabel="autocorrelation")
         right.legend(loc="upper right")
-        save(figure, path)
 
 
 def plot_step(model: Model, tested: StepTest, path: Path) -> None:
@@ -94,8 +84,7 @@ def plot_step(model: Model, tested: StepTest, path: Path) -> None:
     first_order = np.where(
         times >= tested.delay, -tested.gain * np.expm1(-since / tested.time_constant), 0.0
     )
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(8, 4))
+    with drawn(path, 8, 4) as figure:
         axes = figure.subplots()
         axes.fill_between(
             times / 60, low, high, color=COLOURS[0], alpha=0.25, linewidth=0,
@@ -108,4 +97,3 @@ def plot_step(model: Model, tested: StepTest, path: Path) -> None:
         )  # fmt: skip
         axes.set(xlabel="time after the step (min)", ylabel="temperature (°C per t/h)")
         axes.legend()
-        save(figure, path)

@@ -12,10 +12,10 @@ from scipy import stats
 
 from benchmarks.identify.armax import Array, Orders
 from benchmarks.identify.likelihood import MOST_GAPS, Candidate, Gap, Likelihood, Place
-from benchmarks.identify.model import CONFIDENCE, Interval
+from benchmarks.identify.model import Interval
+from benchmarks.lib.statistics import CONFIDENCE, ENDS
 from benchmarks.loop.linear import LinearModel
 
-ENDS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # of the posterior, where an interval ends
 ENDS_OF_ERRORS = float(stats.norm.ppf(ENDS[1]))  # standard errors
 NEAR = 25.0  # of deviances: what is further off has no probability worth a mention
 AS_GOOD = 8.0  # of Akaike's criterion: orders that are no further behind count the same
@@ -60,13 +60,16 @@ class Posterior:
         # all orders that are about as good the same weight: a second time constant may stand
         # for a part of the delay, and a log tells little of it.
         likeliest, weights = self._weights(entries), self._weights(entries, possible=True)
-        self.delay = _of_delay(places, likeliest, self._of_short_b(entries, likeliest, weights))
+        # A B with more coefficients than it need have may begin with some that are nearly 0:
+        # its delay is not when the response begins.
+        lengths = np.array([entry.fit.orders.b for entry in entries])
+        short = weights * (lengths <= lengths[np.argmax(likeliest)])
+        self.delay = _of_delay(places, likeliest, short / short.sum())
         self.dead_zone = _of_dead_zone(
             [place.gap for place in places], weights, ENDS_OF_ERRORS * likelihood.log.flow_error
         )
         self.chosen = self._choose(entries, likeliest)
-        generator = np.random.default_rng(0)
-        self.draws = self._draw(entries, weights, generator)
+        self.draws = self._draw(entries, weights)
         value = self._linear(self.chosen, self.chosen.solution.linear).gain
         endless = math.copysign(math.inf, value)  # where nothing settles
         self.gain = _interval(
@@ -79,16 +82,12 @@ class Posterior:
         gaps = likelihood.gaps()
         for i, fit in enumerate(fits):
             places = likelihood.scan(fit.orders, fit.solution.c, gaps)
-            if i == 0:
-                gaps = self._refined(fit, places)
-                gap = likelihood.scan(
-                    fit.orders,
-                    fit.solution.c,
-                    gaps,
-                    range(fit.place.delay, fit.place.delay + 1),
-                )[0].gap
             near = [p.delay for p in places if p.deviance < places[0].deviance + 2.0 * NEAR]
             delays = range(min(near), max(near) + 1)
+            if i == 0:
+                gaps = self._refined(fit, places, delays)
+                at_its_own = range(fit.place.delay, fit.place.delay + 1)
+                gap = likelihood.scan(fit.orders, fit.solution.c, gaps, at_its_own)[0].gap
             # Another delay may ask for another C.
             stride = max(len(delays) // MOST_FITS, 1)
             for delay in delays[::stride]:
@@ -100,17 +99,6 @@ class Posterior:
                 places = likelihood.scan(fit.orders, refit.solution.c, gaps, around)
                 found += [Entry(i, refit, place) for place in places]
         return found
-
-    def _of_short_b(self, entries: list[Entry], likeliest: Array, weights: Array) -> Array:
-        """Return the probabilities of places by orders whose B is not longer than it need be.
-
-        A B with more coefficients may begin with some that are nearly 0: its delay is not when
-        the response begins.
-        """
-        lengths = np.array([entry.fit.orders.b for entry in entries])
-        short: Array = weights * (lengths <= lengths[np.argmax(likeliest)])
-        short /= short.sum()
-        return short
 
     def _weights(self, entries: list[Entry], *, possible: bool = False) -> Array:
         """Return the probabilities of places."""
@@ -135,11 +123,9 @@ class Posterior:
         weights /= weights.sum()
         return weights
 
-    def _refined(self, fit: Candidate, places: list[Place]) -> list[Gap]:
+    def _refined(self, fit: Candidate, places: list[Place], delays: range) -> list[Gap]:
         """Return gaps near the best, with all gaps between commands told apart there."""
         likelihood = self._likelihood
-        near = [p.delay for p in places if p.deviance < places[0].deviance + 2.0 * NEAR]
-        delays = range(min(near), max(near) + 1)
         best: dict[Gap, float] = {}
         for place in places:
             best.setdefault(place.gap, place.deviance)  # the best of a gap comes first
@@ -166,7 +152,7 @@ class Posterior:
         """Return the probability beforehand: a half that there is no dead zone."""
         if not self._likelihood.options.find_dead_zone:
             return 1.0
-        share = gap.width / float(self._likelihood.magnitudes[-1])
+        share = (gap.high - gap.low) / float(self._likelihood.magnitudes[-1])
         return 0.5 * share + 0.5 * (gap.low == 0.0)
 
     def _choose(self, entries: list[Entry], weights: Array) -> Candidate:
@@ -183,12 +169,8 @@ class Posterior:
         )  # fmt: skip
         return self._likelihood.fit(best.place, best.fit.orders, best.fit.solution.c)
 
-    def _draw(
-        self,
-        entries: list[Entry],
-        weights: Array,
-        generator: np.random.Generator,
-    ) -> list[LinearModel]:
+    def _draw(self, entries: list[Entry], weights: Array) -> list[LinearModel]:
+        generator = np.random.default_rng(0)
         points = (np.arange(PLACES) + generator.random()) / PLACES
         picked = np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
         walks: dict[Candidate, tuple[list[tuple[Orders, Array]], Array]] = {}
@@ -228,11 +210,10 @@ class Posterior:
         orders = replace(fit.orders, walk=True)
         target, columns = self._likelihood.regressors(fit.place, orders)
         both = np.column_stack([columns, target])
-        rows = self._likelihood.rows
         found, scores = [], []
         for distance in WALKS:
             of_walk = np.convolve(c, [1.0, distance - 1.0])[1:]
-            white = rows.whitened(both, of_walk, walk=True)[rows.counts]
+            white = self._likelihood.white(both, of_walk, orders)
             sizes = np.abs(np.diag(np.linalg.qr(white, mode="r")))
             sizes = np.maximum(sizes, 1e-300)
             freedom = len(white) - len(sizes) + 1
@@ -263,8 +244,7 @@ class Posterior:
         """Return the time constant of the slowest pole, s."""
         value = self._linear(self.chosen, self.chosen.solution.linear)
         drawn = np.array([slowest(draw.a) for draw in self.draws])
-        found = _interval(slowest(value.a), drawn)
-        return Interval(*(interval * each for each in (found.value, found.low, found.high)))
+        return _interval(interval * slowest(value.a), interval * drawn)
 
     def noise_variance(self) -> Interval:
         """Return the variance of the prediction errors, degC^2."""

@@ -1,11 +1,13 @@
-"""The look of all plots: colours, style, and how a figure is saved."""
+"""The look of all plots: colours, style, and how a figure is made and saved."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from benchmarks.lib.storage import replacing
@@ -31,7 +33,11 @@ def colours(names: Sequence[str]) -> dict[str, str]:
     return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure, whole or not at all."""
-    with replacing(path) as partial:
-        figure.savefig(partial)
+@contextmanager
+def drawn(path: Path, width: float, height: float, *, grid: bool = True) -> Iterator[Figure]:
+    """Give a figure of this size, inches, to draw on, and write it, whole or not at all."""
+    with mpl.rc_context(STYLE | {"axes.grid": grid}):
+        figure = Figure(figsize=(width, height))
+        yield figure
+        with replacing(path) as partial:
+            figure.savefig(partial)

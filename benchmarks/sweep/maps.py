@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from benchmarks.controllers.roster import label
-from benchmarks.lib.drawing import STYLE, save
+from benchmarks.lib.drawing import drawn
 from mptc_gym import Parameters
 
 _COLUMNS = 4
@@ -53,8 +53,7 @@ def plot_grid(runs: pd.DataFrame, path: Path) -> None:
     nominal = Parameters()
     gain = abs(sum(nominal.b) / sum(nominal.a))
     dead_zone, _ = nominal.range_of("dead_zone")
-    with mpl.rc_context(STYLE | {"axes.grid": False}):
-        figure, panels = _panels(points)
+    with _panels(path, points, grid=False) as (figure, panels):
         for axes, (_, rows) in zip(panels, points.groupby("agent", sort=False), strict=False):
             table = rows.pivot_table(index="gain_factor", columns="delay", values="ratio")
             image = axes.pcolormesh(
@@ -73,7 +72,6 @@ def plot_grid(runs: pd.DataFrame, path: Path) -> None:
         line = Line2D([], [], color="black", linestyle=":",
                       label="above: 5 °C needs a flow within the dead zone")  # fmt: skip
         _finish(figure, panels, image, "mean |e|, of the least possible", [plant, line])
-        save(figure, path)
 
 
 def plot_plants(runs: pd.DataFrame, path: Path) -> None:
@@ -88,8 +86,7 @@ def plot_plants(runs: pd.DataFrame, path: Path) -> None:
     """
     runs = runs.assign(largest=runs["gain_factor"] * runs["gain_drift"].fillna(1.0).clip(1.0))
     points = _by_plant(runs, ["delay", "largest", "gain_drift"])
-    with mpl.rc_context(STYLE):
-        figure, panels = _panels(points)
+    with _panels(path, points) as (figure, panels):
         for axes, (_, rows) in zip(panels, points.groupby("agent", sort=False), strict=False):
             for drifts, marker in ((False, "s"), (True, "^")):
                 some = rows[rows["gain_drift"].notna() == drifts]
@@ -106,7 +103,6 @@ def plot_plants(runs: pd.DataFrame, path: Path) -> None:
             for marker, text in (("s", "as it is"), ("^", "drifts"))
         ]
         _finish(figure, panels, image, "mean |e| (°C)", kinds)
-        save(figure, path)
 
 
 def plot_drift(runs: pd.DataFrame, pair: tuple[str, str], path: Path) -> None:
@@ -127,8 +123,7 @@ def plot_drift(runs: pd.DataFrame, pair: tuple[str, str], path: Path) -> None:
         return
     difference = (late[pair[0]] - late[pair[1]]).groupby("plant")
     plants = drifting.groupby("plant")[["gain_drift", "delay"]].first()
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.5, 4.5))
+    with drawn(path, 7.5, 4.5) as figure:
         axes = figure.subplots()
         median = difference.median()
         spread = [median - difference.quantile(0.1), difference.quantile(0.9) - median]
@@ -153,7 +148,6 @@ def plot_drift(runs: pd.DataFrame, pair: tuple[str, str], path: Path) -> None:
             fontsize="medium",
         )
         figure.colorbar(image, label="delay (samples)")
-        save(figure, path)
 
 
 def _by_plant(runs: pd.DataFrame, plant: list[str]) -> pd.DataFrame:
@@ -165,17 +159,21 @@ def _by_plant(runs: pd.DataFrame, plant: list[str]) -> pd.DataFrame:
     return by.agg(measures | firsts).reset_index()
 
 
-def _panels(points: pd.DataFrame) -> tuple[Figure, list[Axes]]:
+@contextmanager
+def _panels(
+    path: Path, points: pd.DataFrame, *, grid: bool = True
+) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Give a figure with a panel for each controller, and write it."""
     agents = points["agent"].unique()
     rows = math.ceil(len(agents) / _COLUMNS)
-    figure = Figure(figsize=(3.4 * min(_COLUMNS, len(agents)) + 1, 3.2 * rows + 0.6))
-    grid = figure.subplots(rows, min(_COLUMNS, len(agents)), squeeze=False)
-    panels: list[Axes] = list(np.ravel(grid))
-    for axes, agent in zip(panels, agents, strict=False):
-        axes.set_title(label(agent), loc="left")
-    for axes in panels[len(agents) :]:
-        axes.set_axis_off()
-    return figure, panels[: len(agents)]
+    columns = min(_COLUMNS, len(agents))
+    with drawn(path, 3.4 * columns + 1, 3.2 * rows + 0.6, grid=grid) as figure:
+        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+        for axes, agent in zip(panels, agents, strict=False):
+            axes.set_title(label(agent), loc="left")
+        for axes in panels[len(agents) :]:
+            axes.set_axis_off()
+        yield figure, panels[: len(agents)]
 
 
 def _scatter(axes: Axes, mark: Line2D, x: pd.Series, y: pd.Series) -> None:

@@ -30,9 +30,7 @@ def random_plant(number: int, seed: int) -> dict[str, Any]:
         pole = generator.uniform(0.7, 0.97) * np.exp(1j * generator.uniform(0.1, 1.5))
         poles = [pole, pole.conjugate()]
     else:
-        low, high = {"fast": (0.0, 0.6), "slow": (0.9, 0.98), "integrating": (0.99, 0.999)}[
-            kind
-        ]
+        low, high = SLOWEST[kind]
         poles = [generator.uniform(low, high), generator.uniform(-0.5, 0.6)]
     zeros = generator.uniform(-1.5, 1.5, int(generator.integers(0, 3)))
     a, shape = np.real(np.poly(poles)), np.atleast_1d(np.poly(zeros))
