@@ -13,7 +13,9 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"  # windows that nobody sees
 import gymnasium
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from benchmarks.loop.rollout import Trajectory
 
 
 def run(
@@ -31,6 +33,20 @@ def run(
         infos.append(info)
     record = {key: np.array([info[key] for info in infos]) for key in info}
     return {"observation": np.array(observations), "reward": np.array(rewards)} | record
+
+
+def trajectory(
+    setpoint: ArrayLike,
+    output: ArrayLike,
+    command: ArrayLike | None = None,
+    applied: ArrayLike | None = None,
+) -> Trajectory:
+    """Return one run, of columns, as if each step led to its own sample."""
+    still = np.zeros(len(setpoint))
+    command = still if command is None else command
+    columns = setpoint, output, command, command if applied is None else applied, still
+    columns = (*columns, np.subtract(setpoint, output))
+    return Trajectory(*(np.array(column, dtype=float)[:, np.newaxis] for column in columns))
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from benchmarks.claims.runs import Batch, converged_at, fail_node
 from benchmarks.claims.verdicts import Claim, Finding, Verdict, verdict
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.metrics import join, mean_error, settled, split
-from benchmarks.loop.rollout import Trajectory
+from tests.conftest import trajectory
 
 
 def finding(low, high, **bounds):
@@ -114,12 +114,6 @@ class TestConvergence:
         weights[:10] = (30.0, 40.0)  # 50 away
         weights[10:50] = (2.0, 2.0)  # 2.83, more than 5 %, though each alone is less
         assert converged_at(weights) == [50]
-
-
-def trajectory(setpoint, output):
-    columns = [np.array(c, dtype=float)[:, np.newaxis] for c in (setpoint, output)]
-    error = columns[0] - columns[1]  # as if each step led to its own sample
-    return Trajectory(*columns, *(np.zeros((len(setpoint), 1)) for _ in range(3)), error)
 
 
 class TestMeasures:

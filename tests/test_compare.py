@@ -38,21 +38,13 @@ from benchmarks.loop.scenarios import SCENARIOS
 from benchmarks.train import ppo, ppo_training
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
+from tests.conftest import trajectory
 from tests.small_training import SMALL
 
 ROOT = Path(__file__).parent.parent
 
 # Those that are compared without any training before.
 FIXED = [name for name, each in ROSTER.items() if each.compared and not each.trained]
-
-
-def trajectory(setpoint, output, command=None, applied=None):
-    """One run, as columns."""
-    still = np.zeros(len(setpoint))
-    columns = (setpoint, output, still if command is None else command)
-    columns += (columns[2] if applied is None else applied, still)
-    columns += (np.subtract(setpoint, output),)  # as if each step led to its own sample
-    return Trajectory(*(np.array(column, dtype=float)[:, np.newaxis] for column in columns))
 
 
 def measured(runs, **arguments):

@@ -1,9 +1,7 @@
 """The environment as its specification describes it."""
 
-import copy
 import dataclasses
 import inspect
-import pickle
 import warnings
 from functools import partial
 
@@ -399,16 +397,6 @@ def test_spec_round_trips_through_json():
     assert again.unwrapped.parameters == env.unwrapped.parameters
     actions = np.linspace(-1, 1, 50)
     assert data_equivalence(run(env, actions), run(again, actions), exact=True)
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_copies_in_the_middle_of_an_episode_go_on_alike(copied, rng):
-    env = gymnasium.make("MiddlePoint-v0", noise_variance=0.5, setpoint="random")
-    run(env, rng.uniform(-1, 1, 300))
-    twin = copied(env)
-    for action in rng.uniform(-1, 1, (600, 1)).astype(np.float32):
-        assert data_equivalence(env.step(action), twin.step(action), exact=True)
-    assert data_equivalence(env.reset(), twin.reset(), exact=True)
 
 
 def test_help_shows_every_argument():

@@ -78,13 +78,10 @@ class TestForward:
         assert network.act([[0.0]]) == pytest.approx(0.5)
         assert network.command == pytest.approx(5.0)  # three quarters of the way up
 
-    def test_an_observation_of_other_windows_is_refused(self):
-        with pytest.raises(ValueError, match="observation must have 5 elements"):
-            policy().act(np.zeros(6))
-
     @pytest.mark.parametrize("size", [4, 6])
-    def test_the_error_then_says_what_the_environment_needs(self, size):
-        with pytest.raises(ValueError, match="environment needs the network's `observation`"):
+    def test_an_observation_of_other_windows_is_refused_with_what_it_needs(self, size):
+        message = r"^observation must .*5[ ,].*environment needs the network's `observation`"
+        with pytest.raises(ValueError, match=message):
             policy().act(np.zeros(size))
 
     def test_observation_names_every_window(self):
@@ -186,7 +183,7 @@ class TestFile:
                 refused += 1
         assert refused > len(data) // 97 / 2
 
-    def test_files_of_something_else(self, tmp_path):
+    def test_nothing_in_a_file_of_something_else_is_executed(self, tmp_path, capsys):
         class Harm:
             def __reduce__(self):
                 return print, ("executed",)
@@ -198,9 +195,6 @@ class TestFile:
         for name in ("other.npz", "array.npy", "pickle.npz", "object.npz"):
             with pytest.raises(ValueError, match="holds no policy network"):
                 PolicyNetwork.load(tmp_path / name)
-
-    def test_nothing_in_a_file_is_executed(self, tmp_path, capsys):
-        self.test_files_of_something_else(tmp_path)
         assert capsys.readouterr().out == ""
 
     @pytest.mark.parametrize(
@@ -212,26 +206,20 @@ class TestFile:
             ({"observation": {"flow_window": 3}}, "flow_window"),
             ({"increments": {"step": 1}}, "step"),
             ({"observation": 3}, "damaged"),
+            ({}, r"weights of layers\[1\] must be finite"),
         ],
     )
-    def test_a_description_that_does_not_fit(self, tmp_path, change, message):
+    def test_what_does_not_fit_is_named(self, tmp_path, change, message):
         path = tmp_path / "policy.npz"
         policy().save(path)
         with np.load(path) as file:
             arrays = dict(file)
-        about = json.loads(str(arrays.pop("about"))) | change
-        np.savez(path, about=np.array(json.dumps(about)), **arrays)
-        with pytest.raises(ValueError, match=message):
-            PolicyNetwork.load(path)
-
-    def test_weights_that_are_no_numbers(self, tmp_path):
-        path = tmp_path / "policy.npz"
-        policy().save(path)
-        with np.load(path) as file:
-            arrays = dict(file)
-        arrays["W1"][2, 3] = np.nan
+        about = json.loads(str(arrays["about"])) | change
+        arrays["about"] = np.array(json.dumps(about))
+        if not change:
+            arrays["W1"][2, 3] = np.nan
         np.savez(path, **arrays)
-        with pytest.raises(ValueError, match=r"weights of layers\[1\] must be finite"):
+        with pytest.raises(ValueError, match=message):
             PolicyNetwork.load(path)
 
     def test_a_missing_file(self, tmp_path):

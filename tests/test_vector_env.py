@@ -90,11 +90,23 @@ def test_it_equals_one_environment_after_the_other(
         compare(native, sync, steps=10, rng=rng, partial_resets=partial_resets)
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_it_equals_them_over_long_episodes(mode, rng):
-    native, sync = make_both(3, mode, 600, action_window=20, move_weight=0.1, **NOISY)
+@pytest.mark.parametrize(
+    ("mode", "limit", "steps", "arguments"),
+    [
+        *((m, 600, 1300, {"action_window": 20, "move_weight": 0.1, **NOISY}) for m in MODES),
+        *(
+            ("NextStep", 150, 700, {"delay": delay, "b": [0.3, -0.2, 0.1]})
+            for delay in ([0, 7], [2, 40], [0, 100])
+        ),
+        # An actuator that does not reach zero flow.
+        ("NextStep", 9, 30, {"u_min": 6.0, "u_max": 8.0, "dead_zone": 2.0, "move_weight": 0.5}),
+    ],
+    ids=str,
+)
+def test_it_equals_them_over_long_times_and_at_the_edge(mode, limit, steps, arguments, rng):
+    native, sync = make_both(3, mode, limit, **{"action_window": 3, **arguments})
     assert_equal(native.reset(seed=5), sync.reset(seed=5))
-    compare(native, sync, steps=1300, rng=rng, partial_resets=0.001)
+    compare(native, sync, steps=steps, rng=rng, partial_resets=0.005)
 
 
 @pytest.mark.parametrize(
@@ -137,21 +149,6 @@ def test_many_plants_share_a_bounded_memory_for_noise(rng):
     compare(long, short, steps=30, rng=rng, partial_resets=0.05)
 
 
-@pytest.mark.parametrize("delay", [[0, 7], [2, 40], [0, 100]])
-def test_ranges_of_delays_over_a_long_time(delay, rng):
-    native, sync = make_both(4, "NextStep", 150, delay=delay, b=[0.3, -0.2, 0.1])
-    assert_equal(native.reset(seed=5), sync.reset(seed=5))
-    compare(native, sync, steps=700, rng=rng, partial_resets=0.01)
-
-
-def test_an_actuator_that_does_not_reach_zero_flow(rng):
-    native, sync = make_both(
-        2, "NextStep", 9, u_min=6.0, u_max=8.0, dead_zone=2.0, action_window=3, move_weight=0.5
-    )
-    assert_equal(native.reset(seed=0), sync.reset(seed=0))
-    compare(native, sync, steps=30, rng=rng, partial_resets=0.1)
-
-
 def test_limits_of_minus_zero():
     native, sync = make_both(2, "NextStep", None, u_min=-0.0, dead_zone=0.0)
     native.reset(seed=0), sync.reset(seed=0)
@@ -175,18 +172,24 @@ def test_gymnasium_s_wrappers_do_with_it_what_they_do_with_them(wrap, mode, rng,
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_copies_in_the_middle_of_an_episode_go_on_alike(copied, mode, rng):
-    envs = gymnasium.make_vec(
-        "MiddlePoint-v0", 3, max_episode_steps=100, autoreset_mode=mode, **NOISY
-    )
-    envs.reset(seed=0)
+@pytest.mark.parametrize(
+    "made",
+    [
+        partial(gymnasium.make, "MiddlePoint-v0"),
+        partial(MiddlePointVectorEnv, 3, max_episode_steps=100, autoreset_mode="NextStep"),
+        partial(MiddlePointVectorEnv, 3, max_episode_steps=100, autoreset_mode="SameStep"),
+    ],
+)
+def test_copies_in_the_middle_of_an_episode_go_on_alike(copied, made, rng):
+    env = made(**NOISY)
+    env.reset(seed=0)
     for _ in range(130):
-        envs.step(rng.uniform(-1, 1, (3, 1)))
-    twin = copied(envs)
+        env.step(rng.uniform(-1, 1, env.action_space.shape))
+    twin = copied(env)
     for _ in range(700):
-        actions = rng.uniform(-1, 1, (3, 1))
-        assert_equal(envs.step(actions), twin.step(actions))
+        actions = rng.uniform(-1, 1, env.action_space.shape)
+        assert_equal(env.step(actions), twin.step(actions))
+    assert data_equivalence(env.reset(), twin.reset(), exact=True)
 
 
 def test_seeds_are_told():
