@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 # Before NumPy and PyTorch are loaded: the processes of the tests share the cores already.
@@ -16,6 +19,8 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.loop.rollout import Trajectory
+
+ROOT = Path(__file__).parent.parent
 
 
 def run(
@@ -33,6 +38,13 @@ def run(
         infos.append(info)
     record = {key: np.array([info[key] for info in infos]) for key in info}
     return {"observation": np.array(observations), "reward": np.array(rewards)} | record
+
+
+def python(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run Python with these words, in the checkout."""
+    command = [sys.executable, *words]
+    options = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 300.0, **options}
+    return subprocess.run(command, **options)
 
 
 def trajectory(

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -16,8 +15,8 @@ pytest.importorskip("cyclopts", reason="the commands need the extra compare")
 from benchmarks.__main__ import main as show_map
 from benchmarks.lib import command_line
 from benchmarks.lib.options import read
+from tests.conftest import ROOT, python
 
-ROOT = Path(__file__).parent.parent
 COMMANDS = sorted(
     ".".join(path.parent.relative_to(ROOT).parts[1:])
     for path in (ROOT / "benchmarks").glob("*/**/__main__.py")
@@ -43,13 +42,10 @@ main({given})
 
 
 def run_without(package, command, given, folder=ROOT):
-    return subprocess.run(
-        [sys.executable, "-c", WITHOUT.format(package=package, command=command, given=given)],
-        cwd=folder,
+    return python(
+        "-c", WITHOUT.format(package=package, command=command, given=given), cwd=folder,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(folder)])},
-        capture_output=True,
-        text=True,
-    )
+    )  # fmt: skip
 
 
 def main_of(name):
@@ -67,9 +63,7 @@ def test_help_is_printed_alone_and_imports_nothing_heavy(name):
         "print(*{name.partition('.')[0] for name in sys.modules}, file=sys.stderr); "
         "sys.exit(status)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
-    )
+    done = python("-c", program, check=True)
     assert done.stdout.startswith(f"Usage: python -m benchmarks.{name}")
     assert not HEAVY & set(done.stderr.split())
     for clutter in (str(ROOT), "default: None", "default: False", "default: ["):

@@ -7,8 +7,6 @@ import json
 import math
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import matplotlib.image
@@ -38,10 +36,8 @@ from benchmarks.loop.scenarios import SCENARIOS
 from benchmarks.train import ppo, ppo_training
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
-from tests.conftest import trajectory
+from tests.conftest import ROOT, python, trajectory
 from tests.small_training import SMALL
-
-ROOT = Path(__file__).parent.parent
 
 # Those that are compared without any training before.
 FIXED = [name for name, each in ROSTER.items() if each.compared and not each.trained]
@@ -661,13 +657,11 @@ class TestCompare:
         assert (out / "runs.csv").read_text() == "of an earlier run"
 
     def test_as_a_command(self, tmp_path):
-        command = [sys.executable, "-m", "benchmarks.compare", "--agents", "pi", "--runs", "1"]
-        command += ["--jobs", "1", "--scenarios", "constant", "--out", str(tmp_path / "out")]
+        command = ["-m", "benchmarks.compare", "--agents", "pi", "--runs", "1", "--jobs", "1"]
+        command += ["--scenarios", "constant", "--out", str(tmp_path / "out")]
         # Neither a backend that there is not nor a terminal without ° stops it.
         odd = os.environ | {"MPLBACKEND": "nonsense", "PYTHONIOENCODING": "ascii"}
-        done = subprocess.run(
-            command, cwd=ROOT, env=odd, capture_output=True, text=True, check=True
-        )
+        done = python(*command, env=odd, check=True)
         assert "0.709" in done.stdout
         assert "(?C)" in done.stdout
         assert (tmp_path / "out/report.md").exists()

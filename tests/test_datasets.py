@@ -1,9 +1,6 @@
 """Offline data sets: what was logged can be replayed, and scored on an absolute scale."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -14,8 +11,7 @@ from benchmarks.datasets import history
 from benchmarks.datasets.__main__ import main
 from mptc_gym import PRESETS, evaluate
 from mptc_gym.plant import action_from_command
-
-ROOT = Path(__file__).parent.parent
+from tests.conftest import python
 
 
 @pytest.fixture
@@ -79,10 +75,7 @@ def test_the_hash_is_of_the_content_and_the_same_in_every_process():
         "from benchmarks.datasets.history import record; "
         "print(record('fouling', 'mixed', 4).sha256)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    found = done.stdout.strip()
+    found = python("-c", program, check=True).stdout.strip()
     here = history.record("fouling", "mixed", 4)
     assert found == here.sha256
     here.actions[2, 700, 0] += 1e-6

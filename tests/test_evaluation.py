@@ -1,8 +1,6 @@
 """Tests of `mptc_gym.evaluate`, of the bounds that come with it, and of the presets' ids."""
 
 import json
-import subprocess
-import sys
 
 import gymnasium
 import numpy as np
@@ -18,6 +16,7 @@ from benchmarks.limits.packaged import CASES
 from mptc_gym import IDS, PRESETS, MiddlePointEnv, evaluate
 from mptc_gym.evaluation import SEED, least_errors
 from mptc_gym.wrappers import IncrementalAction
+from tests.conftest import python
 
 HARD = "MiddlePointHard-v0"
 
@@ -195,10 +194,7 @@ class TestEvaluate:
             "heavy = 'torch pandas matplotlib pygame stable_baselines3 benchmarks agents'\n"
             "print({'scipy', *heavy.split()} & set(sys.modules))"
         )
-        done = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        )
-        first, second = done.stdout.splitlines()
+        first, second = python("-c", code, check=True).stdout.splitlines()
         assert first.startswith("MiddlePoint-v0: mean error 5.000 degC, 5.4")
         assert second == "set()"
 

@@ -2,11 +2,8 @@
 
 import importlib
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
@@ -24,14 +21,7 @@ from benchmarks.datasets.history import arguments_of, record
 from benchmarks.examples import offline, ppo_torch, sb3
 from mptc_gym import evaluate
 from mptc_gym.sb3 import spec_of
-
-ROOT = Path(__file__).parent.parent
-
-
-def run(*words):
-    return subprocess.run(
-        [sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=300
-    )
+from tests.conftest import ROOT, python
 
 
 def weights(network):
@@ -47,7 +37,7 @@ class TestSB3:
             f"sys.argv = ['page', '--steps', '1', '--seed', '3', '--out', {str(tmp_path)!r}]; "
             f"runpy.run_path({str(page)!r}, run_name='__main__')"
         )
-        done = run("-c", quick)
+        done = python("-c", quick)
         assert done.returncode == 0, done.stderr
         found = re.fullmatch(
             r"seed 3, \d+ s: MiddlePoint-v0: mean error ([\d.]+) degC.*\n", done.stdout
@@ -168,7 +158,7 @@ for name in ("torch", "stable_baselines3", "scipy", "pandas", "matplotlib"):
 sys.argv = ["torch_free", "MiddlePointNoisy-v0"]
 runpy.run_module("benchmarks.examples.torch_free", run_name="__main__")
 """
-    done = run("-c", program)
+    done = python("-c", program)
     assert done.returncode == 0, done.stderr
     # The least possible error is 1.60 degC, and an idle valve has 5 degC.
     names = re.findall(r"^(NN|PI): MiddlePointNoisy-v0: mean error", done.stdout, re.MULTILINE)

@@ -31,8 +31,10 @@ from benchmarks.identify.study.command import (
     beside_rivals,
     synthetic_log,
     synthetic_plants,
-    table,
     task,
+)
+from benchmarks.identify.study.command import (
+    table as table_of,
 )
 from benchmarks.identify.tuning import recommended, reduced
 from benchmarks.loop.linear import LinearModel
@@ -496,6 +498,12 @@ class TestPlant:
         assert 0.6 * reach < arguments["setpoint_amplitude"] < reach
 
 
+def table(samples=400):
+    log = recorded(samples)
+    times = 8.0 * np.arange(samples)
+    return pd.DataFrame({"time": times, "flow": log.flow, "temperature": log.temperature})
+
+
 @pytest.fixture
 def written(tmp_path):
     """Return a function that writes a log as a file, and its path."""
@@ -503,10 +511,7 @@ def written(tmp_path):
     def write(text=None, name="log.csv", **columns):
         path = tmp_path / name
         if text is None:
-            log = recorded(400)
-            table = {"time": 8.0 * np.arange(400), "flow": log.flow,
-                     "temperature": log.temperature}  # fmt: skip
-            text = pd.DataFrame(table | columns).to_csv(index=False)
+            text = table().assign(**columns).to_csv(index=False)
         path.write_text(text, encoding="utf-8")
         return path
 
@@ -518,12 +523,6 @@ class TestLog:
         np.testing.assert_allclose(first.flow, second.flow, rtol=1e-9)
         np.testing.assert_allclose(first.temperature, second.temperature, rtol=1e-9)
         assert first.sampling_interval == second.sampling_interval
-
-    def table(self):
-        log = recorded(400)
-        return pd.DataFrame(
-            {"time": 8.0 * np.arange(400), "flow": log.flow, "temperature": log.temperature}
-        )
 
     def test_plain(self, written):
         log = read_log(written())
@@ -541,10 +540,10 @@ class TestLog:
         ],
     )
     def test_separators_and_decimal_marks(self, written, options):
-        table = self.table()
+        shown = table()
         if options.get("quoting"):
-            table = table.map(lambda value: f"{value!r}".replace(".", ","))
-        self.same(read_log(written(table.to_csv(index=False, **options))), recorded(400))
+            shown = shown.map(lambda value: f"{value!r}".replace(".", ","))
+        self.same(read_log(written(shown.to_csv(index=False, **options))), recorded(400))
 
     @pytest.mark.parametrize("form", ["%Y-%m-%dT%H:%M:%S", "%d.%m.%Y %H:%M:%S"])
     def test_dates(self, written, form):
@@ -553,13 +552,13 @@ class TestLog:
         self.same(read_log(written(time=dates)), recorded(400))
 
     def test_sampling_interval_in_place_of_times(self, written):
-        path = written(self.table().drop(columns="time").to_csv(index=False))
+        path = written(table().drop(columns="time").to_csv(index=False))
         self.same(read_log(path, Columns(sampling_interval=8.0)), recorded(400))
         with pytest.raises(ValueError, match=r"no column 'time'.* or give --sampling-interval"):
             read_log(path)
 
     def test_units_of_headings_and_options(self, written):
-        plain = self.table()
+        plain = table()
         other = pd.DataFrame(
             {
                 "Time (min)": plain["time"] / 60.0,
@@ -574,13 +573,13 @@ class TestLog:
         assert log.sampling_interval == pytest.approx(8.0)
 
     def test_percent_is_said(self, written):
-        path = written(self.table().rename(columns={"flow": "flow [%]"}).to_csv(index=False))
+        path = written(table().rename(columns={"flow": "flow [%]"}).to_csv(index=False))
         assert read_log(path).notes == ["The flow is in %: read % wherever t/h is said."]
 
     def test_missing_rows_and_numbers_are_gaps(self, written):
-        table = self.table().drop(index=[100, 101, 102])
-        table.loc[50, "temperature"] = np.nan
-        log = read_log(written(table.to_csv(index=False)))
+        gappy = table().drop(index=[100, 101, 102])
+        gappy.loc[50, "temperature"] = np.nan
+        log = read_log(written(gappy.to_csv(index=False)))
         assert len(log.flow) == 400
         assert np.isnan(log.temperature[[50, 100, 101, 102]]).all()
         assert any("3 rows are missing" in note for note in log.notes)
@@ -591,8 +590,7 @@ class TestLog:
         assert np.isfinite(log.flow[[100, 101, 102]]).all() == held
 
     def test_pieces_make_no_difference(self, written, monkeypatch):
-        table = self.table().drop(index=[70, 100])
-        path = written(table.to_csv(index=False))
+        path = written(table().drop(index=[70, 100]).to_csv(index=False))
         whole = read_log(path)
         monkeypatch.setattr(log_module, "CHUNK", 10)
         for rows in (20_000, 57):
@@ -626,7 +624,7 @@ class TestLog:
         ],
     )
     def test_missing_column_is_named(self, written, change, complaint):
-        path = written(self.table().rename(columns=change).to_csv(index=False))
+        path = written(table().rename(columns=change).to_csv(index=False))
         with pytest.raises(ValueError, match=complaint):
             read_log(path)
 
@@ -662,8 +660,7 @@ class TestLog:
             read_log(tmp_path / "none.csv")
         with pytest.raises(ValueError, match=r"unit of 'flow' must be one of .* got 'gpm'"):
             read_log(written(), Columns(flow_unit="gpm"))
-        table = self.table().rename(columns={"flow": "flow (furlongs)"})
-        path = written(table.to_csv(index=False))
+        path = written(table().rename(columns={"flow": "flow (furlongs)"}).to_csv(index=False))
         with pytest.raises(ValueError, match=r"unit of .* got 'furlongs'"):
             read_log(path)
         with pytest.raises(ValueError, match="one thing only"):
@@ -677,10 +674,7 @@ class TestLog:
 class TestCommand:
     def test_everything_is_written(self, written, tmp_path, capsys):
         out = tmp_path / "out"
-        log = recorded()
-        table = {"time": 8.0 * np.arange(1200), "flow": log.flow,
-                 "temperature": log.temperature}  # fmt: skip
-        path = written(pd.DataFrame(table).to_csv(index=False))
+        path = written(table(1200).to_csv(index=False))
         assert main([str(path), "--out", str(out), "--longest-delay", "30"]) == 0
         plant = json.loads((out / "plant.json").read_text())
         gymnasium.make("MiddlePoint-v0", **plant).reset(seed=0)
@@ -736,7 +730,7 @@ class TestStudy:
             "delays": [12.0, 10.0, np.nan], "gains": [-1.2, -1.2, -1.2], **rest,
         }  # fmt: skip
         found = {"steps": [right, wrong, {"refused": "no", "seconds": 0.1}]}
-        shares = [each.split(" [")[0] for each in table(found)["steps"]]
+        shares = [each.split(" [")[0] for each in table_of(found)["steps"]]
         # Of the dead zones, one is too small to count. One log is refused.
         assert shares == [*["33 %"] * 3, *["50 %"] * 4, "100 %", "1"]
         beside = beside_rivals(found)

@@ -19,10 +19,10 @@ from agents import LawNetwork
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.sweep.__main__ import main as sweep
 from benchmarks.train.command import trained
+from tests.conftest import ROOT, python
 from tests.nodes.train import TRAININGS
 from tests.test_fan_out import counted, until, work
 
-ROOT = Path(__file__).parent.parent
 NODES = ROOT / "tests" / "nodes"
 SECONDS = 300.0  # after which something hangs, on the slowest machine
 DESIGN = (
@@ -50,13 +50,6 @@ def private():
 def free_port():
     with socket.create_server(("127.0.0.1", 0)) as server:
         return server.getsockname()[1]
-
-
-def python(*words, environment):
-    return subprocess.run(
-        [sys.executable, *words],
-        env=environment, cwd=ROOT, timeout=SECONDS, capture_output=True, text=True,
-    )  # fmt: skip
 
 
 class Cluster:
@@ -127,7 +120,7 @@ def test_a_sweep_loses_a_node(cluster, results):
 
 def test_trainings_give_the_networks_that_they_give_here(cluster, results):
     there, here = results / "trained there", results / "trained here"
-    done = python("-m", "tests.nodes.train", str(there), environment=cluster.environment)
+    done = python("-m", "tests.nodes.train", str(there), env=cluster.environment)
     assert done.returncode == 0, done.stderr
     networks = trained(TRAININGS, here, FanOut(1))
     assert len(networks) == len(list(there.glob("*/network.npz"))) == len(TRAININGS)
@@ -141,7 +134,7 @@ def test_trainings_give_the_networks_that_they_give_here(cluster, results):
 
 def test_a_lost_worker_loses_nothing(cluster, tmp_path):
     (tmp_path / "calls").mkdir()
-    done = python("-m", "tests.ray_run", str(tmp_path), environment=cluster.environment)
+    done = python("-m", "tests.ray_run", str(tmp_path), env=cluster.environment)
     assert done.returncode == 0, done.stderr
     out = json.loads((tmp_path / "out.json").read_text())
     assert (tmp_path / "died").exists()
@@ -160,7 +153,7 @@ CONNECT = "from benchmarks.lib.fan_out import FanOut; FanOut(2, 'ray')"
 
 def test_without_a_cluster_it_says_how_to_start_one():
     nowhere = private() | {"RAY_ADDRESS": f"127.0.0.1:{free_port()}"}
-    assert NO_CLUSTER in python("-c", CONNECT, environment=nowhere).stderr
+    assert NO_CLUSTER in python("-c", CONNECT, env=nowhere).stderr
 
 
 def test_a_cluster_that_is_gone_is_not_waited_for(tmp_path):
@@ -168,4 +161,4 @@ def test_a_cluster_that_is_gone_is_not_waited_for(tmp_path):
     (tmp_path / "ray/ray_current_cluster").write_text(f"127.0.0.1:{free_port()}")
     environment = private() | {"RAY_TMPDIR": str(tmp_path)}
     environment.pop("RAY_ADDRESS", None)
-    assert NO_CLUSTER in python("-c", CONNECT, environment=environment).stderr
+    assert NO_CLUSTER in python("-c", CONNECT, env=environment).stderr

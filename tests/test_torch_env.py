@@ -1,8 +1,6 @@
 """The environment in PyTorch: equal to that in NumPy, its draws, gradients, and no waiting."""
 
 import gc
-import subprocess
-import sys
 from typing import ClassVar
 
 import numpy as np
@@ -20,6 +18,7 @@ from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
 from mptc_gym.signals import Streams  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv  # noqa: E402
 from tests.arguments import valid_arguments  # noqa: E402
+from tests.conftest import python  # noqa: E402
 
 MODES = [mode.value for mode in AutoresetMode]
 
@@ -706,6 +705,6 @@ assert "torch" not in sys.modules
 sys.modules["torch"] = None  # an import is an error from now on
 import mptc_gym.torch_env
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    done = python("-c", program)
     assert done.returncode
     assert 'pip install "mptc_gym[torch]"' in done.stderr.splitlines()[-1]
