@@ -46,12 +46,6 @@ class TestPresets:
         assert {env.unwrapped.parameters for env in ids} == {batch.parameters}
         assert {env.spec.max_episode_steps for env in ids} == {1200}
 
-    def test_arguments_go_on_top(self):
-        env = gymnasium.make(HARD, delay=18, action_window=2)
-        assert env.unwrapped.parameters.delay == 18
-        assert env.unwrapped.parameters.dead_zone == (3.0, 7.0)
-        assert gymnasium.make(HARD).unwrapped.parameters.delay == (12, 24)
-
 
 class TestEvaluate:
     @pytest.mark.parametrize("name", ["paper", "hard"])
