@@ -47,6 +47,13 @@ def python(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, **options)
 
 
+def assert_the_seed_is_all_that_differs(made: Callable[[int], ArrayLike]) -> None:
+    """Make it twice with a seed and once with another, and compare."""
+    first, again, other = (np.asarray(made(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
 def trajectory(
     setpoint: ArrayLike,
     output: ArrayLike,

@@ -13,8 +13,10 @@ import agents
 from agents import (
     Controller,
     DirectNNController,
+    NeuralSmithPredictor,
     PIController,
     PolicyNetwork,
+    SelfTuningController,
     SmithPredictor,
     Weights,
 )
@@ -332,21 +334,6 @@ class TestDirectNN:
         assert np.isfinite(nn.act(np.full(6, 1e3)))
         assert np.isfinite(nn.act(np.full(6, -1e3)))
 
-    @pytest.mark.parametrize(
-        ("name", "value"),
-        [
-            ("n_inputs", 0), ("n_hidden", 1.5), ("eta", -0.1), ("eta_1", np.nan),
-            ("eta_theta", np.inf), ("eta_1_theta", -1), ("direction", 0), ("direction", 0.5),
-            ("input_scale", np.nan), ("weight_scale", -1.0), ("num_envs", 0),
-            ("weight_scale", 1e308),
-            ("update_interval", 0), ("seed", -1), ("error_index", -1), ("n_inputs", "6"),
-            ("num_envs", True), ("eta", None),
-        ],
-    )  # fmt: skip
-    def test_bad_arguments_are_named(self, name, value):
-        with pytest.raises(ValueError, match=name):
-            DirectNNController(**{name: value})
-
     def test_batch_size_must_fit(self):
         with pytest.raises(ValueError, match=r"\(3, n_obs\)"):
             DirectNNController(num_envs=3).act(np.zeros(6))
@@ -396,18 +383,6 @@ class TestSimc:
         # By default tau_c = theta: 100 / (2 x 20) = 2.5; tau_I = 4 x 20, less than 100.
         controller = PIController.simc(gain=-2.0, time_constant=100.0, delay=10.0)
         assert (controller.kp, controller.ki) == pytest.approx((2.5, 2.5 * 8 / 80))
-
-    @pytest.mark.parametrize(
-        ("name", "value"),
-        [
-            ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
-            ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0),
-            ("gain", 10**400), ("time_constant", 10**400), ("anti_windup", "no"),
-        ],
-    )  # fmt: skip
-    def test_bad_numbers_are_named(self, name, value):
-        with pytest.raises(ValueError, match=name):
-            PIController.simc(**{**PLANT, name: value})
 
     def test_without_delay_it_asks_for_the_time_constant_of_the_loop(self):
         with pytest.raises(ValueError, match="must be given where delay is 0"):
@@ -459,13 +434,6 @@ class TestSmithPredictor:
         controller.kp, controller.ki = 7.0, 0.0  # u = -7 at e = 1
         assert np.float64(controller.act([0.0, 0, 0, 1.0])[0]) * 10.0 <= -7.0
 
-    @pytest.mark.parametrize(
-        ("name", "value"), [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)]
-    )
-    def test_bad_numbers_are_named(self, name, value):
-        with pytest.raises(ValueError, match=name):
-            self.smith(**{name: value})
-
 
 @pytest.mark.parametrize(
     "observation",
@@ -498,3 +466,42 @@ def test_damaged_weights_are_refused_by_path(tmp_path):
             Weights.load(path)
     with pytest.raises(ValueError, match=r"^weights must be"):
         DirectNNController().weights = 5
+
+
+BAD = {
+    DirectNNController: [
+        ("n_inputs", 0), ("n_hidden", 1.5), ("eta", -0.1), ("eta_1", np.nan),
+        ("eta_theta", np.inf), ("eta_1_theta", -1), ("direction", 0), ("direction", 0.5),
+        ("input_scale", np.nan), ("weight_scale", -1.0), ("num_envs", 0),
+        ("weight_scale", 1e308), ("update_interval", 0), ("seed", -1), ("error_index", -1),
+        ("n_inputs", "6"), ("num_envs", True), ("eta", None),
+    ],
+    partial(PIController.simc, **PLANT): [
+        ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
+        ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0),
+        ("gain", 10**400), ("time_constant", 10**400), ("anti_windup", "no"),
+    ],
+    partial(SmithPredictor, **TOLD): [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)],
+    partial(NeuralSmithPredictor, **PLANT): [
+        ("gain", 0.0), ("time_constant", 0.0), ("delay", -8.0), ("delay", 1e12),
+        ("dead_zone", -1.0), ("uncertainty", np.nan), ("sampling_interval", 0.0),
+        ("coefficients", ([1.0, -1.0], [0.1])), ("coefficients", ([1.0, 0.0], [0.1, -0.1])),
+    ],
+    partial(SelfTuningController, **PLANT): [
+        ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
+        ("dead_zone", -1.0), ("dead_zones", ()), ("dead_zones", [-1.0]), ("dead_zones", 5.0),
+        ("shortest_delay", -1), ("longest_delay", 5), ("longest_delay", 10.0),
+        ("closed_loop_time_constant", 0.0), ("forgetting", 0.0), ("forgetting", 1.1),
+        ("sampling_interval", 0.0), ("setpoint_index", -1), ("error_index", 1.5),
+        ("u_min", 10.0), ("longest_delay", 10**9), ("dead_zones", b"15"),
+        ("dead_zones", np.array(5.0)), ("gain", 10**400),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("made", "name", "value"), [(made, *each) for made, bad in BAD.items() for each in bad]
+)
+def test_bad_arguments_are_named(made, name, value):
+    with pytest.raises(ValueError, match=name):
+        made(**{name: value})

@@ -240,6 +240,7 @@ class TestReading:
             (["--runs", "99999999999"], "--runs: must be at most 100,000, got '99999999999'"),
             (["--preset", "harder"], "--preset: no 'harder'; there are paper, dead-zone-7"),
             (["--backend", "cloud"], "--backend"),
+            (["--jobs", "0"], "--jobs"),
             (["--out"], "--out requires an argument"),
             (["stray"], "stray"),
         ],

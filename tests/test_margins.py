@@ -9,7 +9,7 @@ from scipy import signal
 
 from agents import PIController, SmithPredictor
 from agents.pi import SEARCHED_GAINS
-from benchmarks.identify.margins import Loop, margins, plot_margins
+from benchmarks.identify.margins import Loop, margins
 from mptc_gym import Parameters
 
 STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of the paper's plant
@@ -107,9 +107,3 @@ def test_other_direction_has_the_same_margins():
         more = {"closed_loop_time_constant": 80.0}
         ours = margins(make(**STEP_TEST, **more), Parameters())
         assert margins(make(**shown, **more), mirrored) == ours
-
-
-def test_plot_is_written(tmp_path):
-    loops = {name: Loop.of(agent, Parameters()) for name, agent in controllers().items()}
-    plot_margins(loops, tmp_path / "margins.png")
-    assert (tmp_path / "margins.png").stat().st_size > 10_000

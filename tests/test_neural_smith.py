@@ -119,18 +119,6 @@ class TestLoop:
 
 
 class TestRefusals:
-    @pytest.mark.parametrize(
-        ("name", "value"),
-        [
-            ("gain", 0.0), ("time_constant", 0.0), ("delay", -8.0), ("delay", 1e12),
-            ("dead_zone", -1.0), ("uncertainty", np.nan), ("sampling_interval", 0.0),
-            ("coefficients", ([1.0, -1.0], [0.1])), ("coefficients", ([1.0, 0.0], [0.1, -0.1])),
-        ],
-    )  # fmt: skip
-    def test_bad_numbers_are_named(self, name, value):
-        with pytest.raises(ValueError, match=name):
-            NeuralSmithPredictor(**{**SHOWN, name: value})
-
     def test_a_file_of_something_else(self, tmp_path):
         path = tmp_path / "network.npz"
         for content in (b"", b"half of it", pickle.dumps(SHOWN)):

@@ -175,20 +175,3 @@ def test_reset_forgets_what_was_learnt():
     control(controller, samples=300, delay=30)
     controller.reset()
     assert controller.estimates == {}
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
-        ("dead_zone", -1.0), ("dead_zones", ()), ("dead_zones", [-1.0]), ("dead_zones", 5.0),
-        ("shortest_delay", -1), ("longest_delay", 5), ("longest_delay", 10.0),
-        ("closed_loop_time_constant", 0.0), ("forgetting", 0.0), ("forgetting", 1.1),
-        ("sampling_interval", 0.0), ("setpoint_index", -1), ("error_index", 1.5),
-        ("u_min", 10.0), ("longest_delay", 10**9), ("dead_zones", b"15"),
-        ("dead_zones", np.array(5.0)), ("gain", 10**400),
-    ],
-)  # fmt: skip
-def test_bad_arguments_are_named(name, value):
-    with pytest.raises(ValueError, match=name):
-        SelfTuningController(**STEP_TEST | {name: value})
