@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from benchmarks.controllers.roster import label
 from benchmarks.lib.statistics import (
@@ -111,10 +112,7 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) ->
     for scenario, cases in groups(runs, "scenario"):
         scale = scales[scenario]
         limit = scale.least.value
-        errors = {
-            agent: group.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
-            for agent, group in groups(cases, "agent")
-        }
+        errors = {agent: _errors(group) for agent, group in groups(cases, "agent")}
         base = errors[reference].mean(axis=0) if reference in errors else None
         for agent, values in errors.items():
             mean = bootstrap(values, BOOTSTRAP)
@@ -159,12 +157,16 @@ def scores(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
     for agent, cases in groups(runs, "agent"):
         tables, means = [], {}
         for scenario, group in groups(cases, "scenario"):
-            errors = group.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
-            tables.append(scales[scenario].least.score(errors))
+            tables.append(scales[scenario].least.score(_errors(group)))
             means[scenario] = float(tables[-1].mean())
         found = stratified(tables, BOOTSTRAP, interquartile_mean)
         rows.append({"agent": agent, **_ends("score", found), **means})
     return pd.DataFrame(rows)
+
+
+def _errors(runs: pd.DataFrame) -> NDArray[np.float64]:
+    """Return the errors of a controller's runs, shape (policies, seeds)."""
+    return runs.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
 
 
 def _ends(name: str, found: Estimate) -> dict[str, float]:
@@ -208,12 +210,7 @@ def _alike(runs: pd.DataFrame, scales: Mapping[str, Scale], one: str, other: str
     """Whether the mean scores of two controllers do not differ beyond their interval."""
     tables = []
     for scenario, cases in groups(runs, "scenario"):
-        errors = [
-            cases[cases["agent"] == agent]
-            .pivot_table(index="policy", columns="seed", values="mae")
-            .to_numpy()
-            for agent in (one, other)
-        ]
+        errors = [_errors(cases[cases["agent"] == agent]) for agent in (one, other)]
         if not all(each.size for each in errors):
             continue  # after an interruption
         # Policies are drawn of the one that has more of them.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,18 +18,13 @@ from benchmarks.loop.rollout import Agent, make_plants
 from mptc_gym import Parameters
 
 
-@dataclass(frozen=True)
-class _Own:
-    """Calls a user's factory with what it accepts, by name."""
-
-    made_by: Callable[..., Agent]
-
-    def __call__(self, plant: Parameters, runs: int, seed: int) -> Agent:
-        offered = {"parameters": plant, "num_envs": runs, "seed": seed, **limits(plant)}
-        accepted = inspect.signature(self.made_by).parameters
-        if any(each.kind is each.VAR_KEYWORD for each in accepted.values()):
-            return self.made_by(**offered)
-        return self.made_by(**{name: offered[name] for name in offered if name in accepted})
+def _made(made_by: Callable[..., Agent], plant: Parameters, runs: int, seed: int) -> Agent:
+    """Call a user's factory with what it accepts, by name."""
+    offered = {"parameters": plant, "num_envs": runs, "seed": seed, **limits(plant)}
+    accepted = inspect.signature(made_by).parameters
+    if any(each.kind is each.VAR_KEYWORD for each in accepted.values()):
+        return made_by(**offered)
+    return made_by(**{name: offered[name] for name in offered if name in accepted})
 
 
 def own_factory(location: str) -> Factory:
@@ -62,7 +58,9 @@ def own_factory(location: str) -> Factory:
                 f"got {name!r}"
             )
     cost = Cost(*(str(getattr(found, each.name, "")) for each in fields(Cost)))
-    factory = Factory(_Own(found), dict(observation), code=found.__module__, cost=cost)
+    factory = Factory(
+        partial(_made, found), dict(observation), code=found.__module__, cost=cost
+    )
     _try_out(factory, repr(found))
     return factory
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import glob
 import hashlib
 import importlib.util
-from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +60,13 @@ def _policy(algorithm: str, file: Path) -> Factory:
             f"{file} was trained in {', '.join(wrappers)}, and only IncrementalAction is known "
             "here: mptc_gym.evaluate scores it"
         )
-    increments = tuple((spec.additional_wrappers[0].kwargs or {}).items()) if wrappers else None
-    made_by = Saved(algorithm, str(file), increments)
-    model = made_by.model()
+    increments = dict(spec.additional_wrappers[0].kwargs or {}) if wrappers else None
+    model = _loaded(algorithm, str(file))
     weights = sum(weight.numel() for weight in model.policy.parameters())
     return Factory(
-        made_by,
+        partial(_made, algorithm, str(file), increments),
         {name: spec.kwargs.get(name, ARGUMENTS[name].default) for name in WINDOWS},
+        code=__name__,
         provenance={
             "file": file.name,
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
@@ -80,35 +79,19 @@ def _policy(algorithm: str, file: Path) -> Factory:
     )
 
 
-@dataclass(frozen=True)
-class Saved:
-    """Makes controllers of a saved policy.
-
-    Attributes
-    ----------
-    algorithm
-        Its class in Stable-Baselines3.
-    file
-        The zip.
-    increments
-        Arguments of `IncrementalAction`, if its action changes the flow.
-    """
-
-    algorithm: str
-    file: str
-    increments: tuple[tuple[str, Any], ...] | None
-
-    def model(self) -> Any:
-        """Return the model; ValueError if the zip does not hold one of this algorithm."""
-        return _loaded(self.algorithm, self.file)
-
-    def __call__(self, plant: Parameters, runs: int, seed: int) -> SavedPolicy:
-        """Return a controller."""
-        actuator = None
-        if self.increments is not None:
-            numbers = drawn_numbers(plant, runs, seed).chosen(NUMBERS)
-            actuator = Actuator(numbers, **dict(self.increments))
-        return SavedPolicy(self.model(), actuator, runs)
+def _made(
+    algorithm: str,
+    file: str,
+    increments: dict[str, Any] | None,
+    plant: Parameters,
+    runs: int,
+    seed: int,
+) -> SavedPolicy:
+    """Return a controller of a zip; `increments` are the arguments of `IncrementalAction`."""
+    actuator = None
+    if increments is not None:
+        actuator = Actuator(drawn_numbers(plant, runs, seed).chosen(NUMBERS), **increments)
+    return SavedPolicy(_loaded(algorithm, file), actuator, runs)
 
 
 class SavedPolicy:
@@ -145,6 +128,7 @@ class SavedPolicy:
 
 @cache
 def _loaded(algorithm: str, file: str) -> Any:
+    """Return the model; ValueError if the zip does not hold one of this algorithm."""
     there = [name for name in LIBRARIES if importlib.util.find_spec(name)]
     modules = [importlib.import_module(name) for name in there]
     found: Any = next((getattr(m, algorithm) for m in modules if hasattr(m, algorithm)), None)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.polynomial.polynomial import polyval
+from numpy.polynomial.polynomial import polyadd, polyval
 from numpy.typing import NDArray
 
 from benchmarks.lib.drawing import colours, drawn
@@ -100,9 +100,7 @@ class Loop:
     def response(self, frequency: Array) -> Complex:
         """Return L at frequencies, rad/s."""
         back = np.exp(-1j * np.asarray(frequency) * self.sampling_interval)  # z^-1
-        up, down = (polyval(back, part) for part in (self.numerator, self.denominator))
-        ratio: Complex = np.asarray(up / down)
-        return ratio
+        return ratio(self.numerator, self.denominator, back)
 
     def frequencies(self) -> Array:
         """Return frequencies up to Nyquist's, rad/s, dense enough to see every crossing."""
@@ -113,11 +111,17 @@ class Loop:
     @property
     def stable(self) -> bool:
         """Whether the closed loop is stable: no root of 1 + L at or beyond the unit circle."""
-        size = max(len(self.numerator), len(self.denominator))
-        closed = np.zeros(size)
-        closed[: len(self.denominator)] += self.denominator
-        closed[: len(self.numerator)] += self.numerator
+        closed = polyadd(self.denominator, self.numerator)
         return bool(np.all(np.abs(np.roots(closed)) < 1.0))
+
+
+def ratio(
+    numerator: Array | Sequence[float], denominator: Array | Sequence[float], back: NDArray[Any]
+) -> Complex:
+    """Return a transfer function, given in powers of z^-1, at values `back` of z^-1."""
+    up, down = (polyval(back, part) for part in (numerator, denominator))
+    values: Complex = np.asarray(up / down)
+    return values
 
 
 def margins(controller: Linear, parameters: Parameters) -> Margins:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from benchmarks.identify import plots
 from benchmarks.identify.margins import Loop, plot_margins
-from benchmarks.identify.model import Interval, Model
+from benchmarks.identify.model import Model
 from benchmarks.identify.plant import plant_arguments
 from benchmarks.identify.tuning import Recommended, recommended, reduced
 from benchmarks.lib.report import Section
@@ -134,7 +134,12 @@ def _found(model: Model, tuned: dict[str, Recommended]) -> Section:
         ),
     ]
     rows = [
-        (name.replace("_", " "), f"{each.value:.4g}", brackets(each), UNITS.get(name, ""))
+        (
+            name.replace("_", " "),
+            f"{each.value:.4g}",
+            f"[{each.low:.4g}, {each.high:.4g}]",
+            UNITS.get(name, ""),
+        )
         for name, each in model.estimates.items()
     ]
     rows += [
@@ -149,11 +154,6 @@ def _found(model: Model, tuned: dict[str, Recommended]) -> Section:
     return Section(
         "What the log shows", text, pd.DataFrame(rows, columns=["", "value", "95 %", "unit"])
     )
-
-
-def brackets(interval: Interval) -> str:
-    """Return an interval as text."""
-    return f"[{interval.low:.4g}, {interval.high:.4g}]"
 
 
 def _residuals(model: Model) -> Section:

@@ -8,13 +8,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import integrate
 
 from agents import PIController, SmithPredictor
 from benchmarks.controllers.step_test import StepTest
 from benchmarks.identify.armax import Array
-from benchmarks.identify.margins import Margins, margins
+from benchmarks.identify.margins import Margins, margins, ratio
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import settling
 from benchmarks.loop.linear import LinearModel
@@ -148,17 +147,9 @@ class Plants:
             np.geomspace(slowest, np.pi, 400), np.linspace(np.pi / turns, np.pi, turns)
         ))  # fmt: skip
         self._responses = np.array([
-            self._of(np.array(plant.b), plant.a) * self._back ** (plant.delay + 1)
+            ratio(plant.b, plant.a, self._back) * self._back ** (plant.delay + 1)
             for plant in plants
         ])  # fmt: skip
-
-    def _of(self, numerator: Array, denominator: Sequence[float]) -> NDArray[np.complex128]:
-        up, down = (
-            np.polynomial.polynomial.polyval(self._back, part)
-            for part in (numerator, denominator)
-        )
-        ratio: NDArray[np.complex128] = up / down
-        return ratio
 
     def sensitivity(self, numerator: Array, denominator: Array) -> Array:
         """Return Ms of each plant with a controller, infinite where the loop is not stable.
@@ -169,7 +160,7 @@ class Plants:
         """
         poles = np.abs(np.roots(denominator))
         beyond = int(np.sum(poles > 1.0 + 1e-6))
-        difference = 1.0 + self._responses * self._of(numerator, denominator.tolist())
+        difference = 1.0 + self._responses * ratio(numerator, denominator, self._back)
         steps = np.angle(difference[:, 1:] / difference[:, :-1])
         start = np.angle(difference[:, 0])
         stable = (start < 0.0) & (np.abs(start + steps.sum(axis=1)) < 1.0) & (beyond == 0)

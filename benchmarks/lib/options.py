@@ -72,7 +72,7 @@ def reads(
     least, most
         Its limits.
     many
-        How many numbers there are, -1 for any number from 1 on; 0 for a single one.
+        How many numbers there are; 0 for a single one.
     """
 
     def convert(text: str) -> Any:
@@ -89,9 +89,7 @@ def reads(
     if not many:
         return Parameter(converter=lambda _, tokens: convert(tokens[0].value), n_tokens=1)
     return Parameter(
-        converter=lambda _, tokens: tuple(map(convert, _latest(_, tokens))),
-        n_tokens=many,
-        consume_multiple=1 if many < 0 else None,
+        converter=lambda _, tokens: tuple(map(convert, _latest(_, tokens))), n_tokens=many
     )
 
 

@@ -48,9 +48,13 @@ def execute(options: Options, console: Console) -> str:
     known = {NOTHING: ROSTER[NOTHING], **controllers}
     members = {name: entry.members(training) for name, entry in known.items()}
     began = time.perf_counter()
+    of_limits = fingerprint(limit_task.__module__, plants=plants, samples=options.samples)
     results = training.fan_out.run(
-        _limit_tasks(plants, options),
-        out / "tasks" / _limit_key(plants, options),
+        {
+            f"limit {i}": partial(limit_task, plant, options.samples)
+            for i, plant in enumerate(plants)
+        },
+        out / "tasks" / of_limits,
         title="limit",
     )
     for name, factories in members.items():
@@ -71,17 +75,6 @@ def execute(options: Options, console: Console) -> str:
     write_report(out, title, sections, provenance_line("sweep", made))
     show(sections, console)
     return f"{len(results)} tasks in {seconds:.0f} s. The report, data and maps are in {out}/"
-
-
-def _limit_tasks(plants: list[Arguments], options: Options) -> dict[str, Callable[[], Any]]:
-    return {
-        f"limit {i}": partial(limit_task, plant, options.samples)
-        for i, plant in enumerate(plants)
-    }
-
-
-def _limit_key(plants: list[Arguments], options: Options) -> str:
-    return fingerprint(limit_task.__module__, plants=plants, samples=options.samples)
 
 
 def _agent_tasks(

@@ -6,7 +6,6 @@ import math
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -35,22 +34,6 @@ from mptc_gym.rendering import Frame
 COLOURS = 48  # of a GIF: the lines', the areas' and what lies between them
 OUT = Path("results/watch")
 Put = Callable[[Frame], object]  # takes the pictures of a film, one after the other
-
-
-@dataclass(frozen=True)
-class Film:
-    """A kind of film.
-
-    Attributes
-    ----------
-    open
-        Opens a file, for a number of pictures a second.
-    fps
-        How many of them a second there are at most.
-    """
-
-    open: Callable[[Path, float], AbstractContextManager[Put]]
-    fps: int
 
 
 def execute(options: Options, console: Console) -> str:
@@ -164,10 +147,10 @@ def in_film(
     """
     arguments = factory.arguments(scenario.arguments)
     plants = make_plants(1, scenario.samples, render_mode="rgb_array", **arguments)
-    film = FILMS[path.suffix]
-    every = math.ceil(speed / film.fps)
+    film, fps = FILMS[path.suffix]
+    every = math.ceil(speed / fps)
     controller = factory(arguments, 1, seed)
-    with replacing(path) as partial, film.open(partial, speed / every) as put:
+    with replacing(path) as partial, film(partial, speed / every) as put:
 
         def draw(k: int) -> None:
             if k % every == 0:
@@ -205,7 +188,11 @@ def _gif(path: Path, fps: float) -> Iterator[Put]:
     first.save(path, save_all=True, append_images=others, duration=1000 / fps, loop=0)
 
 
-FILMS: dict[str, Film] = {".mp4": Film(_mp4, 30), ".gif": Film(_gif, 10)}
+# What opens a file, for a number of pictures a second, and how many of them there are at most.
+FILMS: dict[str, tuple[Callable[[Path, float], AbstractContextManager[Put]], int]] = {
+    ".mp4": (_mp4, 30),
+    ".gif": (_gif, 10),
+}
 
 
 def _controller(agent: str) -> RosterEntry:

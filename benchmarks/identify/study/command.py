@@ -49,7 +49,6 @@ KINDS = {
     "second order": "steps, and plants of second order with a long lag",
 }
 RIVALS = ("this one", "SysIdentPy", "impulse response")
-Question = Callable[[dict[str, Any]], bool]
 TELLING = 2.0  # t/h, dead zones that are counted
 
 
@@ -236,35 +235,26 @@ def execute(options: options.Options, console: Console) -> str:
     return f"{closing} The tables are in {out}/"
 
 
-def _close(name: str, limit: float) -> Question:
-    def right(found: dict[str, Any]) -> bool:
-        truth, value, *_ = found[name]
-        near = abs(value - truth) <= limit
-        return bool(near if name in ("delay", "dead_zone") else
-                    abs(value / truth - 1.0) <= limit)  # fmt: skip
+# Of which estimate, and how far it may be off; None asks whether its interval covers the truth.
+QUESTIONS: dict[str, tuple[str, float | None]] = {
+    "delay within one sample": ("delay", 1.0),
+    "gain within 10 %": ("gain", 0.1),
+    "time constant within 20 %": ("time_constant", 0.2),
+    "dead zone within 1 t/h": ("dead_zone", 1.0),
+    "interval of the delay covers": ("delay", None),
+    "interval of the gain covers": ("gain", None),
+    "interval of the time constant covers": ("time_constant", None),
+    "interval of the dead zone covers": ("dead_zone", None),
+}
 
-    return right
 
-
-def _covers(name: str) -> Question:
-    def right(found: dict[str, Any]) -> bool:
-        truth, _, low, high = found[name]
+def _is_right(name: str, limit: float | None, found: dict[str, Any]) -> bool:
+    truth, value, low, high = found[name]
+    if limit is None:
         slack = 1e-9 * abs(truth)
         return bool(low - slack <= truth <= high + slack)
-
-    return right
-
-
-QUESTIONS: dict[str, tuple[str, Question]] = {
-    "delay within one sample": ("delay", _close("delay", 1.0)),
-    "gain within 10 %": ("gain", _close("gain", 0.1)),
-    "time constant within 20 %": ("time_constant", _close("time_constant", 0.2)),
-    "dead zone within 1 t/h": ("dead_zone", _close("dead_zone", 1.0)),
-    "interval of the delay covers": ("delay", _covers("delay")),
-    "interval of the gain covers": ("gain", _covers("gain")),
-    "interval of the time constant covers": ("time_constant", _covers("time_constant")),
-    "interval of the dead zone covers": ("dead_zone", _covers("dead_zone")),
-}
+    absolute = name in ("delay", "dead_zone")
+    return bool((abs(value - truth) if absolute else abs(value / truth - 1.0)) <= limit)
 
 
 def table(by_kind: dict[str, list[dict[str, Any]]]) -> pd.DataFrame:
@@ -274,13 +264,13 @@ def table(by_kind: dict[str, list[dict[str, Any]]]) -> pd.DataFrame:
     has no interval.
     """
     rows = []
-    for question, (name, right) in QUESTIONS.items():
+    for question, (name, limit) in QUESTIONS.items():
         row = {"how often": question}
         for kind, found in by_kind.items():
             flags = [
-                not each["refused"] and right(each)
+                not each["refused"] and _is_right(name, limit, each)
                 for each in found
-                if (each["refused"] and "covers" not in question)
+                if (each["refused"] and limit is not None)
                 or (not each["refused"] and (name != "dead_zone" or each[name][0] >= TELLING))
             ]
             row[kind] = ""
