@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,14 +21,13 @@ from benchmarks.claims.runs import (
     hidden_nodes,
     with_gains,
 )
-from benchmarks.claims.verdicts import Finding
+from benchmarks.claims.verdicts import OFTEN, Results
 from benchmarks.lib.statistics import Estimate, exact, median, quantile, share
 from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.scenarios import SETPOINTS as CASES
 from mptc_gym import PRESETS, Parameters
 
 # What words are taken to mean: set before the numbers were known, the same for all claims.
-OFTEN = 0.9  # "works", "converges": in at least this share of the draws
 NOTABLE = 0.05  # an error that changes by less has not changed notably
 MUCH = 0.2  # "much better", "seriously worse": an error that differs by this share or more
 SOON = 150  # samples: the paper's own number for the time that the weights take
@@ -44,35 +42,6 @@ KI = PAPER_PI[1]
 SEARCHED_PI = (SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"])
 LEARNING = 600  # samples after which a network is taken to have learnt
 GAINS = {False: "the same gains", True: "gains in proportion"}  # of networks of other shapes
-
-
-@dataclass
-class Results:
-    """What an examination found: numbers to judge by, and tables to draw and keep."""
-
-    findings: list[Finding] = field(default_factory=list)
-    tables: dict[str, pd.DataFrame] = field(default_factory=dict)
-
-    def ask(
-        self,
-        quantity: str,
-        estimate: Estimate,
-        unit: str = "",
-        *,
-        at_least: float = -math.inf,
-        at_most: float = math.inf,
-    ) -> None:
-        """Note a number; `at_least` or `at_most` make it part of the verdict."""
-        self.findings.append(Finding(quantity, estimate, unit, at_least, at_most))
-
-    def ask_share(
-        self, quantity: str, found: NDArray[np.bool_] | Estimate, *, often: bool = False
-    ) -> None:
-        """Note in which share of the draws something is found; `often` asks for `OFTEN`."""
-        of = found if isinstance(found, Estimate) else share(found)
-        in_percent = Estimate(100 * of.value, 100 * of.low, 100 * of.high, of.runs)
-        at_least = 100 * OFTEN if often else -math.inf
-        self.ask(quantity, in_percent, "% of draws", at_least=at_least)
 
 
 def ratio(errors: NDArray[np.float64], reference: NDArray[np.float64]) -> Estimate:

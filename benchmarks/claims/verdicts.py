@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from benchmarks.lib.statistics import Estimate
+from benchmarks.lib.statistics import Estimate, share
 
 if TYPE_CHECKING:
-    from benchmarks.claims.examinations import Results
     from benchmarks.claims.runs import Batch
+
+OFTEN = 0.9  # "works", "converges": in at least this share of the draws
 
 
 class Verdict(str, Enum):
@@ -71,6 +74,35 @@ class Finding:
         if self.at_least <= low and high <= self.at_most:
             return "yes"
         return "no" if high < self.at_least or low > self.at_most else "undecided"
+
+
+@dataclass
+class Results:
+    """What an examination found: numbers to judge by, and tables to draw and keep."""
+
+    findings: list[Finding] = field(default_factory=list)
+    tables: dict[str, pd.DataFrame] = field(default_factory=dict)
+
+    def ask(
+        self,
+        quantity: str,
+        estimate: Estimate,
+        unit: str = "",
+        *,
+        at_least: float = -math.inf,
+        at_most: float = math.inf,
+    ) -> None:
+        """Note a number; `at_least` or `at_most` make it part of the verdict."""
+        self.findings.append(Finding(quantity, estimate, unit, at_least, at_most))
+
+    def ask_share(
+        self, quantity: str, found: NDArray[np.bool_] | Estimate, *, often: bool = False
+    ) -> None:
+        """Note in which share of the draws something is found; `often` asks for `OFTEN`."""
+        of = found if isinstance(found, Estimate) else share(found)
+        in_percent = Estimate(100 * of.value, 100 * of.low, 100 * of.high, of.runs)
+        at_least = 100 * OFTEN if often else -math.inf
+        self.ask(quantity, in_percent, "% of draws", at_least=at_least)
 
 
 def verdict(findings: Iterable[Finding]) -> Verdict:
