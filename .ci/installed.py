@@ -21,7 +21,8 @@ installed = distribution("mptc_gym")
 files = {file.as_posix() for file in installed.files or ()}
 info = f"mptc_gym-{installed.version}.dist-info"
 assert {file.partition("/")[0] for file in files} == {"mptc_gym", info}, sorted(files)
-shipped = {"mptc_gym/py.typed", "mptc_gym/CHANGELOG.md", f"{info}/licenses/LICENSE"}
+shipped = {f"mptc_gym/{name}" for name in ("py.typed", "CHANGELOG.md", "bounds.json")}
+shipped.add(f"{info}/licenses/LICENSE")
 assert shipped <= files, sorted(files)
 present = [name for name in ABSENT if find_spec(name)]
 assert not present, present
@@ -65,4 +66,6 @@ assert Path(mptc_gym.__file__).is_relative_to(sys.prefix), mptc_gym.__file__
 assert mptc_gym.__version__ == installed.version
 changelog = Path(mptc_gym.__file__).with_name("CHANGELOG.md").read_text(encoding="utf-8")
 assert f"## {installed.version}\n" in changelog
+idle = mptc_gym.evaluate(lambda seen: 0.0 * seen[:, :1], "MiddlePointHard-v0")
+assert abs(idle.score) < 1e-9 < idle.least_possible < idle.mean_error, idle
 print(f"mptc_gym {installed.version} is complete and runs, with nothing but {needed}")
