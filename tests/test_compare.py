@@ -494,29 +494,6 @@ class TestCompare:
             assert run_compare(tmp_path / "three", *options, "--retrain") == 1
             assert "policy.npz: TypeError" in capsys.readouterr().out
 
-    def test_a_controller_of_the_user(self, tmp_path, monkeypatch):
-        (tmp_path / "mine.py").write_text(
-            "import numpy as np\n"
-            "class Mine:\n"
-            "    observation = {'output_window': 1, 'error_window': 0}\n"
-            "    def __init__(self, num_envs, parameters):\n"
-            "        self.num_envs = num_envs\n"
-            "        assert parameters.observation_size == 4\n"
-            "    def reset(self): pass\n"
-            "    def act(self, observations):\n"
-            "        assert observations.shape == (self.num_envs, 4)\n"
-            "        return np.full((self.num_envs, 1), -1.0, np.float32)\n"
-        )
-        monkeypatch.syspath_prepend(tmp_path)
-        status = run_compare(
-            tmp_path / "out", "--agents", "pi", "--agent", "mine=mine:Mine",
-            "--scenarios", "constant", "--runs", 2,
-        )  # fmt: skip
-        assert status == 0
-        runs = pd.read_csv(tmp_path / "out/runs.csv")
-        assert list(runs["agent"]) == ["pi", "pi", "mine", "mine"]
-        assert set(runs[runs.agent == "mine"]["saturation_share"]) == {100.0}
-
     def test_the_example_of_the_page(self, tmp_path, monkeypatch):
         readme = (ROOT / "benchmarks/compare/README.md").read_text(encoding="utf-8")
         (example,) = re.findall(r"```python\n(from agents import PIC.*?)```", readme, re.DOTALL)

@@ -304,11 +304,6 @@ def test_bad_arguments_are_named(name, value):
     assert len(str(error.value)) < 300
 
 
-def test_an_observation_with_no_element_is_refused():
-    with pytest.raises(ValueError, match="error_window"):
-        MiddlePointEnv(setpoint_window=0, error_window=0)
-
-
 @pytest.mark.parametrize("made", [gymnasium.make, partial(gymnasium.make_vec, num_envs=2)])
 def test_misspelt_argument_is_refused_and_the_right_one_named(made):
     message = r"unexpected keyword argument 'dead_zon': did you mean 'dead_zone'\?"
