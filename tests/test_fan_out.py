@@ -77,13 +77,12 @@ class TestResume:
         assert run(work(2, calls)) == run(work(2, calls))
         assert set(counted(calls).values()) == {2}
 
-    @pytest.mark.parametrize("name", ["plant 1.json", ".plant 1.1234.partial.json"])
-    def test_half_a_file_is_no_result(self, tmp_path, calls, name):
+    def test_a_file_that_was_begun_is_no_result(self, tmp_path, calls):
         whole = run(work(3), tmp_path / "out")
         file = tmp_path / "out" / "plant 1.json"
         text = file.read_text()
         file.unlink()
-        file.with_name(name).write_text(text[: len(text) // 2])
+        file.with_name(".plant 1.1234.partial.json").write_text(text[: len(text) // 2])
         assert run(work(3, calls), tmp_path / "out") == whole
         assert counted(calls) == Counter([1])
 

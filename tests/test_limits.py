@@ -410,13 +410,6 @@ class TestLeastPossible:
         assert least_possible(samples=1200, kind="preview", folder=None).value < found
         assert found < 0.7 * least_possible(samples=1200).value
 
-    def test_the_controller_that_knows_most_attains_it_where_nothing_changes(self):
-        least = least_possible(samples=600, folder=None, setpoint=5.0)
-        found = errors(MPC, 1, 600, setpoint=5.0)
-        assert found[0] == pytest.approx(least.value, rel=0.01)
-        assert beats(found, replace(least, value=1.03 * least.value, episodes=()))
-        assert not beats(found, least)
-
     def test_with_load_and_transmitter_noise_the_predictive_controller_comes_within_a_tenth(
         self,
     ):
