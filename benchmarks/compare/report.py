@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ from benchmarks.compare import tables
 from benchmarks.compare.comparison import TWICE, Comparison
 from benchmarks.compare.estimates import estimate, scale_of, scores, standing, verdict
 from benchmarks.compare.record import Record
-from benchmarks.controllers.records import Factory, RosterEntry
+from benchmarks.controllers.records import RosterEntry
 from benchmarks.controllers.roster import label
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.report import Section, provenance_line, write_report
@@ -94,7 +94,12 @@ def write(
             comparison.scales[name] = scale
     scales = {name: comparison.scales[name] for name in names}
     summary = tables.summarise(runs)
-    curves = _curves(comparison.controllers)
+    curves = [
+        pd.DataFrame(member.curve).assign(agent=name, policy=number)
+        for name, members in comparison.controllers.items()
+        for number, member in enumerate(members)
+        if member.curve
+    ]
     first = comparison.agents[0]
     of_scenarios: dict[str, Callable[[], Any]] = {
         name: partial(estimate, runs[runs["scenario"] == name], scales, first) for name in names
@@ -121,9 +126,10 @@ def write(
         record.write_table(f"{name}.csv", rows)
         drawn = rows[rows["agent"].isin(shown)]
         pictures[f"{name}.png"] = ("responses", drawn, scenario)
-    if not curves.empty:
-        record.write_table("learning.csv", curves)
-        pictures["learning.png"] = ("learning", curves)
+    if curves:
+        learning = pd.concat(curves, ignore_index=True)
+        record.write_table("learning.csv", learning)
+        pictures["learning.png"] = ("learning", learning)
     draw = {name: partial(_draw, *what, record.path(name)) for name, what in pictures.items()}
     faults = dict(fan_out.stream(draw))
     sections = [
@@ -157,17 +163,6 @@ def _with_pictures(section: Section, faults: Mapping[str, object]) -> Section:
     sentences = [f"{name} could not be drawn ({faults[name]})." for name in missing]
     pictures = [name for name in section.pictures if name not in missing]
     return replace(section, text=[*section.text, *sentences], pictures=pictures)
-
-
-def _curves(controllers: Mapping[str, Sequence[Factory]]) -> pd.DataFrame:
-    """Return the learning curves of all members that have one."""
-    curves = [
-        pd.DataFrame(member.curve).assign(agent=name, policy=number)
-        for name, members in controllers.items()
-        for number, member in enumerate(members)
-        if member.curve
-    ]
-    return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
 
 
 def _sections(

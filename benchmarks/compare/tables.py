@@ -57,18 +57,14 @@ def for_csv(table: pd.DataFrame) -> pd.DataFrame:
     return table.astype(object).where(table != math.inf, NOT_SETTLED)
 
 
-def format_value(metric: str, value: float) -> str:
-    """Write one value of a metric as people read it."""
-    if math.isnan(value):
-        return NO_MEASURE
-    if math.isinf(value):
-        return NOT_SETTLED
-    return f"{value:.3f}" if metric == "mae" else f"{value:,.0f}"
-
-
 def format_cell(row: pd.Series) -> str:
     """Write the median and, where they differ, the 10th and 90th percentile."""
-    median, p10, p90 = (format_value(row["metric"], row[name]) for name in PERCENTILES)
+    form = ".3f" if row["metric"] == "mae" else ",.0f"
+    words = {math.inf: NOT_SETTLED}
+    median, p10, p90 = (
+        NO_MEASURE if math.isnan(value) else words.get(value, format(value, form))
+        for value in row[[*PERCENTILES]]
+    )
     return median if p10 == p90 else f"{median} ({p10} to {p90})"
 
 

@@ -94,9 +94,12 @@ def execute(options: Options, console: Console) -> str:
             MiddlePointTorchEnv(1, device=options.device)
         show(f"Steps a second on {options.device}", on_device(options.device, rounds))
         return f"Medians of {rounds} rounds."
-    cases = [_single(name, *made) for name, made in SINGLE.items()]
+    cases = [_single(name, env, **arguments) for name, (env, arguments) in SINGLE.items()]
     show("One environment, from gymnasium.make", compare(cases, rounds))
-    cases = [_drawn(name) for name in (REFERENCE, "MiddlePoint-v0")]
+    cases = [
+        _single(name, name, FRAMES, render_mode="rgb_array")
+        for name in (REFERENCE, "MiddlePoint-v0")
+    ]
     show('Steps with a picture of each, render_mode="rgb_array"', compare(cases, rounds))
     for n in BATCHES:
         show(f"Vector environments, n = {n}", compare(list(_vector(n)), rounds))
@@ -110,8 +113,10 @@ def execute(options: Options, console: Console) -> str:
     )
     show("Memory of a plant, 20 past actions", memory())
 
+    python = [sys.executable, "-c"]
     imports = [
-        Case(module, partial(_import, module), 1) for module in ("gymnasium", "mptc_gym")
+        Case(module, partial(subprocess.run, [*python, f"import {module}"], check=True), 1)
+        for module in ("gymnasium", "mptc_gym")
     ]
     taken = 1000 * pd.DataFrame(_alternately(imports, rounds))
     more = taken["mptc_gym"] - taken["gymnasium"]
@@ -180,27 +185,23 @@ def _memory(env: Any) -> int:
     return size
 
 
-def _single(name: str, env_id: str, arguments: dict[str, Any]) -> Case:
+def _single(name: str, env_id: str, steps: int = SINGLE_STEPS, **arguments: Any) -> Case:
+    """Return one environment, with a picture of each step if it has a render mode."""
     env = gymnasium.make(env_id, **arguments)
     env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(SINGLE_STEPS)]
-    return Case(name, lambda: _episodes(env, actions), SINGLE_STEPS)
+    actions = [env.action_space.sample() for _ in range(steps)]
+    draws = env.render_mode is not None
 
+    def run() -> None:
+        env.reset(seed=0)
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+            if draws:
+                env.render()
 
-def _drawn(name: str) -> Case:
-    env = gymnasium.make(name, render_mode="rgb_array")
-    env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(FRAMES)]
-    return Case(name, lambda: _episodes(env, actions, env.render), FRAMES)
-
-
-def _episodes(env: Any, actions: list[Any], after: Callable[[], object] = lambda: None) -> None:
-    env.reset(seed=0)
-    for action in actions:
-        _, _, terminated, truncated, _ = env.step(action)
-        if terminated or truncated:
-            env.reset()
-        after()
+    return Case(name, run, steps)
 
 
 def _vector(n: int) -> Iterable[Case]:
@@ -375,7 +376,3 @@ def _alternately(
 def _spread(values: np.ndarray[Any, np.dtype[np.float64]]) -> str:
     low, median, high = np.percentile(values, [10, 50, 90])
     return f"{median:.2f} ({low:.2f} to {high:.2f})"
-
-
-def _import(module: str) -> None:
-    subprocess.run([sys.executable, "-c", f"import {module}"], check=True)

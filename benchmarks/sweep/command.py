@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -57,9 +56,17 @@ def execute(options: Options, console: Console) -> str:
         out / "tasks" / of_limits,
         title="limit",
     )
+    common = {"samples": options.samples, "runs": options.runs, "seed": SEED}
     for name, factories in members.items():
         results |= training.fan_out.run(
-            _agent_tasks(name, factories, plants, nominal, options),
+            {
+                # Every plant has its own member, in turn: how much they differ shows in the
+                # maps.
+                f"{name} {i}": partial(
+                    agent_task, factories[i % len(factories)], nominal, plant, **common
+                )
+                for i, plant in enumerate(plants)
+            },
             # A folder for each, so that one more controller leaves the others' tasks valid.
             out / "tasks" / agent_key(name, factories, plants, nominal, options),
             title=name,
@@ -75,24 +82,6 @@ def execute(options: Options, console: Console) -> str:
     write_report(out, title, sections, provenance_line("sweep", made))
     show(sections, console)
     return f"{len(results)} tasks in {seconds:.0f} s. The report, data and maps are in {out}/"
-
-
-def _agent_tasks(
-    name: str,
-    factories: Sequence[Factory],
-    plants: list[Arguments],
-    nominal: Arguments,
-    options: Options,
-) -> dict[str, Callable[[], Any]]:
-    """Return a controller on every plant, by name."""
-    common = {"samples": options.samples, "runs": options.runs, "seed": SEED}
-    return {
-        # Every plant has its own member, in turn: how much they differ shows in the maps.
-        f"{name} {i}": partial(
-            agent_task, factories[i % len(factories)], nominal, plant, **common
-        )
-        for i, plant in enumerate(plants)
-    }
 
 
 def agent_key(
