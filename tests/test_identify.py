@@ -93,7 +93,7 @@ class TestFit:
 
     def test_without_noise_the_coefficients_are_exact(self):
         log = recorded(dead_zone=0.0, noise=1e-8)
-        model = identify(log, Options(orders=Orders(2, 2, 2), find_dead_zone=False))
+        model = identify(log, Options(orders=Orders(2, 2, 2), applied=True))
         np.testing.assert_allclose(model.plant.a, PAPER.a, atol=2e-3)
         np.testing.assert_allclose(model.plant.b, PAPER.b, atol=2e-4)
         assert model.estimates["delay"].value == 18
@@ -114,7 +114,7 @@ class TestFit:
         np.testing.assert_allclose(model.plant.a, plain.plant.a, rtol=1e-4)
         assert model.operating_flow == 480.0
         assert model.operating_temperature == pytest.approx(385.0, abs=0.5)
-        by_itself = identify(shifted, Options(find_dead_zone=False))
+        by_itself = identify(shifted, Options(applied=True))
         assert by_itself.operating_flow == shifted.flow[0]
         assert any("say --operating-flow" in note for note in by_itself.notes)
         assert not any("say --operating-flow" in note for note in model.notes)
@@ -132,7 +132,7 @@ class TestFit:
     def test_flow_behind_the_actuator_needs_no_dead_zone(self, good):
         log, _ = good
         applied = np.where(np.abs(log.flow) < 5.0, 0.0, log.flow)
-        model = identify(Log(applied, log.temperature, 8.0), Options(find_dead_zone=False))
+        model = identify(Log(applied, log.temperature, 8.0), Options(applied=True))
         assert model.estimates["dead_zone"].value == 0.0
         assert model.estimates["delay"].value == 18
 
@@ -172,7 +172,7 @@ class TestFit:
         run = rollout(plants, PIController.simc(gain=-0.68, time_constant=160.0, delay=150.0),
                       1200, seed=7)  # fmt: skip
         log = Log(run.command[:, 0], run.output[:, 0], 8.0)
-        found = identify(log, Options(find_dead_zone=False)).estimates
+        found = identify(log, Options(applied=True)).estimates
         assert found["delay"].value == pytest.approx(18, abs=1)
         assert found["gain"].value == pytest.approx(-0.6825, rel=0.15)
 
@@ -181,7 +181,7 @@ def found_in(flow, response, generator, **options):
     """Return what is found in a log with noise of a fiftieth of the response's deviation."""
     noise = signal.lfilter([1.0], [1.0, -0.8], generator.normal(size=len(flow)))
     temperature = response + noise / np.std(noise) * 0.02 * np.std(response)
-    return identify(Log(flow, temperature, 8.0), Options(find_dead_zone=False, **options))
+    return identify(Log(flow, temperature, 8.0), Options(applied=True, **options))
 
 
 class TestRealLogs:

@@ -32,12 +32,8 @@ def execute(options: Options, console: Console) -> str:
         model = identify(
             log,
             Settings(
-                longest_delay=options.longest_delay,
                 orders=Orders(*options.orders) if options.orders else None,
-                find_dead_zone=not options.applied,
-                u_min=options.u_min,
-                u_max=options.u_max,
-                operating_flow=options.operating_flow,
+                **vars(options.knowledge),
             ),
         )
         plant, ranges = plant_arguments(model), plant_ranges(model)

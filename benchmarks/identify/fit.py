@@ -293,7 +293,9 @@ def _gained_when_swapped(log: Log, longest_delay: int) -> float:
     """Return what the temperature adds to the likelihood of the flow."""
     swapped = Log(log.temperature, log.flow, log.sampling_interval)
     try:
-        likelihood = Likelihood(swapped, Options(longest_delay, FIRST_ORDERS))
+        likelihood = Likelihood(
+            swapped, Options(longest_delay=longest_delay, orders=FIRST_ORDERS)
+        )
         return likelihood.gained(_first(likelihood)[0])
     except ValueError:
         return 0.0

@@ -232,7 +232,7 @@ class Likelihood:
 
     def gaps(self) -> list[Gap]:
         """Return places of the dead zone to begin with."""
-        if not self.options.find_dead_zone:
+        if self.options.applied:
             return [Gap(0.0, 0.0)]
         edges = np.concatenate([[0.0], self.magnitudes])
         places = np.linspace(0, len(edges) - 1, min(len(edges), COARSE)).round().astype(int)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from benchmarks.identify.armax import Array, Orders
 from benchmarks.identify.log import Log
+from benchmarks.identify.options import Knowledge
 from benchmarks.loop.linear import LinearModel
 
 
@@ -13,31 +14,11 @@ class CannotTellError(ValueError):
     """The log does not hold what is asked of it; the message says why."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What is known beforehand, and what to look for.
+@dataclass(frozen=True, kw_only=True)
+class Options(Knowledge):
+    """What is known beforehand, and the orders of A, B and C; None to choose them."""
 
-    Attributes
-    ----------
-    longest_delay
-        d up to which to look, samples.
-    orders
-        Of A, B and C; None to choose them.
-    find_dead_zone
-        Whether the flow is the command, so that a dead zone may lie between it and the plant.
-    u_min, u_max
-        Limits of the flow as a deviation, t/h; None for the extremes of the log.
-    operating_flow
-        The flow of the operating point, t/h; None for the log's own: 0 if it has flows of both
-        signs, otherwise the first.
-    """
-
-    longest_delay: int = 60
     orders: Orders | None = None
-    find_dead_zone: bool = True
-    u_min: float | None = None
-    u_max: float | None = None
-    operating_flow: float | None = None
 
 
 @dataclass(frozen=True)

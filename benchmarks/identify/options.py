@@ -49,6 +49,26 @@ class Columns:
 
 @options
 @dataclass(frozen=True, kw_only=True)
+class Knowledge:
+    """What is known beforehand, and what to look for."""
+
+    longest_delay: Count = 60
+    """Longest delay to look for, samples."""
+    applied: bool = False
+    """The flow was measured behind the actuator, so that no dead zone is looked for."""
+    u_min: Finite | None = None
+    """Least flow that the actuator can apply, t/h from the operating point (default: the log's
+    least)."""
+    u_max: Finite | None = None
+    """Largest flow that the actuator can apply, t/h from the operating point (default: the
+    log's largest)."""
+    operating_flow: Finite | None = None
+    """Flow of the operating point, t/h (default: 0 if the log has flows of both signs, else its
+    first flow)."""
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
 class Options:
     """Fit the plant's equations to a recorded log, and tune controllers for it.
 
@@ -62,19 +82,7 @@ class Options:
     columns: Columns = field(default_factory=Columns)
     rows: Count = 20_000
     """Of a longer log, the last rows are fitted, so many."""
-    longest_delay: Count = 60
-    """Longest delay to look for, samples."""
     orders: Orders | None = None
     """How many coefficients the polynomials A, B and C have, without the leading 1 of A and C
     (default: chosen by a criterion)."""
-    applied: bool = False
-    """The flow was measured behind the actuator, so that no dead zone is looked for."""
-    u_min: Finite | None = None
-    """Least flow that the actuator can apply, t/h from the operating point (default: the log's
-    least)."""
-    u_max: Finite | None = None
-    """Largest flow that the actuator can apply, t/h from the operating point (default: the
-    log's largest)."""
-    operating_flow: Finite | None = None
-    """Flow of the operating point, t/h (default: 0 if the log has flows of both signs, else its
-    first flow)."""
+    knowledge: Knowledge = field(default_factory=Knowledge)

@@ -150,7 +150,7 @@ class Posterior:
 
     def _prior(self, gap: Gap) -> float:
         """Return the probability beforehand: a half that there is no dead zone."""
-        if not self._likelihood.options.find_dead_zone:
+        if self._likelihood.options.applied:
             return 1.0
         share = (gap.high - gap.low) / float(self._likelihood.magnitudes[-1])
         return 0.5 * share + 0.5 * (gap.low == 0.0)

@@ -95,7 +95,7 @@ def model_of(log: Log) -> Model:
     """Return what the record shows. The heater has no dead zone."""
     known = Options(
         longest_delay=20,
-        find_dead_zone=False,
+        applied=True,
         u_min=-HEATER,
         u_max=100.0 - HEATER,
         operating_flow=HEATER,
