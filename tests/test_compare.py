@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+from contextlib import contextmanager
 from pathlib import Path
 
 import matplotlib.image
@@ -28,6 +29,7 @@ from benchmarks.compare.estimates import (
 )
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage, tables
+from benchmarks.lib.drawing import drawn
 from benchmarks.lib.report import Section, write_report
 from benchmarks.limits import least_possible
 from benchmarks.loop.metrics import METRICS, measure
@@ -647,11 +649,14 @@ class TestCompare:
 def test_a_long_legend_leaves_the_responses_their_room(tmp_path, monkeypatch):
     widths = []
 
-    def measure_width(figure, path):
-        figure.draw_without_rendering()
-        widths.extend(axes.get_position().width for axes in figure.axes)
+    @contextmanager
+    def measured(*arguments):
+        with drawn(*arguments) as figure:
+            yield figure
+            figure.draw_without_rendering()
+            widths.extend(axes.get_position().width for axes in figure.axes)
 
-    monkeypatch.setattr(plots, "save", measure_width)
+    monkeypatch.setattr(plots, "drawn", measured)
     runs = rollout(make_plants(1, 40, setpoint=5.0), PIController(), 40, seed=0)
     responses = pd.concat(
         [

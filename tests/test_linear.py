@@ -88,7 +88,7 @@ ANALYSES = {
     "self-tuning": lambda **p: engineered.self_tuning(Parameters(**p), 1, 0),
     "MPC": lambda **p: PredictiveController(Parameters(**p), 1),
     "margins": lambda **p: margins(PIController(), Parameters(**p)),
-    "by hand": lambda **p: touched_plants(30, p),
+    "by hand": lambda **p: touched_plants(30, p)[0],
 }
 
 

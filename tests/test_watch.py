@@ -297,7 +297,7 @@ def test_speed_pause_and_escape(hands_on, monkeypatch):
 def test_a_plant_that_is_not_touched_is_the_environment_s(preset):
     arguments = {**PRESETS[preset], "output_window": 2, "action_window": 3}
     rng = np.random.default_rng(1)
-    plants = rivals.touched_plants(50, arguments)
+    plants, _ = rivals.touched_plants(50, arguments)
     plain = gymnasium.make("MiddlePoint-v0", **arguments)
     assert np.array_equal(plants.reset(seed=3)[0][0], plain.reset(seed=3)[0])
     for action in rng.uniform(-1, 1, (40, 1)).astype(np.float32):
@@ -309,7 +309,7 @@ def test_a_plant_that_is_not_touched_is_the_environment_s(preset):
 def test_the_observation_is_that_of_the_touched_plant():
     # All windows, against an environment whose own set point changes.
     windows = {"setpoint_window": 2, "error_window": 4, "output_window": 3, "action_window": 1}
-    touched = rivals.touched_plants(50, {"setpoint": 1.0, **windows})
+    touched, _ = rivals.touched_plants(50, {"setpoint": 1.0, **windows})
     other = gymnasium.make("MiddlePoint-v0", setpoint=[1.0] * 6 + [3.0], **windows)
     touched.reset(seed=0), other.reset(seed=0)
     for k in range(40):
@@ -321,7 +321,7 @@ def test_the_observation_is_that_of_the_touched_plant():
 
 def test_a_load_by_hand_is_a_load_of_the_plant_while_it_drifts():
     drift = {"gain_drift": 0.5, "time_constant_drift": 2.0, "drift_samples": 60}
-    touched = rivals.touched_plants(50, drift)
+    touched, _ = rivals.touched_plants(50, drift)
     parameters = Parameters(**drift)
     plant = Plant(parameters, Ranges(parameters).given)
     touched.reset(seed=0)

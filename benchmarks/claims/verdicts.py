@@ -162,24 +162,15 @@ def table(claims: Sequence[Claim]) -> pd.DataFrame:
             "statement": claim.statement,
             "verdict": claim.verdict.value,
         }
-        rows += [about | _row(finding) for finding in claim.findings] or [about]
+        rows += [
+            about
+            | {"quantity": finding.quantity, "unit": finding.unit, **vars(finding.estimate)}
+            | {"criterion": finding.criterion, "shown": finding.shown}
+            for finding in claim.findings
+        ] or [about]
     frame = pd.DataFrame(rows)
     # Whole numbers, though a claim without findings has none.
     return frame.astype({"runs": "Int64"}) if "runs" in frame else frame
-
-
-def _row(finding: Finding) -> dict[str, object]:
-    estimate = finding.estimate
-    return {
-        "quantity": finding.quantity,
-        "unit": finding.unit,
-        "value": estimate.value,
-        "low": estimate.low,
-        "high": estimate.high,
-        "runs": estimate.runs,
-        "criterion": finding.criterion,
-        "shown": finding.shown,
-    }
 
 
 def overview(claims: Sequence[Claim]) -> pd.DataFrame:

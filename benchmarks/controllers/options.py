@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from benchmarks.controllers.own import own_entry
 from benchmarks.controllers.records import RosterEntry
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import UsageError, known, out_folder
+from benchmarks.lib.command_line import UsageError, blame, known, out_folder
 from benchmarks.lib.options import Count, FanOutOptions, Names, Repeated, options
 from benchmarks.train.ppo import KEPT, PolicyRequest
 
@@ -104,7 +104,5 @@ def own_controller(name: str, locations: Sequence[str]) -> RosterEntry:
     UsageError
         If there is no such factory or file, or if what it makes is no controller.
     """
-    try:
+    with blame("--agent"):
         return own_entry(name, locations)
-    except ValueError as error:
-        raise UsageError(f"--agent: {error}") from error

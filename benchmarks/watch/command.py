@@ -115,8 +115,7 @@ def in_window(
     def show(record: Record) -> None:
         drawing.show(record, hands.speed)
 
-    plants = rivals.touched_plants(scenario.samples, arguments, show)
-    touched = rivals.touched_one(plants)
+    plants, touched = rivals.touched_plants(scenario.samples, arguments, show)
     moves: rivals.Moves = {}
 
     def attend(k: int) -> None:

@@ -23,8 +23,8 @@ EPISODES = 20  # of the bound, where a plant is drawn
 
 def touched_plants(
     samples: int, arguments: Mapping[str, Any], show: Callable[[Record], None] | None = None
-) -> gymnasium.vector.SyncVectorEnv:
-    """Return a batch of one plant that can be touched."""
+) -> tuple[gymnasium.vector.SyncVectorEnv, Touched]:
+    """Return a batch of one plant that can be touched, and that plant."""
     plants = gymnasium.make_vec(
         "MiddlePoint-v0",
         1,
@@ -34,20 +34,14 @@ def touched_plants(
         **arguments,
     )
     assert isinstance(plants, gymnasium.vector.SyncVectorEnv)
-    return plants
-
-
-def touched_one(plants: gymnasium.vector.SyncVectorEnv) -> Touched:
-    """Return the plant of `touched_plants`."""
-    return cast("Touched", plants.envs[0])
+    return plants, cast("Touched", plants.envs[0])
 
 
 def replay(name: str, moves: Moves, scenario: Scenario, seed: int) -> Trajectory:
     """Run a controller of the roster, with the noise and the moves of another's run."""
     (factory,) = ROSTER[name].members()
     arguments = factory.arguments(scenario.arguments)
-    plants = touched_plants(scenario.samples, arguments)
-    touched = touched_one(plants)
+    plants, touched = touched_plants(scenario.samples, arguments)
 
     def move(k: int) -> None:
         if k in moves:
