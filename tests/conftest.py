@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
+from agents import Controller
 from benchmarks.loop.rollout import Trajectory
 
 ROOT = Path(__file__).parent.parent
@@ -45,6 +46,18 @@ def python(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, *words]
     options = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 300.0, **options}
     return subprocess.run(command, **options)
+
+
+def run_closed(
+    env: gymnasium.Env[Any, Any], controller: Controller, samples: int, seed: int = 0
+) -> dict[str, NDArray[np.float64]]:
+    """Let a controller act for so many samples, and return the infos, k = 0 first."""
+    observation, info = env.reset(seed=seed)
+    infos = [info]
+    for _ in range(samples):
+        observation, *_, info = env.step(controller.act(observation))
+        infos.append(info)
+    return {key: np.array([info[key] for info in infos]) for key in info}
 
 
 def assert_the_seed_is_all_that_differs(made: Callable[[int], ArrayLike]) -> None:

@@ -26,15 +26,9 @@ from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.parameters import PlantNumbers
 from mptc_gym.plant import Plant
+from tests.conftest import run_closed
 
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
-
-
-def operate(controller, samples):
-    env = gymnasium.make("MiddlePoint-v0")
-    observation, _ = env.reset(seed=0)
-    for _ in range(samples):
-        observation, *_ = env.step(controller.act(observation))
 
 
 def same(first, second):
@@ -292,12 +286,12 @@ class TestDirectNN:
 
     def test_save_load_and_operate_without_learning(self, tmp_path):
         trained = DirectNNController()
-        operate(trained, samples=300)
+        run_closed(gymnasium.make("MiddlePoint-v0"), trained, 300)
         trained.weights.save(tmp_path / "weights.npz")
         operated = DirectNNController(seed=9, learning=False)
         operated.weights = Weights.load(tmp_path / "weights.npz")
         assert same(operated.weights, trained.weights)
-        operate(operated, samples=50)
+        run_closed(gymnasium.make("MiddlePoint-v0"), operated, 50)
         assert same(operated.weights, trained.weights)
 
     def test_load_of_something_else(self, tmp_path):

@@ -16,7 +16,7 @@ from benchmarks.limits.packaged import CASES
 from mptc_gym import IDS, PRESETS, MiddlePointEnv, evaluate
 from mptc_gym.evaluation import SEED, least_errors
 from mptc_gym.wrappers import IncrementalAction
-from tests.conftest import python
+from tests.conftest import python, run_closed
 
 HARD = "MiddlePointHard-v0"
 
@@ -53,16 +53,10 @@ class TestEvaluate:
         found = evaluate(PIController(), IDS[name], episodes=3)
         assert list(found.seeds) == [SEED, SEED + 1, SEED + 2]
         for i, seed in enumerate(found.seeds):
-            env, controller = gymnasium.make(IDS[name]), PIController()
-            observation, info = env.reset(seed=seed)
-            errors, flows, ended = [], [0.0], False
-            while not ended:
-                observation, _, _, ended, info = env.step(controller.act(observation))
-                errors.append(abs(info["error"]))
-                flows.append(info["applied"])
-            assert len(errors) == 1200
-            assert found.errors[i] == pytest.approx(np.mean(errors), abs=1e-12)
-            assert found.travels[i] == pytest.approx(np.abs(np.diff(flows)).sum(), abs=1e-9)
+            infos = run_closed(gymnasium.make(IDS[name]), PIController(), 1200, seed)
+            errors, travel = np.abs(infos["error"][1:]), np.abs(np.diff(infos["applied"]))
+            assert found.errors[i] == pytest.approx(errors.mean(), abs=1e-12)
+            assert found.travels[i] == pytest.approx(travel.sum(), abs=1e-9)
         assert found.mean_error == pytest.approx(found.errors.mean(), abs=1e-12)
 
     @pytest.mark.parametrize("name", IDS)

