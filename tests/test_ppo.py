@@ -43,16 +43,6 @@ def parameters_of(model):
 
 
 class TestPPO:
-    def test_a_finished_policy_is_loaded(self, tmp_path, monkeypatch):
-        trained = train(tmp_path)
-        with monkeypatch.context() as patch:
-            patch.setattr(ppo_training, "train", None)  # training again would raise
-            loaded = train(tmp_path)
-        assert np.array_equal(weights(loaded), weights(trained))
-        stamp = (tmp_path / "policy.npz").stat().st_mtime_ns
-        train(tmp_path, retrain=True)
-        assert (tmp_path / "policy.npz").stat().st_mtime_ns > stamp
-
     def test_learning_curve_and_provenance_are_kept(self, tmp_path):
         train(tmp_path)
         provenance = PolicyNetwork.load(tmp_path / "policy.npz").provenance
