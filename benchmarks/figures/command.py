@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -73,6 +71,16 @@ class Figure:
         """Name of its picture."""
         return f"figure_{self.number:02d}.png"
 
+    @property
+    def title(self) -> str:
+        """Its heading."""
+        return f"Fig. {self.number}: {CASES[self.case].title}"
+
+    @property
+    def parameters(self) -> Parameters:
+        """The plant's: dead zone and limits are drawn behind the command."""
+        return Parameters(**CASES[self.case].arguments)
+
 
 CASES = {
     "nn": Case("NN, dead zone 5 t/h, R = 0"),
@@ -104,22 +112,9 @@ def execute(options: Options, console: Console) -> str:
         write_csv(options.out / f"{name}.csv", curves[name])
         for figure in FIGURES:
             if figure.case == name:
-                _draw([figure], curves, options.out / figure.file)
-    _draw(FIGURES, curves, options.out / "figures.png")
+                plots.plot_figures([figure], curves, options.out / figure.file)
+    plots.plot_figures(FIGURES, curves, options.out / "figures.png")
     return f"Figures 5 to 12, their sheet figures.png and their data: {options.out}/"
-
-
-def _draw(figures: Sequence[Figure], curves: dict[str, pd.DataFrame], path: Path) -> None:
-    panels = [
-        plots.Panel(
-            title=f"Fig. {figure.number}: {CASES[figure.case].title}",
-            curves=curves[figure.case],
-            signals=figure.signals,
-            parameters=Parameters(**CASES[figure.case].arguments),
-        )
-        for figure in figures
-    ]
-    plots.plot_figures(panels, path)
 
 
 def summarise(trajectory: Trajectory) -> pd.DataFrame:

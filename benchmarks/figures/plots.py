@@ -3,37 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pandas as pd
 from matplotlib.axes import Axes
 
 from benchmarks.lib.drawing import COLOURS, drawn
-from mptc_gym import Parameters
 
-
-@dataclass(frozen=True)
-class Panel:
-    """One of the paper's figures, as `plot_figures` draws it.
-
-    Attributes
-    ----------
-    title
-        Its heading.
-    curves
-        What `figures.summarise` returns.
-    signals
-        What to draw of it, each on axes of its own: "output", "command" or "noise".
-    parameters
-        The plant's: dead zone and limits are drawn behind the command.
-    """
-
-    title: str
-    curves: pd.DataFrame
-    signals: tuple[str, ...]
-    parameters: Parameters
+if TYPE_CHECKING:
+    from benchmarks.figures.command import Figure
 
 
 _SIGNALS = {
@@ -43,16 +23,28 @@ _SIGNALS = {
 }
 
 
-def plot_figures(panels: Sequence[Panel], path: Path) -> None:
-    """Draw figures of the paper: one, or a sheet of several in two columns."""
-    axes_of = [(panel, signal) for panel in panels for signal in panel.signals]
-    columns = min(2, len(panels))
+def plot_figures(
+    figures: Sequence[Figure], curves: Mapping[str, pd.DataFrame], path: Path
+) -> None:
+    """Draw figures of the paper: one, or a sheet of several in two columns.
+
+    Parameters
+    ----------
+    figures
+        Each signal of a figure has axes of its own.
+    curves
+        What `summarise` returns, by case.
+    path
+        The PNG file to write.
+    """
+    axes_of = [(figure, signal) for figure in figures for signal in figure.signals]
+    columns = min(2, len(figures))
     rows = math.ceil(len(axes_of) / columns)
     size = (8, 3 * rows) if columns == 1 else (13, 2.4 * rows)
-    with drawn(path, *size) as figure:
-        grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
-        for axes, (panel, signal) in zip(grid.flat, axes_of, strict=False):
-            _draw_signal(axes, panel, signal)
+    with drawn(path, *size) as sheet:
+        grid = sheet.subplots(rows, columns, sharex=True, squeeze=False)
+        for axes, (figure, signal) in zip(grid.flat, axes_of, strict=False):
+            _draw_signal(axes, figure, signal, curves[figure.case])
         used, unused = grid.flat[: len(axes_of)], grid.flat[len(axes_of) :]
         for axes in used[-columns:]:  # the lowest of each column
             axes.tick_params(labelbottom=True)
@@ -61,8 +53,7 @@ def plot_figures(panels: Sequence[Panel], path: Path) -> None:
             axes.set_visible(False)
 
 
-def _draw_signal(axes: Axes, panel: Panel, signal: str) -> None:
-    curves, parameters = panel.curves, panel.parameters
+def _draw_signal(axes: Axes, figure: Figure, signal: str, curves: pd.DataFrame) -> None:
     minutes = curves["time_s"] / 60
     name, colour = _SIGNALS[signal]
     axes.fill_between(
@@ -77,6 +68,7 @@ def _draw_signal(axes: Axes, panel: Panel, signal: str) -> None:
             minutes, curves["setpoint"], "k--", linewidth=1, where="post", label="set point"
         )
     if signal == "command":
+        parameters = figure.parameters
         zone, _ = parameters.range_of("dead_zone")
         axes.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0, label="dead zone")
         for limit in (parameters.range_of("u_min")[0], parameters.range_of("u_max")[1]):
@@ -85,5 +77,5 @@ def _draw_signal(axes: Axes, panel: Panel, signal: str) -> None:
     axes.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
     axes.set_xlim(0, minutes.max())
     axes.set_ylabel(name)
-    axes.set_title(panel.title, loc="left", fontsize="medium")
+    axes.set_title(figure.title, loc="left", fontsize="medium")
     axes.legend(loc="upper right", ncols=3, fontsize="small")
