@@ -227,6 +227,7 @@ def test_same_seed_same_trajectory_to_the_bit(rng):
         ({"action_window": 20}, ("noise", "setpoint")),  # whatever the controller does
         ({"setpoint": 0.0}, ("noise",)),
         ({"noise_variance": 0.0}, ("setpoint",)),
+        ({"disturbance_amplitude": 4.0}, ("noise", "setpoint")),
     ],
 )
 def test_noise_and_set_point_come_from_the_seed_alone_in_separate_streams(others, alone, rng):
