@@ -210,20 +210,20 @@ class TestRealLogs:
         left = model.log.temperature - model.simulated
         assert np.var(left) < 0.1 * np.var(model.log.temperature)
 
-    def test_spikes_are_left_out_and_counted(self, good):
+    @pytest.mark.parametrize(
+        ("places", "added", "said", "rel"),
+        [
+            ([20, 400, 401, 900], [40, -30, -30, 25], "4 spikes of the temperature", 0.02),
+            (np.s_[700:], 40.0, "sample 701 the temperature jumps by 39.8", 0.1),
+        ],
+    )
+    def test_spikes_are_left_out_and_jumps_subtracted(self, places, added, said, rel, good):
         log, whole = good
-        spiked = log.temperature.copy()
-        spiked[[20, 400, 401, 900]] += [40.0, -30.0, -30.0, 25.0]
-        model = identify(Log(log.flow, spiked, 8.0))
-        assert any(note.startswith("4 spikes of the temperature") for note in model.notes)
-        assert model.estimates["gain"].value == pytest.approx(whole.plant.gain, rel=0.02)
-
-    def test_jumps_of_the_sensor_are_subtracted(self, good):
-        log, whole = good
-        jumped = log.temperature + np.where(np.arange(1200) < 700, 0.0, 40.0)
-        model = identify(Log(log.flow, jumped, 8.0))
-        assert any("sample 701 the temperature jumps by 39.8" in note for note in model.notes)
-        assert model.estimates["gain"].value == pytest.approx(whole.plant.gain, rel=0.1)
+        faulty = log.temperature.copy()
+        faulty[places] += added
+        model = identify(Log(log.flow, faulty, 8.0))
+        assert any(said in note for note in model.notes)
+        assert model.estimates["gain"].value == pytest.approx(whole.plant.gain, rel=rel)
 
     def test_sensor_that_is_stuck_is_left_out(self, good):
         log, whole = good

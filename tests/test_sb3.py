@@ -26,11 +26,11 @@ ARGUMENTS = {
 
 
 def make_both():
-    def make():
-        return gymnasium.make("MiddlePoint-v0", **ARGUMENTS)
+    return make_both_of([(N, ARGUMENTS)])
 
-    envs = gymnasium.make_vec("MiddlePoint-v0", N, autoreset_mode="SameStep", **ARGUMENTS)
-    return GymnasiumVecEnv(envs), DummyVecEnv([make] * N)
+
+def make_both_of_two_batches():
+    return make_both_of([(3, ARGUMENTS), (1, {**ARGUMENTS, "noise_variance": 0.0})])
 
 
 def make_both_of_episodes_that_terminate():
@@ -41,9 +41,7 @@ def make_both_of_episodes_that_terminate():
     return GymnasiumVecEnv(envs), DummyVecEnv([make] * N)
 
 
-def make_both_of_two_batches():
-    calm = {**ARGUMENTS, "noise_variance": 0.0}
-    parts = [(3, ARGUMENTS), (1, calm)]
+def make_both_of(parts):
     batches = [
         gymnasium.make_vec("MiddlePoint-v0", count, autoreset_mode="SameStep", **arguments)
         for count, arguments in parts
