@@ -105,6 +105,7 @@ def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
     design
         "grid", "random" or "wide".
     """
+    picture = "map.png" if design == "grid" else "plants.png"
     sections = [
         Section(
             "How many plants each controller works on",
@@ -118,27 +119,21 @@ def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
                 "control. Both are shares of the runs. PPO's policies take the plants in turn."
             ],
             _overview(runs),
+            [picture],
         )
     ]
     if design == "grid":
-        maps.plot_grid(runs, out / "map.png")
-        sections[0] = replace(sections[0], pictures=["map.png"])
+        maps.plot_grid(runs, out / picture)
         return sections
-    maps.plot_plants(runs, out / "plants.png")
-    sections[0] = replace(sections[0], pictures=["plants.png"])
+    maps.plot_plants(runs, out / picture)
     for title, text, pairs, picture in QUESTIONS:
         asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
         if not asked:
             continue
         maps.plot_drift(runs, asked[0], out / picture)
         for measure, when in MEASURES.items():
-            sections.append(
-                Section(
-                    f"{title} Mean error {when}",
-                    [text, DIFFERENCES_TEXT],
-                    _differences(runs, asked, measure),
-                )
-            )
+            heading, said = f"{title} Mean error {when}", [text, DIFFERENCES_TEXT]
+            sections.append(Section(heading, said, _differences(runs, asked, measure)))
         sections[-1] = replace(sections[-1], pictures=[picture])
     return sections
 
