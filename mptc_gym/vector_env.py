@@ -9,7 +9,7 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from mptc_gym import rendering
@@ -36,7 +36,7 @@ NOISE_BYTES = 1 << 27  # of a block of noise, unless a single sample of all plan
 STEPS_PER_SHIFT = 64  # steps until the window of the observations is moved back
 
 
-class MiddlePointVectorEnv(BatchEnv):
+class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at the bases
     """n plants that advance together: `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
 
     Given the same seed, all that `reset` and `step` return equals, to the bit, what Gymnasium's

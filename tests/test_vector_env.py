@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import vector
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -229,3 +229,8 @@ def test_a_plant_costs_a_few_kib(limit):
     used, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert used / plants < 12 * 1024
+
+
+def test_it_is_a_direct_child_of_gymnasium_s():
+    # By which skrl tells whose environment it is.
+    assert VectorEnv in MiddlePointVectorEnv.__bases__
