@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,6 @@ from benchmarks.loop.linear import Course
 Array = NDArray[np.float64]
 
 Rows = list[list[Any]]  # of blocks of the matrix of equations
-Way = Callable[..., tuple[Array | None, str]]
-
 NOTHING = 1e-9  # of the largest response: what is smaller is left out
 SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)  # with presolve or not
 TIME_LIMIT = 30.0  # s, of each attempt
@@ -26,6 +24,19 @@ TIME_LIMIT = 30.0  # s, of each attempt
 
 class NotSolvedError(RuntimeError):
     """The optimum of a linear programme was not found; the message says why."""
+
+
+class Programme(NamedTuple):
+    """Equations in blocks, a row of matrices each, with costs and bounds for each column."""
+
+    rows: Rows
+    right: list[Array]
+    cost: list[Array]
+    bounds: list[Array]
+
+
+# Returns the unknowns, or None, and what the solver says.
+Way = Callable[[Programme, dict[str, Any]], tuple[Array | None, str]]
 
 
 @dataclass(frozen=True)
@@ -183,7 +194,7 @@ def _solve(
         right.append(first)
         cost += [price * ones] * 2
         bounds += [_bounds(zeros, np.inf * ones)] * 2
-    programme = rows, right, cost, bounds
+    programme = Programme(rows, right, cost, bounds)
     ways: list[Way] = [_as_recursion, _as_response]
     if np.any(np.abs(np.roots(course.beta[start])) > 1.0):
         ways.reverse()
@@ -191,7 +202,7 @@ def _solve(
     why = ""
     for way, (method, presolve) in attempts:
         options = {"time_limit": TIME_LIMIT, "presolve": presolve}
-        found, why = way(*programme, {"method": method, "options": options})
+        found, why = way(programme, {"method": method, "options": options})
         if found is not None:
             return found
     raise NotSolvedError(
@@ -200,36 +211,25 @@ def _solve(
     )
 
 
-def _as_recursion(
-    rows: Rows,
-    right: list[Array],
-    cost: list[Array],
-    bounds: list[Array],
-    solver: dict[str, Any],
-) -> tuple[Array | None, str]:
+def _as_recursion(programme: Programme, solver: dict[str, Any]) -> tuple[Array | None, str]:
     """Solve with the outputs among the unknowns: sparse, and fast where A is slow.
 
     Where a zero of B lies outside the unit circle, the flow that belongs to an output grows
     without end: solvers that try outputs at will fail, or end at what is not the optimum.
     """
     solved = optimize.linprog(
-        np.concatenate(cost),
-        A_eq=sparse.vstack([sparse.hstack(row) for row in rows]).tocsc(),
-        b_eq=np.concatenate(right),
-        bounds=np.concatenate(bounds),
+        np.concatenate(programme.cost),
+        A_eq=sparse.vstack([sparse.hstack(row) for row in programme.rows]).tocsc(),
+        b_eq=np.concatenate(programme.right),
+        bounds=np.concatenate(programme.bounds),
         **solver,
     )
     return (solved.x if solved.success else None), solved.message
 
 
-def _as_response(
-    rows: Rows,
-    right: list[Array],
-    cost: list[Array],
-    bounds: list[Array],
-    solver: dict[str, Any],
-) -> tuple[Array | None, str]:
+def _as_response(programme: Programme, solver: dict[str, Any]) -> tuple[Array | None, str]:
     """Solve for the flows alone, with each output the sum of what the flows do to it."""
+    rows, right, cost, bounds = programme
     A, B = rows[0][0].toarray(), -rows[0][1].toarray()
     alone, G = (
         linalg.solve_triangular(A, right[0], lower=True),
@@ -237,10 +237,9 @@ def _as_response(
     )
     G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
     second = [sparse.csr_array(G), *rows[1][2:]]
-    solved, why = _as_recursion(
-        [second, *(row[1:] for row in rows[2:])],
-        [right[1] - alone, *right[2:]], cost[1:], bounds[1:], solver,
-    )  # fmt: skip
+    reduced = [second, *(row[1:] for row in rows[2:])]
+    of_flows = Programme(reduced, [right[1] - alone, *right[2:]], cost[1:], bounds[1:])
+    solved, why = _as_recursion(of_flows, solver)
     if solved is None:
         return None, why
     return np.concatenate([alone + G @ solved[: len(alone)], solved]), why

@@ -17,7 +17,7 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import student
-from benchmarks.limits.bounds import LeastPossible, least_possible
+from benchmarks.limits.bounds import LeastPossible, least_possible, theorem
 from benchmarks.loop.linear import nominal
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import make_plants, rollout
@@ -155,8 +155,7 @@ def verify(
 
 def _bound(case: str, runs: int) -> dict[str, Any]:
     arguments = CASES[case]
-    # A theorem, not the reference, which may be beaten.
-    kind = "news" if arguments.get("setpoint") == "random" else "preview"
+    kind = theorem(Parameters(**arguments))
     found = least_possible(samples=SAMPLES, kind=kind, episodes=runs, folder=None, **arguments)
     return asdict(found)
 
