@@ -5,39 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import pandas as pd
 from matplotlib.axes import Axes
 
+from benchmarks.figures.cases import Figure
 from benchmarks.lib.drawing import COLOURS, drawn
-from mptc_gym import Parameters
 
 _SIGNALS = {
     "output": ("temperature y (°C)", COLOURS[0]),
     "command": ("command u (t/h)", COLOURS[2]),
     "noise": ("noise n (°C)", COLOURS[3]),
 }
-
-
-class Figure(Protocol):
-    """What is drawn: some signals of a case."""
-
-    @property
-    def case(self) -> str:
-        """Whose curves."""
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """From top to bottom."""
-
-    @property
-    def title(self) -> str:
-        """Its heading."""
-
-    @property
-    def parameters(self) -> Parameters:
-        """The plant's: dead zone and limits are drawn behind the command."""
 
 
 def plot_figures(
