@@ -2,18 +2,16 @@
 
 import pickle
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 
-from agents import PolicyNetwork
-from benchmarks.controllers.pretrained import Trained, ppo_policies
+from benchmarks.controllers.pretrained import ppo_policies, trained
 from benchmarks.lib.fan_out import FanOut, TasksFailedError
 from benchmarks.loop.rollout import make_plants, rollout
-from benchmarks.train import kept, ppo, ppo_arguments, ppo_training
+from benchmarks.train import ppo, ppo_arguments, ppo_training
 from benchmarks.train.ppo import PolicyRequest
 from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
@@ -28,10 +26,14 @@ def small(monkeypatch):
     monkeypatch.setattr(ppo_training, "HELD", ppo_training.HELD[:20])
 
 
-def train(folder, arguments=SMALL, *, retrain=False):
-    file = folder / "policy.npz"
-    kept.train({file: partial(ppo.train, arguments)}, FanOut(1), retrain=retrain)
-    return ppo.Policy(arguments, file).network
+def members(folder, arguments=SMALL, *, jobs=1, policies=2, **request):
+    request = PolicyRequest(FanOut(jobs), folder, policies=policies, **request)
+    return ppo.members(request, arguments)
+
+
+def train(folder, arguments=SMALL, **request):
+    (policy,) = members(folder, arguments, policies=1, **request)
+    return policy.network
 
 
 def weights(network):
@@ -44,8 +46,7 @@ def parameters_of(model):
 
 class TestPPO:
     def test_learning_curve_and_provenance_are_kept(self, tmp_path):
-        train(tmp_path)
-        provenance = PolicyNetwork.load(tmp_path / "policy.npz").provenance
+        provenance = train(tmp_path).provenance
         curve = pd.DataFrame(provenance["curve"])
         assert list(curve["steps"]) == [256, 512, 768, 1024]
         assert (curve[["training_mae", "validation_mae", "square_mae"]] > 0).all(axis=None)
@@ -60,7 +61,7 @@ class TestPPO:
         monkeypatch.setattr(ppo_training.Keeper, "_on_step", interrupt)
         with pytest.raises(KeyboardInterrupt):
             train(tmp_path)
-        assert not list(tmp_path.iterdir())
+        assert not list(tmp_path.rglob("*.npz"))
 
     def test_starts_differ_in_all_that_is_random(self):
         first, second = (ppo_training.begin(SMALL, start=start) for start in (0, 1))
@@ -74,29 +75,16 @@ class TestPPO:
         assert min(seeds) >= 1 << 32  # no comparison has any so large
 
     def test_seed_is_honoured(self, tmp_path):
-        def trained(seed):
-            return weights(train(tmp_path, replace(SMALL, steps=256, seed=seed), retrain=True))
-
-        assert_the_seed_is_all_that_differs(trained)
+        short = replace(SMALL, steps=256)
+        assert_the_seed_is_all_that_differs(
+            lambda seed: weights(train(tmp_path, replace(short, seed=seed), retrain=True))
+        )
 
     def test_key_names_all_that_shapes_a_policy(self):
-        keys = {
-            ppo.policy_key(arguments)
-            for arguments in (
-                SMALL, replace(SMALL, seed=1), replace(SMALL, gamma=0.9),
-                replace(SMALL, noise_variance=0.1), replace(SMALL, max_move=0.3),
-            )
-        }  # fmt: skip
-        assert len(keys) == 5
+        others = {"seed": 1, "gamma": 0.9, "noise_variance": 0.1, "max_move": 0.3}
+        changed = [replace(SMALL, **{name: value}) for name, value in others.items()]
+        assert len({ppo.policy_key(each) for each in (SMALL, *changed)}) == 5
         assert ppo.policy_key(SMALL) == ppo.policy_key(replace(SMALL))
-
-    def test_it_is_trained_on_random_set_points_with_past_moves(self):
-        parameters = Parameters(**SMALL.training)
-        assert parameters.setpoint == "random"
-        assert parameters.action_window == parameters.delay + 3
-        assert parameters.noise_variance == SMALL.noise_variance
-        assert Parameters().delay == ppo_arguments.DELAY
-        assert Parameters().dead_zone == ppo_arguments.DEAD_ZONE
 
     def test_some_of_the_plants_are_calm(self):
         arguments = replace(SMALL, n_envs=8, calm=0.75)
@@ -122,12 +110,10 @@ class TestPPO:
 
     def test_a_policy_for_many_plants(self, tmp_path):
         arguments = replace(SMALL, steps=256, **ppo_arguments.RANDOMISED)
-        train(tmp_path, arguments)
-        kept = ppo.Policy(arguments, tmp_path / "policy.npz")
-        assert kept.network.observation["action_window"] == 39
+        network = train(tmp_path, arguments)
+        assert network.observation["action_window"] == 39
         size = Parameters(**arguments.training).observation_size
-        assert kept.network.act(np.zeros((5, size), np.float32)).shape == (5, 1)
-        assert ppo.policy_key(arguments) != ppo.policy_key(replace(SMALL, steps=256))
+        assert network.act(np.zeros((5, size), np.float32)).shape == (5, 1)
 
     def test_set_points_of_validation_are_met_nowhere_else(self):
         flows = np.abs(ppo_training.HELD) * 0.07273 / 0.04964  # t/h, by the steady-state gain
@@ -191,8 +177,7 @@ class TestPPO:
 
 
 class TestExported:
-    def test_it_is_the_policy_without_torch(self, tmp_path):
-        train(tmp_path)
+    def test_it_is_the_policy_without_torch(self):
         model = ppo_training.begin(replace(SMALL, seed=5))
         with torch.no_grad():  # so that the limits of the action matter, too
             model.policy.action_net.weight.mul_(100.0)
@@ -234,7 +219,8 @@ class TestExported:
 
 
 def test_a_damaged_policy_is_named(tmp_path):
-    file = tmp_path / "policy.npz"
+    file = tmp_path / ppo.policy_key(SMALL) / "policy.npz"
+    file.parent.mkdir()
     for content in (b"", b"half of it", pickle.dumps(SMALL)):
         file.write_bytes(content)
         with pytest.raises(ValueError, match=r"damaged.*remove it, or --retrain") as error:
@@ -245,25 +231,19 @@ def test_a_damaged_policy_is_named(tmp_path):
 
 class TestMembers:
     def test_a_controller_is_told_the_dead_zone_of_its_plant(self, tmp_path):
-        train(tmp_path)
-        policy = ppo.Policy(SMALL, tmp_path / "policy.npz")
-        observation = np.random.default_rng(0).normal(size=policy.network.n_obs)
+        network = train(tmp_path)
+        observation = np.random.default_rng(0).normal(size=network.n_obs)
         for given, edge in ((7.0, 0.7), (5.0, 0.5), ([3.0, 7.0], 0.5)):
-            controller = Trained(policy.network)(Parameters(dead_zone=given), 1, 0)
+            controller = trained(network, Parameters(dead_zone=given), 1, 0)
             # At its first move the policy is just beyond the edge of the dead zone.
             position = (abs(controller.act(observation)[0]) - edge) / (1.0 - edge)
             assert 0.0 < position < 0.2
-        assert policy.network.increments.dead_zone == 5.0  # is not changed by it
-
-    def members(self, folder, jobs, *, policies=2, retrain=False):
-        return ppo.members(
-            PolicyRequest(FanOut(jobs), folder, policies=policies, retrain=retrain), SMALL
-        )
+        assert network.increments.dead_zone == 5.0  # is not changed by it
 
     def test_another_process_trains_the_same_policy(self, tmp_path, monkeypatch):
         monkeypatch.undo()  # other processes would not know of it
-        ones = self.members(tmp_path / "one", jobs=1)
-        others = self.members(tmp_path / "two", jobs=2, policies=1)
+        ones = members(tmp_path / "one")
+        others = members(tmp_path / "two", jobs=2, policies=1)
         first, second, third = (weights(policy.network) for policy in (*ones, *others))
         assert np.array_equal(first, third)
         assert not np.array_equal(first, second)
@@ -271,14 +251,14 @@ class TestMembers:
         assert [policy.curve[-1]["steps"] for policy in ones] == [1024, 1024]
 
     def test_only_what_is_missing_is_trained(self, tmp_path):
-        files = [policy.file for policy in self.members(tmp_path, jobs=1)]
+        files = [policy.file for policy in members(tmp_path)]
         stamps = [file.stat().st_mtime_ns for file in files]
         files[1].unlink()
-        self.members(tmp_path, jobs=1)
+        members(tmp_path)
         again = [file.stat().st_mtime_ns for file in files]
         assert again[0] == stamps[0]
         assert again[1] > stamps[1]
-        self.members(tmp_path, jobs=1, retrain=True)
+        members(tmp_path, retrain=True)
         assert files[0].stat().st_mtime_ns > stamps[0]
 
     def test_one_that_fails_does_not_stop_the_others(self, tmp_path, monkeypatch):
@@ -291,36 +271,38 @@ class TestMembers:
 
         monkeypatch.setattr(ppo_training, "train", faulty)
         with pytest.raises(TasksFailedError, match=r"1 of 2 tasks failed(.|\n)*out of memory"):
-            self.members(tmp_path, jobs=1)
+            members(tmp_path)
         assert len(list(tmp_path.glob("*/policy.npz"))) == 1
 
-    def test_a_policy_goes_along_to_where_its_file_is_not(self, tmp_path):
-        network = train(tmp_path)
-        packed = pickle.dumps(Trained(network))
-        (tmp_path / "policy.npz").unlink()
-        made = pickle.loads(packed)(Parameters(), 1, 0)
-        assert np.array_equal(weights(made), weights(network))
+    def test_a_policy_goes_along_to_where_its_file_is_not(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(ppo, "PPOArguments", lambda: SMALL)
+        request = PolicyRequest(folder=tmp_path, policies=1)
+        (factory,) = ppo_policies(request)
+        packed = pickle.dumps(factory)
+        (policy,) = ppo.members(request)
+        policy.file.unlink()
+        made = pickle.loads(packed)({}, 1, 0)
+        assert np.array_equal(weights(made), weights(policy.network))
 
     def test_published_policies_are_taken_if_they_were_trained_like_this(
         self, tmp_path, monkeypatch
     ):
         monkeypatch.setattr(ppo, "PRETRAINED", tmp_path / "shipped")
-        trained = self.members(tmp_path / "kept", jobs=1)
-        ppo.publish(trained, tmp_path / "shipped")
-        shipped = self.members(tmp_path / "none", jobs=1)
+        own = members(tmp_path / "kept")
+        (tmp_path / "shipped").mkdir()
+        for each in own:
+            each.network.save(tmp_path / "shipped" / ppo.file_name(each.arguments))
+        shipped = members(tmp_path / "none")
         assert [policy.file.name for policy in shipped] == ["ppo-0.npz", "ppo-1.npz"]
-        for one, other in zip(trained, shipped, strict=True):
+        for one, other in zip(own, shipped, strict=True):
             assert np.array_equal(weights(one.network), weights(other.network))
         # Those that were trained here come first, and others are trained where asked for.
-        files = {
-            policy.file.parent.parent for policy in self.members(tmp_path / "kept", jobs=1)
+        assert {each.file.parent.parent for each in members(tmp_path / "kept")} == {
+            tmp_path / "kept"
         }
-        assert files == {tmp_path / "kept"}
-        anew = self.members(tmp_path / "anew", jobs=1, retrain=True)
+        anew = members(tmp_path / "anew", retrain=True)
         assert anew[0].file.parent.parent == tmp_path / "anew"
-        other = ppo.members(
-            PolicyRequest(FanOut(1), tmp_path / "o", steps=256, policies=1), SMALL
-        )
+        other = members(tmp_path / "o", policies=1, steps=256)
         assert other[0].file.parent.parent == tmp_path / "o"
 
     def test_the_policies_of_the_project_are_those_of_the_defaults(self):

@@ -26,13 +26,7 @@ from mptc_gym.plant import action_from_command
 
 
 class Nothing:
-    """Leaves the valve at 0 t/h.
-
-    Parameters
-    ----------
-    u_min, u_max
-        The actuator's limits, t/h.
-    """
+    """Leaves the valve at 0 t/h, given the actuator's limits, t/h."""
 
     def __init__(self, u_min: float = -10.0, u_max: float = 10.0) -> None:
         self._action = np.float32(action_from_command(0.0, u_min, u_max))
@@ -50,9 +44,13 @@ def limits(plant: Parameters) -> dict[str, Any]:
     return {"u_min": plant.range_of("u_min")[0], "u_max": plant.range_of("u_max")[1]}
 
 
-def data_sheet(plant: Parameters) -> dict[str, Any]:
-    """Return what the actuator's data sheet says, the middle of a dead zone that is drawn."""
-    return {**limits(plant), "dead_zone": sum(plant.range_of("dead_zone")) / 2}
+def step_test_and_data_sheet(plant: Parameters) -> dict[str, Any]:
+    """Return what a step test shows and what the actuator's data sheet says.
+
+    The dead zone is the middle of one that is drawn.
+    """
+    dead_zone = sum(plant.range_of("dead_zone")) / 2
+    return {**asdict(step_test(plant)), **limits(plant), "dead_zone": dead_zone}
 
 
 def nothing(plant: Parameters, runs: int, seed: int) -> Nothing:
@@ -92,31 +90,25 @@ def simc_pi(plant: Parameters, runs: int = 1, seed: int = 0) -> PIController:
 
 
 def smith(plant: Parameters, runs: int = 1, seed: int = 0) -> SmithPredictor:
-    """Return a Smith predictor whose model comes from a step test of the plant.
-
-    Its closed loop has half the plant's time constant. It knows the actuator's data sheet.
-    """
-    tested = step_test(plant)
-    return SmithPredictor(
-        **asdict(tested),
-        closed_loop_time_constant=float(f"{tested.time_constant / 2:.2g}"),
-        **data_sheet(plant),
-    )
+    """Return a Smith predictor whose closed loop has half the plant's time constant."""
+    known = step_test_and_data_sheet(plant)
+    half = float(f"{known['time_constant'] / 2:.2g}")
+    return SmithPredictor(**known, closed_loop_time_constant=half)
 
 
 def self_tuning(plant: Parameters, runs: int, seed: int) -> SelfTuningController:
     """Return a self-tuning controller that starts from what a step test shows."""
-    return SelfTuningController(**asdict(step_test(plant)), **data_sheet(plant))
+    return SelfTuningController(**step_test_and_data_sheet(plant))
 
 
 def nn_smith(plant: Parameters, runs: int = 1, seed: int = 0) -> NeuralSmithPredictor:
     """Return the network behind a model, told what a Smith predictor is told."""
-    return NeuralSmithPredictor(**asdict(step_test(plant)), **data_sheet(plant))
+    return NeuralSmithPredictor(**step_test_and_data_sheet(plant))
 
 
 def nn_self_tuning(plant: Parameters, runs: int, seed: int) -> NeuralSelfTuningController:
     """Return the network behind a bank of models that starts from what a step test shows."""
-    return NeuralSelfTuningController(**asdict(step_test(plant)), **data_sheet(plant))
+    return NeuralSelfTuningController(**step_test_and_data_sheet(plant))
 
 
 def mpc(plant: Parameters, runs: int, seed: int) -> PredictiveController:

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from benchmarks.controllers.own import own_entry
 from benchmarks.controllers.records import RosterEntry
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import UsageError, blame, known, out_folder
+from benchmarks.lib.command_line import UsageError, known, out_folder
 from benchmarks.lib.options import Count, FanOutOptions, Names, Repeated, options
 from benchmarks.train.ppo import KEPT, PolicyRequest
 
@@ -90,19 +90,7 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEnt
                 f"--agent must be NEW_NAME={LOCATION}, and {name!r} is taken, got {text!r}"
             )
         locations.setdefault(name, []).append(location)
-    found |= {name: own_controller(name, each) for name, each in locations.items()}
+    found |= {name: own_entry(name, each) for name, each in locations.items()}
     if not found:
         raise UsageError("--agents, --agent: no controller to run")
     return found
-
-
-def own_controller(name: str, locations: Sequence[str]) -> RosterEntry:
-    """Return an entry for a user's own controller, which has been tried out.
-
-    Raises
-    ------
-    UsageError
-        If there is no such factory or file, or if what it makes is no controller.
-    """
-    with blame("--agent"):
-        return own_entry(name, locations)

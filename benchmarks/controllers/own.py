@@ -14,6 +14,7 @@ import numpy as np
 from agents.policy_network import WINDOWS
 from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Cost, Factory, RosterEntry
+from benchmarks.lib.command_line import blame
 from benchmarks.loop.rollout import Agent, make_plants
 from mptc_gym import Parameters
 
@@ -70,17 +71,18 @@ def own_entry(name: str, locations: Sequence[str]) -> RosterEntry:
 
     Raises
     ------
-    ValueError
-        As `own_factory` and `benchmarks.controllers.saved.policies` raise it.
+    UsageError
+        As `own_factory` and `benchmarks.controllers.saved.policies` raise a ValueError.
     """
     factories: list[Factory] = []
-    for location in locations:
-        if location.endswith(".zip"):
-            from benchmarks.controllers import saved  # here: PyTorch takes seconds to load
+    with blame("--agent"):
+        for location in locations:
+            if location.endswith(".zip"):
+                from benchmarks.controllers import saved  # here: PyTorch takes seconds to load
 
-            factories += saved.policies(location)
-        else:
-            factories.append(own_factory(location))
+                factories += saved.policies(location)
+            else:
+                factories.append(own_factory(location))
     return RosterEntry(name, name, lambda request: factories, drawn=True)
 
 

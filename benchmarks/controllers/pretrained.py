@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 from agents import LawNetwork, PolicyNetwork
 from benchmarks.controllers.engineered import limits
@@ -15,38 +17,27 @@ from benchmarks.train.ppo_arguments import RANDOMISED, PPOArguments
 from mptc_gym import Parameters
 
 
-@dataclass(frozen=True)
-class Trained:
-    """Makes controllers of a trained network, which is told the actuator's limits.
+def trained(network: PolicyNetwork, plant: Parameters, runs: int, seed: int) -> PolicyNetwork:
+    """Return a controller that has the network, and is told the actuator's limits.
 
-    Attributes
-    ----------
-    network
-        It goes along to machines where its file is not.
+    In velocity form it is told the dead zone, too, if that is a number.
+
+    Raises
+    ------
+    ValueError
+        If the dead zone that it is to undo leaves no flow on one side.
     """
-
-    network: PolicyNetwork
-
-    def __call__(self, plant: Parameters, runs: int, seed: int) -> PolicyNetwork:
-        """Return a controller; in velocity form it is told the dead zone, if it is a number.
-
-        Raises
-        ------
-        ValueError
-            If the dead zone that it is to undo leaves no flow on one side.
-        """
-        network = copy.deepcopy(self.network)
-        known = limits(plant)
-        network.u_min, network.u_max = known["u_min"], known["u_max"]
-        zone = plant.dead_zone
-        if network.increments and not isinstance(zone, Sequence):
-            if zone >= min(-network.u_min, network.u_max):
-                raise ValueError(
-                    f"dead_zone must be inside u_min = {plant.u_min} and u_max = {plant.u_max} "
-                    f"for a policy that undoes it, got {zone}"
-                )
-            network.increments = replace(network.increments, dead_zone=zone)
-        return network
+    controller = copy.deepcopy(network)
+    controller.u_min, controller.u_max = limits(plant).values()
+    zone = plant.dead_zone
+    if controller.increments and not isinstance(zone, Sequence):
+        if zone >= min(-controller.u_min, controller.u_max):
+            raise ValueError(
+                f"dead_zone must be inside u_min = {plant.u_min} and u_max = {plant.u_max} "
+                f"for a policy that undoes it, got {zone}"
+            )
+        controller.increments = replace(controller.increments, dead_zone=zone)
+    return controller
 
 
 def told_network(make: Callable[..., Agent]) -> Members:
@@ -59,33 +50,37 @@ def told_network(make: Callable[..., Agent]) -> Members:
     return members
 
 
-def ppo_policies(request: ppo.PolicyRequest) -> list[Factory]:
+def ppo_policies(
+    request: ppo.PolicyRequest, arguments: PPOArguments | None = None
+) -> list[Factory]:
     """Return PPO's policies for the paper's plant; those that are missing are trained."""
-    return [_policy(each) for each in ppo.members(request)]
+    policies = ppo.members(request, arguments)
+    return [_factory(each.arguments, each.network, each.file.name) for each in policies]
 
 
 def randomised_policies(request: ppo.PolicyRequest) -> list[Factory]:
     """Return PPO's policies for many plants."""
-    arguments = replace(PPOArguments(), **RANDOMISED)
-    return [_policy(each) for each in ppo.members(request, arguments)]
+    return ppo_policies(request, PPOArguments(**RANDOMISED))
 
 
-def tuned_policy(*, final: bool, member: int, **gains: float) -> Factory:
-    """Return a policy of PPO that was trained with other settings, for a search."""
-    return _policy(ppo.tuned(final=final, member=member, **gains))
+def tuned_policy(*, final: bool, member: int, **gains: Any) -> Factory:
+    """Train a policy with other settings for a search, of a seed that no comparison has."""
+    first = ppo.FINAL_SEED if final else ppo.TUNING_SEED
+    arguments = PPOArguments(seed=first + member, **gains)
+    return _factory(arguments, ppo.train(arguments))
 
 
-def _policy(policy: ppo.Policy) -> Factory:
-    weights = sum(W.size + b.size for W, b in policy.network.layers)
-    cost = Cost(
-        "dead zone; delay, by the past actions it sees",
-        f"{weights:,} weights a policy",
-        f"{policy.arguments.steps / 1e6:g} M a policy",
-    )
-    made = _factory(policy.network, policy.file.name)
-    return replace(made, curve=policy.curve, cost=cost)
-
-
-def _factory(network: PolicyNetwork, file: str) -> Factory:
+def _factory(arguments: PPOArguments, network: PolicyNetwork, file: str = "") -> Factory:
     about = {name: value for name, value in network.provenance.items() if name != "curve"}
-    return Factory(Trained(network), network.observation, provenance={"file": file, **about})
+    weights = sum(W.size + b.size for W, b in network.layers)
+    return Factory(
+        partial(trained, network),  # which goes along to machines where its file is not
+        network.observation,
+        provenance={"file": file, **about},
+        curve=network.provenance.get("curve", []),
+        cost=Cost(
+            "dead zone; delay, by the past actions it sees",
+            f"{weights:,} weights a policy",
+            f"{arguments.steps / 1e6:g} M a policy",
+        ),
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from agents.controller import PAPER_WINDOWS
@@ -17,58 +18,41 @@ COMMISSIONING_SEED = 3_000_000  # of plants and noise then
 
 @dataclass(frozen=True)
 class Cost:
-    """What a controller costs before it runs.
-
-    Attributes
-    ----------
-    prior_knowledge
-        What it is told about the plant.
-    parameters
-        How many numbers shape it: gains, and weights if it has any.
-    samples
-        Samples of the plant, or of a simulated one, that went into tuning and training.
-    """
+    """What a controller costs before it runs."""
 
     prior_knowledge: str = ""
+    """What it is told about the plant."""
     parameters: str = ""
+    """How many numbers shape it: gains, and weights if it has any."""
     samples: str = ""
+    """Samples of the plant, or of a simulated one, that went into tuning and training."""
 
 
 @dataclass(frozen=True)
 class Factory:
-    """Makes controllers: all that a command may ask of a controller before it runs.
-
-    Attributes
-    ----------
-    make
-        Called with the plant that the controllers are made for (`Parameters`), how many runs
-        there are, and a seed: run i is to use `seed + i`. A search adds gains by name.
-    observation
-        The windows of the environment that the controllers want.
-    learns
-        Whether they go on learning from run to run.
-    code
-        The module whose code shapes them, if it is not that of `make`.
-    provenance
-        Where a trained policy comes from, in a form for JSON; empty if nothing was trained.
-    curve
-        Its learning curve, a row an evaluation.
-    cost
-        What it costs, where that is not known before the training.
-    """
+    """Makes controllers: all that a command may ask of a controller before it runs."""
 
     make: Callable[..., Agent]
+    """Called with the plant that the controllers are made for (`Parameters`), how many runs
+    there are, and a seed: run i is to use `seed + i`. A search adds gains by name."""
     observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
+    """The windows of the environment that the controllers want."""
     learns: bool = False
+    """Whether they go on learning from run to run."""
     code: str = ""
+    """The module whose code shapes them, if it is not that of `make`."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    """Where a trained policy comes from, in a form for JSON; empty if nothing was trained."""
     curve: Sequence[Mapping[str, float]] = ()
+    """Its learning curve, a row an evaluation."""
     cost: Cost | None = None
+    """What it costs, where that is not known before the training."""
 
     @property
     def module(self) -> str:
         """The module whose code shapes the controllers."""
-        return self.code or self.make.__module__
+        make = self.make.func if isinstance(self.make, partial) else self.make
+        return self.code or make.__module__
 
     def arguments(self, plant: Mapping[str, Any]) -> dict[str, Any]:
         """Return a plant's arguments of the environment, with the windows that are wanted."""
@@ -93,89 +77,62 @@ class Factory:
         return controller
 
 
+# Returns the factories of a controller's members, given which trained policies are wanted.
 Members = Callable[[PolicyRequest], Sequence[Factory]]
-
-
-def alone(make: Callable[..., Agent], **more: Any) -> Members:
-    """Return the members of a controller that is not trained: one factory, as `Factory`."""
-    factory = Factory(make, **more)
-    return lambda request: [factory]
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """How the gains of a controller are searched.
-
-    Attributes
-    ----------
-    space
-        Name of a gain: lowest and highest value. Gains are searched on a logarithmic scale.
-    trials, startup
-        Number of trials, and how many of them are at random before the sampler learns.
-    finalists
-        How many of the best are judged again.
-    penalty
-        For failing to settle at a constant set point, degC: what doing nothing about 5 degC
-        costs.
-    members
-        How many controllers are made of the same gains, in the search and at last. Their
-        objectives are averaged.
-    train
-        Called with the gains, `final` (whether they are judged for the last time) and `member`
-        (the number of the controller); returns a factory. None: the controller's own factory
-        makes it with these gains.
-    """
+    """How the gains of a controller are searched."""
 
     space: Mapping[str, tuple[float, float]]
+    """Name of a gain: lowest and highest value. Gains are searched on a logarithmic scale."""
     trials: int = 800
     startup: int = 200
+    """How many of the trials are at random, before the sampler learns."""
     finalists: int = 10
+    """How many of the best are judged again."""
     penalty: float = 5.0
+    """For failing to settle at a constant set point, degC: what doing nothing about 5 degC
+    costs."""
     members: tuple[int, int] = (1, 1)
+    """How many controllers are made of the same gains, in the search and at last. Their
+    objectives are averaged."""
     train: Callable[..., Factory] | None = None
+    """Called with the gains, `final` (whether they are judged for the last time) and `member`
+    (the number of the controller); returns a factory. None: the controller's own factory makes
+    it with these gains."""
 
 
 @dataclass(frozen=True)
 class RosterEntry:
-    """A controller and all that any command has to know of it.
-
-    Attributes
-    ----------
-    name
-        In options and files.
-    label
-        In tables and plots.
-    made_by
-        Returns its factories: one, or several for policies that were trained apart. Called
-        with a request, which controllers that are not trained ignore.
-    cost
-        What it costs before it runs.
-    told
-        Whether it is set up for the plant that it is told. Otherwise it is made for the paper's
-        plant, and is told no more than the actuator.
-    trained
-        Whether `made_by` may have to train.
-    tuning
-        How its gains are searched, if they are.
-    compared, swept
-        Whether `compare` and `sweep` run it unless told otherwise.
-    drawn
-        Whether its responses are drawn in a comparison.
-    """
+    """A controller and all that any command has to know of it."""
 
     name: str
+    """In options and files."""
     label: str
-    made_by: Members
+    """In tables and plots."""
+    made_by: Factory | Members
+    """Makes it; or a function that returns several, for policies that were trained apart."""
     cost: Cost = Cost()
+    """What it costs before it runs."""
     told: bool = True
+    """Whether it is set up for the plant that it is told. Otherwise it is made for the paper's
+    plant, and is told no more than the actuator."""
     trained: bool = False
+    """Whether `made_by` may have to train."""
     tuning: Tuning | None = None
+    """How its gains are searched, if they are."""
     compared: bool = True
     swept: bool = False
+    """Whether `compare` and `sweep` run it unless told otherwise."""
     drawn: bool = False
+    """Whether its responses are drawn in a comparison."""
 
     def members(self, request: PolicyRequest | None = None) -> list[Factory]:
         """Return the factories of its members: one, or several that were trained apart."""
+        if isinstance(self.made_by, Factory):
+            return [self.made_by]
         return list(self.made_by(request or PolicyRequest()))
 
     def first(self) -> Factory:

@@ -7,7 +7,7 @@ know it then. A user's own controllers (`--agent NAME=MODULE:FACTORY`) become su
 from __future__ import annotations
 
 from benchmarks.controllers import engineered, pretrained
-from benchmarks.controllers.records import Cost, RosterEntry, Tuning, alone
+from benchmarks.controllers.records import Cost, Factory, RosterEntry, Tuning
 
 _STEP_TEST = "gain, time constant, delay"
 _NETWORK = "8,427 weights for all plants"
@@ -19,14 +19,14 @@ ROSTER: dict[str, RosterEntry] = {
         RosterEntry(
             "nothing",
             "no control",
-            alone(engineered.nothing, observation={}),
+            Factory(engineered.nothing, observation={}),
             Cost("nothing", "0", "none"),
             compared=False,
         ),
         RosterEntry(
             "nn",
             "NN",
-            alone(engineered.direct_nn, learns=True),
+            Factory(engineered.direct_nn, learns=True),
             Cost(
                 "direction; gains searched on the paper's plant", "25 weights, 6 gains", _SEARCH
             ),
@@ -46,7 +46,7 @@ ROSTER: dict[str, RosterEntry] = {
         RosterEntry(
             "nn-frozen",
             "NN, frozen",
-            alone(engineered.frozen_nn),
+            Factory(engineered.frozen_nn),
             Cost(
                 "direction; gains searched on the paper's plant",
                 "25 weights, 6 gains",
@@ -58,7 +58,7 @@ ROSTER: dict[str, RosterEntry] = {
         RosterEntry(
             "pi",
             "PI",
-            alone(engineered.paper_pi, code="agents.pi"),
+            Factory(engineered.paper_pi, code="agents.pi"),
             Cost("gains of the paper", "2", "not stated"),
             told=False,
             tuning=Tuning({"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}),
@@ -68,21 +68,21 @@ ROSTER: dict[str, RosterEntry] = {
         RosterEntry(
             "pi-simc",
             "PI, SIMC",
-            alone(engineered.simc_pi),
+            Factory(engineered.simc_pi),
             Cost(_STEP_TEST, "2", "one step test"),
             swept=True,
         ),
         RosterEntry(
             "pi-searched",
             "PI, searched",
-            alone(engineered.searched_pi),
+            Factory(engineered.searched_pi),
             Cost("gains searched on the paper's plant", "2", _SEARCH),
             told=False,
         ),
         RosterEntry(
             "smith",
             "Smith",
-            alone(engineered.smith),
+            Factory(engineered.smith),
             Cost(
                 f"{_STEP_TEST}, dead zone, limits", "2 gains, 5 of the model", "one step test"
             ),
@@ -92,7 +92,7 @@ ROSTER: dict[str, RosterEntry] = {
         RosterEntry(
             "self-tuning",
             "self-tuning",
-            alone(engineered.self_tuning),
+            Factory(engineered.self_tuning),
             Cost(
                 f"{_STEP_TEST}, dead zone, limits; delay range",
                 "a bank of models, 30 settings",
@@ -103,7 +103,7 @@ ROSTER: dict[str, RosterEntry] = {
         RosterEntry(
             "mpc",
             "MPC",
-            alone(engineered.mpc),
+            Factory(engineered.mpc),
             Cost("everything but the future", "all of the plant's", "none"),
         ),
         RosterEntry(

@@ -114,5 +114,6 @@ def _ppo(options: Options, console: Console, out: Path, target: Path) -> str:
         )
     shown = pd.DataFrame(rows).map(lambda x: f"{x:.4g}" if isinstance(x, float) else str(x))
     console.print(on_screen(shown))
-    ppo.publish(policies, target)
+    for policy in policies:
+        policy.network.save(target / ppo.file_name(policy.arguments))
     return f"The policies are in {target}"

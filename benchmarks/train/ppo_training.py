@@ -6,21 +6,20 @@ import copy
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from typing import Any, cast
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from agents import Increments, PolicyNetwork
+from agents.policy_network import WINDOWS
 from benchmarks.lib.storage import versions
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import make_plants, rollout
@@ -39,9 +38,7 @@ VALIDATION_DEAD_ZONE = 6.5  # t/h, one that no comparison has
 HELD = [level for level in (4.8, -5.6, 5.3, -4.7, 5.8, -5.1) for _ in range(150)]
 PROBE = SCENARIOS["square"]  # shown in the learning curve, without a part in the training
 PROBE_SEED = 1_000_000  # met by no comparison
-TRAINING_SEEDS = (
-    1 << 32
-)  # and above: of what the plants meet in training, and nothing else does
+TRAINING_SEEDS = 1 << 32  # and above: what the plants meet in training, and nothing else does
 
 
 def train(arguments: PPOArguments) -> PolicyNetwork:
@@ -50,36 +47,24 @@ def train(arguments: PPOArguments) -> PolicyNetwork:
     Validation is on set points that are met neither in training nor in a comparison. The
     policy's provenance holds the arguments and the learning curve.
     """
-    kept = Progress()
+    keeper = Keeper(arguments)
     for start in range(arguments.starts):
-        keeper = Keeper(arguments, kept)
-        begin(arguments, start=start).learn(keeper.share, callback=keeper)
-        keeper.record()
-        kept.starts += 1
+        begin(arguments, start).learn(keeper.share, callback=keeper)
     provenance = {
         "algorithm": "PPO of Stable-Baselines3",
         "arguments": asdict(arguments),
         "versions": versions(),
-        "curve": kept.curve,
+        "curve": keeper.curve,
     }
-    return exported(kept.best, arguments, provenance)
+    return exported(keeper.best, arguments, provenance)
 
 
 def features(parameters: Parameters) -> NDArray[np.float64]:
     """Return what turns an observation into the inputs of the networks.
 
     They are the error, how set point and error change, the flow and the past moves: what
-    holds the flow is that nothing changes. Factors bring each to about 1.
-
-    Parameters
-    ----------
-    parameters
-        Of the environment, for its windows.
-
-    Returns
-    -------
-    ndarray
-        Shape (inputs, observation_size).
+    holds the flow is that nothing changes. Factors bring each to about 1. The result has the
+    shape (inputs, observation_size).
     """
     size, (error, _, action) = parameters.observation_size, parameters.heads
     rows: list[NDArray[np.float64]] = []
@@ -99,15 +84,7 @@ def features(parameters: Parameters) -> NDArray[np.float64]:
 
 
 class FixedFeatures(BaseFeaturesExtractor):
-    """Multiplies observations with a fixed matrix: the same in training and in use.
-
-    Parameters
-    ----------
-    observation_space
-        Of the environment.
-    matrix
-        Shape (inputs, observation_size), as lists.
-    """
+    """Multiplies observations with a matrix of `features`: the same in training and in use."""
 
     matrix: torch.Tensor
 
@@ -122,37 +99,19 @@ class FixedFeatures(BaseFeaturesExtractor):
         return observations @ self.matrix.T
 
 
-def begin(arguments: PPOArguments, plants: VecEnv | None = None, *, start: int = 0) -> PPO:
-    """Make a model that has learnt nothing yet.
-
-    Parameters
-    ----------
-    arguments
-        How it is to be trained.
-    plants
-        What to train on, if not a batch of plants that are stepped at once. Its action is one
-        of `IncrementalAction`.
-    start
-        The number of the start; what is random depends on it, too.
-
-    Returns
-    -------
-    PPO
-        The model.
-    """
+def begin(arguments: PPOArguments, start: int = 0) -> PPO:
+    """Return a model that has learnt nothing yet; what is random depends on the start, too."""
     torch.set_num_threads(1)  # the networks are too small for more
-    if plants is None:
-        plants = GymnasiumVecEnv(
-            *(
-                _incremental(
-                    gymnasium.make_vec(
-                        "MiddlePoint-v0", count, autoreset_mode="SameStep", **given
-                    ),
-                    arguments,
-                )
-                for count, given in arguments.plants
+    plants = GymnasiumVecEnv(
+        *(
+            IncrementalAction(
+                gymnasium.make_vec("MiddlePoint-v0", count, autoreset_mode="SameStep", **given),
+                max_move=arguments.max_move,
+                undo_dead_zone=arguments.undo_dead_zone,
             )
+            for count, given in arguments.plants
         )
+    )
     matrix = features(Parameters(**arguments.training))
     seeds = np.random.SeedSequence([arguments.seed, start]).generate_state(2)
     model_seed, plants_seed = (int(seed) for seed in seeds)
@@ -185,28 +144,12 @@ def begin(arguments: PPOArguments, plants: VecEnv | None = None, *, start: int =
     return model
 
 
-def _incremental(plants: VectorEnv[Any, Any, Any], arguments: PPOArguments) -> VectorEnv:
-    return IncrementalAction(
-        plants, max_move=arguments.max_move, undo_dead_zone=arguments.undo_dead_zone
-    )
-
-
 def exported(
     state: Mapping[str, torch.Tensor],
     arguments: PPOArguments,
     provenance: dict[str, Any] | None = None,
 ) -> PolicyNetwork:
-    """Return the mean of a policy as a controller that needs NumPy alone.
-
-    Parameters
-    ----------
-    state
-        The policy's parameters, by their names in PyTorch.
-    arguments
-        How it was made.
-    provenance
-        Where its weights come from.
-    """
+    """Return the mean of a policy, given by its state in PyTorch, in NumPy alone."""
     # Stable-Baselines3 has an activation after each hidden layer, which counts as one, too.
     names = [f"mlp_extractor.policy_net.{2 * i}" for i in range(len(arguments.hidden))]
     (first, bias), *others = [
@@ -214,10 +157,9 @@ def exported(
         for name in (*names, "action_net")
     ]
     parameters = Parameters(**arguments.training)
-    windows = "setpoint_window", "error_window", "output_window", "action_window"
     return PolicyNetwork(
         [(first @ features(parameters), bias), *others],
-        observation=dict(zip(windows, parameters.windows, strict=True)),
+        observation={name: getattr(parameters, name) for name in WINDOWS},
         input_scale=np.ones(parameters.observation_size),
         activation="tanh",
         increments=Increments(arguments.max_move, arguments.undo_dead_zone),
@@ -225,56 +167,39 @@ def exported(
     )
 
 
-State = dict[str, torch.Tensor]
-
-
-@dataclass
-class Progress:
-    """How far a training got.
+class Keeper(BaseCallback):
+    """Lets the exploration fall, and records how far a training gets, start after start.
 
     Attributes
     ----------
-    starts
-        How many starts are finished.
+    share
+        Samples of a start.
     curve
         The learning curve, a row a point.
     best
         The parameters of the policy that did best in validation.
     """
 
-    starts: int = 0
-    curve: list[dict[str, float]] = field(default_factory=list)
-    best: State = field(default_factory=dict)
-
-
-class Keeper(BaseCallback):
-    """Lets the exploration fall, and records how far a training gets.
-
-    Parameters
-    ----------
-    arguments
-        How the policy is trained.
-    progress
-        How far the training got; it is carried on.
-    """
-
-    def __init__(self, arguments: PPOArguments, progress: Progress) -> None:
+    def __init__(self, arguments: PPOArguments) -> None:
         super().__init__()
-        self.progress = progress
+        self.share = arguments.steps // arguments.starts
+        self.curve: list[dict[str, float]] = []
+        self.best: dict[str, torch.Tensor] = {}
         self._arguments = arguments
         self._errors: list[float] = []
-        self.share = arguments.steps // arguments.starts
-        self._before = progress.starts * self.share
+        self._before = -self.share  # samples of the starts before this one
         self._recorded = 0  # when, in samples of this start
-        spent = progress.curve[-1]["seconds"] if progress.curve else 0.0
-        self._began = time.process_time() - spent
+        self._began = time.process_time()
 
-    @property
-    def _plants(self) -> GymnasiumVecEnv:
-        return cast("GymnasiumVecEnv", self.training_env)
+    def _on_training_start(self) -> None:
+        self._before += self.share
+        self._recorded = 0
+
+    def _on_training_end(self) -> None:
+        self.record()
 
     def _on_step(self) -> bool:
-        errors = self._plants.infos["error"]
+        errors = cast("GymnasiumVecEnv", self.training_env).infos["error"]
         self._errors.append(float(np.mean(np.abs(errors))))
         return True
 
@@ -298,11 +223,10 @@ class Keeper(BaseCallback):
                 self._mae({**held, "dead_zone": VALIDATION_DEAD_ZONE}, 1, len(HELD), 0),
             ]
         )
-        curve = self.progress.curve
-        if not curve or validation < min(point["validation_mae"] for point in curve):
-            self.progress.best = copy.deepcopy(self.model.policy.state_dict())
+        if not self.curve or validation < min(each["validation_mae"] for each in self.curve):
+            self.best = copy.deepcopy(self.model.policy.state_dict())
         square = {**self._arguments.observation, **PROBE.arguments}
-        curve.append(
+        self.curve.append(
             {
                 "steps": self._before + self.num_timesteps,
                 "seconds": time.process_time() - self._began,  # of the processor

@@ -14,7 +14,7 @@ from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
 from PIL import Image
 from rich.console import Console
 
-from benchmarks.controllers.options import own_controller
+from benchmarks.controllers.own import own_entry
 from benchmarks.controllers.records import Factory, RosterEntry
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import UsageError
@@ -197,7 +197,7 @@ FILMS: dict[str, tuple[Callable[[Path, float], AbstractContextManager[Put]], int
 def _controller(agent: str) -> RosterEntry:
     name, equals, location = agent.partition("=")
     if ":" in agent:
-        return own_controller(name, [location if equals else agent])
+        return own_entry(name, [location if equals else agent])
     if agent not in ROSTER:
         raise UsageError(
             f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, {YOU}, and "
