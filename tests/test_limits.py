@@ -343,9 +343,7 @@ class TestNews:
         plants = make_plants(runs, samples, **RANDOM)
         setpoints = rollout(plants, PIController(0.0, 0.0), samples, seed=1).setpoint
         starts = [np.array([0, *(np.flatnonzero(np.diff(s)) + 1)]) for s in setpoints.T]
-        penalties = np.array(
-            [law.penalty(s, b) for s, b in zip(setpoints.T, starts, strict=True)]
-        )
+        penalties = np.array([law.penalty(s) for s in setpoints.T])
         ages = np.array(
             [np.arange(samples) - np.repeat(b, np.diff([*b, samples])) for b in starts]
         )

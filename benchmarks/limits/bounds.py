@@ -39,7 +39,7 @@ from benchmarks.lib.statistics import Estimate, student
 from benchmarks.lib.storage import ROOT, seal, unseal, write_text
 from benchmarks.limits.news import News
 from benchmarks.limits.programme import Plan, plan
-from benchmarks.limits.reference import SMOOTH, TAIL, held, reference
+from benchmarks.limits.reference import SMOOTH, TAIL, reference
 from benchmarks.limits.unknown import Unknown, unknown
 from benchmarks.loop.linear import Course, check_linear, course
 from benchmarks.loop.rollout import make_plants, rollout
@@ -62,27 +62,21 @@ PRICES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # of travel, for the frontier
 class LeastPossible(Estimate):
     """The least possible mean |e| of a case, degC, with a 95 % interval over drawn episodes.
 
-    Attributes
-    ----------
-    value, low, high, runs
-        As those of `Estimate`. The ends are `value` where nothing is drawn.
-    kind
-        One of `KINDS`.
-    idle, idle_low, idle_high
-        Mean |e| of the same episodes if the valve is left alone, degC, with its interval.
-    episodes
-        The terms of the mean, degC; element i is for the episode of seed `seed + i`. Those of
-        the kind "news" are bounds in their mean alone.
-    seed
-        Of the first episode.
+    `value`, `low`, `high` and `runs` are those of `Estimate`; the ends are `value` where
+    nothing is drawn.
     """
 
     kind: str
+    """One of `KINDS`."""
     idle: float
+    """Mean |e| of the same episodes if the valve is left alone, degC, with its interval."""
     idle_low: float
     idle_high: float
     episodes: tuple[float, ...]
+    """The terms of the mean, degC; element i is for the episode of seed `seed + i`. Those of
+    the kind "news" are bounds in their mean alone."""
     seed: int
+    """Of the first episode."""
 
     @property
     def holds_for(self) -> str:
@@ -156,23 +150,30 @@ def least_possible(
     for name, count in (("samples", samples), ("episodes", episodes)):
         if not isinstance(count, int) or count < 1:
             raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
-    random = parameters.setpoint == "random"
-    if kind is None and not random:
-        return _reference_or_preview(samples, episodes, seed, folder, **arguments)
+    if kind is None and theorem(parameters) == "preview":
+        case = {**arguments, "samples": samples, "episodes": episodes, "seed": seed}
+        preview = least_possible(kind="preview", folder=folder, **case)
+        with suppress(ValueError):  # it does not settle between changes
+            found = least_possible(kind="reference", folder=folder, **case)
+            # What cannot be foreseen makes no difference where nothing changes.
+            return found if abs(found.value - preview.value) >= SAME else preview
+        return preview
     kind = kind or "news"
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
-    if kind == "news" and not random:
+    if kind == "news" and theorem(parameters) != "news":
         raise ValueError(f'kind must not be "news" for the set point {parameters.setpoint!r}')
     file = None
     if folder is not None:
-        file = folder / f"{_key(parameters, samples, kind, episodes, seed)}.json"
+        shaped_by = [repr(parameters), samples, kind, episodes, seed]
+        code = "benchmarks.limits.bounds"
+        file = folder / f"{fingerprint(code, case=shaped_by, scipy=scipy.__version__)}.json"
         with suppress(OSError, ValueError, TypeError):  # not there, or damaged: made again
             kept = unseal(file.read_text(encoding="utf-8"))
             return LeastPossible(**{**kept, "episodes": tuple(kept["episodes"])})
     cases, idle = _draw(parameters, samples, episodes, seed)
     # The same on every machine, as solvers differ in later digits.
-    values = [round(case.least(kind) / samples, DIGITS) for case in cases]
+    values = [round(case.solve(kind).cost / samples, DIGITS) for case in cases]
     least, left_alone = student(values), student(idle)
     found = LeastPossible(
         **vars(least),
@@ -186,18 +187,6 @@ def least_possible(
     if file is not None:
         write_text(file, seal(asdict(found)))
     return found
-
-
-def _reference_or_preview(
-    samples: int, episodes: int, seed: int, folder: Path | None, **arguments: Any
-) -> LeastPossible:
-    case = {**arguments, "samples": samples, "episodes": episodes, "seed": seed}
-    preview = least_possible(kind="preview", folder=folder, **case)
-    with suppress(ValueError):  # it does not settle between changes
-        found = least_possible(kind="reference", folder=folder, **case)
-        # What cannot be foreseen makes no difference where nothing changes.
-        return found if abs(found.value - preview.value) >= SAME else preview
-    return preview
 
 
 def theorem(parameters: Parameters) -> str:
@@ -244,7 +233,7 @@ def frontier(
     for price in sorted(prices):
         plans = [case.solve(kind, price) for case in cases]
         travel = float(np.mean([p.travel.sum() for p in plans])) / samples
-        value = float(np.mean([p.value - p.error[0] for p in plans])) / samples
+        value = float(np.mean([p.cost for p in plans])) / samples
         points.append((travel, value - price * travel))
     return [*points, (0.0, float(np.mean(idle)))]
 
@@ -265,14 +254,8 @@ class _Case:
         now, unknown = self.course.first(samples), self.unknown.of(0, samples)
         penalty = None
         if kind == "news" and self.parameters.setpoint_amplitude > 0.0:
-            starts = np.array([start for start, _ in held(self.setpoint)])
-            penalty = News(self.parameters, now, unknown).penalty(self.setpoint, starts)
+            penalty = News(self.parameters, now, unknown).penalty(self.setpoint)
         return plan(now, unknown, self.setpoint, price=price, penalty=penalty)
-
-    def least(self, kind: str) -> float:
-        """Return the least sum of |e(k)| over k = 1 to N; nothing changes e(0)."""
-        found = self.solve(kind)
-        return found.value - float(found.error[0])
 
 
 class _Idle:
@@ -280,7 +263,7 @@ class _Idle:
 
     def __init__(self, numbers: PlantNumbers[Array], runs: int) -> None:
         action = action_from_command(0.0, numbers.u_min, numbers.u_max)
-        self._actions = np.full((runs, 1), np.asarray(action).reshape(-1, 1))
+        self._actions = np.full((runs, 1), np.reshape(action, (-1, 1)))
 
     def reset(self) -> None:
         """Do nothing."""
@@ -312,19 +295,10 @@ def _draw(
     numbers = replace(Ranges(parameters).given_arrays, **drawn_numbers)
     trajectory = rollout(plants, _Idle(numbers, runs), samples + 1, seed)
     plants.close()
-    cases = [
-        _case(parameters, numbers_of_plant(numbers, i), trajectory.setpoint[:, i].copy())
-        for i in range(count)
-    ]
+    cases = []
+    for i in range(count):
+        of_plant, setpoint = numbers_of_plant(numbers, i), trajectory.setpoint[:, i].copy()
+        longer = samples + 1 + int(of_plant.delay) + len(parameters.b) + TAIL
+        along = course(parameters, of_plant, longer)
+        cases.append(_Case(parameters, along, unknown(along), setpoint))
     return cases, np.abs(trajectory.setpoint - trajectory.output)[1:].mean(axis=0)
-
-
-def _case(parameters: Parameters, numbers: PlantNumbers[float], setpoint: Array) -> _Case:
-    beyond = int(numbers.delay) + len(parameters.b) + TAIL
-    longer = course(parameters, numbers, len(setpoint) + beyond)
-    return _Case(parameters, longer, unknown(longer), setpoint)
-
-
-def _key(parameters: Parameters, samples: int, kind: str, episodes: int, seed: int) -> str:
-    case = [repr(parameters), samples, kind, episodes, seed]
-    return fingerprint("benchmarks.limits.bounds", case=case, scipy=scipy.__version__)

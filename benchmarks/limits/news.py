@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from benchmarks.limits.reference import held
 from benchmarks.limits.unknown import Unknown
 from benchmarks.loop.linear import Coefficients, Course
 from mptc_gym import Parameters
@@ -81,18 +82,10 @@ class News:
         # The response to one t/h, after as many samples.
         self._impulse = np.concatenate([np.zeros(course.delay + 1), after])[:samples]
 
-    def penalty(self, setpoint: Array, starts: NDArray[np.intp]) -> Array:
-        """Return pi, degC times samples for each t/h, shape (samples,).
-
-        Parameters
-        ----------
-        setpoint
-            One draw of y_d(k), degC, shape (samples,).
-        starts
-            The samples at which its levels begin, 0 first.
-        """
+    def penalty(self, setpoint: Array) -> Array:
+        """Return pi, degC times samples for each t/h, for one draw of y_d(k): (samples,)."""
         samples = len(setpoint)
-        ends = [*starts[1:], samples]
+        starts, ends = np.transpose(held(setpoint))
         levels = setpoint[starts]
         stays = []  # g of each level by its age, were it held for ever
         changed = []  # what a change adds to the mean of g, by age, summed up

@@ -22,17 +22,7 @@ CASES = PRESETS | {
 
 
 def write(cache: Path, fan_out: FanOut, place: Path = PLACE) -> None:
-    """Write the least possible error of each case, episode by episode where they differ.
-
-    Parameters
-    ----------
-    cache
-        Where bounds are kept once they are known.
-    fan_out
-        Where they are computed.
-    place
-        The file.
-    """
+    """Write the least possible error of each case, episode by episode where they differ."""
     case: dict[str, Any] = {"samples": SAMPLES, "seed": SEED, "episodes": EPISODES + MORE}
     tasks = {
         name: partial(_least, {**case, **arguments}, cache) for name, arguments in CASES.items()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,7 +15,6 @@ from benchmarks.loop.linear import Course
 
 Array = NDArray[np.float64]
 
-Rows = list[list[Any]]  # of blocks of the matrix of equations
 NOTHING = 1e-9  # of the largest response: what is smaller is left out
 SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)  # with presolve or not
 TIME_LIMIT = 30.0  # s, of each attempt
@@ -29,34 +27,29 @@ class NotSolvedError(RuntimeError):
 class Programme(NamedTuple):
     """Equations in blocks, a row of matrices each, with costs and bounds for each column."""
 
-    rows: Rows
+    rows: list[list[Any]]
     right: list[Array]
     cost: list[Array]
     bounds: list[Array]
 
 
-# Returns the unknowns, or None, and what the solver says.
-Way = Callable[[Programme, dict[str, Any]], tuple[Array | None, str]]
-
-
 @dataclass(frozen=True)
 class Plan:
-    """What the programme found. All arrays have the shape (samples,).
-
-    Attributes
-    ----------
-    error
-        The bound of E|e(k)|, degC.
-    output, flow
-        The means of y(k) and u_a(k), degC and t/h.
-    value
-        The least value of what was minimised, degC times samples.
-    """
+    """What the programme found. All arrays have the shape (samples,)."""
 
     error: Array
+    """The bound of E|e(k)|, degC."""
     output: Array
+    """The mean of y(k), degC."""
     flow: Array
+    """The mean of u_a(k), t/h."""
     value: float
+    """The least value of what was minimised, degC times samples."""
+
+    @property
+    def cost(self) -> float:
+        """The value over k = 1 to N: nothing changes e(0)."""
+        return self.value - float(self.error[0])
 
     @property
     def travel(self) -> Array:
@@ -195,14 +188,15 @@ def _solve(
         cost += [price * ones] * 2
         bounds += [_bounds(zeros, np.inf * ones)] * 2
     programme = Programme(rows, right, cost, bounds)
-    ways: list[Way] = [_as_recursion, _as_response]
+    ways = [_as_recursion, _as_response]
     if np.any(np.abs(np.roots(course.beta[start])) > 1.0):
         ways.reverse()
     attempts = list(itertools.product(ways, SOLVERS))
+    found: Array | None
     why = ""
     for way, (method, presolve) in attempts:
         options = {"time_limit": TIME_LIMIT, "presolve": presolve}
-        found, why = way(programme, {"method": method, "options": options})
+        found, why = way(programme, method=method, options=options)
         if found is not None:
             return found
     raise NotSolvedError(
@@ -211,8 +205,10 @@ def _solve(
     )
 
 
-def _as_recursion(programme: Programme, solver: dict[str, Any]) -> tuple[Array | None, str]:
+def _as_recursion(programme: Programme, **solver: Any) -> tuple[Array | None, str]:
     """Solve with the outputs among the unknowns: sparse, and fast where A is slow.
+
+    What is returned are the unknowns, or None, and what the solver says.
 
     Where a zero of B lies outside the unit circle, the flow that belongs to an output grows
     without end: solvers that try outputs at will fail, or end at what is not the optimum.
@@ -227,19 +223,17 @@ def _as_recursion(programme: Programme, solver: dict[str, Any]) -> tuple[Array |
     return (solved.x if solved.success else None), solved.message
 
 
-def _as_response(programme: Programme, solver: dict[str, Any]) -> tuple[Array | None, str]:
+def _as_response(programme: Programme, **solver: Any) -> tuple[Array | None, str]:
     """Solve for the flows alone, with each output the sum of what the flows do to it."""
     rows, right, cost, bounds = programme
     A, B = rows[0][0].toarray(), -rows[0][1].toarray()
-    alone, G = (
-        linalg.solve_triangular(A, right[0], lower=True),
-        linalg.solve_triangular(A, B, lower=True),
-    )
+    alone = linalg.solve_triangular(A, right[0], lower=True)
+    G = linalg.solve_triangular(A, B, lower=True)
     G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
     second = [sparse.csr_array(G), *rows[1][2:]]
     reduced = [second, *(row[1:] for row in rows[2:])]
     of_flows = Programme(reduced, [right[1] - alone, *right[2:]], cost[1:], bounds[1:])
-    solved, why = _as_recursion(of_flows, solver)
+    solved, why = _as_recursion(of_flows, **solver)
     if solved is None:
         return None, why
     return np.concatenate([alone + G @ solved[: len(alone)], solved]), why

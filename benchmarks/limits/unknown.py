@@ -45,18 +45,12 @@ BELOW = (64, 53, 42, 31, 22, 14, 8, 4, 1, 0)
 
 @dataclass(frozen=True)
 class Unknown:
-    """Lower bounds of E|m - n|: intercept + slope * |m|, the highest of all slopes.
-
-    Attributes
-    ----------
-    slopes
-        Ascending, from 0 to 1; or 1 alone if nothing is unknown. Shape (slopes,).
-    intercepts
-        degC, shape (samples, slopes).
-    """
+    """Lower bounds of E|m - n|: intercept + slope * |m|, the highest of all slopes."""
 
     slopes: Array
+    """Ascending, from 0 to 1; or 1 alone if nothing is unknown. Shape (slopes,)."""
     intercepts: Array
+    """degC, shape (samples, slopes)."""
 
     def mean_error(self, m: Array) -> Array:
         """Return the bound of E|m - n| for the last len(m) samples, degC."""
@@ -100,17 +94,10 @@ def unknown(course: Course) -> Unknown:
 
 
 def noise_variance(course: Course) -> Array:
-    """Return the variance of the noise in y(k) that is unknown at k - d - 1, degC^2.
+    """Return the variance of the noise in y(k) that is unknown at k - d - 1, degC^2, for all k.
 
-    Parameters
-    ----------
-    course
-        The plant's. With a noisy transmitter the variance is that of the best prediction.
-
-    Returns
-    -------
-    ndarray, shape (samples,)
-        At the beginning of an episode less noise has come.
+    With a noisy transmitter it is that of the best prediction. At the beginning of an episode
+    less noise has come.
     """
     samples = len(course.load)
     R = course.numbers.noise_variance
@@ -142,11 +129,8 @@ def noise_variance(course: Course) -> Array:
 def _load_weights(course: Course) -> tuple[NDArray[np.bool_], Array]:
     """Return which changes of the load fall into the window of y(k), and what they do to it.
 
-    Returns
-    -------
-    ndarray, ndarray
-        Shape (samples, most changes in a window), the latest change first: whether there is
-        one, and what it adds to y(k) for a unit of the load.
+    Both have the shape (samples, most changes in a window), the latest change first: whether
+    there is one, and what it adds to y(k) for a unit of the load.
     """
     samples, order = course.alpha.shape
     lag = min(course.lag, samples)

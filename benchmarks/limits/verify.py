@@ -55,7 +55,6 @@ class Counting:
 
     def __init__(self, plant: Parameters, runs: int, seed: int = 0) -> None:
         self._p = plant
-        self._runs = runs
         self._lead = plant.range_of("delay")[0] + 10
         self.reset()
 
@@ -71,7 +70,7 @@ class Counting:
             first_half = (self._k + self._lead) % p.setpoint_period < (
                 p.setpoint_period + 1
             ) // 2
-            level = np.full(self._runs, p.setpoint_amplitude * (1.0 if first_half else -1.0))
+            level = np.full_like(level, p.setpoint_amplitude * (1.0 if first_half else -1.0))
         self._k += 1
         u_min, u_max = (float(np.mean(p.range_of(name))) for name in ("u_min", "u_max"))
         command = level / nominal(p).gain
@@ -94,14 +93,10 @@ def errors(factory: Factory, runs: int, samples: int, **arguments: Any) -> Array
 
 
 def beats(found: Array, least: LeastPossible) -> bool:
-    """Return whether runs lie below a bound beyond the interval of the difference.
+    """Return whether runs, of the seeds from `least.seed` on, lie below a bound.
 
-    Parameters
-    ----------
-    found
-        Mean |e| of runs, degC; run i has the seed `least.seed + i`.
-    least
-        The bound. Where it is the mean over as many episodes, run i is compared with episode i.
+    They do if their mean |e|, degC, is below it beyond the interval of the difference. Where
+    the bound is the mean over as many episodes, each run is compared with its episode.
     """
     paired = len(least.episodes) == len(found)
     difference = found - (np.array(least.episodes) if paired else least.value)
@@ -111,18 +106,9 @@ def beats(found: Array, least: LeastPossible) -> bool:
 def verify(
     runs: int, folder: Path, fan_out: FanOut, cases: Sequence[str] = ()
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Run every controller on every case.
+    """Run every controller on every case, or on some of `CASES`, so many times each.
 
-    Parameters
-    ----------
-    runs
-        How many of each.
-    folder
-        Where bounds and runs are kept as soon as they are known.
-    fan_out
-        Where to run them.
-    cases
-        Which of `CASES`; none for all.
+    Bounds and runs are kept in a folder as soon as they are known.
 
     Returns
     -------
@@ -135,7 +121,8 @@ def verify(
     tasks: dict[str, Callable[[], Any]] = {}
     for case in cases:
         tasks[f"bound, {case}"] = partial(_bound, case, runs)
-        tasks |= {f"{name}, {case}": partial(_errors, name, case, runs) for name in factories}
+        for name, factory in factories.items():
+            tasks[f"{name}, {case}"] = partial(_errors, factory, case, runs)
     sources = [factory.module for factory in factories.values()]
     kept = folder / f"verify-{fingerprint('benchmarks.limits.verify', *sources, runs=runs)}"
     results = fan_out.run(tasks, kept, title="verify")
@@ -160,6 +147,6 @@ def _bound(case: str, runs: int) -> dict[str, Any]:
     return asdict(found)
 
 
-def _errors(name: str, case: str, runs: int) -> list[float]:
-    found: list[float] = errors(controllers()[name], runs, SAMPLES, **CASES[case]).tolist()
+def _errors(factory: Factory, case: str, runs: int) -> list[float]:
+    found: list[float] = errors(factory, runs, SAMPLES, **CASES[case]).tolist()
     return found

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.controllers.records import Factory
-from benchmarks.limits import least_possible, steady_stretches
+from benchmarks.limits import least_possible
+from benchmarks.limits.reference import steady_stretches
 from benchmarks.loop.designs import Arguments
 from benchmarks.loop.metrics import measure
 from benchmarks.loop.rollout import make_plants, rollout

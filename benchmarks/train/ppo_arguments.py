@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from benchmarks.loop.designs import SPANS
-from mptc_gym import Parameters
 
-PLANT = Parameters()  # the paper's
+DELAY, DEAD_ZONE = 18, 5.0  # of the paper's plant, samples and t/h
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class PPOArguments:
     not mend that."""
     max_move: float = 1.0
     """How far an action of 1 moves the flow, as a share of half its range."""
-    undo_dead_zone: float = PLANT.dead_zone
+    undo_dead_zone: float = DEAD_ZONE
     """The dead zone that is undone on the way from the policy to the plant, t/h. A comparison
     takes that of the plant that is run."""
     noise_variance: float = 0.5
@@ -44,7 +43,7 @@ class PPOArguments:
     much sooner than large ones."""
     error_window: int = 3
     """Errors in the observation."""
-    action_window: int = PLANT.delay + 3
+    action_window: int = DELAY + 3
     """Past actions in the observation, the differences of which are the past moves; with
     delay + 2 moves the noise-free problem is Markov."""
     n_envs: int = 64
