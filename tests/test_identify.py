@@ -22,8 +22,8 @@ from benchmarks.identify.cleaning import without_noise_of_held_flow, without_sta
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log, read_log
 from benchmarks.identify.margins import margins
-from benchmarks.identify.model import CannotTellError, HeldOut, Interval, Options
-from benchmarks.identify.options import Columns
+from benchmarks.identify.model import CannotTellError, HeldOut, Interval
+from benchmarks.identify.options import Columns, Knowledge
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import fault, headline, report
 from benchmarks.identify.study.command import (
@@ -93,7 +93,7 @@ class TestFit:
 
     def test_without_noise_the_coefficients_are_exact(self):
         log = recorded(dead_zone=0.0, noise=1e-8)
-        model = identify(log, Options(orders=Orders(2, 2, 2), applied=True))
+        model = identify(log, Knowledge(orders=(2, 2, 2), applied=True))
         np.testing.assert_allclose(model.plant.a, PAPER.a, atol=2e-3)
         np.testing.assert_allclose(model.plant.b, PAPER.b, atol=2e-4)
         assert model.estimates["delay"].value == 18
@@ -110,11 +110,11 @@ class TestFit:
     def test_operating_point_is_found_and_deviations_are_from_it(self, good):
         log, plain = good
         shifted = Log(log.flow + 480.0, log.temperature + 385.0, 8.0)
-        model = identify(shifted, Options(operating_flow=480.0))
+        model = identify(shifted, Knowledge(operating_flow=480.0))
         np.testing.assert_allclose(model.plant.a, plain.plant.a, rtol=1e-4)
         assert model.operating_flow == 480.0
         assert model.operating_temperature == pytest.approx(385.0, abs=0.5)
-        by_itself = identify(shifted, Options(applied=True))
+        by_itself = identify(shifted, Knowledge(applied=True))
         assert by_itself.operating_flow == shifted.flow[0]
         assert any("say --operating-flow" in note for note in by_itself.notes)
         assert not any("say --operating-flow" in note for note in model.notes)
@@ -132,7 +132,7 @@ class TestFit:
     def test_flow_behind_the_actuator_needs_no_dead_zone(self, good):
         log, _ = good
         applied = np.where(np.abs(log.flow) < 5.0, 0.0, log.flow)
-        model = identify(Log(applied, log.temperature, 8.0), Options(applied=True))
+        model = identify(Log(applied, log.temperature, 8.0), Knowledge(applied=True))
         assert model.estimates["dead_zone"].value == 0.0
         assert model.estimates["delay"].value == 18
 
@@ -164,7 +164,7 @@ class TestFit:
         assert any("direction is unusual" in note for note in model.notes)
 
     def test_longer_delay_than_looked_for_is_said(self):
-        model = identify(recorded(noise=0.02), Options(longest_delay=17))
+        model = identify(recorded(noise=0.02), Knowledge(longest_delay=17))
         assert any("longer --longest-delay" in note for note in model.notes)
 
     def test_closed_loop_with_set_points_that_move_can_tell(self):
@@ -172,7 +172,7 @@ class TestFit:
         run = rollout(plants, PIController.simc(gain=-0.68, time_constant=160.0, delay=150.0),
                       1200, seed=7)  # fmt: skip
         log = Log(run.command[:, 0], run.output[:, 0], 8.0)
-        found = identify(log, Options(applied=True)).estimates
+        found = identify(log, Knowledge(applied=True)).estimates
         assert found["delay"].value == pytest.approx(18, abs=1)
         assert found["gain"].value == pytest.approx(-0.6825, rel=0.15)
 
@@ -181,7 +181,7 @@ def found_in(flow, response, generator, **options):
     """Return what is found in a log with noise of a fiftieth of the response's deviation."""
     noise = signal.lfilter([1.0], [1.0, -0.8], generator.normal(size=len(flow)))
     temperature = response + noise / np.std(noise) * 0.02 * np.std(response)
-    return identify(Log(flow, temperature, 8.0), Options(applied=True, **options))
+    return identify(Log(flow, temperature, 8.0), Knowledge(applied=True, **options))
 
 
 class TestRealLogs:
@@ -195,8 +195,7 @@ class TestRealLogs:
         assert 0.95 < model.held_out.model < 1.0
         assert model.held_out.impulse_response > 0.95
         assert not fault(model)
-        (other,) = model.known
-        assert 0.0 < sum(other.b) / sum(model.plant.a) < 0.3 * model.plant.gain
+        assert 0.0 < model.known["heater2"].gain < 0.3 * model.plant.gain
         alone = identify(Log(log.flow, log.temperature, 1.0))
         assert alone.held_out.model < model.held_out.model - 0.02
 
@@ -204,7 +203,7 @@ class TestRealLogs:
         log, whole = good
         half = np.where(np.arange(1200) % 2, np.nan, log.temperature)
         model = identify(Log(log.flow, half, 8.0))
-        assert model.sampling_interval == 16.0
+        assert model.plant.sampling_interval == 16.0
         assert model.estimates["gain"].value == pytest.approx(whole.plant.gain, rel=0.1)
         assert any("one row in 2 has a temperature" in note for note in model.notes)
         left = model.log.temperature - model.simulated
@@ -324,7 +323,7 @@ class TestRealLogs:
             temperature = np.round(temperature / step) * step
         temperature[generator.random(rows) < missing] = np.nan
         try:
-            model = identify(Log(flow, temperature, 1.0), Options(longest_delay=10))
+            model = identify(Log(flow, temperature, 1.0), Knowledge(longest_delay=10))
             Parameters(**plant_ranges(model))
             recommended(model, Parameters(**plant_arguments(model)))
         except ValueError:
@@ -386,7 +385,7 @@ class TestRows:
         known = np.ones(12, dtype=bool)
         known[[0, 5, 6]] = False
         values = np.arange(12.0)
-        rows = Rows(known)
+        rows = Rows(known, known)
         column = rows.lagged(values, [1])
         np.testing.assert_array_equal(column[:, 0], [0, 1, 2, 3, 6, 7, 8, 9, 10])
         # xi(k) = w(k) - 0.5 xi(k-1), from 0: 0, 1, 1.5, 2.25; then 6, 4, 6, 6, 7.
@@ -401,16 +400,17 @@ class TestRows:
         known = np.ones(8001, dtype=bool)
         known[4000] = False
         target = 3.0 * regressor + noise.ravel()
-        found = Rows(known).solve(target, regressor[:, np.newaxis], 1)
-        assert found.linear[0] == pytest.approx(3.0, abs=0.05)
-        assert found.c[0] == pytest.approx(-0.6, abs=0.05)
-        np.testing.assert_allclose(found.errors, xi.ravel(), atol=0.3)
+        table = np.column_stack([target, regressor])
+        linear, c, errors = Rows(known, known).solve(table, Orders(0, 1, 1))
+        assert linear[0] == pytest.approx(3.0, abs=0.05)
+        assert c[0] == pytest.approx(-0.6, abs=0.05)
+        np.testing.assert_allclose(errors, xi.ravel(), atol=0.3)
 
 
 class TestRefusal:
     def refuse(self, flow, temperature, match, **options):
         with pytest.raises(CannotTellError, match=match):
-            identify(Log(np.asarray(flow), np.asarray(temperature), 8.0), Options(**options))
+            identify(Log(np.asarray(flow), np.asarray(temperature), 8.0), Knowledge(**options))
 
     def test_constant_flow(self):
         noise = np.random.default_rng(0).normal(size=500)

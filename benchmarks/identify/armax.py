@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,30 +50,6 @@ def invertible(c: Array) -> bool:
     return bool(np.all(np.abs(roots) <= np.where(slow, LARGEST, LARGEST_OTHER)))
 
 
-@dataclass(frozen=True)
-class Solution:
-    """What minimises the sum of squares of the prediction errors.
-
-    Attributes
-    ----------
-    linear
-        Coefficients of the regressors.
-    c
-        C, or C' with a walk, from z^-1 on.
-    errors
-        The prediction errors xi, one a row that counts.
-    """
-
-    linear: Array
-    c: Array
-    errors: Array
-
-    @property
-    def square(self) -> float:
-        """Sum of squares of the errors."""
-        return float(self.errors @ self.errors)
-
-
 class Rows:
     """The rows of a log in which everything is known that (28) needs.
 
@@ -84,21 +61,15 @@ class Rows:
         Which of them to count: the others are bridges, with temperatures that were filled in.
     """
 
-    def __init__(self, known: Flags, counted: Flags | None = None) -> None:
+    def __init__(self, known: Flags, counted: Flags) -> None:
         self.index = np.flatnonzero(known)
-        self.counts = np.ones(len(self.index), bool) if counted is None else counted[known]
+        self.counts = counted[known]
         # Stretches without a gap: the recursion for xi starts anew in each.
         breaks = np.flatnonzero(np.diff(self.index) > 1) + 1
-        bounds = [0, *breaks.tolist(), len(self.index)]
-        self._stretches = list(itertools.pairwise(bounds))
+        self._stretches = list(itertools.pairwise([0, *breaks.tolist(), len(self.index)]))
 
     def __len__(self) -> int:
         return int(self.counts.sum())
-
-    @property
-    def counted(self) -> NDArray[np.intp]:
-        """Which rows of the log count."""
-        return self.index[self.counts]
 
     def lagged(self, values: Array, lags: Sequence[int]) -> Array:
         """Return a column for each lag, shape (rows, lags)."""
@@ -115,34 +86,27 @@ class Rows:
             columns[start + 1 : stop, i] = 1.0
         return columns
 
-    def whitened(self, columns: Array, c: Array, *, walk: bool = False) -> Array:
+    def whitened(self, columns: Array, c: Array, walk: bool = False) -> Array:
         """Return the columns divided by C, and with a walk differenced, in all rows."""
-        denominator = np.concatenate([[1.0], c])
         parts = []
         for start, stop in self._stretches:
             part = columns[start:stop]
             if walk:
                 part = np.diff(part, axis=0, prepend=part[:1])
-            parts.append(signal.lfilter([1.0], denominator, part, axis=0) if len(c) else part)
-        return np.concatenate(parts) if parts else columns
+            parts.append(signal.lfilter([1.0], [1.0, *c], part, axis=0) if len(c) else part)
+        return np.concatenate(parts)
 
-    def _later(self, values: Array, order: int) -> Array:
-        """Return values moved back by 1 to `order` rows, 0 where a stretch begins."""
-        lags = np.zeros((len(values), order))
-        for i in range(order):
-            for begin, end in self._stretches:
-                lags[begin + i + 1 : end, i] = values[begin : max(end - i - 1, begin)]
-        return lags
+    def _slopes(self, errors: Array, c: Array) -> Array:
+        """Return what each coefficient of C does to the errors, with its sign turned."""
+        whitened, slopes = self.whitened(errors, c), np.zeros((len(errors), len(c)))
+        for lag in range(1, len(c) + 1):
+            for start, stop in self._stretches:
+                slopes[start + lag : stop, lag - 1] = whitened[start : max(stop - lag, start)]
+        return slopes
 
     def solve(
-        self,
-        target: Array,
-        regressors: Array,
-        order: int,
-        start: Array | None = None,
-        *,
-        walk: bool = False,
-    ) -> Solution:
+        self, table: Array, orders: Orders, start: Array | None = None
+    ) -> tuple[Array, Array, Array]:
         """Minimise the squares of xi = (target - regressors @ linear) / C over linear and C.
 
         For a given C the problem is linear, so that only C is searched: variable projection
@@ -151,69 +115,60 @@ class Rows:
 
         Parameters
         ----------
-        target
-            Shape (rows,).
-        regressors
-            Shape (rows, n).
-        order
-            Of C, or of C' with a walk.
+        table
+            The target and the regressors, shape (rows, 1 + n).
+        orders
+            C has as many coefficients; with a walk, C'.
         start
             C from z^-1 on, to search from.
-        walk
-            Whether a random walk is part of the noise.
-        """
-        columns = np.column_stack([target, regressors])
-        latest: dict[bytes, tuple[Array, Array, Array]] = {}  # the search asks twice
 
-        def project(c: Array) -> tuple[Array, Array, Array]:
-            key = c.tobytes()
-            if key not in latest:
-                latest.clear()
-                white = self.whitened(columns, c, walk=walk)
-                basis, triangle = np.linalg.qr(white[self.counts, 1:])
-                shares = basis.T @ white[self.counts, 0]
-                linear = np.linalg.lstsq(triangle, shares, rcond=None)[0]
-                latest[key] = white[:, 0] - white[:, 1:] @ linear, basis, linear
-            return latest[key]
+        Returns
+        -------
+        linear, c, errors
+            Coefficients of the regressors; C from z^-1 on; xi of all rows.
+        """
+
+        @lru_cache(maxsize=1)  # the search asks twice
+        def project(c: tuple[float, ...]) -> tuple[Array, Array, Array]:
+            white = self.whitened(table, np.array(c), orders.walk)
+            basis, triangle = np.linalg.qr(white[self.counts, 1:])
+            shares = basis.T @ white[self.counts, 0]
+            linear = np.linalg.lstsq(triangle, shares, rcond=None)[0]
+            return white[:, 0] - white[:, 1:] @ linear, basis, linear
 
         def residuals(c: Array) -> Array:
             if not invertible(c):
                 return np.full(len(self), np.inf)
-            return project(c)[0][self.counts]
+            return project(tuple(c))[0][self.counts]
 
         def jacobian(c: Array) -> Array:
-            errors, basis, _ = project(c)
-            slopes = self._later(-self.whitened(errors, c), order)[self.counts]
+            errors, basis, _ = project(tuple(c))
+            slopes = -self._slopes(errors, c)[self.counts]
             projected: Array = slopes - basis @ (basis.T @ slopes)
             return projected
 
-        c = np.zeros(0)
-        if order:
-            first = np.zeros(order)
-            if start is not None:
-                first[: len(start)] = start[:order]
-                if not invertible(first):  # a part of an invertible C need not be
-                    first[:] = 0.0
-            if walk and not first.any():
-                first[0] = -0.7
-            found = optimize.least_squares(
-                residuals, first, jacobian, method="trf", ftol=1e-7, xtol=1e-5, max_nfev=30
-            )
-            c = np.asarray(found.x)
-        errors, _, linear = project(c)
-        return Solution(linear, c, errors[self.counts])
+        c = np.zeros(orders.noise)
+        if len(c):
+            if start is not None and invertible(start[: len(c)]):  # a part of C need not be
+                c[: len(start)] = start[: len(c)]
+            if orders.walk and not c.any():
+                c[0] = -0.7
+            c = optimize.least_squares(
+                residuals, c, jacobian, method="trf", ftol=1e-7, xtol=1e-5, max_nfev=30
+            ).x
+        errors, _, linear = project(tuple(c))
+        return linear, c, errors
 
     def covariance(
-        self, target: Array, regressors: Array, solution: Solution, *, walk: bool
+        self, table: Array, linear: Array, c: Array, square: float, walk: bool
     ) -> Array:
         """Return the covariance of `linear` and C, from the curvature of the likelihood."""
-        white = self.whitened(regressors, solution.c, walk=walk)
-        left = self.whitened(target, solution.c, walk=walk) - white @ solution.linear
-        slopes = self._later(self.whitened(left, solution.c), len(solution.c))
-        jacobian = np.hstack([white, slopes])[self.counts]
+        white = self.whitened(table[:, 1:], c, walk)
+        errors = self.whitened(table[:, 0], c, walk) - white @ linear
+        jacobian = np.hstack([white, self._slopes(errors, c)])[self.counts]
         scale = np.linalg.norm(jacobian, axis=0)
         scale[scale == 0.0] = 1.0  # of a flow that never leaves a dead zone
         information = (jacobian / scale).T @ (jacobian / scale)
-        variance = solution.square / max(len(self) - jacobian.shape[1], 1)
+        variance = square / max(len(self) - jacobian.shape[1], 1)
         spread: Array = variance * linalg.pinvh(information) / np.outer(scale, scale)
         return spread

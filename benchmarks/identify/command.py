@@ -6,10 +6,8 @@ import time
 
 from rich.console import Console
 
-from benchmarks.identify.armax import Orders
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import read_log
-from benchmarks.identify.model import Options as Settings
 from benchmarks.identify.options import Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import report
@@ -23,19 +21,9 @@ def execute(options: Options, console: Console) -> str:
     made = origin()
     began = time.process_time()
     out = out_folder(options.out)
-    if options.orders and min(options.orders[:2]) < 1:
-        raise UsageError(
-            f"--orders: A and B must have at least 1 coefficient, got {options.orders[:2]}"
-        )
     try:
         log = read_log(options.log, options.columns, options.rows)
-        model = identify(
-            log,
-            Settings(
-                orders=Orders(*options.orders) if options.orders else None,
-                **vars(options.knowledge),
-            ),
-        )
+        model = identify(log, options.knowledge)
         plant, ranges = plant_arguments(model), plant_ranges(model)
         sections = report(model, out)
     except ValueError as error:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 from scipy import stats
 
 from benchmarks.identify import simulation
-from benchmarks.identify.armax import Array, Orders
+from benchmarks.identify.armax import Orders
 from benchmarks.identify.cleaning import (
     at_one_rate,
     protrusion,
@@ -17,16 +18,11 @@ from benchmarks.identify.cleaning import (
     without_noise_of_held_flow,
     without_standstill,
 )
-from benchmarks.identify.likelihood import Candidate, Gap, Likelihood
+from benchmarks.identify.likelihood import Fit, Gap, Likelihood
 from benchmarks.identify.log import Log
-from benchmarks.identify.model import (
-    CannotTellError,
-    HeldOut,
-    Known,
-    Model,
-    Options,
-)
-from benchmarks.identify.noise import in_the_environment
+from benchmarks.identify.model import CannotTellError, HeldOut, Model
+from benchmarks.identify.options import Knowledge
+from benchmarks.identify.plant import noise_of
 from benchmarks.identify.posterior import Posterior
 from benchmarks.loop.linear import LinearModel
 
@@ -34,6 +30,7 @@ OWN_LAGS = 0.6, 0.75, 0.85, 0.92, 0.96  # poles of the plant that are not poles 
 FIRST_ORDERS = Orders(2, 1, 2)  # to look for the delay with, before the orders are known
 TO_FORESEE = Orders(2, 6, 2)  # so that a fast response is not taken for a spike
 OF_A, OF_B, OF_C = (1, 2, 3), (1, 2, 3, 6, 12), (0, 1, 3)
+LONG = 3  # coefficients of B: more are a response of any form
 WORTH_A_FIT = 7  # orders that are fitted, of those that come out best with a common C
 WORTH_A_TRIAL = 4  # of those, the ones that are tried on the last third
 CLOSE = 12.0  # of criteria: orders that far behind take no part
@@ -46,7 +43,7 @@ PLAIN = 24.0  # deviations that a suspect without a prediction sticks out, to be
 SLOW = 3.0  # time constants that a log should hold
 
 
-def identify(log: Log, options: Options | None = None) -> Model:
+def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
     """Fit (28), and the dead zone of (29), to a log.
 
     Orders of A, B and C, with and without a random walk of the base line, are fitted by maximum
@@ -60,7 +57,7 @@ def identify(log: Log, options: Options | None = None) -> Model:
     ----------
     log
         What was recorded.
-    options
+    knowledge
         What is known.
 
     Raises
@@ -68,81 +65,70 @@ def identify(log: Log, options: Options | None = None) -> Model:
     CannotTellError
         If the log cannot tell; the message says why.
     ValueError
-        If the options do not fit to the log.
+        If what is known does not fit to the log.
     """
-    options = options or Options()
+    knowledge = knowledge or Knowledge()
+    given = Orders(*knowledge.orders) if knowledge.orders else None
+    if given and min(given.a, given.b) < 1:
+        raise ValueError(
+            f"--orders: A and B must have at least 1 coefficient, got {(given.a, given.b)}"
+        )
     log = without_noise_of_held_flow(at_one_rate(without_standstill(log)))
-    log = _without_jumps(_cleaned(log, options), options)
-    longest_b = options.orders.b if options.orders else max(OF_B)
-    likelihood = Likelihood(log, options, longest_b)
-    fits = _fits(likelihood)
-    _check_answer(likelihood, fits[0], log)
+    log = _without_spikes(log, knowledge, given or TO_FORESEE)
+    log = _without_jumps(log, knowledge, given)
+    likelihood = Likelihood(log, knowledge, given or Orders(max(OF_A), max(OF_B), 0))
+    fits = _first(likelihood, [given]) if given else _fits(likelihood)
+    _check_answer(likelihood, fits[0])
     fits, held_out = _tried(likelihood, fits)
     posterior = Posterior(likelihood, fits)
-    chosen = posterior.chosen
-    a, b, of_known = likelihood.parts(chosen)
-    _check_stable(a)
-    interval = log.sampling_interval
-    estimates = {
-        "delay": posterior.delay,
-        "dead_zone": posterior.dead_zone,
-        "gain": posterior.gain,
-        "time_constant": posterior.time_constant(interval),
-        "noise_variance": posterior.noise_variance(),
-        **posterior.coefficients(),
-    }
-    noise, c = in_the_environment(a, chosen)
-    errors = np.full(len(likelihood.output), np.nan)
-    errors[likelihood.rows.counted] = chosen.solution.errors
-    plant = LinearModel(a.tolist(), b.tolist(), c, chosen.place.delay, interval)
-    known = tuple(
-        Known(name, lag, tuple(each.tolist()))
-        for name, lag, each in zip(log.disturbances, likelihood.lags, of_known, strict=True)
+    chosen, estimates = posterior.chosen, posterior.estimates
+    plant, *known = likelihood.models(chosen)
+    _check_stable(plant)
+    noise, c = noise_of(
+        replace(plant, c=(1.0, *chosen.c)), chosen.orders, estimates["noise_variance"].value
     )
     simulated = likelihood.simulated(chosen)
     level = float(np.nanmean(log.temperature - simulated))
     model = Model(
-        plant=plant, noise=noise, known=known,
+        plant=replace(plant, c=c), noise=noise,
+        known=dict(zip(log.disturbances, known, strict=True)),
         estimates=estimates, possible=posterior.draws,
         u_min=likelihood.u_min, u_max=likelihood.u_max,
         operating_flow=likelihood.operating_flow, operating_temperature=level,
-        orders=chosen.orders, sampling_interval=interval, errors=errors, held_out=held_out,
-        log=log, simulated=level + simulated, notes=list(log.notes),
+        orders=chosen.orders, errors=likelihood.errors(chosen, bridged=False),
+        held_out=held_out, log=log, simulated=level + simulated, notes=list(log.notes),
     )  # fmt: skip
     model.notes.extend(_notes(model, likelihood))
     return model
 
 
-def _cleaned(log: Log, options: Options) -> Log:
+def _without_spikes(log: Log, knowledge: Knowledge, orders: Orders) -> Log:
     """Return a log without its spikes: suspects that no answer to the flow explains."""
     apart = protrusion(log)
     found = apart > 0.0
     if not found.any():
         return log
-    orders = options.orders or TO_FORESEE
-    likelihood = Likelihood(log, replace(options, orders=orders), orders.b)
-    errors = np.abs(likelihood.errors(_first(likelihood)[0]))
+    likelihood = Likelihood(log, knowledge, orders)
+    errors = np.abs(likelihood.errors(_first(likelihood, [orders])[0]))
     scale = 1.4826 * float(np.nanmedian(errors))
     # The first rows have no prediction: they go with the others, if those are spikes all. The
     # second sample of a spike may follow from the first.
     outlying, known = errors > OUTLYING * scale, np.isfinite(errors)
     outlying |= ~known & (apart > PLAIN) & bool(outlying[found & known].all())
     runs = np.cumsum(np.diff(found, prepend=False))
-    outlying = np.unique(runs[found & outlying])
-    return without(log, found & np.isin(runs, outlying))
+    return without(log, found & np.isin(runs, runs[found & outlying]))
 
 
-def _without_jumps(log: Log, options: Options) -> Log:
+def _without_jumps(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
     """Return a log without jumps of its sensor: moves that neither flow nor noise explain."""
+    orders = replace(given or TO_FORESEE, walk=True)
     for _ in range(MOST_JUMPS):
         moves = np.diff(log.temperature, prepend=np.nan)
         scale = 1.4826 * float(np.nanmedian(np.abs(moves))) if np.isfinite(moves).any() else 0.0
         if scale == 0.0 or not np.nanmax(np.abs(moves)) > JUMP * scale:
             return log
-        orders = replace(options.orders or TO_FORESEE, walk=True)
-        likelihood = Likelihood(log, options, orders.b)
-        c = np.zeros(0)
-        place = likelihood.scan(replace(orders, c=0), c, likelihood.gaps())[0]
+        likelihood = Likelihood(log, knowledge, given or replace(orders, a=max(OF_A)))
+        place = likelihood.scan(replace(orders, c=0), np.zeros(0), likelihood.gaps())[0]
         errors = likelihood.errors(likelihood.fit(place, orders))
         if not np.isfinite(errors).any():
             return log
@@ -157,120 +143,101 @@ def _without_jumps(log: Log, options: Options) -> Log:
     return log
 
 
-def _first(likelihood: Likelihood) -> list[Candidate]:
-    """Return fits of the first orders without and with a walk, the better one first."""
-    options = likelihood.options
-    orders = options.orders or FIRST_ORDERS
+def _first(likelihood: Likelihood, tried: list[Orders]) -> list[Fit]:
+    """Return fits of orders, the best first, and find the delays of known disturbances."""
+    orders = tried[0]
     place = likelihood.scan(replace(orders, c=0), np.zeros(0), likelihood.gaps())[0]
-    fit = likelihood.fit(place, orders)
     if likelihood.known:
-        likelihood.place_known(place, orders, fit.solution.c)
-        fit = likelihood.fit(place, orders, fit.solution.c)
-    tried = [orders] if options.orders else [orders, replace(orders, walk=True)]
+        c = likelihood.fit(place, orders).c
+        likelihood.place_known(place, orders, c)
     fits = []
     for each in tried:
-        c = likelihood.fit(place, each).solution.c
+        c = likelihood.fit(place, each).c
         best = likelihood.scan(each, c, likelihood.gaps())[0]
         fits.append(likelihood.fit(best, each, c))
-    return sorted(fits, key=lambda fit: likelihood.criterion(fit.orders, fit.deviance))
+    return likelihood.ranked(fits)
 
 
-def _fits(likelihood: Likelihood) -> list[Candidate]:
+def _fits(likelihood: Likelihood) -> list[Fit]:
     """Return fits of all orders that are worth it, by their criterion, the best first."""
-    first = _first(likelihood)
-    if likelihood.options.orders:
-        return first
     scanned = []
-    for base in first:
-        gaps = [base.place.gap]
-        for a in OF_A:
-            for b in OF_B:
-                orders = Orders(a, b, 2, base.orders.walk)
-                place = likelihood.scan(orders, base.solution.c, gaps)[0]
-                scanned.append(
-                    (likelihood.criterion(orders, place.deviance), orders, place, base)
-                )
+    for base in _first(likelihood, [FIRST_ORDERS, replace(FIRST_ORDERS, walk=True)]):
+        for a, b in itertools.product(OF_A, OF_B):
+            orders = Orders(a, b, 2, base.orders.walk)
+            place = likelihood.scan(orders, base.c, [base.place.gap])[0]
+            scanned.append(
+                (likelihood.criterion(orders, place.deviance), orders, place, base.c)
+            )
     scanned.sort(key=lambda entry: entry[0])
     # Of each kind one at least: a common C is no measure for all.
-    kinds = [(walk, long) for walk in (False, True) for long in (False, True)]
-    chosen = scanned[:WORTH_A_FIT] + [
-        next(e for e in scanned if (e[1].walk, e[1].b > 3) == kind) for kind in kinds
+    kinds = itertools.product((False, True), repeat=2)
+    of_kinds = [
+        next(e for e in scanned if (e[1].walk, e[1].b > LONG) == kind) for kind in kinds
     ]
-    fits: dict[Orders, Candidate] = {}
-    for _, orders, place, base in chosen:
+    fits: dict[Orders, Fit] = {}
+    for _, orders, place, c in [*scanned[:WORTH_A_FIT], *of_kinds]:
         if orders not in fits:
-            fits[orders] = likelihood.best_fit(place, orders, base.solution.c)
-
-    def by_criterion() -> list[Candidate]:
-        return sorted(
-            fits.values(), key=lambda fit: likelihood.criterion(fit.orders, fit.deviance)
-        )
-
-    for fit in by_criterion()[:3]:
-        for c in OF_C:
-            orders = replace(fit.orders, c=c)
+            fits[orders] = likelihood.best_fit(place, orders, c)
+    for fit in likelihood.ranked(fits.values())[:3]:
+        for of_c in OF_C:
+            orders = replace(fit.orders, c=of_c)
             if orders not in fits:
-                fits[orders] = likelihood.best_fit(fit.place, orders, fit.solution.c)
+                fits[orders] = likelihood.best_fit(fit.place, orders, fit.c)
+    found = likelihood.ranked(fits.values())
     # A second time constant of the plant that is not one of the noise has a peak of its own.
-    lags, found = [], by_criterion()
+    lags = []
     for b in (1, 2):
         orders = Orders(2, b, 1)
         tried = []
         for pole in OWN_LAGS:
-            of_lag = np.array([-pole])
-            place = likelihood.scan(orders, of_lag, [found[0].place.gap])[0]
-            tried.append(likelihood.linear(place, orders, of_lag))
-        lags.append(min(tried, key=lambda fit: fit.deviance))
+            c = np.array([-pole])
+            place = likelihood.scan(orders, c, [found[0].place.gap])[0]
+            tried.append(likelihood.with_c(place, orders, c))
+        lags.append(min(tried, key=lambda fit: fit.place.deviance))
     return [*([fit for fit in found if not fit.walks_nowhere] or found), *lags]
 
 
-def _tried(likelihood: Likelihood, fits: list[Candidate]) -> tuple[list[Candidate], HeldOut]:
+def _tried(likelihood: Likelihood, fits: list[Fit]) -> tuple[list[Fit], HeldOut]:
     """Return the fits that simulate the last third well, and how well the best of them does."""
-    log = likelihood.log
     cut = int(likelihood.rows.index[len(likelihood.rows.index) * 2 // 3])
-    last = np.arange(len(log.flow)) >= cut
-    flow = simulation.held(likelihood.applied(Gap(0.0, 0.0)))
-    known = [simulation.held(each) for each in likelihood.known]
-    impulse, _ = simulation.of_impulse_response([flow, *known], likelihood.output, ~last)
-    mild = sorted(
-        fits, key=lambda fit: likelihood.criterion(fit.orders, fit.deviance, mild=True)
+    last, start = np.arange(len(likelihood.output)) >= cut, likelihood.first(cut)
+    inputs = [likelihood.applied(Gap(0.0, 0.0)), *likelihood.known]
+    impulse, _ = simulation.of_impulse_response(
+        [simulation.held(each) for each in inputs], likelihood.output, ~last
     )
-    long = [fit for fit in fits if fit.orders.b > 3]
-    trial = fits[:WORTH_A_TRIAL]
-    others = dict.fromkeys([*mild[:2], *long[:1], *(fit for fit in fits if fit.has_own_lag)])
-    trial += [fit for fit in others if fit not in trial]
-    likelihood.narrow(likelihood.longest_delay, cut)
-    shares = []
-    for fit in trial:
-        part = likelihood.fit(fit.place, fit.orders, fit.solution.c)
-        simulated = likelihood.simulated(part)
-        shares.append(simulation.explained(likelihood.output, simulated, last))
-    likelihood.narrow(likelihood.longest_delay)
+    mild = likelihood.ranked(fits, mild=True)
+    long = [fit for fit in fits if fit.orders.b > LONG]
+    own_lag = [fit for fit in fits if fit.has_own_lag]
+    shares = {}
+    for fit in [*fits[:WORTH_A_TRIAL], *mild[:2], *long[:1], *own_lag]:
+        if fit not in shares:
+            simulated = start.simulated(start.fit(fit.place, fit.orders, fit.c))
+            shares[fit] = simulation.explained(likelihood.output, simulated, last)
     # What a better simulation leaves open, and a part of the noise that no one foresees.
-    least = max(WORSE * (1.0 - max(shares)), 1.0 - max(shares) + 0.005)
+    left = 1.0 - max(shares.values())
+    least = max(WORSE * left, left + 0.005)
     good = [
-        (fit, share)
-        for fit, share in zip(trial, shares, strict=True)
+        fit for fit, share in shares.items()
         if 1.0 - share <= least * (2.0 if fit.has_own_lag else 1.0)
-    ] or list(zip(trial, shares, strict=True))[:1]
-    criteria = [likelihood.criterion(fit.orders, fit.deviance, mild=True) for fit, _ in good]
+    ] or list(shares)[:1]  # fmt: skip
+    criteria = [likelihood.criterion(fit.orders, fit.place.deviance, mild=True) for fit in good]
     # One of each kind: without a walk and with it, with a short B and a long one, and with a
     # time constant of its own.
-    kinds: dict[tuple[bool, ...], Candidate] = {}
-    for (fit, _), each in zip(good, criteria, strict=True):
+    kinds: dict[tuple[bool, ...], Fit] = {}
+    for fit, each in zip(good, criteria, strict=True):
         if each < min(criteria) + CLOSE:
-            kind = fit.orders.walk, fit.orders.b > 3, fit.has_own_lag, fit.orders.b > 1
+            orders = fit.orders
+            kind = orders.walk, orders.b > LONG, fit.has_own_lag, orders.b > 1
             kinds.setdefault(kind, fit)
-    near = [fit for fit in kinds.values() if fit is not good[0][0]]
+    near = [fit for fit in kinds.values() if fit is not good[0]]
     found = simulation.explained(likelihood.output, impulse, last)
-    return [good[0][0], *near], HeldOut(float(good[0][1]), float(found))
+    return [good[0], *near], HeldOut(float(shares[good[0]]), float(found))
 
 
-def _check_answer(likelihood: Likelihood, best: Candidate, log: Log) -> None:
+def _check_answer(likelihood: Likelihood, best: Fit) -> None:
     """Refuse a log in which the flow does nothing that can be told from noise."""
     gained = likelihood.gained(best)
-    longest = likelihood.options.longest_delay
-    if gained < WEAK and _gained_when_swapped(log, longest) > WEAK:
+    if gained < WEAK and _gained_when_swapped(likelihood) > WEAK:
         raise CannotTellError(
             "the direction is unusual: the flow answers the temperature rather than the "
             "temperature the flow. The two columns seem to be swapped; name them with "
@@ -278,7 +245,7 @@ def _check_answer(likelihood: Likelihood, best: Candidate, log: Log) -> None:
             "told from noise: move it further, or move the set point of a closed loop more"
         )
     # As many delays and dead zones have been tried, the best of them gains by chance.
-    tried = (longest + 1) * len(likelihood.gaps())
+    tried = (likelihood.knowledge.longest_delay + 1) * len(likelihood.gaps())
     least = float(stats.chi2.isf(CHANCE / tried, best.orders.b))
     if gained < least:
         raise CannotTellError(
@@ -289,20 +256,21 @@ def _check_answer(likelihood: Likelihood, best: Candidate, log: Log) -> None:
         )
 
 
-def _gained_when_swapped(log: Log, longest_delay: int) -> float:
+def _gained_when_swapped(likelihood: Likelihood) -> float:
     """Return what the temperature adds to the likelihood of the flow."""
-    swapped = Log(log.temperature, log.flow, log.sampling_interval)
+    log, longest_delay = likelihood.log, likelihood.knowledge.longest_delay
     try:
-        likelihood = Likelihood(
-            swapped, Options(longest_delay=longest_delay, orders=FIRST_ORDERS)
-        )
-        return likelihood.gained(_first(likelihood)[0])
+        swapped = Likelihood(
+            Log(log.temperature, log.flow, log.sampling_interval),
+            Knowledge(longest_delay=longest_delay), FIRST_ORDERS,
+        )  # fmt: skip
+        return swapped.gained(_first(swapped, [FIRST_ORDERS])[0])
     except ValueError:
         return 0.0
 
 
-def _check_stable(a: Array) -> None:
-    largest = float(np.max(np.abs(np.roots(a)), initial=0.0))
+def _check_stable(plant: LinearModel) -> None:
+    largest = float(np.max(np.abs(plant.poles), initial=0.0))
     if largest >= 1.0 - 1e-4:
         raise CannotTellError(
             "the log does not show where the temperature settles: the best model has a "
@@ -314,7 +282,7 @@ def _check_stable(a: Array) -> None:
 def _notes(model: Model, likelihood: Likelihood) -> list[str]:
     """Return what the user should know about the fit."""
     notes = []
-    longest, samples = likelihood.options.longest_delay, len(likelihood.output)
+    longest, samples = likelihood.knowledge.longest_delay, len(likelihood.output)
     gain, constant = model.estimates["gain"], model.estimates["time_constant"]
     walk = model.noise["disturbance_walk_variance"]
     if gain.value > 0:
@@ -327,7 +295,7 @@ def _notes(model: Model, likelihood: Likelihood) -> list[str]:
             f"The delay is as long as was looked for, {longest} "
             "samples: try a longer --longest-delay, or a longer sampling interval."
         )
-    if likelihood.options.operating_flow is None and likelihood.operating_flow:
+    if likelihood.knowledge.operating_flow is None and likelihood.operating_flow:
         notes.append(
             f"The operating point is taken at the log's first flow, {model.operating_flow:g} "
             "t/h, and a dead zone would lie around it: say --operating-flow if it is elsewhere."
@@ -342,7 +310,7 @@ def _notes(model: Model, likelihood: Likelihood) -> list[str]:
             "The plant may be integrating: an interval has no end, as the log does not show "
             "where the temperature settles. Hold the flow longer."
         )
-    elif SLOW * constant.value > samples * model.sampling_interval:
+    elif SLOW * constant.value > samples * model.log.sampling_interval:
         notes.append(
             f"The log holds less than {SLOW:g} time constants of the plant. Its gain rests on "
             "how the response goes on, which no one has seen."

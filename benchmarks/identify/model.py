@@ -1,12 +1,12 @@
-"""What is asked of a log, and what it answers: options, estimates and the model."""
+"""What a log answers: estimates and the model."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from benchmarks.identify.armax import Array, Orders
 from benchmarks.identify.log import Log
-from benchmarks.identify.options import Knowledge
 from benchmarks.loop.linear import LinearModel
 
 
@@ -14,15 +14,7 @@ class CannotTellError(ValueError):
     """The log does not hold what is asked of it; the message says why."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options(Knowledge):
-    """What is known beforehand, and the orders of A, B and C; None to choose them."""
-
-    orders: Orders | None = None
-
-
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """An estimate with its 95 % interval."""
 
     value: float
@@ -30,27 +22,7 @@ class Interval:
     high: float
 
 
-@dataclass(frozen=True)
-class Known:
-    """A known disturbance in a model: its part of A y is B w(k - d).
-
-    Attributes
-    ----------
-    name
-        Column of the log.
-    delay
-        d, samples.
-    b
-        Coefficients of B, from z^-1 on.
-    """
-
-    name: str
-    delay: int
-    b: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class HeldOut:
+class HeldOut(NamedTuple):
     """How much of the last third of a log models explain that were fitted to the rest.
 
     Shares of the temperature's variance, in simulation: the models are given the flow and the
@@ -74,7 +46,7 @@ class Model:
         `noise_variance`, `measurement_noise_variance` and `disturbance_walk_variance` of the
         environment, degC^2.
     known
-        The known disturbances.
+        What each known disturbance does, by its column of the log.
     estimates
         With their intervals: `delay` (samples), `dead_zone` (t/h), `gain` (degC per t/h),
         `time_constant` (s, of the slowest pole), `noise_variance` (degC^2, of the prediction
@@ -101,7 +73,7 @@ class Model:
 
     plant: LinearModel
     noise: dict[str, float]
-    known: tuple[Known, ...]
+    known: dict[str, LinearModel]
     estimates: dict[str, Interval]
     possible: list[LinearModel]
     u_min: float
@@ -109,7 +81,6 @@ class Model:
     operating_flow: float
     operating_temperature: float
     orders: Orders
-    sampling_interval: float
     errors: Array
     held_out: HeldOut
     log: Log

@@ -65,6 +65,9 @@ class Knowledge:
     operating_flow: Finite | None = None
     """Flow of the operating point, t/h (default: 0 if the log has flows of both signs, else its
     first flow)."""
+    orders: Orders | None = None
+    """How many coefficients the polynomials A, B and C have, without the leading 1 of A and C
+    (default: chosen by a criterion)."""
 
 
 @options
@@ -82,7 +85,4 @@ class Options:
     columns: Columns = field(default_factory=Columns)
     rows: Count = 20_000
     """Of a longer log, the last rows are fitted, so many."""
-    orders: Orders | None = None
-    """How many coefficients the polynomials A, B and C have, without the leading 1 of A and C
-    (default: chosen by a criterion)."""
     knowledge: Knowledge = field(default_factory=Knowledge)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.identify.armax import Array
+from benchmarks.identify.armax import Array, Orders
 from benchmarks.identify.model import CannotTellError, Interval, Model
 from benchmarks.loop.linear import LinearModel
 from mptc_gym import Parameters
@@ -17,6 +17,63 @@ LARGEST_FACTOR = 10.0  # of gain and time constant in a range, where the log giv
 REACH = 0.8  # share of the temperature that the flow can hold, for the set point
 SETTLED = 0.02  # share of a transient that is left when it counts as over
 LONGEST = 100_000  # samples of a step response
+POINTS = 1024  # of the spectra of noise
+MOSTLY = 0.5  # share of the noise that is white in the temperature, to be the transmitter's
+OF_C = 3  # coefficients, of a noise that is parted
+
+
+def noise_of(
+    plant: LinearModel, orders: Orders, variance: float
+) -> tuple[dict[str, float], tuple[float, ...]]:
+    """Return the variances of the environment's noises, degC^2, and C.
+
+    The noise of a log is C' xi / (A (1 - z^-1)) with a walk, C xi / A without. The walk is what
+    is left of it at frequency 0. Of the rest, the white part is the transmitter's noise if it
+    is most of it, as (28) cannot tell the two apart otherwise.
+
+    Parameters
+    ----------
+    plant
+        With C, or with a walk C'.
+    orders
+        Of the plant.
+    variance
+        Of xi, degC^2.
+
+    Returns
+    -------
+    dict, tuple of float
+        `noise_variance`, `measurement_noise_variance` and `disturbance_walk_variance`, and C
+        with its leading 1.
+    """
+    a, c = np.array(plant.a), np.array(plant.c)
+    of_a = np.abs(np.fft.rfft(a, POINTS)) ** 2
+    left = variance * np.abs(np.fft.rfft(c, POINTS)) ** 2
+    walk = 0.0
+    if orders.walk:
+        walk = float(variance * c.sum() ** 2 / a.sum() ** 2)
+        step = np.abs(np.fft.rfft([1.0, -1.0], POINTS)) ** 2
+        left = (left - left[0]) / np.maximum(step, 1e-12)
+        left[0] = left[1]
+        left = np.maximum(left, 1e-6 * float(np.mean(np.abs(left))))
+    white = float(np.min(left / of_a))
+    if white < MOSTLY * float(np.mean(left / of_a)):
+        white = 0.0
+    if white or orders.walk:
+        # The rest as C xi: the factor of its spectrum with all zeros inside the unit circle.
+        left = np.maximum(left - white * of_a, 1e-4 * left)
+        cepstrum = np.fft.irfft(np.log(left))
+        variance = float(np.exp(cepstrum[0]))
+        c = np.zeros(OF_C + 1)
+        c[0] = 1.0
+        for i in range(1, OF_C + 1):  # exp of the causal part, term by term
+            c[i] = sum(j * cepstrum[j] * c[i - j] for j in range(1, i + 1)) / i
+    noise = {
+        "noise_variance": variance,
+        "measurement_noise_variance": white,
+        "disturbance_walk_variance": walk,
+    }
+    return noise, tuple(c.tolist())
 
 
 def plant_arguments(model: Model) -> dict[str, Any]:
@@ -35,7 +92,7 @@ def plant_arguments(model: Model) -> dict[str, Any]:
         "u_min": model.u_min,
         "u_max": model.u_max,
         **{name: value for name, value in model.noise.items() if value},
-        "sampling_interval": model.sampling_interval,
+        "sampling_interval": model.plant.sampling_interval,
     }
     defaults = Parameters()
     gain, limits = abs(plant.gain), (abs(model.u_min), abs(model.u_max))
@@ -74,7 +131,7 @@ def plant_ranges(model: Model) -> dict[str, Any]:
         # The environment's time constant is 1 / (1 - pole) samples, and 1 at the least.
         rate = 1.0 - pole.real
         fast, slow = (
-            -math.expm1(-model.sampling_interval / max(end, 1e-9))
+            -math.expm1(-model.plant.sampling_interval / max(end, 1e-9))
             for end in (constant.low, constant.high)
         )
         low, high = rate / fast, min(rate / max(slow, 1e-12), LARGEST_FACTOR)

@@ -59,7 +59,7 @@ def plot_residuals(model: Model, path: Path) -> None:
     known = np.isfinite(model.errors)
     correlation = autocorrelation(model.errors)
     chance = 1.96 / np.sqrt(known.sum())
-    minutes = np.arange(len(model.errors)) * model.sampling_interval / 60.0
+    minutes = np.arange(len(model.errors)) * model.plant.sampling_interval / 60.0
     with drawn(path, 10, 3.6) as figure:
         left, right = figure.subplots(1, 2)
         left.plot(minutes[:SHOWN], model.errors[:SHOWN], color=COLOURS[0], linewidth=0.6)
@@ -76,11 +76,11 @@ def plot_residuals(model: Model, path: Path) -> None:
 def plot_step(model: Model, tested: StepTest, path: Path) -> None:
     """Draw the step response with its band, and the first-order model of it."""
     length = tested.delay + 6.0 * tested.time_constant
-    samples = min(int(np.ceil(length / model.sampling_interval)), LONGEST) + 1
+    samples = min(int(np.ceil(length / model.plant.sampling_interval)), LONGEST) + 1
     response = model.plant.step_response(samples)
     low, high = step_band(model, samples)
-    times = np.arange(samples) * model.sampling_interval
-    since = np.maximum(times - tested.delay + model.sampling_interval, 0.0)
+    times = np.arange(samples) * model.plant.sampling_interval
+    since = np.maximum(times - tested.delay + model.plant.sampling_interval, 0.0)
     first_order = np.where(
         times >= tested.delay, -tested.gain * np.expm1(-since / tested.time_constant), 0.0
     )

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.identify.armax import Array, Orders
-from benchmarks.identify.likelihood import MOST_GAPS, Candidate, Gap, Likelihood, Place
+from benchmarks.identify.likelihood import Fit, Gap, Likelihood, Place
 from benchmarks.identify.model import Interval
 from benchmarks.lib.statistics import CONFIDENCE, ENDS
 from benchmarks.loop.linear import LinearModel
@@ -19,6 +19,7 @@ from benchmarks.loop.linear import LinearModel
 ENDS_OF_ERRORS = float(stats.norm.ppf(ENDS[1]))  # standard errors
 NEAR = 25.0  # of deviances: what is further off has no probability worth a mention
 AS_GOOD = 8.0  # of Akaike's criterion: orders that are no further behind count the same
+MOST_GAPS = 250  # that are tried in all
 MOST_FITS = 8  # of orders, at as many delays
 WALKS = [0.0, *np.geomspace(0.001, 0.512, 10)]  # of the root of C' from 1, where a walk shows
 PLACES, DRAWS_EACH = 60, 6  # drawn: orders with a delay and a dead zone, and coefficients
@@ -28,7 +29,7 @@ class Entry(NamedTuple):
     """Orders, as one of the fits that take part has them, with a C, at a place."""
 
     number: int
-    fit: Candidate
+    fit: Fit
     place: Place
 
 
@@ -44,15 +45,15 @@ class Posterior:
 
     Attributes
     ----------
-    delay, dead_zone, gain : Interval
-        Samples, t/h and degC per t/h.
-    chosen : Candidate
-        The fit of delay and dead zone.
+    chosen : Fit
+        The one with the delay and the dead zone of the estimates.
     draws : list of LinearModel
         Plants.
+    estimates : dict
+        Those of a `Model`.
     """
 
-    def __init__(self, likelihood: Likelihood, fits: list[Candidate]) -> None:
+    def __init__(self, likelihood: Likelihood, fits: list[Fit]) -> None:
         self._likelihood = likelihood
         entries = self._entries(fits)
         places = [entry.place for entry in entries]
@@ -64,58 +65,87 @@ class Posterior:
         # its delay is not when the response begins.
         lengths = np.array([entry.fit.orders.b for entry in entries])
         short = weights * (lengths <= lengths[np.argmax(likeliest)])
-        self.delay = _of_delay(places, likeliest, short / short.sum())
-        self.dead_zone = _of_dead_zone(
-            [place.gap for place in places], weights, ENDS_OF_ERRORS * likelihood.log.flow_error
-        )
-        self.chosen = self._choose(entries, likeliest)
+        delay = _of_delay(places, likeliest, short / short.sum())
+        slack = ENDS_OF_ERRORS * likelihood.log.flow_error
+        dead_zone = _of_dead_zone([place.gap for place in places], weights, slack)
+        self.chosen = self._choose(entries, likeliest, delay.value, dead_zone.value)
         self.draws = self._draw(entries, weights)
-        value = self._linear(self.chosen, self.chosen.solution.linear).gain
-        endless = math.copysign(math.inf, value)  # where nothing settles
-        self.gain = _interval(
-            value, np.array([d.gain if sum(d.a) > 0.0 else endless for d in self.draws])
-        )
+        plant, interval = likelihood.models(self.chosen)[0], likelihood.log.sampling_interval
+        endless = math.copysign(math.inf, plant.gain)  # where nothing settles
+        self.estimates = {
+            "delay": delay,
+            "dead_zone": dead_zone,
+            "gain": _interval(
+                plant.gain, [d.gain if sum(d.a) > 0.0 else endless for d in self.draws]
+            ),
+            "time_constant": _interval(
+                interval * slowest(plant.a), [interval * slowest(d.a) for d in self.draws]
+            ),
+            **self._of_errors(self.chosen),
+        }
 
-    def _entries(self, fits: list[Candidate]) -> list[Entry]:
+    def _entries(self, fits: list[Fit]) -> list[Entry]:
         """Return places for all orders that are near the best."""
         likelihood, found = self._likelihood, []
         gaps = likelihood.gaps()
         for i, fit in enumerate(fits):
-            places = likelihood.scan(fit.orders, fit.solution.c, gaps)
+            places = likelihood.scan(fit.orders, fit.c, gaps)
             near = [p.delay for p in places if p.deviance < places[0].deviance + 2.0 * NEAR]
             delays = range(min(near), max(near) + 1)
             if i == 0:
                 gaps = self._refined(fit, places, delays)
                 at_its_own = range(fit.place.delay, fit.place.delay + 1)
-                gap = likelihood.scan(fit.orders, fit.solution.c, gaps, at_its_own)[0].gap
+                gap = likelihood.scan(fit.orders, fit.c, gaps, at_its_own)[0].gap
             # Another delay may ask for another C.
             stride = max(len(delays) // MOST_FITS, 1)
             for delay in delays[::stride]:
                 around = range(delay, min(delay + stride, delays.stop))
-                middle = Place(0.0, around[len(around) // 2], gap)
-                refit = likelihood.fit(middle, fit.orders, fit.solution.c)
+                refit = likelihood.fit(Place(around[len(around) // 2], gap), fit.orders, fit.c)
                 if fit.has_own_lag and not refit.has_own_lag:
                     refit = fit
-                places = likelihood.scan(fit.orders, refit.solution.c, gaps, around)
+                places = likelihood.scan(fit.orders, refit.c, gaps, around)
                 found += [Entry(i, refit, place) for place in places]
         return found
+
+    def _refined(self, fit: Fit, places: list[Place], delays: range) -> list[Gap]:
+        """Return gaps near the best, with all gaps between commands told apart there."""
+        magnitudes = self._likelihood.magnitudes
+        best: dict[Gap, float] = {}
+        for place in places:
+            best.setdefault(place.gap, place.deviance)  # the best of a gap comes first
+        while len(best) < MOST_GAPS:
+            gaps = sorted(best)
+            limit = min(best.values()) + NEAR
+            middles = {}
+            for gap, above in zip(gaps, [*gaps[1:], gaps[-1]], strict=True):
+                inside = magnitudes[(magnitudes > gap.low) & (magnitudes < gap.high)]
+                if len(inside) and min(best[gap], best[above]) < limit:
+                    middles[gap] = float(inside[len(inside) // 2])
+            if not middles:
+                break
+            # The lower half has the same commands at rest as the whole.
+            for gap, middle in middles.items():
+                best[Gap(gap.low, middle)] = best.pop(gap)
+            upper = [Gap(middle, gap.high) for gap, middle in middles.items()]
+            for place in self._likelihood.scan(fit.orders, fit.c, upper, delays):
+                best.setdefault(place.gap, place.deviance)
+        return sorted(gap for gap in best if best[gap] < min(best.values()) + NEAR)
 
     def _weights(self, entries: list[Entry], *, possible: bool = False) -> Array:
         """Return the probabilities of places."""
         likelihood = self._likelihood
         deviances = np.array([entry.place.deviance for entry in entries])
-        prior = np.array([self._prior(entry.place.gap) for entry in entries])
         member = np.array([entry.number for entry in entries])
-        weights = np.zeros(len(entries))
+        weights = np.array([self._prior(entry.place.gap) for entry in entries])
         behind = np.zeros(member.max() + 1)
-        for number in range(member.max() + 1):
+        for number in range(len(behind)):
             own = member == number
             least, fit = deviances[own].min(), entries[int(np.argmax(own))].fit
             behind[number] = likelihood.criterion(fit.orders, least, mild=possible)
             # How a response with a lag sets in is a matter of few samples, and of chance: the
             # likelihood of delays is trusted half as far.
             trust = 0.5 if possible and fit.has_own_lag else 1.0
-            weights[own] = np.exp(trust * (least - deviances[own]) / 2.0) * prior[own]
+            weights[own] *= np.exp(trust * (least - deviances[own]) / 2.0)
             if possible:
                 weights[own] /= weights[own].sum()
         behind = np.maximum(behind - behind.min() - AS_GOOD * possible, 0.0)
@@ -123,57 +153,30 @@ class Posterior:
         weights /= weights.sum()
         return weights
 
-    def _refined(self, fit: Candidate, places: list[Place], delays: range) -> list[Gap]:
-        """Return gaps near the best, with all gaps between commands told apart there."""
-        likelihood = self._likelihood
-        best: dict[Gap, float] = {}
-        for place in places:
-            best.setdefault(place.gap, place.deviance)  # the best of a gap comes first
-        while len(best) < MOST_GAPS:
-            gaps = sorted(best)
-            limit = min(best.values()) + NEAR
-            parts = {
-                gap: likelihood.halves(gap)
-                for gap, above in zip(gaps, [*gaps[1:], gaps[-1]], strict=True)
-                if min(best[gap], best[above]) < limit
-            }
-            parts = {gap: halves for gap, halves in parts.items() if len(halves) > 1}
-            if not parts:
-                break
-            # The lower half has the same commands at rest as the whole.
-            for gap, (lower, _) in parts.items():
-                best[lower] = best.pop(gap)
-            upper = [halves[1] for halves in parts.values()]
-            for place in likelihood.scan(fit.orders, fit.solution.c, upper, delays):
-                best.setdefault(place.gap, place.deviance)
-        return sorted(gap for gap in best if best[gap] < min(best.values()) + NEAR)
-
     def _prior(self, gap: Gap) -> float:
         """Return the probability beforehand: a half that there is no dead zone."""
-        if self._likelihood.options.applied:
+        if self._likelihood.knowledge.applied:
             return 1.0
         share = (gap.high - gap.low) / float(self._likelihood.magnitudes[-1])
         return 0.5 * share + 0.5 * (gap.low == 0.0)
 
-    def _choose(self, entries: list[Entry], weights: Array) -> Candidate:
+    def _choose(
+        self, entries: list[Entry], weights: Array, delay: float, dead_zone: float
+    ) -> Fit:
         """Return the fit of the likeliest orders with the delay and the dead zone."""
-        there = np.array([entry.place.delay == self.delay.value for entry in entries])
-        shares = np.bincount([entry.number for entry in entries], weights * there)
+        there = np.array([entry.place.delay == delay for entry in entries])
+        number = int(np.argmax(np.bincount([e.number for e in entries], weights * there)))
         best = max(
-            (entry for entry, right in zip(entries, there, strict=True)
-             if right and entry.number == int(np.argmax(shares))),
-            key=lambda entry: (
-                entry.place.gap.low <= self.dead_zone.value <= entry.place.gap.high,
-                -entry.place.deviance,
-            ),
-        )  # fmt: skip
-        return self._likelihood.fit(best.place, best.fit.orders, best.fit.solution.c)
+            (e for e in entries if e.number == number and e.place.delay == delay),
+            key=lambda e: (e.place.gap.low <= dead_zone <= e.place.gap.high, -e.place.deviance),
+        )
+        return self._likelihood.fit(best.place, best.fit.orders, best.fit.c)
 
     def _draw(self, entries: list[Entry], weights: Array) -> list[LinearModel]:
         generator = np.random.default_rng(0)
         points = (np.arange(PLACES) + generator.random()) / PLACES
         picked = np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
-        walks: dict[Candidate, tuple[list[tuple[Orders, Array]], Array]] = {}
+        walks: dict[Fit, tuple[list[tuple[Orders, Array]], Array]] = {}
         draws = []
         for i, times in zip(*np.unique(picked, return_counts=True), strict=True):
             _, fit, place = entries[i]
@@ -184,18 +187,19 @@ class Posterior:
             for (orders, c), count in zip(likely, counts, strict=True):
                 if not count:
                     continue
-                found = self._likelihood.linear(place, orders, c)
-                size = len(found.solution.linear)
-                covariance = self.covariance(found)[:size, :size]
+                found = self._likelihood.with_c(place, orders, c)
+                size = len(found.linear)
+                covariance = self._likelihood.covariance(found)[:size, :size]
+                drawn = generator.multivariate_normal(
+                    found.linear, covariance, count, method="eigh"
+                )
                 draws += [
-                    self._linear(found, linear)
-                    for linear in generator.multivariate_normal(
-                        found.solution.linear, covariance, count, method="eigh"
-                    )
+                    self._likelihood.models(replace(found, linear=linear))[0]
+                    for linear in drawn
                 ]
         return draws
 
-    def _walks(self, fit: Candidate) -> tuple[list[tuple[Orders, Array]], Array]:
+    def _walks(self, fit: Fit) -> tuple[list[tuple[Orders, Array]], Array]:
         """Return orders and C' for random walks of all sizes, and their probabilities.
 
         A walk that no criterion asks for may still move the base line, above all where the
@@ -203,17 +207,16 @@ class Posterior:
         probability beforehand is a half for that, and the rest is even over the logarithm of
         the root's distance from 1. The coefficients of A, B and the levels are integrated over.
         """
-        rest = np.roots([1.0, *fit.solution.c])
+        rest = np.roots([1.0, *fit.c])
         if fit.orders.walk:
             rest = np.delete(rest, np.argmax(rest.real - 9.0 * (rest.imag != 0.0)))
         c = np.atleast_1d(np.real(np.poly(rest)))
         orders = replace(fit.orders, walk=True)
-        target, columns = self._likelihood.regressors(fit.place, orders)
-        both = np.column_stack([columns, target])
+        table = np.roll(self._likelihood.table(orders, fit.place), -1, axis=1)
         found, scores = [], []
         for distance in WALKS:
             of_walk = np.convolve(c, [1.0, distance - 1.0])[1:]
-            white = self._likelihood.white(both, of_walk, orders)
+            white = self._likelihood.white(table, of_walk, orders)
             sizes = np.abs(np.diag(np.linalg.qr(white, mode="r")))
             sizes = np.maximum(sizes, 1e-300)
             freedom = len(white) - len(sizes) + 1
@@ -224,46 +227,20 @@ class Posterior:
         shares[0] *= len(WALKS) - 1
         return found, shares / shares.sum()
 
-    def _linear(self, fit: Candidate, linear: Array) -> LinearModel:
-        a, b = fit.orders.a, fit.orders.b
-        return LinearModel(
-            [1.0, *linear[:a].tolist()],
-            linear[a : a + b].tolist(),
-            delay=fit.place.delay,
-            sampling_interval=self._likelihood.log.sampling_interval,
-        )
-
-    def covariance(self, fit: Candidate) -> Array:
-        """Return the covariance of the linear coefficients and C."""
-        target, columns = self._likelihood.regressors(fit.place, fit.orders)
-        return self._likelihood.rows.covariance(
-            target, columns, fit.solution, walk=fit.orders.walk
-        )
-
-    def time_constant(self, interval: float) -> Interval:
-        """Return the time constant of the slowest pole, s."""
-        value = self._linear(self.chosen, self.chosen.solution.linear)
-        drawn = np.array([slowest(draw.a) for draw in self.draws])
-        return _interval(interval * slowest(value.a), interval * drawn)
-
-    def noise_variance(self) -> Interval:
-        """Return the variance of the prediction errors, degC^2."""
-        freedom = len(self._likelihood.rows) - self.chosen.orders.count
-        low, high = stats.chi2.ppf(ENDS, freedom)
-        square = self.chosen.solution.square
-        return Interval(square / freedom, square / float(high), square / float(low))
-
-    def coefficients(self) -> dict[str, Interval]:
-        """Return A, B and C of the chosen fit with intervals, by name."""
-        fit = self.chosen
-        values = np.concatenate([fit.solution.linear, fit.solution.c])
-        spreads = stats.norm.ppf(ENDS[1]) * np.sqrt(np.diag(self.covariance(fit)))
-        a, b, all_linear = fit.orders.a, fit.orders.b, len(fit.solution.linear)
-        places = {f"a{i + 1}": i for i in range(a)} | {f"b{i + 1}": a + i for i in range(b)}
-        places |= {f"c{i + 1}": all_linear + i for i in range(fit.orders.noise)}
+    def _of_errors(self, fit: Fit) -> dict[str, Interval]:
+        """Return the variance of the prediction errors, degC^2, and A, B and C, by name."""
+        freedom = max(len(self._likelihood.rows) - fit.orders.count, 1)
+        a, b, c = fit.orders.a, fit.orders.b, fit.orders.noise
+        names = [f"a{i + 1}" for i in range(a)] + [f"b{i + 1}" for i in range(b)]
+        names += [f"c{i + 1}" for i in range(c)]
+        values = np.concatenate([fit.linear[: a + b], fit.c])
+        spreads = ENDS_OF_ERRORS * np.sqrt(np.diag(self._likelihood.covariance(fit)))
+        spreads = np.concatenate([spreads[: a + b], spreads[len(fit.linear) :]])
+        bounds = np.column_stack([values, values - spreads, values + spreads]).tolist()
+        high, low = (fit.square / stats.chi2.ppf(ENDS, freedom)).tolist()
         return {
-            name: Interval(*(float(values[i] + sign * spreads[i]) for sign in (0, -1, 1)))
-            for name, i in places.items()
+            "noise_variance": Interval(fit.square / freedom, low, high),
+            **{name: Interval(*each) for name, each in zip(names, bounds, strict=True)},
         }
 
 
@@ -279,21 +256,17 @@ def slowest(a: Sequence[float]) -> float:
     return math.inf if size >= 1.0 else -1.0 / math.log(max(size, 1e-12))
 
 
-def _interval(value: float, drawn: Array) -> Interval:
+def _interval(value: float, drawn: Sequence[float]) -> Interval:
     """Return a value with the quantiles of draws."""
     # Without interpolation: between a number and infinity there is none.
-    low, high = np.quantile(drawn, ENDS, method="nearest")
-    return Interval(value, min(float(low), value), max(float(high), value))
+    low, high = np.quantile(drawn, ENDS, method="nearest").tolist()
+    return Interval(value, min(low, value), max(high, value))
 
 
 def _of_delay(places: list[Place], likeliest: Array, weights: Array) -> Interval:
     """Return the delay that has most probability within one sample, and its interval."""
-    delays = np.array([place.delay for place in places])
-    tried = np.unique(delays)
-    shares, of_interval = (
-        np.array([each[delays == delay].sum() for delay in tried])
-        for each in (likeliest, weights)
-    )
+    tried, member = np.unique([place.delay for place in places], return_inverse=True)
+    shares, of_interval = (np.bincount(member, each) for each in (likeliest, weights))
     near = np.abs(tried[:, np.newaxis] - tried) <= 1
     # Of equal ones, the delay that is itself the likelier.
     value = float(tried[np.lexsort((shares, (near @ shares).round(6)))[-1]])
@@ -310,8 +283,7 @@ def _of_dead_zone(places: list[Gap], weights: Array, slack: float) -> Interval:
 
     The commands at both ends of a gap may be off by `slack`, t/h.
     """
-    each = np.array([(gap.low, gap.high) for gap in places])
-    gaps, member = np.unique(each, axis=0, return_inverse=True)
+    gaps, member = np.unique(places, axis=0, return_inverse=True)
     shares = np.bincount(member.ravel(), weights)
     sums = np.cumsum(shares)
     below = np.column_stack([sums - shares, sums]).ravel()

@@ -45,7 +45,7 @@ def report(model: Model, out: Path) -> list[Section]:
     """
     arguments = plant_arguments(model)
     parameters = Parameters(**arguments)
-    step = reduced(model.plant, model.sampling_interval)
+    step = reduced(model.plant, model.plant.sampling_interval)
     plots.plot_log(model, out / "log.png")
     plots.plot_residuals(model, out / "residuals.png")
     plots.plot_step(model, step, out / "step.png")
@@ -97,7 +97,7 @@ def headline(model: Model) -> str:
         f"{100 * max(each, 0.0):.1f} %"
         for each in (model.held_out.model, model.held_out.impulse_response)
     )
-    known = ", ".join(each.name for each in model.known)
+    known = ", ".join(model.known)
     verdict = f"**The model should not be used:** {why}. Nothing is recommended." if (
         why := fault(model)
     ) else ""  # fmt: skip
@@ -114,7 +114,7 @@ def _found(model: Model, tuned: dict[str, Recommended]) -> Section:
         headline(model),
         *(
             f"Recommended: {name} with Kp = {controller.kp:.4g} t/h per °C and an integral "
-            f"time of {controller.kp / controller.ki * model.sampling_interval:.3g} s."
+            f"time of {controller.kp / controller.ki * model.plant.sampling_interval:.3g} s."
             for name, each in tuned.items()
             if (controller := each.controller)
         ),
@@ -127,10 +127,9 @@ def _found(model: Model, tuned: dict[str, Recommended]) -> Section:
         f"A, B and C have the orders {model.orders.a}, {model.orders.b} and {model.orders.c}"
         f"{', with a random walk' if model.orders.walk else ''}. Brackets are 95 % intervals.",
         *(
-            f"{each.name} is a known disturbance with a gain of "
-            f"{sum(each.b) / sum(model.plant.a):.4g} °C a unit and a delay of {each.delay} "
-            "samples. `plant.json` does not have it."
-            for each in model.known
+            f"{name} is a known disturbance with a gain of {each.gain:.4g} °C a unit and a "
+            f"delay of {each.delay} samples. `plant.json` does not have it."
+            for name, each in model.known.items()
         ),
     ]
     rows = [

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pandas as pd
 from scipy import signal
 
 from benchmarks.identify.armax import Array, Flags
+from benchmarks.loop.linear import LinearModel
 
 LAGS = 60  # of the impulse response, samples
 TAILS = (30.0, 60.0, 120.0, 240.0)  # time constants of what goes on after them, samples
@@ -20,14 +19,12 @@ def held(values: Array) -> Array:
     return np.asarray(pd.Series(values).ffill().bfill(), np.float64)
 
 
-def response(a: Sequence[float], b: Sequence[float], delay: int, flow: Array) -> Array:
-    """Return what a flow does to the temperature by (28), from rest at its first value."""
-    start = float(flow[0])
-    numerator = [0.0] * (delay + 1) + list(b)
-    if np.max(np.abs(np.roots(a)), initial=0.0) >= 1.0:
+def from_rest(model: LinearModel, flow: Array) -> Array:
+    """Return the response to a flow, from rest at its first value; NaN of an unstable plant."""
+    if np.max(np.abs(model.poles), initial=0.0) >= 1.0:
         return np.full(len(flow), np.nan)
-    moved: Array = signal.lfilter(numerator, a, flow - start)
-    return moved + start * sum(b) / sum(a)
+    start = float(flow[0])
+    return model.response(flow - start) + start * sum(model.b) / sum(model.a)
 
 
 def explained(output: Array, simulated: Array, rows: Flags) -> float:

@@ -82,7 +82,7 @@ def recommended(model: Model, parameters: Parameters) -> dict[str, Recommended]:
     Each is slowed until Ms is at most 2 with the identified plant and with 95 % of those that
     the log leaves possible.
     """
-    interval = model.sampling_interval
+    interval = model.plant.sampling_interval
     step = reduced(model.plant, interval)
     limits: dict[str, Any] = {"u_min": model.u_min, "u_max": model.u_max}
 

@@ -22,7 +22,8 @@ from scipy import signal
 from benchmarks.controllers.engineered import simc_pi
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
-from benchmarks.identify.model import CannotTellError, Options
+from benchmarks.identify.model import CannotTellError
+from benchmarks.identify.options import Knowledge
 from benchmarks.identify.simulation import explained, of_impulse_response
 from benchmarks.identify.study import loops, options
 from benchmarks.lib.command_line import out_folder
@@ -38,7 +39,7 @@ NOISE = 0.02, 0.5  # R of the logs, degC^2
 HELD = 30, 120  # samples between two steps of the flow
 LEVELS = -10.0, 10.0  # of the flow, t/h
 LONG, SHORT = (15.0, 40.0), (5.0, 15.0)  # samples, time constants of second order
-DATA_SHEET = Options(operating_flow=0.0, u_min=LEVELS[0], u_max=LEVELS[1])  # of the actuator
+DATA_SHEET = Knowledge(operating_flow=0.0, u_min=LEVELS[0], u_max=LEVELS[1])  # of the actuator
 METER = 0.1  # t/h, of the noise of a flow meter
 DRIFT = 0.05  # degC, of each step of a random walk of the base line
 KINDS = {

@@ -27,7 +27,8 @@ from agents import Controller, PIController
 from benchmarks.controllers.engineered import nn_smith
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
-from benchmarks.identify.model import Model, Options
+from benchmarks.identify.model import Model
+from benchmarks.identify.options import Knowledge
 from benchmarks.identify.plant import plant_arguments
 from benchmarks.identify.tclab_twin import options
 from benchmarks.identify.tuning import recommended
@@ -93,7 +94,7 @@ def experiment(seed: int = 0) -> Log:
 
 def model_of(log: Log) -> Model:
     """Return what the record shows. The heater has no dead zone."""
-    known = Options(
+    known = Knowledge(
         longest_delay=20,
         applied=True,
         u_min=-HEATER,
