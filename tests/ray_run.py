@@ -17,10 +17,10 @@ calls = scratch / "calls"
 work = {f"plant {seed}": partial(tasks.draw, seed, calls, 0.05) for seed in range(24)}
 work["plant 9"] = partial(tasks.die_once, 9, scratch / "died", calls)
 fan_out = FanOut(backend="ray")
-results = fan_out.run(work, scratch / "results", progress=False)
+results = fan_out.run(work, scratch / "results")
 faulty = {"the fault": partial(tasks.fail, 1), "plant 3": work["plant 3"]}
 try:
-    fan_out.run(faulty, scratch / "results", progress=False)
+    fan_out.run(faulty, scratch / "results")
 except TasksFailedError as error:
     out = {"results": results, "errors": error.errors, "jobs": fan_out.jobs}
     (scratch / "out.json").write_text(json.dumps(out))

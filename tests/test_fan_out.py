@@ -26,7 +26,7 @@ def work(n, calls=None, seconds=0.0):
 
 
 def run(given, folder=None, jobs=2):
-    return FanOut(jobs).run(given, folder, progress=False)
+    return FanOut(jobs).run(given, folder)
 
 
 def counted(calls):
@@ -116,7 +116,7 @@ class TestResume:
             "from benchmarks.lib.fan_out import FanOut; from tests import tasks\n"
             "out, calls = map(Path, sys.argv[1:])\n"
             "work = {f'plant {i}': partial(tasks.draw, i, calls, 0.2) for i in range(40)}\n"
-            "FanOut(2).run(work, out, progress=False)"
+            "FanOut(2).run(work, out)"
         )
         command = [sys.executable, "-c", program, str(tmp_path / "out"), str(calls)]
         with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE) as process:
@@ -141,7 +141,7 @@ class TestResume:
             "import sys; from functools import partial\n"
             "from benchmarks.lib.fan_out import FanOut; from tests import tasks\n"
             "work = {str(i): partial(tasks.hold, sys.argv[1], 60.0 * i) for i in range(2)}\n"
-            "FanOut(2).run(work, progress=False)"
+            "FanOut(2).run(work)"
         )
         command = [sys.executable, "-c", program, str(pipe)]
         with subprocess.Popen(command, cwd=ROOT) as process, pipe.open("rb", 0) as held:

@@ -11,7 +11,6 @@ from scipy import linalg, optimize, signal
 from agents import PIController
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.statistics import interquartile_mean, stratified
 from benchmarks.limits import bounds, command, frontier, least_possible, programme, verify
 from benchmarks.limits.__main__ import main
 from benchmarks.limits.news import News
@@ -496,19 +495,6 @@ class TestFrontier:
         moved = rollout(plants, Plan(np.full(600, -steady)), 600, seed=0)
         worth = mean_error(moved)[0] + 25.0 * steady / 600
         assert 0.98 * worth < error + 25.0 * travel <= worth * (1 + 1e-6)
-
-
-def test_stratified_bootstrap():
-    rng = np.random.default_rng(3)
-    tables = [rng.normal(mean, 0.1, (2, 40)) for mean in (0.2, 0.8)]
-    found = stratified(tables, 0, np.mean)
-    assert found.value == pytest.approx(np.mean(tables))
-    # Tasks are not drawn, so that how much they differ does not widen the interval.
-    assert 0.2 < (found.high - found.low) / (4 * 0.1 / np.sqrt(160)) < 2.0
-    assert stratified(tables, 0).value == pytest.approx(interquartile_mean(np.array(tables)))
-    assert stratified(tables, 0) == stratified(tables, 0)
-    with pytest.raises(ValueError, match="as many in each task"):
-        stratified([tables[0], tables[1][:, 1:]], 0)
 
 
 class TestPredictiveController:

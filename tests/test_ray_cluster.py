@@ -138,7 +138,7 @@ def test_a_lost_worker_loses_nothing(cluster, tmp_path):
     assert done.returncode == 0, done.stderr
     out = json.loads((tmp_path / "out.json").read_text())
     assert (tmp_path / "died").exists()
-    assert out["results"] == FanOut(1).run(work(24), progress=False)
+    assert out["results"] == FanOut(1).run(work(24))
     assert list(out["results"]) == list(work(24))
     # The cluster makes up for the worker: nothing that had finished runs again.
     assert counted(tmp_path / "calls") == Counter(range(24))

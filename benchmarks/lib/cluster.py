@@ -30,89 +30,78 @@ START_RAY = (
     "No Ray cluster can be reached: start one with `ray start --head`, or set RAY_ADDRESS"
 )
 
+# The name of a task, its result, what went wrong, and whether its worker is lost.
+Answer = tuple[str, Any, str, bool]
 
-class Cluster:
-    """The Ray cluster of RAY_ADDRESS, or of this machine.
 
-    Attributes
-    ----------
-    cores
-        How many it has now.
+def connect() -> int:
+    """Connect to the cluster of RAY_ADDRESS, or of this machine; return how many cores it has.
 
     Raises
     ------
     ValueError
         If Ray is not installed, or no cluster is found.
     """
-
-    def __init__(self) -> None:
+    try:
+        import ray  # here: an extra, which takes a second to load
+    except ImportError as error:
+        raise ValueError(INSTALL_RAY) from error
+    if not ray.is_initialized():
+        # Code that `ray job submit` has brought there is the same.
+        os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
+        address = os.environ.get("RAY_ADDRESS", "")
         try:
-            import ray  # here: an extra, which takes a second to load
-        except ImportError as error:
-            raise ValueError(INSTALL_RAY) from error
-        if not ray.is_initialized():
-            # Code that `ray job submit` has brought there is the same.
-            os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
-            address = os.environ.get("RAY_ADDRESS", "")
-            try:
-                _knock(address or _latest())
-                with tempfile.TemporaryDirectory() as folder:
-                    _pack(Path(folder))
-                    ray.init(
-                        address=address or "auto",
-                        runtime_env={"working_dir": folder},
-                        log_to_driver=False,
-                        logging_level=logging.ERROR,
-                    )
-            except OSError as error:
-                raise ValueError(f"{START_RAY} ({error})") from error
-        self._ray = ray
-        self.cores = int(ray.cluster_resources().get("CPU", 1))
+            _knock(address or _latest())
+            with tempfile.TemporaryDirectory() as folder:
+                _pack(Path(folder))
+                ray.init(
+                    address=address or "auto",
+                    runtime_env={"working_dir": folder},
+                    log_to_driver=False,
+                    logging_level=logging.ERROR,
+                )
+        except OSError as error:
+            raise ValueError(f"{START_RAY} ({error})") from error
+    return int(ray.cluster_resources().get("CPU", 1))
 
-    def answers(
-        self, tasks: Mapping[str, Callable[[], Any]], jobs: int | None, tries: int
-    ) -> Iterator[tuple[str, Any, str, bool]]:
-        """Run tasks and yield their answers as they come.
 
-        Parameters
-        ----------
-        tasks
-            What to run, by name.
-        jobs
-            How many at once; None for as many as the cluster has cores.
-        tries
-            How often a task is begun at most, if its worker or node is lost.
+def answers(
+    tasks: Mapping[str, Callable[[], Any]], jobs: int | None, tries: int
+) -> Iterator[Answer]:
+    """Run tasks on the cluster that is connected, and yield their answers as they come.
 
-        Yields
-        ------
-        tuple
-            The name of a task, its result, what went wrong, if anything, and whether that was
-            on the side of the cluster.
-        """
-        ray = self._ray
-        remote = ray.remote(num_cpus=1, max_retries=tries - 1)(_answer)
-        waiting = iter(tasks.items())
-        running: dict[Any, str] = {}
-        here = versions()
-        try:
-            while True:
-                room = (jobs or QUEUED * self.cores) - len(running)
-                for key, task in islice(waiting, room):
-                    running[remote.remote(task, here)] = key
-                if not running:
-                    return
-                for done in ray.wait(list(running))[0]:
-                    key = running.pop(done)
-                    try:
-                        result, error, other = ray.get(done)
-                    except ray.exceptions.RayError as lost:
-                        reason = f"No result came back: {type(lost).__name__}"
-                        yield key, None, f"{lost}\n{reason}", True
-                    else:
-                        yield key, result, error, other
-        finally:
-            for left in running:
-                ray.cancel(left, force=True)
+    Parameters
+    ----------
+    tasks
+        What to run, by name.
+    jobs
+        How many at once; None for as many as the cluster has cores.
+    tries
+        How often a task is begun at most, if its worker or node is lost.
+    """
+    import ray
+
+    remote = ray.remote(num_cpus=1, max_retries=tries - 1)(_answer)
+    at_once = jobs or QUEUED * int(ray.cluster_resources().get("CPU", 1))
+    here, waiting = versions(), iter(tasks.items())
+    running: dict[Any, str] = {}
+    try:
+        while True:
+            for key, task in islice(waiting, at_once - len(running)):
+                running[remote.remote(task, here)] = key
+            if not running:
+                return
+            for done in ray.wait(list(running))[0]:
+                key = running.pop(done)
+                try:
+                    answer = ray.get(done)
+                except ray.exceptions.RayError as lost:
+                    reason = f"No result came back: {type(lost).__name__}"
+                    answer = None, f"{lost}\n{reason}", True
+                yield key, *answer
+    finally:
+        for left in running:
+            ray.cancel(left, force=True)
 
 
 def _answer(task: Callable[[], Any], here: dict[str, str]) -> tuple[Any, str, bool]:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from benchmarks.lib.cluster import Cluster
+from benchmarks.lib import cluster
 from benchmarks.lib.storage import seal, unseal, write_text
 
 BACKENDS = ("loky", "ray")
@@ -31,19 +31,12 @@ NAMED = 10  # failed tasks in a message
 PATIENCE = 0.5  # s between two looks at whether the parent is still there
 
 Tasks = Mapping[str, Callable[[], Any]]
-# The name of a task, its result, what went wrong, and whether its worker is lost.
-Answer = tuple[str, Any, str, bool]
 
 
 class TasksFailedError(RuntimeError):
-    """Some tasks have no result; those of all others are kept.
+    """Some of `tasks` tasks have no result; those of all others are kept.
 
-    Parameters
-    ----------
-    errors
-        What went wrong, by the name of the task: a traceback, or a sentence.
-    tasks
-        How many there were in all.
+    `errors` says what went wrong, by the name of the task: a traceback, or a sentence.
     """
 
     def __init__(self, errors: Mapping[str, str], tasks: int) -> None:
@@ -51,11 +44,10 @@ class TasksFailedError(RuntimeError):
         lines = [f"{key}: {text.strip().splitlines()[-1]}" for key, text in errors.items()]
         if len(lines) > NAMED:
             lines[NAMED:] = [f"and {len(lines) - NAMED} more"]
-        first = next(iter(errors.values()))
         super().__init__(
             f"{len(errors)} of {tasks} tasks failed; the results of the others are kept\n"
             + "\n".join(lines)
-            + f"\nThe first of them:\n{first}"
+            + f"\nThe first of them:\n{next(iter(errors.values()))}"
         )
 
 
@@ -82,19 +74,11 @@ class FanOut:
         import joblib  # here: it takes a while to load
 
         self.backend = backend
-        self._cluster = Cluster() if backend == "ray" else None
         self._asked = jobs
-        cores = self._cluster.cores if self._cluster else joblib.cpu_count()
+        cores = cluster.connect() if backend == "ray" else joblib.cpu_count()
         self.jobs = jobs or cores
 
-    def run(
-        self,
-        tasks: Tasks,
-        folder: Path | None = None,
-        *,
-        title: str = "tasks",
-        progress: bool = True,
-    ) -> dict[str, Any]:
+    def run(self, tasks: Tasks, folder: Path | None = None, title: str = "") -> dict[str, Any]:
         """Run the tasks that have no result yet, and return the results of all.
 
         Parameters
@@ -107,9 +91,7 @@ class FanOut:
             for its result: tasks with other arguments or code need a folder of their own. A
             file that is not what was written is no result. None: they are not saved.
         title
-            Stands before the progress bar.
-        progress
-            Whether to show one.
+            Stands before a progress bar; "" for none.
 
         Returns
         -------
@@ -121,52 +103,38 @@ class FanOut:
         TasksFailedError
             At the end, if tasks raised an exception or lost their worker again and again.
         """
-        results = {} if folder is None else _saved(tasks, folder)
-        missing = {
-            key: partial(_as_json, task) for key, task in tasks.items() if key not in results
-        }
-        try:
-            for key, text in self.stream(missing, title if progress else "", len(results)):
-                results[key] = json.loads(text)
-                if folder is not None:
-                    write_text(_file(folder, key), seal(results[key]))
-        except TasksFailedError as error:
-            raise TasksFailedError(error.errors, len(tasks)) from None
+        results: dict[str, Any] = {}
+        files = {key: folder / f"{quote(key, safe=' ,=+')}.json" for key in tasks if folder}
+        for key, file in files.items():
+            with suppress(FileNotFoundError, ValueError):  # not there, or damaged
+                results[key] = unseal(file.read_text(encoding="utf-8"))
+        missing = {key: partial(_as_json, tasks[key]) for key in tasks if key not in results}
+        for key, text in self.stream(missing, title, len(results)):
+            results[key] = json.loads(text)
+            if folder:
+                write_text(files[key], seal(results[key]))
         return {key: results[key] for key in tasks}
 
     def stream(self, tasks: Tasks, title: str = "", done: int = 0) -> Iterator[tuple[str, Any]]:
         """Run tasks, and yield each name and result as they come.
 
-        Parameters
-        ----------
-        tasks
-            As those of `run`, but what they return need only be such that it can be pickled.
-            Tasks that cannot be pickled themselves run in this process, after the others.
-        title
-            Stands before a progress bar; "" for none.
-        done
-            How many tasks have been done before.
-
-        Raises
-        ------
-        TasksFailedError
-            At the end, if tasks raised an exception or lost their worker again and again.
+        As `run`, but what tasks return need only be such that it can be pickled, and those that
+        cannot be pickled themselves run in this process, after the others. `done` tasks have
+        been done before.
         """
         from tqdm import tqdm
 
         bar = tqdm(total=done + len(tasks), initial=done, desc=title, disable=not title)
-        errors: dict[str, str] = {}
-        answered: set[str] = set()
+        errors = dict.fromkeys(tasks, "Not run: too many lost their worker.")
         blamed = 0
-        answers = (
-            self._cluster.answers(tasks, self._asked, LOSSES)
-            if self._cluster
-            else self._local(tasks)
-        )
+        if self.backend == "ray":
+            answers = cluster.answers(tasks, self._asked, LOSSES)
+        else:
+            answers = self._local(tasks)
         with bar:
             for key, result, error, lost in answers:
-                answered.add(key)
                 if not error:
+                    del errors[key]
                     bar.update()
                     yield key, result
                     continue
@@ -174,51 +142,47 @@ class FanOut:
                 blamed += lost
                 if blamed == GIVE_UP:
                     break
-        for key in tasks.keys() - answered:
-            errors[key] = "Not run: too many lost their worker."
         if errors:
-            in_order = {key: errors[key] for key in tasks if key in errors}
-            raise TasksFailedError(in_order, len(tasks))
+            raise TasksFailedError(errors, done + len(tasks))
 
-    def _local(self, tasks: Tasks) -> Iterator[Answer]:
+    def _local(self, tasks: Tasks) -> Iterator[cluster.Answer]:
         """Run tasks on this machine, those again whose worker is lost."""
-        missing = {key: task for key, task in tasks.items() if self.jobs == 1 or _travels(task)}
-        stays = tasks.keys() - missing.keys()
+        away = {key: task for key, task in tasks.items() if self.jobs > 1 and _travels(task)}
+        here = [key for key in tasks if key not in away]
         losses: Counter[str] = Counter()
-        while missing:
-            suspect = next((key for key in missing if losses[key] >= LOSSES), None)
+        while away:
+            suspects = [key for key in away if losses[key] >= LOSSES][:1]
             started: list[str] = []
             try:
-                tried = missing if suspect is None else {suspect: missing[suspect]}
-                for key, result, error in self._answers(tried, started):
-                    del missing[key]
+                tried = {key: away[key] for key in suspects or away}
+                for key, result, error in self._in_processes(tried, started):
+                    del away[key]
                     yield key, result, error, False
             except BrokenExecutor as lost:
-                if suspect is None:
-                    # Any of these may have been the end of the worker.
-                    in_flight = [key for key in started if key in missing]
-                    if not in_flight:
-                        raise
-                    losses.update(in_flight)
-                    continue
-                del missing[suspect]
-                yield suspect, None, f"{lost}\nIts worker was lost each time.", True
-        for key in stays:
-            yield *_answer(key, tasks[key], os.getpid()), False
+                # Any of those under way may have been the end of the worker.
+                under_way = [key for key in started if key in away]
+                if not under_way:
+                    raise
+                losses.update(under_way)
+                for key in suspects:
+                    del away[key]
+                    yield key, None, f"{lost}\nIts worker was lost each time.", True
+        for key in here:
+            yield *_answer(key, tasks[key]), False
 
-    def _answers(self, tasks: Tasks, started: list[str]) -> Iterator[tuple[str, Any, str]]:
+    def _in_processes(
+        self, tasks: Tasks, started: list[str]
+    ) -> Iterator[tuple[str, Any, str]]:
         """Run tasks, yield their answers as they come, and note which were handed out."""
         import joblib
 
-        parent = os.getpid()
-
         def handed_out() -> Iterator[Any]:
-            for key, task in list(tasks.items()):
+            for key, task in tasks.items():
                 started.append(key)
-                yield joblib.delayed(_answer)(key, task, parent)
+                yield joblib.delayed(_answer)(key, task, os.getpid())
 
         # With one process joblib would use this one, which no task is to bring down.
-        processes = 1 if self.jobs == 1 else max(2, min(self.jobs, len(tasks)))
+        processes = max(2, min(self.jobs, len(tasks)))
         with joblib.parallel_config("loky", inner_max_num_threads=1):
             parallel = joblib.Parallel(
                 processes,
@@ -243,9 +207,11 @@ def _as_json(task: Callable[[], Any]) -> str:
     return json.dumps(task())
 
 
-def _answer(key: str, task: Callable[[], Any], parent: int) -> tuple[str, Any, str]:
+def _answer(
+    key: str, task: Callable[[], Any], parent: int | None = None
+) -> tuple[str, Any, str]:
     """Run a task; return its name, its result, and what went wrong, if anything."""
-    if parent != os.getpid():
+    if parent is not None:
         _end_with(parent)
     try:
         return key, task(), ""
@@ -268,15 +234,3 @@ def _end_with(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _file(folder: Path, key: str) -> Path:
-    return folder / f"{quote(key, safe=' ,=+')}.json"
-
-
-def _saved(keys: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    results = {}
-    for key in keys:
-        with suppress(FileNotFoundError, ValueError):  # not there, or damaged
-            results[key] = unseal(_file(folder, key).read_text(encoding="utf-8"))
-    return results

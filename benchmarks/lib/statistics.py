@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -52,17 +52,9 @@ def exact(value: float) -> Estimate:
 
 
 def student(values: ArrayLike) -> Estimate:
-    """Estimate a mean over runs, with Student's interval.
+    """Estimate a mean over runs, shape (runs,), with Student's interval.
 
-    Parameters
-    ----------
-    values
-        Shape (runs,).
-
-    Returns
-    -------
-    Estimate
-        Its interval has no width where there is one run, or all are the same.
+    It has no width where there is one run, or all are the same.
     """
     numbers = np.asarray(values, dtype=np.float64)
     mean, runs = float(numbers.mean()), len(numbers)
@@ -74,23 +66,12 @@ def student(values: ArrayLike) -> Estimate:
 
 
 def quantile(values: ArrayLike, probability: float) -> Estimate:
-    """Estimate a quantile over runs.
+    """Estimate a quantile over runs, shape (runs,).
 
     The interval lies between two of the ordered values (Conover, "Practical Nonparametric
     Statistics", 3rd edition, 1999, section 3.2; see `scipy.stats.quantile_test`). It assumes
-    nothing about the distribution and accepts infinite values ("never").
-
-    Parameters
-    ----------
-    values
-        Shape (runs,).
-    probability
-        Between 0 and 1, 0.5 for the median.
-
-    Returns
-    -------
-    Estimate
-        An end is infinite where there are too few runs to tell.
+    nothing about the distribution, accepts infinite values ("never"), and is infinite where
+    there are too few runs to tell.
 
     Raises
     ------
@@ -116,17 +97,7 @@ def median(values: ArrayLike) -> Estimate:
 
 
 def share(flags: ArrayLike) -> Estimate:
-    """Estimate how often something happens, with Wilson's interval.
-
-    Parameters
-    ----------
-    flags
-        Shape (runs,): whether it happened.
-
-    Returns
-    -------
-    Estimate
-        A share between 0 and 1.
+    """Estimate how often something happens, from 0 to 1, with Wilson's interval.
 
     Raises
     ------
@@ -147,48 +118,49 @@ def interquartile_mean(values: ArrayLike, axis: int | None = None) -> Any:
 
 
 def bootstrap(
-    values: NDArray[np.float64],
-    seed: int,
-    statistic: Callable[..., Any] = np.mean,
+    *tasks: NDArray[np.float64], seed: int, statistic: Callable[..., Any] = np.mean
 ) -> Estimate:
-    """Estimate a statistic over runs, with a percentile bootstrap interval.
+    """Estimate a statistic over runs of one task or several, by a percentile bootstrap.
 
     Parameters
     ----------
-    values
-        Shape (runs,); or (members, runs) for several trained controllers in the same runs. Then
-        members and runs are drawn independently, and a sample holds every cell where they
-        cross. Members of the same run meet the same noise, so they do not count as runs of
-        their own. The interval also covers other trainings (A. B. Owen, "The pigeonhole
-        bootstrap", Annals of Applied Statistics 1, 2007, 386-411). With five members that
-        differ far more than runs do, it holds the true value in 82 % of the cases: five are few
-        to draw from.
+    *tasks
+        The values of each, all of the same shape: (runs,), or (members, runs) for several
+        trained controllers in the same runs. Then members and runs are drawn independently, and
+        a sample holds every cell where they cross. Members of the same run meet the same noise,
+        so they do not count as runs of their own, and the interval also covers other trainings
+        (A. B. Owen, "The pigeonhole bootstrap", Annals of Applied Statistics 1, 2007, 386-411).
+        With five members that differ far more than runs do, it holds the true value in 82 % of
+        the cases: five are few to draw from. The tasks themselves are not drawn.
     seed
         Of the draws.
     statistic
-        Called with an array and `axis`, the last.
-
-    Returns
-    -------
-    Estimate
-        Of all values together; `runs` counts them.
+        Called with an array of all values of all tasks together and `axis`, the last.
 
     Raises
     ------
     ValueError
-        If there is no value, or one that is not finite.
+        If there is no value, the shapes differ, or a value is not finite.
     """
-    return stratified([values], seed, statistic)
-
-
-def _resampled(
-    table: NDArray[np.float64], generator: np.random.Generator
-) -> NDArray[np.float64]:
-    """Return samples of a table (members, runs), shape (RESAMPLES, members * runs)."""
-    members, runs = table.shape
-    member = generator.integers(members, size=(RESAMPLES, members, 1))
-    run = generator.integers(runs, size=(RESAMPLES, 1, runs))
-    return table[member, run].reshape(RESAMPLES, -1)
+    tables = [np.atleast_2d(np.asarray(task, dtype=np.float64)) for task in tasks]
+    of_one_shape = len({table.shape for table in tables}) == 1 and tables[0].ndim == 2
+    if not (of_one_shape and tables[0].size and np.isfinite(tables).all()):
+        raise ValueError(
+            f"values must be finite, one for each run, and as many in each task, got {tasks!r}"
+        )
+    together = np.concatenate([table.ravel() for table in tables])
+    value = float(statistic(together[np.newaxis], axis=-1)[0])
+    if all(np.all(table == table.flat[0]) for table in tables):  # nothing was random
+        return Estimate(value, value, value, together.size)
+    generator = np.random.default_rng(seed)
+    members, runs = tables[0].shape
+    samples = []
+    for table in tables:
+        member = generator.integers(members, size=(RESAMPLES, members, 1))
+        run = generator.integers(runs, size=(RESAMPLES, 1, runs))
+        samples.append(table[member, run].reshape(RESAMPLES, -1))
+    low, high = np.quantile(statistic(np.hstack(samples), axis=-1), ENDS)
+    return Estimate(value, float(low), float(high), together.size)
 
 
 def improvement(
@@ -196,62 +168,8 @@ def improvement(
 ) -> Estimate:
     """Estimate how probable it is that one controller does better than another in the same run.
 
-    Parameters
-    ----------
-    errors
-        Shape (runs,) or (members, runs), as in `bootstrap`.
-    reference
-        Those of the other, of the same runs: shape (runs,).
-    seed
-        Of the bootstrap.
-
-    Returns
-    -------
-    Estimate
-        A probability; runs in which both do the same count as half.
+    Runs in which both do the same count as half. The shapes of `errors` are those of
+    `bootstrap`; `reference` is of the same runs, shape (runs,) or that of `errors`.
     """
     better = (errors < reference) + 0.5 * (errors == reference)
-    return bootstrap(better, seed)
-
-
-def stratified(
-    tables: Sequence[NDArray[np.float64]],
-    seed: int,
-    statistic: Callable[..., Any] = interquartile_mean,
-) -> Estimate:
-    """Estimate a statistic over several tasks, with a stratified bootstrap interval.
-
-    Parameters
-    ----------
-    tables
-        One for each task, all of the same shape: (runs,), or (members, runs) as in `bootstrap`.
-        Runs and members are drawn within each task; the tasks themselves are not drawn.
-    seed
-        Of the draws.
-    statistic
-        Called with an array and `axis`, the last.
-
-    Returns
-    -------
-    Estimate
-        Of all values of all tasks together.
-
-    Raises
-    ------
-    ValueError
-        If there is no task, the shapes differ, or a value is not finite.
-    """
-    arrays = [np.atleast_2d(np.asarray(table, dtype=np.float64)) for table in tables]
-    of_one_shape = len({array.shape for array in arrays}) == 1 and arrays[0].ndim == 2
-    if not (of_one_shape and arrays[0].size and np.isfinite(arrays).all()):
-        raise ValueError(
-            f"values must be finite, one for each run, and as many in each task, got {tables!r}"
-        )
-    together = np.concatenate([array.ravel() for array in arrays])
-    value = float(statistic(together[np.newaxis], axis=-1)[0])
-    if all(np.all(array == array.flat[0]) for array in arrays):  # nothing was random
-        return Estimate(value, value, value, together.size)
-    generator = np.random.default_rng(seed)
-    drawn = statistic(np.hstack([_resampled(array, generator) for array in arrays]), axis=-1)
-    low, high = np.quantile(drawn, ENDS)
-    return Estimate(value, float(low), float(high), together.size)
+    return bootstrap(better, seed=seed)

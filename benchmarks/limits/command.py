@@ -109,5 +109,5 @@ def bounds(
         row[title] = f"{found[kind]:.3f}" if kind in found else ""
     if mpc:
         (predictive,) = ROSTER["mpc"].members()
-        row["MPC"] = f"{bootstrap(errors(predictive, mpc, SAMPLES, **arguments), 0):.3f}"
+        row["MPC"] = f"{bootstrap(errors(predictive, mpc, SAMPLES, **arguments), seed=0):.3f}"
     return row

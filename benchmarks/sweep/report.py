@@ -173,7 +173,7 @@ def _differences(
                 for agent in pair
             )
             if len(ours) > 1:
-                difference = bootstrap(ours - theirs, SEED)
+                difference = bootstrap(ours - theirs, seed=SEED)
                 better = improvement(ours, theirs, SEED)
                 shown = f"{difference:+.3f}; {100 * better.value:.0f} %"
                 row[" - ".join(map(label, pair))] = shown

@@ -213,7 +213,7 @@ class Search:
         }
         # One alone gains nothing from another process, which takes seconds to start.
         fan_out = self._fan_out if len(tasks) > 1 else FanOut(jobs=1)
-        answers = fan_out.run(tasks, title="new runs for the best", progress=final)
+        answers = fan_out.run(tasks, title="new runs for the best" if final else "")
         scores = pd.DataFrame(list(answers.values()))
         groups = [scores.iloc[i : i + members] for i in range(0, len(scores), members)]
         return [
