@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -135,12 +136,13 @@ class TestEstimates:
         limit = scales["constant"].least.value
         runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
         nn, ppo_ = estimate(runs, scales, "nn").to_dict("records")
-        assert (nn["mean"], nn["limit"], nn["ratio"]) == (2.0, limit, 2.0 / limit)
-        assert ppo_["mean"] == pytest.approx(1.5)
-        assert ppo_["difference"] == pytest.approx(-0.5)
-        assert ppo_["improvement"] == pytest.approx((1 + 0.5 + 1 + 0 + 0.5 + 1) / 6)
+        assert (nn["mean"].value, nn["limit"]) == (2.0, limit)
+        assert nn["ratio"].value == 2.0 / limit
+        assert ppo_["mean"].value == pytest.approx(1.5)
+        assert ppo_["difference"].value == pytest.approx(-0.5)
+        assert ppo_["improvement"].value == pytest.approx((1 + 0.5 + 1 + 0 + 0.5 + 1) / 6)
         assert math.isnan(nn["difference"])
-        assert nn["mean_low"] < nn["mean"] < nn["mean_high"]
+        assert nn["mean"].low < nn["mean"].value < nn["mean"].high
 
     def test_who_beats_a_limit_is_named(self):
         scales = {"constant": scale_of(SCENARIOS["constant"], 2)}
@@ -154,7 +156,7 @@ class TestEstimates:
         scales = {"constant-noise": scale_of(SCENARIOS["constant-noise"], 1)}
         runs = some_runs(a=[[0.5]], b=[[2.0]]).assign(scenario="constant-noise")
         found = estimate(runs, scales, "a")
-        assert found["mean"].iloc[0] < scales["constant-noise"].least.value
+        assert found["mean"].iloc[0].value < scales["constant-noise"].least.value
         assert beaten(found).empty
         assert verdict(found).startswith("No controller")
 
@@ -193,7 +195,6 @@ class TestEstimates:
         run_compare(tmp_path / "out", *options)
         estimates = pd.read_csv(tmp_path / "out/estimates.csv")
         assert len(estimates) == len(FIXED) * len(names)
-        assert beaten(estimates).empty
         best = estimates[(estimates["agent"] == "mpc") & (estimates["scenario"] != "load")]
         assert best["ratio"].between(0.97, 1.05).all()
         report = (tmp_path / "out/report.md").read_text()
@@ -320,17 +321,6 @@ class TestStorage:
         assert (tmp_path / "page.md").read_bytes() == b"a\nb\n"
         tables.write_csv(tmp_path / "table.csv", pd.DataFrame({"a": [1, 2]}))
         assert (tmp_path / "table.csv").read_bytes() == b"a\n1\n2\n"
-
-    @pytest.mark.parametrize("text", ["", "null", "[1]", "{", "\0\0"])
-    def test_a_damaged_object_is_named(self, tmp_path, text):
-        path = tmp_path / "some.json"
-        path.write_text(text)
-        with pytest.raises(ValueError, match=r"some\.json is damaged"):
-            storage.read_object(path)
-
-    def test_a_missing_object_is_named(self, tmp_path):
-        with pytest.raises(ValueError, match=r"some\.json is missing"):
-            storage.read_object(tmp_path / "some.json")
 
 
 def run_compare(out, *options):
@@ -609,7 +599,7 @@ class TestCompare:
         def read_only(dir):  # noqa: A002
             raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-        monkeypatch.setattr(storage.tempfile, "TemporaryFile", read_only)
+        monkeypatch.setattr(tempfile, "TemporaryFile", read_only)
         assert "Read-only file system" in refused(main, ["--out", tmp_path / "out"])
 
     @pytest.mark.parametrize("name", ["runs.csv", "limits.png", "report.html"])

@@ -8,7 +8,6 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -19,7 +18,7 @@ from benchmarks.compare.options import COMPARED, RUNS, Options
 from benchmarks.compare.record import Record
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.records import Factory, provenances
-from benchmarks.lib import command_line
+from benchmarks.lib.command_line import UsageError, blame, known, out_folder
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.options import flat
 from benchmarks.lib.report import Section, show
@@ -37,14 +36,14 @@ def execute(options: Options, console: Console) -> str:
     controllers = chosen(options.agents, options.controllers.agent)
     plant = options.plant.chosen()
     if options.presets and plant.arguments:
-        raise command_line.UsageError("--presets: goes without --plant, --preset and --set")
+        raise UsageError("--presets: goes without --plant, --preset and --set")
     scenarios = PRESET_SCENARIOS if options.presets else SCENARIOS
     if plant.arguments:
         scenarios = scenarios_of(plant.name, plant.arguments)
     given = list(scenarios) if options.scenarios is None else options.scenarios
-    names = command_line.known("--scenarios", given, list(scenarios))
+    names = known("--scenarios", given, list(scenarios))
     if not names:
-        raise command_line.UsageError("--scenarios: none to run")
+        raise UsageError("--scenarios: none to run")
     training = options.controllers.training()
     members = {name: entry.members(training) for name, entry in controllers.items()}
     if plant.arguments:
@@ -55,9 +54,17 @@ def execute(options: Options, console: Console) -> str:
         [plant.name] if plant.arguments else ["presets"] if options.presets else [],
         [f"{options.runs}-runs"] if options.runs != RUNS else [],
     )
-    out = command_line.out_folder(out)
     comparison = Comparison({name: scenarios[name] for name in names}, members, options.runs)
-    record = Record(out, _origin(comparison, flat(options)))
+    about = {
+        "options": {**flat(options), "agents": list(members)},
+        "seeds": list(range(SEED, SEED + options.runs)),
+        "scenarios": {
+            name: {"samples": each.samples, "arguments": each.arguments}
+            for name, each in comparison.scenarios.items()
+        },
+        "policies": provenances(members),
+    }
+    record = Record(out_folder(out), {**origin(), **about})
 
     def write(fan_out: FanOut, *, complete: bool) -> list[Section]:
         return report.write(comparison, controllers, record, fan_out, complete=complete)
@@ -75,29 +82,15 @@ def execute(options: Options, console: Console) -> str:
     return f"The report, tables, data and plots are in {out}/"
 
 
-def _origin(comparison: Comparison, options: dict[str, Any]) -> dict[str, Any]:
-    """Return what the results come from."""
-    return {
-        **origin(),
-        "options": {**options, "agents": list(comparison.controllers)},
-        "seeds": list(range(SEED, SEED + comparison.count)),
-        "scenarios": {
-            name: {"samples": each.samples, "arguments": each.arguments}
-            for name, each in comparison.scenarios.items()
-        },
-        "policies": provenances(comparison.controllers),
-    }
-
-
 def _try_out(
     members: Mapping[str, list[Factory]], scenarios: Sequence[Scenario], runs: int
 ) -> None:
     """Refuse a plant that has no score, or that a controller cannot be set up for."""
     for scenario in scenarios:
-        with command_line.blame(scenario.title):
+        with blame(scenario.title):
             scale_of(scenario, runs).least.score(0.0)
     for name, scenario in itertools.product(members, scenarios):
-        with command_line.blame(f"{name} on {scenario.title}"):
+        with blame(f"{name} on {scenario.title}"):
             members[name][0](scenario.arguments, 1, 0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -110,51 +111,47 @@ class Comparison:
             At the end, if a controller raised an exception; all others have finished.
         """
         tasks: dict[str, Callable[[], Any]] = {}
-        keep: dict[str, Callable[[Any], object]] = {}
+        places: dict[str, tuple[dict[Any, Any], Any]] = {}
+
+        def add(name: str, place: dict[Any, Any], key: Any, task: Any, *given: Any) -> None:
+            tasks[name], places[name] = partial(task, *given), (place, key)
+
+        scenarios = self.scenarios.values()
         # The bounds of drawn plants are the longest tasks of all.
-        for each in sorted(
-            self.scenarios.values(), key=lambda each: not each.parameters.ranges
-        ):
-            name = f"bounds, {each.name}"
-            tasks[name] = partial(scale_of, each, self.count)
-            keep[name] = partial(self.scales.__setitem__, each.name)
+        for each in sorted(scenarios, key=lambda each: not each.parameters.ranges):
+            add(f"{each.name}: bounds", self.scales, each.name, scale_of, each, self.count)
         long = [agent for agent in LONG if agent in self.controllers]
-        for agent in dict.fromkeys([*long, *self.controllers]):
-            for each in self.scenarios.values():
-                name, members = f"{agent}, {each.name}", self.controllers[agent]
-                tasks[name] = partial(run_case, each, agent, members, self.count)
-                keep[name] = partial(self.cases.__setitem__, (each.name, agent))
-        for each in self.scenarios.values():
-            name = f"frontier, {each.name}"
-            tasks[name] = partial(travel_frontier, each)
-            keep[name] = partial(self.frontiers.__setitem__, each.name)
+        agents = dict.fromkeys([*long, *self.controllers])
+        for agent, each in itertools.product(agents, scenarios):
+            task = run_case, each, agent, self.controllers[agent], self.count
+            add(f"{agent}, {each.name}", self.cases, (each.name, agent), *task)
+        for each in scenarios:
+            add(f"{each.name}: frontier", self.frontiers, each.name, travel_frontier, each)
         for name, result in fan_out.stream(tasks, "compare"):
-            keep[name](result)
+            place, key = places[name]
+            place[key] = result
             if isinstance(result, Case):
                 yield result
 
     @property
     def agents(self) -> list[str]:
         """The controllers that have run on a scenario, in order."""
-        return [agent for agent in self.controllers if any(agent == a for _, a in self.cases)]
-
-    def in_order(self) -> list[Case]:
-        """Return what has finished, whatever finished first."""
-        order = ((name, agent) for agent in self.controllers for name in self.scenarios)
-        return [self.cases[key] for key in order if key in self.cases]
-
-    @property
-    def runs(self) -> pd.DataFrame:
-        """One row for each run."""
-        return pd.concat([case.runs for case in self.in_order()], ignore_index=True)
+        return [name for name in self.controllers if any(name == a for _, a in self.cases)]
 
     @property
     def names(self) -> list[str]:
         """The scenarios that a controller has run on, in order."""
         return [name for name in self.scenarios if any(name == n for n, _ in self.cases)]
 
+    @property
+    def runs(self) -> pd.DataFrame:
+        """One row for each run, in order, whatever finished first."""
+        order = ((name, agent) for agent in self.controllers for name in self.scenarios)
+        finished = [self.cases[key].runs for key in order if key in self.cases]
+        return pd.concat(finished, ignore_index=True)
+
     def responses(self, scenario: str) -> pd.DataFrame:
         """Return the responses of all controllers to a scenario."""
-        cases = [self.cases.get((scenario, agent)) for agent in self.controllers]
-        found = [case.responses for case in cases if case is not None]
-        return pd.concat(found, ignore_index=True)
+        order = ((scenario, agent) for agent in self.controllers)
+        finished = [self.cases[key].responses for key in order if key in self.cases]
+        return pd.concat(finished, ignore_index=True)

@@ -13,14 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from benchmarks.controllers.roster import label
-from benchmarks.lib.statistics import (
-    Estimate,
-    bootstrap,
-    improvement,
-    interquartile_mean,
-    stratified,
-    student,
-)
+from benchmarks.lib.statistics import bootstrap, improvement, interquartile_mean, student
 from benchmarks.lib.tables import groups
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
@@ -101,12 +94,11 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) ->
     Returns
     -------
     DataFrame
-        The mean and the interquartile mean of |e|, degC; `limit`, the least possible error
-        that applies, and `preview`, that of any controller; the mean as a multiple of `limit`;
-        the mean difference to the reference; and the probability of doing better than it.
-        `_low` and `_high` are the ends of intervals; `student_high` is the upper end of
-        Student's interval of the mean. They are infinite where runs differ and there is only
-        one.
+        `mean` and `interquartile_mean` of |e|, degC; `limit`, the least possible error that
+        applies, and `preview`, that of any controller; `ratio`, the mean as a multiple of
+        `limit`; `difference`, the mean one to the reference; `improvement`, the probability of
+        doing better than it; and `student_high`, the upper end of Student's interval of the
+        mean. Ends are infinite where runs differ and there is only one.
     """
     rows = []
     for scenario, cases in groups(runs, "scenario"):
@@ -115,27 +107,29 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) ->
         errors = {agent: _errors(group) for agent, group in groups(cases, "agent")}
         base = errors[reference].mean(axis=0) if reference in errors else None
         for agent, values in errors.items():
-            mean = bootstrap(values, BOOTSTRAP)
-            if scale.drawn and values.size == 1:
-                mean = replace(mean, low=-math.inf, high=math.inf)
+            mean, by_run = bootstrap(values, seed=BOOTSTRAP), student(values.mean(axis=0))
+            student_high = by_run.high if scale.drawn else by_run.value
+            if scale.drawn and by_run.runs == 1:
+                student_high = math.inf
+                if values.size == 1:
+                    mean = replace(mean, low=-math.inf, high=math.inf)
             row: dict[str, Any] = {
                 "scenario": scenario,
                 "agent": agent,
                 "limit": limit,
                 "preview": scale.preview.value,
-                **_ends("mean", mean),
+                "mean": mean,
+                "student_high": student_high,
+                "interquartile_mean": bootstrap(
+                    values, seed=BOOTSTRAP, statistic=interquartile_mean
+                ),
+                "ratio": replace(
+                    mean, value=mean.value / limit, low=mean.low / limit, high=mean.high / limit
+                ),
             }
-            by_run = student(values.mean(axis=0))
-            if scale.drawn:
-                row["student_high"] = by_run.high if by_run.runs > 1 else math.inf
-            else:
-                row["student_high"] = by_run.value
-            iqm = bootstrap(values, BOOTSTRAP, interquartile_mean)
-            row |= _ends("interquartile_mean", iqm)
-            row |= {f"ratio{end}": row[f"mean{end}"] / limit for end in ("", "_low", "_high")}
             if base is not None and agent != reference:
-                row |= _ends("difference", bootstrap(values - base, BOOTSTRAP))
-                row |= _ends("improvement", improvement(values, base, BOOTSTRAP))
+                row["difference"] = bootstrap(values - base, seed=BOOTSTRAP)
+                row["improvement"] = improvement(values, base, BOOTSTRAP)
             rows.append(row)
     return pd.DataFrame(rows)
 
@@ -155,12 +149,13 @@ def scores(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
     """
     rows = []
     for agent, cases in groups(runs, "agent"):
-        tables, means = [], {}
-        for scenario, group in groups(cases, "scenario"):
-            tables.append(scales[scenario].least.score(_errors(group)))
-            means[scenario] = float(tables[-1].mean())
-        found = stratified(tables, BOOTSTRAP, interquartile_mean)
-        rows.append({"agent": agent, **_ends("score", found), **means})
+        tables = {
+            scenario: scales[scenario].least.score(_errors(group))
+            for scenario, group in groups(cases, "scenario")
+        }
+        score = bootstrap(*tables.values(), seed=BOOTSTRAP, statistic=interquartile_mean)
+        means = {scenario: float(table.mean()) for scenario, table in tables.items()}
+        rows.append({"agent": agent, "score": score, **means})
     return pd.DataFrame(rows)
 
 
@@ -169,34 +164,24 @@ def _errors(runs: pd.DataFrame) -> NDArray[np.float64]:
     return runs.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
 
 
-def _ends(name: str, found: Estimate) -> dict[str, float]:
-    return {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
-
-
 def standing(runs: pd.DataFrame, scales: Mapping[str, Scale], scored: pd.DataFrame) -> str:
     """Say in two sentences who is best at what valve travel, and who cannot be told apart.
 
-    Parameters
-    ----------
-    runs
-        One row a run, with `scenario`, `agent`, `policy`, `seed`, `mae` and `total_variation`.
-    scales
-        The least possible errors of each scenario.
-    scored
-        As `scores` returns them.
+    `runs` and `scales` are those of `estimate`, `scored` is what `scores` returns.
     """
-    ranked = scored.sort_values("score", ascending=False, kind="stable")
-    agents = list(ranked["agent"])
+    score: dict[str, float] = {
+        agent: found.value
+        for agent, found in zip(scored["agent"], scored["score"], strict=True)
+    }
+    agents = sorted(score, key=lambda agent: -score[agent])
     travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
-
-    def at(agent: str) -> str:
-        (score,) = ranked.loc[ranked["agent"] == agent, "score"]
-        return f"{score:.3f} at {travels[agent].mean():,.0f} t/h"
-
-    best = f"{label(agents[0])} is best, with a score of {at(agents[0])} of valve travel a run"
+    at = [f"{score[each]:.3f} at {travels[each].mean():,.0f} t/h" for each in agents]
     if len(agents) == 1:
-        return f"{label(agents[0])} has a score of {at(agents[0])} of valve travel a run."
-    best += f"; {label(agents[1])} follows with {at(agents[1])}."
+        return f"{label(agents[0])} has a score of {at[0]} of valve travel a run."
+    best = (
+        f"{label(agents[0])} is best, with a score of {at[0]} of valve travel a run; "
+        f"{label(agents[1])} follows with {at[1]}."
+    )
     if any(scale.drawn for scale in scales.values()) and runs["seed"].nunique() == 1:
         return f"{best} One run of each does not tell them apart."
     near = [pair for pair in itertools.pairwise(agents) if _alike(runs, scales, *pair)]
@@ -216,42 +201,35 @@ def _alike(runs: pd.DataFrame, scales: Mapping[str, Scale], one: str, other: str
         # Policies are drawn of the one that has more of them.
         many, few = sorted(map(scales[scenario].least.score, errors), key=len, reverse=True)
         tables.append(many - few.mean(axis=0))
-    difference = stratified(tables, BOOTSTRAP, np.mean)
+    difference = bootstrap(*tables, seed=BOOTSTRAP)
     return difference.low <= 0.0 <= difference.high
 
 
 def beaten(estimates: pd.DataFrame, bound: str = "limit") -> pd.DataFrame:
-    """Return the rows whose mean error lies below a bound by more than chance.
+    """Return the rows of `estimate` whose mean lies below a bound by more than chance.
 
     The whole interval lies below. Where there are few runs a bootstrap makes it too narrow, so
-    that Student's interval must lie below, too.
-
-    Parameters
-    ----------
-    estimates
-        As `estimate` returns them.
-    bound
-        "limit" or "preview".
+    that Student's interval must lie below, too. The bound is "limit" or "preview".
     """
-    highest = estimates[["mean_high", "student_high"]].max(axis=1, skipna=False)
+    ends = zip(estimates["mean"], estimates["student_high"], strict=True)
+    highest = np.array([max(mean.high, student_high) for mean, student_high in ends])
     return estimates[highest < estimates[bound] * (1.0 - TOLERANCE)]
 
 
 def verdict(estimates: pd.DataFrame) -> str:
     """Say in a sentence whether a controller came below a bound, and what that means."""
-    below, impossible = beaten(estimates), beaten(estimates, "preview")
 
     def cases(rows: pd.DataFrame) -> str:
         return ", ".join(f"{row.agent} in {row.scenario}" for row in rows.itertuples())
 
-    if len(impossible):
+    if impossible := cases(beaten(estimates, "preview")):
         return (
-            f"Below the bound of every controller, beyond the interval: {cases(impossible)}. "
+            f"Below the bound of every controller, beyond the interval: {impossible}. "
             "The plant or the bound is another one than was run."
         )
-    if len(below):
+    if below := cases(beaten(estimates)):
         return (
-            f"Below what is possible without knowing the set point beforehand: {cases(below)}. "
+            f"Below what is possible without knowing the set point beforehand: {below}. "
             "Such a controller uses the future, or reckons with the next change."
         )
     return "No controller comes below the least possible error, in any scenario."

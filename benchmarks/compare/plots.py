@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -16,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from benchmarks.controllers.roster import label
-from benchmarks.lib.drawing import COLOURS, colours, drawn
+from benchmarks.lib.drawing import COLOURS, colours, draw_actuator, drawn, panels
 from benchmarks.lib.tables import groups
 from benchmarks.loop.metrics import METRICS
 from benchmarks.loop.scenarios import Scenario
@@ -25,71 +24,55 @@ from benchmarks.loop.scenarios import Scenario
 def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> None:
     """Draw set point, output and applied input of every agent over time.
 
-    Parameters
-    ----------
-    responses
-        Rows as `tables.summarise_responses` makes them, of all agents.
-    scenario
-        What was run.
-    path
-        The PNG file to write.
+    The rows are those that `tables.summarise_responses` makes, of all agents.
     """
-    parameters = scenario.parameters
     palette = colours(list(responses["agent"].unique()))
     with drawn(path, 9, 6) as figure:
         above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
         for agent, rows in groups(responses, "agent"):
-            _band(above, rows, "output", palette[agent], label(agent))
-            _band(below, rows, "applied", palette[agent], label(agent))
-        minutes = rows["time_s"] / 60
+            minutes = rows["time_s"] / 60
+            for axes, signal, held in ((above, "output", False), (below, "applied", True)):
+                axes.fill_between(
+                    minutes, rows[f"{signal}_p10"], rows[f"{signal}_p90"],
+                    step="post" if held else None, color=palette[agent], alpha=0.2, linewidth=0,
+                )  # fmt: skip
+                axes.plot(
+                    minutes, rows[f"{signal}_median"], color=palette[agent], linewidth=1.2,
+                    drawstyle="steps-post" if held else "default", label=label(agent),
+                )  # fmt: skip
         above.step(
             minutes, rows["setpoint"], "k--", linewidth=1, where="post", label="set point"
         )
         above.set_ylabel("temperature y (°C)")
         above.set_title(scenario.title, loc="left")
         figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        # Of drawn actuators, what none of them lets pass, and what none of them exceeds.
-        zone, _ = parameters.range_of("dead_zone")
-        below.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0)
+        draw_actuator(below, scenario.parameters)
         below.text(
             1.005, 0.5, "dead\nzone", transform=below.transAxes, va="center", color="0.4"
         )
-        for limit in (parameters.range_of("u_min")[0], parameters.range_of("u_max")[1]):
-            below.axhline(limit, color="0.4", linestyle=":", linewidth=1)
         below.set_ylabel("applied flow u_a (t/h)")
         below.set_xlabel("time (min)")
         below.set_xlim(0, minutes.max())
 
 
-def _band(axes: Axes, rows: pd.DataFrame, signal: str, colour: str, name: str) -> None:
-    minutes = rows["time_s"] / 60
-    step: Literal["post"] | None = "post" if signal == "applied" else None
-    axes.fill_between(
-        minutes, rows[f"{signal}_p10"], rows[f"{signal}_p90"], step=step,
-        color=colour, alpha=0.2, linewidth=0,
-    )  # fmt: skip
-    drawstyle = "steps-post" if step else "default"
-    axes.plot(
-        minutes, rows[f"{signal}_median"], color=colour, linewidth=1.2, drawstyle=drawstyle,
-        label=name,
-    )  # fmt: skip
-
-
 def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
     """Draw the mean errors as points with 95 % intervals; each axis begins at the limit."""
-    with _scenario_panels(path, estimates) as (_, panels):
-        shades = colours(list(estimates["agent"].unique()))
-        for axes, (_, rows) in zip(panels, groups(estimates, "scenario"), strict=True):
-            for place, (_, row) in enumerate(rows.iterrows()):
-                low, high = row["mean"] - row["mean_low"], row["mean_high"] - row["mean"]
-                ends = [[low], [high]] if math.isfinite(high) else None
-                colour = shades[row["agent"]]
-                axes.errorbar(row["mean"], place, xerr=ends, fmt="o", capsize=3, color=colour)
-            axes.set_yticks(range(len(rows)), [label(agent) for agent in rows["agent"]])
-            axes.invert_yaxis()
-            highest = rows[["mean", "mean_high"]].to_numpy()
-            # The end of an interval may be infinite.
-            limit, worst = rows["limit"].iloc[0], highest[np.isfinite(highest)].max()
+    shades = colours(list(estimates["agent"].unique()))
+    with _scenario_panels(path, estimates) as (_, found):
+        for axes, (_, rows) in zip(found, groups(estimates, "scenario"), strict=True):
+            worst = rows["mean"].map(lambda mean: mean.value).max()
+            for place, (agent, mean) in enumerate(
+                zip(rows["agent"], rows["mean"], strict=True)
+            ):
+                ends = None
+                if math.isfinite(mean.high):
+                    ends = [[mean.value - mean.low], [mean.high - mean.value]]
+                    worst = max(worst, mean.high)
+                axes.errorbar(
+                    mean.value, place, xerr=ends, fmt="o", capsize=3, color=shades[agent]
+                )
+            _list_agents(axes, list(rows["agent"]))
+            limit = rows["limit"].iloc[0]
             # A little to the left of it, so that a point on the limit is whole.
             axes.axvline(limit, color="0.4", linewidth=1)
             axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
@@ -99,36 +82,29 @@ def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
 def plot_runs(runs: pd.DataFrame, path: Path) -> None:
     """Draw the mean error of every single run, so that no failure is averaged away."""
     generator = np.random.default_rng(0)  # scatters points that would hide each other
-    with _scenario_panels(path, runs) as (_, panels):
-        shades = colours(list(runs["agent"].unique()))
-        for axes, (_, cases) in zip(panels, groups(runs, "scenario"), strict=True):
-            agents = list(cases["agent"].unique())
-            for place, agent in enumerate(agents):
-                errors = cases.loc[cases["agent"] == agent, "mae"]
-                around = place + generator.uniform(-0.3, 0.3, len(errors))
-                axes.plot(errors, around, ".", markersize=3, alpha=0.4, color=shades[agent])
-            axes.set_yticks(range(len(agents)), [label(agent) for agent in agents])
-            axes.invert_yaxis()
+    shades = colours(list(runs["agent"].unique()))
+    with _scenario_panels(path, runs) as (_, found):
+        for axes, (_, cases) in zip(found, groups(runs, "scenario"), strict=True):
+            for place, (agent, rows) in enumerate(groups(cases, "agent")):
+                around = place + generator.uniform(-0.3, 0.3, len(rows))
+                axes.plot(
+                    rows["mae"], around, ".", markersize=3, alpha=0.4, color=shades[agent]
+                )
+            _list_agents(axes, list(cases["agent"].unique()))
             axes.set_xlim(left=0)
             axes.set_xlabel("mean |e| of a run (°C)")
 
 
-@contextmanager
+def _list_agents(axes: Axes, agents: Sequence[str]) -> None:
+    axes.set_yticks(range(len(agents)), [label(agent) for agent in agents])
+    axes.invert_yaxis()
+
+
 def _scenario_panels(
     path: Path, rows: pd.DataFrame, height: float | None = None
-) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Give a figure with a panel for each scenario, and write it."""
-    names = rows["scenario"].unique()
-    columns = min(3, len(names))
+) -> AbstractContextManager[tuple[Figure, list[Axes]]]:
     height = height or 1.2 + 0.28 * rows["agent"].nunique()
-    lines = math.ceil(len(names) / columns)
-    with drawn(path, 4.2 * columns, height * lines) as figure:
-        panels = list(figure.subplots(lines, columns, squeeze=False).flat)
-        for axes, name in zip(panels, names, strict=False):
-            axes.set_title(name, loc="left")
-        for axes in panels[len(names) :]:
-            axes.set_visible(False)
-        yield figure, panels[: len(names)]
+    return panels(path, list(rows["scenario"].unique()), (4.2, height), 3)
 
 
 def plot_travel(
@@ -139,26 +115,18 @@ def plot_travel(
 ) -> None:
     """Draw the error of every agent against its valve travel, a panel for each scenario.
 
-    Parameters
-    ----------
-    summary
-        Rows as `tables.summarise` makes them.
-    limits
-        The least possible error of each scenario, degC.
-    frontiers
-        The least possible error for a given travel: t/h and degC, by descending travel.
-    path
-        The PNG file to write.
+    `summary` is what `tables.summarise` returns; the limits are the least possible errors,
+    degC, and the frontiers those for a given travel: t/h and degC, by descending travel.
     """
     medians = summary.pivot_table(
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
-    with _scenario_panels(path, medians, 3.0) as (figure, panels):
+    with _scenario_panels(path, medians, 3.0) as (figure, found):
         agents = list(medians["agent"].unique())
         shades = colours(agents)
         # Not as many as hues, so that two of like colour have other marks.
         marks = dict(zip(agents, itertools.cycle("osD^v"), strict=False))
-        for axes, (name, rows) in zip(panels, groups(medians, "scenario"), strict=True):
+        for axes, (name, rows) in zip(found, groups(medians, "scenario"), strict=True):
             # A valve that never moves has no place on this axis.
             moving = rows[rows["total_variation"] > 0.0]
             for _, row in moving.iterrows():
@@ -189,7 +157,7 @@ def plot_travel(
             axes.xaxis.set_minor_locator(NullLocator())
             axes.set_xlabel("valve travel (t/h)")
             axes.set_ylabel("mean |e| (°C)")
-        shown = [axes.get_legend_handles_labels() for axes in panels]
+        shown = [axes.get_legend_handles_labels() for axes in found]
         # Each once, although not every panel has all.
         entries = {name: handle for pair in shown for handle, name in zip(*pair, strict=True)}
         figure.legend(entries.values(), entries, loc="outside lower center", ncols=5)
@@ -203,9 +171,9 @@ def plot_learning(curves: pd.DataFrame, path: Path) -> None:
         "square_mae": "square wave, no noise",
     }
     agents = list(curves["agent"].unique())
-    with drawn(path, 9, 4.5 * len(agents)) as figure:
-        panels = figure.subplots(len(agents), 1, squeeze=False)[:, 0]
-        for axes, agent in zip(panels, agents, strict=True):
+    titles = [f"{label(agent)}: a line a policy" for agent in agents]
+    with panels(path, titles, (9, 4.5), 1) as (figure, found):
+        for axes, agent in zip(found, agents, strict=True):
             policies = curves[curves["agent"] == agent].dropna(axis=1, how="all")
             for (column, name), colour in zip(shown.items(), COLOURS, strict=False):
                 for i, (_, curve) in enumerate(policies.groupby("policy")):
@@ -218,6 +186,5 @@ def plot_learning(curves: pd.DataFrame, path: Path) -> None:
             axes.set_xlim(left=0)
             axes.set_xlabel("samples of experience (thousands)")
             axes.set_ylabel(METRICS["mae"])
-            axes.set_title(f"{label(agent)}: a line a policy", loc="left")
-        handles, names = panels[0].get_legend_handles_labels()
+        handles, names = found[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from benchmarks.compare import tables
-from benchmarks.lib.storage import read_object, write_json
+from benchmarks.lib.storage import write_json
 from benchmarks.lib.tables import write_csv
 
 PROVENANCE = "provenance.json"
@@ -38,14 +39,27 @@ class Record:
     def path(self, name: str) -> Path:
         """Return where to write a file."""
         if not self._files:
-            for stale in _files_of_earlier_run(self.folder / PROVENANCE):
-                (self.folder / Path(stale).name).unlink(missing_ok=True)
+            self._remove_files_of_earlier_run()
         if name not in self._files:
             self._files.append(name)
         return self.folder / name
 
+    def _remove_files_of_earlier_run(self) -> None:
+        """Do so; if it cannot be read what they are, say so and go on."""
+        provenance = self.folder / PROVENANCE
+        if not provenance.exists():
+            return
+        try:
+            stale = [Path(name) for name in json.loads(provenance.read_text("utf-8"))["files"]]
+        except (KeyError, TypeError, ValueError) as error:
+            text = f"{provenance} is damaged: {error}. Other files of the earlier run may stay."
+            tqdm.write(text, file=sys.stderr)
+            return
+        for file in stale:
+            (self.folder / file.name).unlink(missing_ok=True)
+
     def write_table(self, name: str, table: pd.DataFrame) -> None:
-        """Write a table, infinite values in words."""
+        """Write a table of numbers, texts and estimates."""
         write_csv(self.path(name), tables.for_csv(table))
 
     def write_runs(self, runs: pd.DataFrame, *, complete: bool) -> None:
@@ -55,17 +69,3 @@ class Record:
         seconds = round(time.perf_counter() - self._clock, 1)
         about = {"complete": complete, "seconds": seconds, **self.origin, "files": self._files}
         write_json(path, about)
-
-
-def _files_of_earlier_run(provenance: Path) -> list[str]:
-    """Return what an earlier comparison wrote; if that cannot be read, say so and go on."""
-    if not provenance.exists():
-        return []
-    try:
-        files = read_object(provenance).get("files", [])
-        if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
-            raise ValueError(f"{provenance} is damaged: it lists no files")
-    except ValueError as error:
-        tqdm.write(f"{error}. Other files of the earlier run may stay.", file=sys.stderr)
-        return []
-    return files

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -19,41 +19,6 @@ from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.report import Section, provenance_line, write_report
 from benchmarks.lib.storage import NotWrittenError
 
-BOUNDS_TEXT = (
-    "The least possible error marked * supposes that each change of the set point finds the "
-    "plant settled and is not foreseen; of random set points it supposes that their law is "
-    "known. With preview of the whole set point, no controller that reads the transmitter, and "
-    "not the true output, does better than the second row says."
-)
-SCORE_TEXT = (
-    "The first column is the interquartile mean over all scenarios and runs, with its 95 % "
-    "interval; the others are means. Below 0, doing nothing is better. The valve travel above "
-    "is that of the median run, as a mean over the scenarios."
-)
-LIMITS_CAPTION = (
-    "A point is the mean over all runs, a bar its 95 % interval. Each axis begins at the least "
-    "possible error, the vertical line."
-)
-TRAVEL_CAPTION = (
-    "A point is the median run of a controller: its error against the distance that it moves "
-    "the valve. Down and left is better. The line is the least possible error for a given "
-    "travel, the dashed one for any travel."
-)
-RUNS_CAPTION = "A point is one run: so unlucky initial weights and unlucky trainings show."
-RESPONSES_CAPTION = (
-    "A line is the median over all runs at each sample, a band the 10th to 90th percentile. "
-    "The grey band is the dead zone."
-)
-COSTS_TEXT = (
-    "First and second run: mean error on the square wave, the second time with what was learnt "
-    "the first time. Most controllers learn nothing in a run, and do the same twice. Training: "
-    "of one policy, the median. Runs: all scenarios, including what is measured."
-)
-METRICS_TEXT = (
-    "The noise is the same for all. Overshoot and settling time are left out where there is "
-    "noise: it crosses every band."
-)
-
 
 def write(
     comparison: Comparison,
@@ -63,56 +28,35 @@ def write(
     *,
     complete: bool,
 ) -> list[Section]:
-    """Write the report of all that has finished, with its tables and pictures.
+    """Write the report of all that has finished, with its tables and pictures, and return it.
 
-    Parameters
-    ----------
-    comparison
-        What has been run.
-    entries
-        Its controllers.
-    record
-        Where to write.
-    fan_out
-        Where estimates are made and pictures drawn.
-    complete
-        Whether all has finished.
-
-    Returns
-    -------
-    list of Section
-        What stands in the report; nothing if nothing has finished. A picture that cannot be
-        drawn is a sentence in it.
+    The fan-out makes the estimates and draws the pictures; one that cannot be drawn is a
+    sentence in the report. Nothing is written as long as nothing has finished. `complete` says
+    whether all has.
     """
     if not comparison.cases:
         return []
-    record.write_runs(comparison.runs, complete=False)
-    runs, names = comparison.runs, comparison.names
+    runs, names, agents = comparison.runs, comparison.names, comparison.agents
+    record.write_runs(runs, complete=False)
     for name in names:  # after an interruption not all may be known
         if name not in comparison.scales:
             scale = scale_of(comparison.scenarios[name], comparison.count)
             comparison.scales[name] = scale
     scales = {name: comparison.scales[name] for name in names}
-    summary = tables.summarise(runs)
-    curves = [
-        pd.DataFrame(member.curve).assign(agent=name, policy=number)
-        for name, members in comparison.controllers.items()
-        for number, member in enumerate(members)
-        if member.curve
-    ]
-    first = comparison.agents[0]
-    of_scenarios: dict[str, Callable[[], Any]] = {
-        name: partial(estimate, runs[runs["scenario"] == name], scales, first) for name in names
+    of_scenarios = {
+        name: partial(estimate, runs[runs["scenario"] == name], scales, agents[0])
+        for name in names
     }
     of_agents = {
-        agent: partial(scores, runs[runs["agent"] == agent], scales)
-        for agent in comparison.agents
+        agent: partial(scores, runs[runs["agent"] == agent], scales) for agent in agents
     }
     made = dict(fan_out.stream(of_scenarios | of_agents))
     estimates = pd.concat([made[name] for name in names], ignore_index=True)
-    scored = pd.concat([made[agent] for agent in comparison.agents], ignore_index=True)
+    scored = pd.concat([made[agent] for agent in agents], ignore_index=True)
+    summary = tables.summarise(runs)
     record.write_table("summary.csv", summary)
     record.write_table("estimates.csv", estimates)
+
     limits = {name: scale.least.value for name, scale in scales.items()}
     frontiers = {name: comparison.frontiers.get(name, []) for name in names}
     pictures: dict[str, tuple[Any, ...]] = {
@@ -120,18 +64,25 @@ def write(
         "limits.png": ("limits", estimates),
         "runs.png": ("runs", runs),
     }
-    shown = [agent for agent in comparison.agents if entries[agent].drawn] or comparison.agents
+    drawn = [agent for agent in agents if entries[agent].drawn] or agents
     for name in names:
-        rows, scenario = comparison.responses(name), comparison.scenarios[name]
+        rows = comparison.responses(name)
         record.write_table(f"{name}.csv", rows)
-        drawn = rows[rows["agent"].isin(shown)]
-        pictures[f"{name}.png"] = ("responses", drawn, scenario)
+        rows = rows[rows["agent"].isin(drawn)]
+        pictures[f"{name}.png"] = ("responses", rows, comparison.scenarios[name])
+    curves = [
+        pd.DataFrame(member.curve).assign(agent=name, policy=number)
+        for name, members in comparison.controllers.items()
+        for number, member in enumerate(members)
+        if member.curve
+    ]
     if curves:
         learning = pd.concat(curves, ignore_index=True)
         record.write_table("learning.csv", learning)
         pictures["learning.png"] = ("learning", learning)
     draw = {name: partial(_draw, *what, record.path(name)) for name, what in pictures.items()}
     faults = dict(fan_out.stream(draw))
+
     sections = [
         _with_pictures(section, faults)
         for section in _sections(comparison, entries, summary, estimates, scored)
@@ -157,7 +108,7 @@ def _draw(kind: str, *arguments: Any) -> str:
     return ""
 
 
-def _with_pictures(section: Section, faults: Mapping[str, object]) -> Section:
+def _with_pictures(section: Section, faults: Mapping[str, str]) -> Section:
     """Return a section whose pictures that are not there are sentences."""
     missing = [name for name in section.pictures if faults[name]]
     sentences = [f"{name} could not be drawn ({faults[name]})." for name in missing]
@@ -180,23 +131,63 @@ def _sections(
         Section("", [standing(comparison.runs, scales, scored)]),
         Section(
             "Score: 0 for leaving the valve alone, 1 for the least possible error",
-            [SCORE_TEXT, f"The picture: {titles[0][1]}. {RESPONSES_CAPTION}"],
+            [
+                "The first column is the interquartile mean over all scenarios and runs, with "
+                "its 95 % interval; the others are means. Below 0, doing nothing is better. "
+                "The valve travel above is that of the median run, as a mean over the "
+                "scenarios.",
+                f"The picture: {titles[0][1]}. A line is the median over all runs at each "
+                "sample, a band the 10th to 90th percentile. The grey band is the dead zone.",
+            ],
             tables.score_table(scored),
             [f"{names[0]}.png"],
         ),
         Section(
             "Mean absolute error as a multiple of the least possible error, with its 95 % "
             "interval",
-            [verdict(estimates), BOUNDS_TEXT, LIMITS_CAPTION],
+            [
+                verdict(estimates),
+                "The least possible error marked * supposes that each change of the set point "
+                "finds the plant settled and is not foreseen; of random set points it supposes "
+                "that their law is known. With preview of the whole set point, no controller "
+                "that reads the transmitter, and not the true output, does better than the "
+                "second row says.",
+                "A point is the mean over all runs, a bar its 95 % interval. Each axis begins "
+                "at the least possible error, the vertical line.",
+            ],
             tables.ratio_table(estimates, scales),
             ["limits.png"],
         ),
-        Section("Error against valve travel", [TRAVEL_CAPTION], pictures=["travel.png"]),
-        Section("What each controller costs", [COSTS_TEXT], _costs(comparison, entries)),
-        Section("Every run", [RUNS_CAPTION], pictures=["runs.png"]),
+        Section(
+            "Error against valve travel",
+            [
+                "A point is the median run of a controller: its error against the distance "
+                "that it moves the valve. Down and left is better. The line is the least "
+                "possible error for a given travel, the dashed one for any travel."
+            ],
+            pictures=["travel.png"],
+        ),
+        Section(
+            "What each controller costs",
+            [
+                "First and second run: mean error on the square wave, the second time with "
+                "what was learnt the first time. Most controllers learn nothing in a run, and "
+                "do the same twice. Training: of one policy, the median. Runs: all scenarios, "
+                "including what is measured."
+            ],
+            _costs(comparison, entries),
+        ),
+        Section(
+            "Every run",
+            ["A point is one run: so unlucky initial weights and unlucky trainings show."],
+            pictures=["runs.png"],
+        ),
         Section(
             f"All measures: median (10th to 90th percentile) of {comparison.count} runs",
-            [METRICS_TEXT],
+            [
+                "The noise is the same for all. Overshoot and settling time are left out where "
+                "there is noise: it crosses every band."
+            ],
             tables.metrics_table(summary, comparison.scenarios),
         ),
         Section(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,7 @@ import pandas as pd
 from benchmarks.compare.estimates import Scale
 from benchmarks.controllers.roster import label
 from benchmarks.lib.statistics import Estimate
-from benchmarks.lib.tables import PERCENTILES, percentiles
+from benchmarks.lib.tables import PERCENTILES, groups, percentiles
 from benchmarks.loop.metrics import METRICS
 from benchmarks.loop.rollout import Trajectory
 from benchmarks.loop.scenarios import Scenario
@@ -23,12 +24,14 @@ STEP_METRICS = ("overshoot", "settling_time")  # which mean nothing in noise
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row for each scenario, agent and metric: percentiles over the runs."""
-    rows = []
-    for (scenario, agent), group in runs.groupby(["scenario", "agent"], sort=False):
-        for metric in METRICS:
-            row = {"scenario": scenario, "agent": agent, "metric": metric, "runs": len(group)}
-            rows.append(row | percentiles(group[metric].to_numpy()))
-    return pd.DataFrame(rows)
+    return pd.DataFrame(
+        [
+            {"scenario": scenario, "agent": agent, "metric": metric, "runs": len(group)}
+            | percentiles(group[metric].to_numpy())
+            for (scenario, agent), group in runs.groupby(["scenario", "agent"], sort=False)
+            for metric in METRICS
+        ]
+    )
 
 
 def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) -> pd.DataFrame:
@@ -53,67 +56,58 @@ def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) 
 
 
 def for_csv(table: pd.DataFrame) -> pd.DataFrame:
-    """Write infinite values, which only a settling time can have, in words."""
-    return table.astype(object).where(table != math.inf, NOT_SETTLED)
+    """Return a table of numbers and texts.
 
-
-def format_cell(row: pd.Series) -> str:
-    """Write the median and, where they differ, the 10th and 90th percentile."""
-    form = ".3f" if row["metric"] == "mae" else ",.0f"
-    words = {math.inf: NOT_SETTLED}
-    median, p10, p90 = (
-        NO_MEASURE if math.isnan(value) else words.get(value, format(value, form))
-        for value in row[[*PERCENTILES]]
-    )
-    return median if p10 == p90 else f"{median} ({p10} to {p90})"
+    An estimate becomes three columns, its value and the ends of its interval; infinite values,
+    which apart from such ends only a settling time can have, are written in words.
+    """
+    columns: dict[Any, Any] = {}
+    for name, cells in table.items():
+        if any(isinstance(cell, Estimate) for cell in cells):
+            for end, column in (
+                ("value", name),
+                ("low", f"{name}_low"),
+                ("high", f"{name}_high"),
+            ):
+                columns[column] = [getattr(cell, end, math.nan) for cell in cells]
+        else:
+            columns[name] = cells
+    flat = pd.DataFrame(columns)
+    return flat.astype(object).where(flat != math.inf, NOT_SETTLED)
 
 
 def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
     """Return the mean errors as multiples of the least possible error, and what that is."""
-    shown = estimates.apply(lambda row: f"{_ends(row, 'ratio'):.2f}", axis=1)
-    table = _by_agent(estimates, shown)
-    rows = [
-        {"agent": "least possible (°C)"}
-        | {
-            name: f"{scale.least.value:.3f}" + "*" * (scale.least.kind == "reference")
-            for name, scale in scales.items()
-        },
-        {"agent": "with preview (°C)"}
-        | {name: f"{scale.preview.value:.3f}" for name, scale in scales.items()},
-    ]
-    return pd.concat([pd.DataFrame(rows), table], ignore_index=True)
+    bounds = [{"agent": "least possible (°C)"}, {"agent": "with preview (°C)"}]
+    for name, scale in scales.items():
+        mark = "*" * (scale.least.kind == "reference")
+        bounds[0][name] = f"{scale.least.value:.3f}{mark}"
+        bounds[1][name] = f"{scale.preview.value:.3f}"
+    table = _by_agent(estimates, estimates["ratio"].map("{:.2f}".format))
+    return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
 
 
 def score_table(scores: pd.DataFrame) -> pd.DataFrame:
     """Return the scores: a row for each agent, the overall score first."""
-    scenarios = [
-        n for n in scores.columns if n not in ("agent", "score", "score_low", "score_high")
-    ]
-    cells = {
-        "agent": scores["agent"].map(label),
-        "score": scores.apply(lambda row: f"{_ends(row, 'score'):.3f}", axis=1),
-    }
-    return pd.DataFrame(cells | {name: scores[name].map("{:.2f}".format) for name in scenarios})
+    forms: dict[Any, Any] = {"agent": label, "score": "{:.3f}".format}
+    return pd.DataFrame(
+        {name: cells.map(forms.get(name, "{:.2f}".format)) for name, cells in scores.items()}
+    )
 
 
 def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
     """Return differences to the reference: a row for each other agent."""
     others = estimates.dropna(subset=["difference"])
-
-    def cell(row: pd.Series) -> str:
-        better = f"{100 * row['improvement']:.0f} %"
-        return f"{_ends(row, 'difference'):+.3f}; {better}"
-
-    return _by_agent(others, others.apply(cell, axis=1))
-
-
-def _ends(row: pd.Series, name: str) -> Estimate:
-    """Return an estimate that stands in a row with its interval."""
-    value, low, high = (float(row[n]) for n in (name, f"{name}_low", f"{name}_high"))
-    return Estimate(value, low, high, 1)
+    cells = [
+        f"{difference:+.3f}; {100 * improvement.value:.0f} %"
+        for difference, improvement in zip(
+            others["difference"], others["improvement"], strict=True
+        )
+    ]
+    return _by_agent(others, cells)
 
 
-def _by_agent(rows: pd.DataFrame, cells: pd.Series) -> pd.DataFrame:
+def _by_agent(rows: pd.DataFrame, cells: Any) -> pd.DataFrame:
     table = rows.assign(cell=cells).pivot_table(
         index="agent", columns="scenario", values="cell", aggfunc="first", sort=False
     )
@@ -123,16 +117,25 @@ def _by_agent(rows: pd.DataFrame, cells: pd.Series) -> pd.DataFrame:
 def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> pd.DataFrame:
     """Return all metrics: a row for each scenario and agent, a column for each metric."""
     rows = []
-    in_order = summary.sort_values(
-        "scenario", key=lambda names: names.map(list(scenarios).index), kind="stable"
-    )
-    for (scenario, agent), group in in_order.groupby(["scenario", "agent"], sort=False):
-        noisy = scenarios[str(scenario)].parameters.range_of("noise_variance")[1] > 0.0
-        cells = {
-            METRICS[row["metric"]]: (
-                "" if noisy and row["metric"] in STEP_METRICS else format_cell(row)
-            )
-            for _, row in group.iterrows()
-        }
-        rows.append({"scenario": scenario, "agent": label(str(agent))} | cells)
+    for name, scenario in scenarios.items():
+        noisy = scenario.parameters.range_of("noise_variance")[1] > 0.0
+        for agent, group in groups(summary[summary["scenario"] == name], "agent"):
+            cells = {
+                METRICS[row["metric"]]: (
+                    "" if noisy and row["metric"] in STEP_METRICS else _median(row)
+                )
+                for row in group.to_dict("records")
+            }
+            rows.append({"scenario": name, "agent": label(agent)} | cells)
     return pd.DataFrame(rows)
+
+
+def _median(row: Mapping[Any, Any]) -> str:
+    """Write the median and, where they differ, the 10th and 90th percentile."""
+    form = ".3f" if row["metric"] == "mae" else ",.0f"
+    words = {math.inf: NOT_SETTLED}
+    median, p10, p90 = (
+        NO_MEASURE if math.isnan(row[name]) else words.get(row[name], format(row[name], form))
+        for name in PERCENTILES
+    )
+    return median if p10 == p90 else f"{median} ({p10} to {p90})"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks.lib.storage import replacing
@@ -41,3 +43,43 @@ def drawn(path: Path, width: float, height: float, *, grid: bool = True) -> Iter
         yield figure
         with replacing(path) as partial:
             figure.savefig(partial)
+
+
+@contextmanager
+def panels(
+    path: Path,
+    names: Sequence[str],
+    size: tuple[float, float],
+    columns: int,
+    margin: tuple[float, float] = (0.0, 0.0),
+    *,
+    grid: bool = True,
+) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Give a figure with a panel for each name, and write it.
+
+    A panel is of this size, inches; the margin, right and below, has room for what is common.
+    """
+    columns = min(columns, len(names))
+    rows = math.ceil(len(names) / columns)
+    width, height = (
+        each * count + more
+        for each, count, more in zip(size, (columns, rows), margin, strict=True)
+    )
+    with drawn(path, width, height, grid=grid) as figure:
+        axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+        for panel, name in zip(axes, names, strict=False):
+            panel.set_title(name, loc="left")
+        for panel in axes[len(names) :]:
+            panel.set_visible(False)
+        yield figure, axes[: len(names)]
+
+
+def draw_actuator(axes: Axes, parameters: Any) -> None:
+    """Shade the dead zone, and mark the limits, of a plant's `Parameters`, t/h.
+
+    Of drawn actuators, what none of them lets pass, and what none of them exceeds.
+    """
+    zone, _ = parameters.range_of("dead_zone")
+    axes.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0, label="dead zone")
+    for limit in (parameters.range_of("u_min")[0], parameters.range_of("u_max")[1]):
+        axes.axhline(limit, color="0.4", linestyle=":", linewidth=1)

@@ -170,9 +170,7 @@ class FanOut:
         for key in here:
             yield *_answer(key, tasks[key]), False
 
-    def _in_processes(
-        self, tasks: Tasks, started: list[str]
-    ) -> Iterator[tuple[str, Any, str]]:
+    def _in_processes(self, tasks: Tasks, started: list[str]) -> Iterator[tuple[str, Any, str]]:
         """Run tasks, yield their answers as they come, and note which were handed out."""
         import joblib
 

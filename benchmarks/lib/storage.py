@@ -7,7 +7,6 @@ import json
 import os
 import platform
 import subprocess
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -29,12 +28,8 @@ class NotWrittenError(RuntimeError):
 def replacing(path: Path) -> Iterator[Path]:
     """Give a path to write to, and put what was written in place of `path` at the end.
 
-    After an error, or if the process is killed, `path` is what it was before.
-
-    Raises
-    ------
-    NotWrittenError
-        If the folder or the disk does not let it be written.
+    After an error, such as a `NotWrittenError` of a full disk, or if the process is killed,
+    `path` is what it was before.
     """
     # The suffix stays the last, as some writers choose a format by it or append it.
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
@@ -63,25 +58,6 @@ def _move(partial: Path, path: Path) -> None:
     partial.replace(path)
 
 
-def check_folder(folder: Path) -> None:
-    """Make a folder, and see that files can be written to it, before anything is computed.
-
-    Raises
-    ------
-    NotWrittenError
-        If not.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as probe:
-            probe.write(b"x")
-    except OSError as error:
-        reason = (
-            "it is no folder" if folder.exists() and not folder.is_dir() else error.strerror
-        )
-        raise NotWrittenError(f"{folder} cannot be written to: {reason}") from error
-
-
 def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all."""
     with replacing(path) as partial:
@@ -94,32 +70,13 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2) + "\n")
 
 
-def read_object(path: Path) -> dict[str, Any]:
-    """Read a JSON object; ValueError if the file is not there or is damaged."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ValueError(f"{path} is missing") from error
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    if not isinstance(value, dict):
-        raise ValueError(f"{path} is damaged: it holds no JSON object")
-    return value
-
-
 def seal(value: Any) -> str:
     """Return a value as JSON, with a checksum that tells whether it is what was written."""
     return json.dumps({"sha256": _checksum(value), "value": value})
 
 
 def unseal(text: str) -> Any:
-    """Return the value of a text that `seal` has made.
-
-    Raises
-    ------
-    ValueError
-        If it is damaged, or something else.
-    """
+    """Return the value of a text that `seal` has made; ValueError if it is damaged."""
     sealed = json.loads(text)
     if not isinstance(sealed, dict) or sealed.keys() != {"sha256", "value"}:
         raise ValueError("not a kept result")

@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks.lib.commands import command
+from benchmarks.lib.command_line import command
 
 main = command("speed", width=130, interrupted="nothing is kept.")
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks.lib.commands import command
+from benchmarks.lib.command_line import command
 
 main = command(
     "sweep", width=150, interrupted="what has finished is kept, and the next call goes on."

@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks.lib.commands import command
+from benchmarks.lib.command_line import command
 
 main = command("train", interrupted="the same command trains what is missing.")
 

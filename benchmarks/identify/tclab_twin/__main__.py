@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks.lib.commands import command
+from benchmarks.lib.command_line import command
 
 main = command("identify.tclab_twin", interrupted="nothing is kept.")
 
