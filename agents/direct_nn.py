@@ -25,29 +25,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)  # arrays have no single truth value
 class Weights:
-    """Weights and thresholds of one network, or with a leading batch axis of many.
-
-    Attributes
-    ----------
-    W : ndarray, shape (N_1, N)
-        W_ij, from input i to hidden node j.
-    theta_1 : ndarray, shape (N_1,)
-        theta_1j, thresholds of the hidden nodes.
-    W_1 : ndarray, shape (N_1,)
-        W_1j1, from hidden node j to the output.
-    theta_2 : ndarray, shape ()
-        theta_21, threshold of the output.
-    """
+    """Weights and thresholds of one network, or with a leading batch axis of many."""
 
     W: Array
+    """W_ij, from input i to hidden node j; shape (N_1, N)."""
     theta_1: Array
+    """theta_1j, thresholds of the hidden nodes; shape (N_1,)."""
     W_1: Array
+    """W_1j1, from hidden node j to the output; shape (N_1,)."""
     theta_2: Array
+    """theta_21, threshold of the output; shape ()."""
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the weights to a `.npz` file."""
         with Path(path).open("wb") as file:
-            np.savez(file, **{field.name: getattr(self, field.name) for field in fields(self)})
+            np.savez(file, **vars(self))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Weights:
@@ -84,14 +76,12 @@ class DirectNNController(Controller):
         N, number of inputs: the first N elements of the observation.
     n_hidden
         N_1, number of hidden nodes.
-    eta
-        eta^y, gain factor of the weights W from the inputs to the hidden nodes.
-    eta_1
-        eta_1^y, gain factor of the weights W_1 from the hidden nodes to the output.
-    eta_theta
-        eta_theta^y, gain factor of the thresholds theta_1 of the hidden nodes.
-    eta_1_theta
-        eta_1theta^y, gain factor of the threshold theta_2 of the output.
+    eta, eta_1
+        eta^y and eta_1^y, gain factors of the weights: of W, from the inputs to the hidden
+        nodes, and of W_1, from the hidden nodes to the output.
+    eta_theta, eta_1_theta
+        eta_theta^y and eta_1theta^y, gain factors of the thresholds: of theta_1, those of the
+        hidden nodes, and of theta_2, that of the output.
     direction
         D(G), -1 for a plant whose output falls when its input rises, 1 for the opposite.
     input_scale
@@ -171,15 +161,14 @@ class DirectNNController(Controller):
             "theta_2": (),
         }
         self._sample = 0  # k
-        drawn = [self._draw(np.random.default_rng(seed + i)) for i in range(num_envs or 1)]
-        if num_envs is None:
-            self.weights = Weights(*drawn[0])
-        else:
-            self.weights = Weights(*(np.stack(arrays) for arrays in zip(*drawn, strict=True)))
-
-    def _draw(self, generator: np.random.Generator) -> list[Array]:
-        scale = self.weight_scale
-        return [np.array(generator.uniform(-scale, scale, s)) for s in self._shapes.values()]
+        generators = [np.random.default_rng(seed + i) for i in range(num_envs or 1)]
+        scale, batch = self.weight_scale, self._batch
+        self.weights = Weights(
+            *(
+                np.reshape([g.uniform(-scale, scale, shape) for g in generators], batch + shape)
+                for shape in self._shapes.values()
+            )
+        )
 
     @property
     def weights(self) -> Weights:
@@ -193,10 +182,9 @@ class DirectNNController(Controller):
             If a shape does not fit or a value is not finite; nothing is changed then.
         """
         batch_last = (self._W.swapaxes(0, 1), self._theta_1, self._W_1, self._theta_2)
-        batch_first = [np.moveaxis(array, -1, 0) for array in batch_last]
-        if self.num_envs is None:
-            batch_first = [array[0] for array in batch_first]
-        return Weights(*(np.array(array, order="C") for array in batch_first))
+        batch_first = (np.moveaxis(array, -1, 0) for array in batch_last)
+        which = 0 if self.num_envs is None else slice(None)
+        return Weights(*(np.array(array[which], order="C") for array in batch_first))
 
     @weights.setter
     def weights(self, weights: Weights) -> None:

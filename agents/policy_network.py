@@ -29,22 +29,10 @@ PRETRAINED: Final = Path(__file__).parent / "pretrained"
 _FORMAT = 1  # of the file
 
 
-def _elu(x: Array) -> Array:
-    return np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))
-
-
-def _relu(x: Array) -> Array:
-    return np.maximum(x, 0.0)
-
-
-def _tanh(x: Array) -> Array:
-    return np.tanh(x)
-
-
 ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
-    "elu": _elu,
-    "relu": _relu,
-    "tanh": _tanh,
+    "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
+    "relu": lambda x: np.maximum(x, 0.0),
+    "tanh": np.tanh,
 }
 
 
@@ -133,9 +121,9 @@ class PolicyNetwork(Controller):
             name: check_count(f"observation[{name!r}]", observation.get(name, 0), 0)
             for name in WINDOWS
         }
-        if not (increments is None or isinstance(increments, Increments)):
+        if not isinstance(increments, Increments | None):
             raise ValueError(f"increments must be None or an Increments, got {increments!r}")
-        if not (provenance is None or isinstance(provenance, Mapping)):
+        if not isinstance(provenance, Mapping | None):
             raise ValueError(f"provenance must be None or a dict, got {provenance!r}")
         dead_zone = 0.0 if increments is None else increments.dead_zone
         super().__init__(
@@ -241,9 +229,8 @@ class PolicyNetwork(Controller):
 
     def _move(self, output: Values, increments: Increments) -> Values:
         """Move the valve, and return its flow, t/h."""
-        before = np.zeros_like(output) if self._position is None else self._position
-        position = np.clip(before + increments.max_move * output, -1.0, 1.0)
-        self._position = position
+        before = 0.0 if self._position is None else self._position
+        self._position = position = np.clip(before + increments.max_move * output, -1.0, 1.0)
         edge = increments.dead_zone
         if edge == 0.0:
             return self.u_min + (position + 1.0) * (self.u_max - self.u_min) / 2.0

@@ -25,19 +25,14 @@ class SmithPredictor(PIController):
 
     Parameters
     ----------
-    gain
-        Steady-state gain of the plant, degC per t/h, of either sign.
-    time_constant
-        Its time constant, s.
-    delay
-        Its delay, s; the sample that any input takes to show is part of it.
+    gain, time_constant, delay, sampling_interval
+        The model, as for `PIController.simc`: degC per t/h, s, s, s. The sample that any input
+        takes to show is part of the delay.
     closed_loop_time_constant
         Of the loop without the delay, s.
     dead_zone
         The actuator's, t/h: commands within it are 0 to the model, those on its edge have an
         effect. 0 if it is not known.
-    sampling_interval
-        s.
     error_index
         Where the observation holds e(k), degC.
     u_min, u_max
@@ -105,9 +100,8 @@ class SmithPredictor(PIController):
         ahead[-1] -= 1.0
         outgoing = np.convolve(integral, model[1])
         returning = np.convolve(np.convolve(pi, model[0]), ahead)
-        denominator = np.zeros(max(len(outgoing), len(returning)))
-        denominator[: len(outgoing)] += outgoing
-        denominator[: len(returning)] += returning
+        shorter, denominator = sorted((outgoing, returning), key=len)
+        denominator[: len(shorter)] += shorter
         return np.convolve(pi, model[1]), denominator
 
     def _control(self, observation: Array) -> Values:
