@@ -28,7 +28,6 @@ from benchmarks.watch.hands import HELP, Closed, Hands
 from benchmarks.watch.options import YOU, Options
 from mptc_gym import Parameters, drawing
 from mptc_gym.drawing import SIZE
-from mptc_gym.record import Record
 from mptc_gym.rendering import Frame
 
 COLOURS = 48  # of a GIF: the lines', the areas' and what lies between them
@@ -54,15 +53,14 @@ def execute(options: Options, console: Console) -> str:
     if controller is None and not has_screen:
         raise UsageError(f"--agent {YOU}: needs a screen to open a window on, and no --video")
     factory = controller.first() if controller else None
-
     if film is None and not has_screen:
         film = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.mp4"
         console.print(f"There is no screen to open a window on: writing a film, {film}")
-    label = controller.label if controller else YOU
+    closing = f"{controller.label if controller else YOU} on {scenario.title}: mean absolute"
     if film is not None:
         assert factory is not None
         trajectory = in_film(factory, scenario, options.seed, options.speed, film)
-        return f"{_closing(label, scenario, trajectory)}\nThe film is {film}"
+        return f"{closing} error {mean_error(trajectory)[0]:.3f} °C\nThe film is {film}"
     console.print(HELP)
     try:
         trajectory, moves = in_window(factory, scenario, options.seed, options.speed)
@@ -70,38 +68,19 @@ def execute(options: Options, console: Console) -> str:
         return "The window was closed."
     if controller is None or moves:
         console.print("The same for the controllers ...")
+        label = controller.label if controller else YOU
         table = rivals.table(label, trajectory, moves, scenario, options.seed)
         console.print(on_screen(table))
-    return _closing(label, scenario, trajectory)
-
-
-def _closing(label: str, scenario: Scenario, trajectory: Trajectory) -> str:
-    error = mean_error(trajectory)[0]
-    return f"{label} on {scenario.title}: mean absolute error {error:.3f} °C"
+    return f"{closing} error {mean_error(trajectory)[0]:.3f} °C"
 
 
 def in_window(
     factory: Factory | None, scenario: Scenario, seed: int, speed: int
 ) -> tuple[Trajectory, rivals.Moves]:
-    """Run a controller, or the one who watches, and show it in a window.
+    """Run a controller, or the one who watches if there is none, and show it in a window.
 
-    Parameters
-    ----------
-    factory
-        Makes the controller; None for the one who watches.
-    scenario
-        What it runs on.
-    seed
-        Of the plant and of the controller.
-    speed
-        Samples a second at the start, if so many can be drawn.
-
-    Returns
-    -------
-    Trajectory
-        Of the one run.
-    Moves
-        What was done to set point and load.
+    The speed, samples a second, is that at the start, if so many can be drawn. What is returned
+    are the one run, and what was done to set point and load.
 
     Raises
     ------
@@ -111,11 +90,9 @@ def in_window(
     arguments = factory.arguments(scenario.arguments) if factory else scenario.arguments
     parameters = Parameters(**arguments)
     hands = Hands(parameters.range_of("u_min")[0], parameters.range_of("u_max")[1], speed)
-
-    def show(record: Record) -> None:
-        drawing.show(record, hands.speed)
-
-    plants, touched = rivals.touched_plants(scenario.samples, arguments, show)
+    plants, touched = rivals.touched_plants(
+        scenario.samples, arguments, lambda record: drawing.show(record, hands.speed)
+    )
     moves: rivals.Moves = {}
 
     def attend(k: int) -> None:
@@ -172,17 +149,15 @@ def _mp4(path: Path, fps: float) -> Iterator[Put]:
 @contextmanager
 def _gif(path: Path, fps: float) -> Iterator[Put]:
     kept: list[bytes] = []  # compressed: in memory a minute of them takes a gigabyte
+    yield lambda frame: kept.append(zlib.compress(frame.tobytes(), 1))
 
-    def put(frame: Frame) -> None:
-        kept.append(zlib.compress(frame.tobytes(), 1))
+    def picture(data: bytes) -> Image.Image:
+        return Image.frombytes("RGB", SIZE, zlib.decompress(data))
 
-    yield put
-    pictures = (Image.frombytes("RGB", SIZE, zlib.decompress(data)) for data in kept)
     # One palette for all, of the last picture, which has something of everything in it.
-    last = Image.frombytes("RGB", SIZE, zlib.decompress(kept[-1]))
-    palette = last.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
+    palette = picture(kept[-1]).quantize(COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=1)
     first, *others = (
-        picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
+        picture(data).quantize(palette=palette, dither=Image.Dither.NONE) for data in kept
     )
     first.save(path, save_all=True, append_images=others, duration=1000 / fps, loop=0)
 
@@ -201,8 +176,7 @@ def _controller(agent: str) -> RosterEntry:
     if agent not in ROSTER:
         raise UsageError(
             f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, {YOU}, and "
-            "NAME=MODULE:FACTORY or NAME=PPO:FILE.zip "
-            "of your own"
+            "NAME=MODULE:FACTORY or NAME=PPO:FILE.zip of your own"
         )
     return ROSTER[agent]
 

@@ -33,31 +33,14 @@ class Closed(Exception):  # noqa: N818 (no error)
 
 
 class Hands:
-    """A controller whose flow comes from keys and mouse.
-
-    Parameters
-    ----------
-    u_min, u_max
-        The actuator's limits, t/h.
-    speed
-        Samples a second at the start.
-
-    Attributes
-    ----------
-    flow : float
-        The command, t/h.
-    setpoint, load : float
-        What has been added to both by hand, degC.
-    speed : float
-        Samples a second.
-    paused : bool
-        Whether the plant is to stand still.
-    """
+    """A controller whose flow comes from keys and mouse."""
 
     def __init__(self, u_min: float, u_max: float, speed: float) -> None:
-        self.u_min, self.u_max, self.speed = u_min, u_max, speed
-        self.flow = self.setpoint = self.load = 0.0
-        self.paused = False
+        self.u_min, self.u_max = u_min, u_max  # t/h
+        self.speed = speed  # samples a second
+        self.flow = 0.0  # the command, t/h
+        self.setpoint = self.load = 0.0  # what has been added to both by hand, degC
+        self.paused = False  # whether the plant is to stand still
 
     def reset(self) -> None:
         """Let go of the flow."""
@@ -69,14 +52,7 @@ class Hands:
         return np.full((len(observation), 1), action, np.float32)
 
     def take(self, events: Iterable[Any], record: Record) -> None:
-        """Do what events of pygame ask for.
-
-        Parameters
-        ----------
-        events
-            In their order.
-        record
-            What the window shows.
+        """Do what events of pygame ask for, in a window that shows the record.
 
         Raises
         ------

@@ -56,30 +56,20 @@ def replay(name: str, moves: Moves, scenario: Scenario, seed: int) -> Trajectory
 def table(
     label: str, trajectory: Trajectory, moves: Moves, scenario: Scenario, seed: int
 ) -> pd.DataFrame:
-    """Return mean error and valve travel of a run, of the controllers', and the bound.
+    """Return mean error and valve travel of a run, and of the controllers; and the bound.
 
-    The bound is none where the load was moved by hand.
-
-    Parameters
-    ----------
-    label
-        Of the run.
-    trajectory
-        The run.
-    moves
-        What was done to set point and load in it.
-    scenario, seed
-        What it ran on.
+    There is no bound where the load was moved by hand.
     """
     runs = {label: trajectory} | {
         controller.label: replay(name, moves, scenario, seed)
         for name, controller in ROSTER.items()
         if controller.compared and not controller.trained and controller.label != label
     }
+    found = {name: float(mean_error(run)[0]) for name, run in runs.items()}
     rows = [
-        (name, float(mean_error(run)[0]), float(travel(run)[0])) for name, run in runs.items()
+        (name, f"{found[name]:.3f}", f"{travel(runs[name])[0]:.0f}")
+        for name in sorted(found, key=lambda name: found[name])
     ]
-    rows.sort(key=lambda row: row[1])
     if not any(load for _, load in moves.values()):
         arguments, kind = dict(scenario.arguments), None
         if moves:
@@ -91,12 +81,5 @@ def table(
         bound = least_possible(
             samples=scenario.samples, kind=kind, episodes=EPISODES, **arguments
         )
-        rows.insert(0, ("least possible, on average", bound.value, float("nan")))
-    found: pd.DataFrame = pd.DataFrame(
-        [
-            (name, f"{error:.3f}", "" if moved != moved else f"{moved:.0f}")
-            for name, error, moved in rows
-        ],
-        columns=["", "mean |e| (°C)", "valve travel (t/h)"],
-    )
-    return found
+        rows.insert(0, ("least possible, on average", f"{bound.value:.3f}", ""))
+    return pd.DataFrame(rows, columns=["", "mean |e| (°C)", "valve travel (t/h)"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import islice
 from typing import Any, cast
 
 import gymnasium
@@ -16,8 +15,6 @@ from benchmarks.loop.linear import check_linear, coefficients
 from mptc_gym import MiddlePointEnv
 from mptc_gym.ranges import Ranges
 from mptc_gym.record import Record
-
-Step = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]
 
 
 class Touched(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -30,28 +27,17 @@ class Touched(gymnasium.Wrapper[Any, Any, Any, Any]):
     which nothing here uses, is that of the plant that is not, and so is the limit of the
     transmitter.
 
-    Parameters
-    ----------
-    env
-        A `MiddlePointEnv`, wrapped or not.
-    show
-        Called with a record of the last samples at each reset and step; None for no record.
-
-    Attributes
-    ----------
-    setpoint, load : float
-        What is added from the next sample on, degC.
+    `show`, if given, is called with a record of the last samples at each reset and step.
     """
 
     def __init__(
         self, env: gymnasium.Env[Any, Any], show: Callable[[Record], None] | None = None
     ) -> None:
         super().__init__(env)
-        plant = cast("MiddlePointEnv", env.unwrapped)
-        self.parameters = plant.parameters
+        self.parameters = cast("MiddlePointEnv", env.unwrapped).parameters
         check_linear(self.parameters)
         self._show = show
-        self.setpoint = self.load = 0.0
+        self.setpoint = self.load = 0.0  # what is added from the next sample on, degC
 
     def reset(self, **arguments: Any) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Reset the plant; nothing is added at k = 0."""
@@ -69,7 +55,9 @@ class Touched(gymnasium.Wrapper[Any, Any, Any, Any]):
             self._show(self.record)
         return observation, info
 
-    def step(self, action: Any) -> Step:
+    def step(
+        self, action: Any
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Step the plant, and add what the hand does."""
         self._k += 1
         now = coefficients(self.parameters, self._numbers, self._k)
@@ -86,19 +74,10 @@ class Touched(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._show is not None:
             self.record.add(*(info[x] for x in ("setpoint", "output", "command", "applied")))
             self._show(self.record)
-        shift = self._shift()
-        shifted = observation + shift if shift.any() else observation
-        return shifted, float(reward), terminated, truncated, info
-
-    def _shift(self) -> NDArray[np.float32]:
-        """Return what is added to the observation."""
-        setpoints, errors, outputs, actions = self.parameters.windows
-        return np.array(
-            [
-                *islice(self._setpoints, setpoints),
-                *(s - d for s, d in islice(zip(self._setpoints, self._outputs), errors)),  # noqa: B905 (of one length)
-                *islice(self._outputs, outputs),
-                *[0.0] * actions,
-            ],
-            np.float32,
-        )
+        setpoints, outputs = np.array(self._setpoints), np.array(self._outputs)
+        added_to = setpoints, setpoints - outputs, outputs, np.zeros(len(outputs))
+        windows = zip(added_to, self.parameters.windows, strict=True)
+        shift = np.concatenate([each[:length] for each, length in windows]).astype(np.float32)
+        if shift.any():
+            observation = observation + shift
+        return observation, float(reward), terminated, truncated, info
