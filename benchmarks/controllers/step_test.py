@@ -17,24 +17,16 @@ LEVELS = 0.283, 0.632  # shares of the final value, at a third of T and at T aft
 
 @dataclass(frozen=True)
 class StepTest:
-    """A model of first order with delay. The fields are arguments of SIMC and of Smith.
-
-    Attributes
-    ----------
-    gain
-        Steady-state gain, degC per t/h.
-    time_constant
-        s.
-    delay
-        s. The sample that any input takes to show is part of it.
-    sampling_interval
-        s.
-    """
+    """A model of first order with delay. The fields are arguments of SIMC and of Smith."""
 
     gain: float
+    """Steady-state gain, degC per t/h."""
     time_constant: float
+    """s."""
     delay: float
+    """s. The sample that any input takes to show is part of it."""
     sampling_interval: float
+    """s."""
 
 
 def step_test(parameters: Parameters) -> StepTest:
@@ -45,11 +37,8 @@ def step_test(parameters: Parameters) -> StepTest:
     L. Smith, "Digital Computer Process Control", 1972). As they would be read off a chart, the
     gain has four digits, the time constant three, and the delay is a whole number of samples.
 
-    Parameters
-    ----------
-    parameters
-        The plant's. A range stands for its middle, and a plant that drifts is tested at k = 0.
-        The flow moves outside the dead zone, and noise and load disturbances average out.
+    A range stands for its middle, and a plant that drifts is tested at k = 0. The flow moves
+    outside the dead zone, and noise and load disturbances average out.
 
     Raises
     ------

@@ -44,18 +44,7 @@ def random_design(
     """Return plants that differ in everything, spread evenly over spans.
 
     The second half of them drift: in the course of `samples` samples, gain and time constant
-    go to another place in their spans.
-
-    Parameters
-    ----------
-    count
-        How many.
-    seed
-        Of the design, a Latin hypercube.
-    samples
-        How long they drift.
-    spans
-        Lowest and highest value of each argument, such as `SPANS` or `WIDE`.
+    go to another place in their spans. The design is a Latin hypercube.
     """
     from scipy.stats import qmc  # here: it takes long to import
 

@@ -48,23 +48,18 @@ def check_linear(parameters: Parameters) -> None:
 
 @dataclass(frozen=True)
 class LinearModel:
-    """(28) with coefficients that do not change.
-
-    Attributes
-    ----------
-    a, b, c
-        Coefficients of A, B and C: `a` and `c` from z^0 on, `b` from z^-1 on.
-    delay
-        d, samples.
-    sampling_interval
-        s.
-    """
+    """(28) with coefficients that do not change."""
 
     a: Sequence[float]
+    """Coefficients of A, from z^0 on."""
     b: Sequence[float]
+    """Coefficients of B, from z^-1 on."""
     c: Sequence[float] = (1.0,)
+    """Coefficients of C, from z^0 on."""
     delay: int = 0
+    """d, samples."""
     sampling_interval: float = 8.0
+    """s."""
 
     @property
     def gain(self) -> float:
@@ -91,10 +86,7 @@ class LinearModel:
     def step_response(self, samples: int | None = None) -> Array:
         """Return y(0), y(1), ... after a step of u_a from 0 to 1 t/h at k = 0, degC per t/h.
 
-        Parameters
-        ----------
-        samples
-            How many; None for as many as the response takes to settle.
+        None stands for as many samples as the response takes to settle.
 
         Raises
         ------
@@ -115,27 +107,19 @@ class LinearModel:
 
 @dataclass(frozen=True)
 class Coefficients:
-    """What (28) has for one plant, for many, or at each sample of an episode.
-
-    Attributes
-    ----------
-    alpha, beta
-        Shapes (..., order of A) and (..., length of B).
-    load
-        A(1), shape (...).
-    """
+    """What (28) has for one plant, for many, or at each sample of an episode."""
 
     alpha: Array
+    """Shape (..., order of A)."""
     beta: Array
+    """Shape (..., length of B)."""
     load: Array
+    """A(1), shape (...)."""
 
     def impulse_response(self, samples: int) -> Array:
-        """Return what 1 t/h does to the first `samples` outputs that it can show in.
+        """Return what 1 t/h at j does to y(j + d + 1) and on, degC per t/h, (..., samples).
 
-        Returns
-        -------
-        ndarray, shape (..., samples)
-            degC per t/h, from y(j + d + 1) on for a flow at j. The coefficients do not change.
+        The coefficients do not change meanwhile.
         """
         response = np.zeros((*self.load.shape, samples))
         for k in range(samples):
@@ -146,19 +130,10 @@ class Coefficients:
         return response
 
     def state_space(self, c: Sequence[float]) -> tuple[Array, Array]:
-        """Return what noise alone does to the state y(k), y(k-1), ..., xi(k), xi(k-1), ...
+        """Return F, shape (..., size, size), and g, shape (size,): x(k) = F x(k-1) + g xi(k).
 
-        Parameters
-        ----------
-        c
-            Coefficients of C, from z^0 on.
-
-        Returns
-        -------
-        F
-            Shape (..., size, size): x(k) = F x(k-1) + g xi(k).
-        g
-            Shape (size,).
+        The state x is y(k), y(k-1), ..., xi(k), xi(k-1), ..., and noise alone acts on it. C has
+        the coefficients `c`, from z^0 on.
         """
         order = max(self.alpha.shape[-1], 1)
         size = order + len(c) - 1
@@ -226,26 +201,18 @@ def nominal(parameters: Parameters) -> LinearModel:
 
 @dataclass(frozen=True)
 class Course(Coefficients):
-    """What (28) and (29) are at each sample of an episode: coefficients, one row a sample.
-
-    Attributes
-    ----------
-    c
-        Coefficients of C, from z^0 on.
-    delay
-        d, samples.
-    low, high
-        The least and the greatest flow that the actuator can apply, t/h. It can apply 0, even
-        if the limits exclude it, if there is a dead zone.
-    numbers
-        The plant numbers of the episode.
-    """
+    """What (28) and (29) are at each sample of an episode: coefficients, one row a sample."""
 
     c: tuple[float, ...]
+    """Coefficients of C, from z^0 on."""
     delay: int
+    """d, samples."""
     low: float
+    """The least flow that the actuator can apply, t/h; 0 can be, if there is a dead zone."""
     high: float
+    """The greatest, likewise."""
     numbers: PlantNumbers[float]
+    """The plant numbers of the episode."""
 
     @property
     def lag(self) -> int:
@@ -272,28 +239,21 @@ class Course(Coefficients):
 
 
 def course(parameters: Parameters, numbers: PlantNumbers[float], samples: int) -> Course:
-    """Return the course of an episode.
-
-    Parameters
-    ----------
-    parameters
-        The environment's.
-    numbers
-        All plant numbers, as they were drawn.
-    samples
-        Length of the course.
+    """Return the course of an episode, given its plant numbers, for so many samples.
 
     Raises
     ------
     ValueError
         If the plant is not linear between its limits; see `check_linear`.
     """
-    rest = [0.0] if numbers.dead_zone > 0.0 else []
+    flows = [numbers.u_min, numbers.u_max]
+    if numbers.dead_zone > 0.0:
+        flows.append(0.0)
     return Course(
         **vars(coefficients(parameters, numbers, np.arange(samples))),
         c=tuple(parameters.c),
         delay=int(numbers.delay),
-        low=min([numbers.u_min, *rest]),
-        high=max([numbers.u_max, *rest]),
+        low=min(flows),
+        high=max(flows),
         numbers=numbers,
     )

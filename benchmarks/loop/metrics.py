@@ -33,13 +33,6 @@ METRICS: dict[str, str] = {
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     """Compute every measure of `METRICS` for every run.
 
-    Parameters
-    ----------
-    trajectory
-        The runs.
-    parameters
-        The environment's arguments in these runs.
-
     Returns
     -------
     dict of ndarray, shape (runs,)
@@ -117,13 +110,7 @@ def travel(trajectory: Trajectory) -> Array:
 
 
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
-    """Return for each run whether its last errors are within `SETTLING_BAND` of the set point.
-
-    Returns
-    -------
-    ndarray of bool, shape (runs,)
-        Judged by the last `LAST` samples.
-    """
+    """Return for each run whether its last `LAST` errors are within `SETTLING_BAND`."""
     setpoint, output = trajectory.setpoint[-LAST:], trajectory.output[-LAST:]
     within: NDArray[np.bool_] = np.all(
         np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint), axis=0
@@ -147,14 +134,8 @@ def reversals(applied: Array, sampling_interval: float) -> Array:
     """Return how often a minute the valve turns round, shape (runs,).
 
     A reversal is a move against the direction of the last move before it, however long the
-    valve stood still in between. A run begins with the valve at rest at 0.
-
-    Parameters
-    ----------
-    applied
-        u_a(k), t/h, shape (samples, runs), such as `Trajectory.applied`.
-    sampling_interval
-        s.
+    valve stood still in between. A run begins with the valve at rest at 0. `applied` is u_a(k),
+    t/h, shape (samples, runs), such as `Trajectory.applied`; the sampling interval is in s.
     """
     moves = np.sign(np.diff(applied, axis=0, prepend=0.0))
     counts = [np.count_nonzero(np.diff(run[run != 0.0])) for run in moves.T]

@@ -15,18 +15,12 @@ from mptc_gym.parameters import slowest_pole
 
 @dataclass(frozen=True)
 class ChosenPlant:
-    """A plant that was asked for.
-
-    Attributes
-    ----------
-    name
-        What was asked for, in a few words; "the paper's plant" if nothing was.
-    arguments
-        Arguments of the environment that are not its defaults.
-    """
+    """A plant that was asked for."""
 
     name: str
+    """What was asked for, in a few words; "the paper's plant" if nothing was."""
     arguments: dict[str, Any]
+    """Arguments of the environment that are not its defaults."""
 
 
 @options
@@ -86,16 +80,8 @@ class PlantOptions:
 def read_plant(path: str | Path) -> dict[str, Any]:
     """Return the arguments of `MiddlePoint-v0` that a file holds, checked.
 
-    Parameters
-    ----------
-    path
-        A JSON file with one object, whose names are arguments of the environment, such as
-        `plant.json` or `ranges.json` of `python -m benchmarks.identify`.
-
-    Returns
-    -------
-    dict
-        `gymnasium.make("MiddlePoint-v0", **read_plant(path))` takes it.
+    The file is JSON, with one object whose names are arguments of the environment, such as
+    `plant.json` or `ranges.json` of `python -m benchmarks.identify`.
 
     Raises
     ------

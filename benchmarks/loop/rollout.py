@@ -25,26 +25,20 @@ class Agent(Protocol):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What happened in a batch of runs; every array has shape (samples, runs).
-
-    Attributes
-    ----------
-    setpoint, output
-        y_d(k) and y(k), degC.
-    command, applied
-        u(k) and u_a(k), t/h.
-    noise
-        n(k), degC.
-    error
-        e(k + 1), degC: that of the reward of sample k. Every mean error is over k = 1 to N.
-    """
+    """What happened in a batch of runs; every array has shape (samples, runs)."""
 
     setpoint: NDArray[np.float64]
+    """y_d(k), degC."""
     output: NDArray[np.float64]
+    """y(k), degC."""
     command: NDArray[np.float64]
+    """u(k), t/h."""
     applied: NDArray[np.float64]
+    """u_a(k), t/h."""
     noise: NDArray[np.float64]
+    """n(k), degC."""
     error: NDArray[np.float64]
+    """e(k + 1), degC: that of the reward of sample k. Every mean error is over k = 1 to N."""
 
 
 def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vector.VectorEnv:
@@ -75,11 +69,6 @@ def rollout(
         Run i meets the noise and the set point of seed `seed + i`.
     before
         Called with k before the controller acts at sample k: to watch it, or to damage it.
-
-    Returns
-    -------
-    Trajectory
-        Of all runs.
     """
     shape = samples, plants.num_envs
     trajectory = Trajectory(*(np.empty(shape) for _ in fields(Trajectory)))

@@ -11,24 +11,16 @@ from mptc_gym import PRESETS, Parameters
 
 @dataclass(frozen=True)
 class Scenario:
-    """A plant, a set point and a length.
-
-    Attributes
-    ----------
-    name
-        Short name, for options and file names.
-    title
-        What it is, for headings.
-    samples
-        Length of a run, samples.
-    arguments
-        Arguments of the environment that are not its defaults.
-    """
+    """A plant, a set point and a length."""
 
     name: str
+    """For options and file names."""
     title: str
+    """For headings."""
     samples: int
+    """Length of a run."""
     arguments: dict[str, Any] = field(default_factory=dict)
+    """Arguments of the environment that are not its defaults."""
 
     @property
     def parameters(self) -> Parameters:
@@ -76,20 +68,10 @@ PRESET_SCENARIOS: dict[str, Scenario] = {
 
 
 def scenarios_of(name: str, arguments: Mapping[str, Any]) -> dict[str, Scenario]:
-    """Return the cases of a plant that is not the paper's.
+    """Return the cases of a plant that is not the paper's, given its name and arguments.
 
-    Parameters
-    ----------
-    name
-        What the plant is called.
-    arguments
-        Arguments of the environment that are not its defaults.
-
-    Returns
-    -------
-    dict of Scenario
-        The set points of the paper's cases on this plant; or, if the arguments say what the set
-        point is, one case with theirs.
+    They are the set points of the paper's cases on this plant; or, if the arguments say what
+    the set point is, one case with theirs.
     """
     own = {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments)
     cases = [("run", "its own set point", 1200, {})] if own else SETPOINTS

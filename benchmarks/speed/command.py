@@ -60,25 +60,22 @@ SINGLE: dict[str, tuple[str, dict[str, Any]]] = {
     "MiddlePoint-v0, R = 0.5": ("MiddlePoint-v0", NOISE),
     "MiddlePoint-v0, 20 past actions": ("MiddlePoint-v0", {"action_window": 20}),
 }
+VECTOR: dict[str, tuple[str, dict[str, Any]]] = {
+    REFERENCE: (REFERENCE, {}),
+    "MiddlePoint-v0": ("MiddlePoint-v0", {}),
+    "MiddlePoint-v0, R = 0.5": ("MiddlePoint-v0", NOISE),
+    "MiddlePoint-v0, hard": ("MiddlePoint-v0", PRESETS["hard"]),  # everything is on
+}
 
 
 @dataclass(frozen=True)
 class Case:
-    """Something to be timed.
-
-    Attributes
-    ----------
-    name
-        Its row in the table.
-    run
-        What is timed; it returns nothing and may be called again and again.
-    steps
-        Environment steps of a call.
-    """
+    """Something to be timed."""
 
     name: str
     run: Callable[[], object]
     steps: int
+    """Environment steps of a call."""
 
 
 def execute(options: Options, console: Console) -> str:
@@ -94,23 +91,19 @@ def execute(options: Options, console: Console) -> str:
             MiddlePointTorchEnv(1, device=options.device)
         show(f"Steps a second on {options.device}", on_device(options.device, rounds))
         return f"Medians of {rounds} rounds."
-    cases = [_single(name, env, **arguments) for name, (env, arguments) in SINGLE.items()]
-    show("One environment, from gymnasium.make", compare(cases, rounds))
-    cases = [
+    single = [_single(name, env, **arguments) for name, (env, arguments) in SINGLE.items()]
+    drawn = [
         _single(name, name, FRAMES, render_mode="rgb_array")
         for name in (REFERENCE, "MiddlePoint-v0")
     ]
-    show('Steps with a picture of each, render_mode="rgb_array"', compare(cases, rounds))
+    learners = f"Plants with R = 0.5 and NNs that learn, one each: {EPISODE} samples together"
+    policy = "Through the plant: a policy of two layers of 64, forward and backward"
+    show("One environment, from gymnasium.make", compare(single, rounds))
+    show('Steps with a picture of each, render_mode="rgb_array"', compare(drawn, rounds))
     for n in BATCHES:
         show(f"Vector environments, n = {n}", compare(list(_vector(n)), rounds))
-    show(
-        f"Plants with R = 0.5 and NNs that learn, one each: {EPISODE} samples together",
-        compare([_alone(), *(_closed_loop(n) for n in LOOPS)], rounds),
-    )
-    show(
-        "Through the plant: a policy of two layers of 64, forward and backward",
-        compare([_through_the_plant(GRADIENTS)], rounds),
-    )
+    show(learners, compare([_alone(), *(_closed_loop(n) for n in LOOPS)], rounds))
+    show(policy, compare([_through_the_plant(GRADIENTS)], rounds))
     show("Memory of a plant, 20 past actions", memory())
 
     python = [sys.executable, "-c"]
@@ -118,7 +111,7 @@ def execute(options: Options, console: Console) -> str:
         Case(module, partial(subprocess.run, [*python, f"import {module}"], check=True), 1)
         for module in ("gymnasium", "mptc_gym")
     ]
-    taken = 1000 * pd.DataFrame(_alternately(imports, rounds))
+    taken = 1000 * _alternately(imports, rounds)
     more = taken["mptc_gym"] - taken["gymnasium"]
     missing = " and ".join(peer for peer in PEERS if not importlib.util.find_spec(peer))
     left_out = (
@@ -132,39 +125,26 @@ def execute(options: Options, console: Console) -> str:
 
 
 def compare(cases: list[Case], rounds: int) -> pd.DataFrame:
-    """Time cases alternately.
+    """Time cases alternately, so many rounds, and return a row a case.
 
-    Parameters
-    ----------
-    cases
-        What to time; the first is what the others are compared with.
-    rounds
-        How often each is timed.
-
-    Returns
-    -------
-    DataFrame
-        A row a case: its name, environment steps a second, seconds a round, and the ratio of
-        its steps a second to those of the first case in the same round, with its spread.
+    The ratio is that of its steps a second to those of the first case in the same round.
     """
     seconds = _alternately(cases, rounds)
-    rates = {case.name: case.steps / seconds[case.name] for case in cases}
+    rates = seconds.rdiv([case.steps for case in cases], axis="columns")
     first = cases[0].name
     return pd.DataFrame(
         {
-            "case": [case.name for case in cases],
-            "steps a second": [f"{np.median(rates[case.name]):,.0f}" for case in cases],
-            "seconds a round": [f"{np.median(seconds[case.name]):.3f}" for case in cases],
-            f"ratio to {first}": [_spread(rates[case.name] / rates[first]) for case in cases],
+            "steps a second": rates.median().map("{:,.0f}".format),
+            "seconds a round": seconds.median().map("{:.3f}".format),
+            f"ratio to {first}": rates.div(rates[first], axis="index").apply(_spread),
         }
-    )
+    ).reset_index(names="case")
 
 
 def memory() -> pd.DataFrame:
     """Measure the memory of a plant, in a batch and alone."""
     rows = []
-    cases: dict[str, dict[str, Any]] = {"R = 0": {}, "R = 0.5, random set point": RANDOM}
-    for name, arguments in cases.items():
+    for name, arguments in {"R = 0": {}, "R = 0.5, random set point": RANDOM}.items():
         batch = MiddlePointVectorEnv(
             MEMORY_PLANTS, max_episode_steps=EPISODE, action_window=20, **arguments
         )
@@ -206,13 +186,7 @@ def _single(name: str, env_id: str, steps: int = SINGLE_STEPS, **arguments: Any)
 
 def _vector(n: int) -> Iterable[Case]:
     """Yield vector environments; a call is one of our episodes, with its reset."""
-    made: dict[str, tuple[str, dict[str, Any]]] = {
-        REFERENCE: (REFERENCE, {}),
-        "MiddlePoint-v0": ("MiddlePoint-v0", {}),
-        "MiddlePoint-v0, R = 0.5": ("MiddlePoint-v0", NOISE),
-        "MiddlePoint-v0, hard": ("MiddlePoint-v0", PRESETS["hard"]),  # everything is on
-    }
-    for name, (env_id, arguments) in made.items():
+    for name, (env_id, arguments) in VECTOR.items():
         envs = gymnasium.make_vec(
             env_id, n, vectorization_mode="vector_entry_point", **arguments
         )
@@ -293,21 +267,15 @@ def _in_torch(name: str, n: int, device: str, steps: int, arguments: dict[str, A
 
 
 def on_device(device: str, rounds: int) -> pd.DataFrame:
-    """Measure the environment in PyTorch on a device, for more and more plants.
-
-    Returns
-    -------
-    DataFrame
-        A row a number of plants: environment steps a second of each case.
-    """
+    """Return steps a second of the environment in PyTorch on a device, a row a batch."""
     rows = []
     for n in DEVICE_BATCHES:
         row = {"n": f"{n:,}"}
         for name, arguments in IN_TORCH.items():
             case = _in_torch(name, n, device, DEVICE_STEPS, arguments)
             case.run()  # what is done once, the first time
-            seconds = _alternately([case], rounds)[name]
-            row[name] = f"{np.median(case.steps / seconds):.3g}"
+            rates = n * DEVICE_STEPS / _alternately([case], rounds)[name]
+            row[name] = f"{rates.median():.3g}"
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -360,19 +328,19 @@ def _closed_loop(n: int) -> Case:
     )
 
 
-def _alternately(
-    cases: list[Case], rounds: int
-) -> dict[str, np.ndarray[Any, np.dtype[np.float64]]]:
-    """Time each in turn, round after round, in seconds."""
-    seconds: dict[str, list[float]] = {case.name: [] for case in cases}
+def _alternately(cases: list[Case], rounds: int) -> pd.DataFrame:
+    """Time each in turn, and return seconds: a row a round, a column a case."""
+    rows = []
     for _ in tqdm(range(rounds), leave=False):
+        row = {}
         for case in cases:
             began = time.perf_counter()
             case.run()
-            seconds[case.name].append(time.perf_counter() - began)
-    return {name: np.array(values) for name, values in seconds.items()}
+            row[case.name] = time.perf_counter() - began
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
-def _spread(values: np.ndarray[Any, np.dtype[np.float64]]) -> str:
-    low, median, high = np.percentile(values, [10, 50, 90])
+def _spread(values: pd.Series) -> str:
+    low, median, high = values.quantile([0.1, 0.5, 0.9])
     return f"{median:.2f} ({low:.2f} to {high:.2f})"
