@@ -37,15 +37,8 @@ class PredictiveController:
     staying as it is, with inputs within the limits. A first input inside the dead zone becomes
     0 or what a command on the edge brings about, whichever the rest of a plan makes better.
 
-    Parameters
-    ----------
-    parameters
-        All arguments of the environment.
-    num_envs
-        Number of loops.
-    seed
-        Where plant numbers are ranges, it is told those that loop i draws with seed `seed + i`,
-        in its first episode.
+    Where plant numbers are ranges, it is told those that loop i draws with seed `seed + i`, in
+    its first episode.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int, seed: int = 0) -> None:
@@ -55,7 +48,12 @@ class PredictiveController:
         self._delay = numbers.delay.astype(np.intp)
         self._u_min, self._u_max = numbers.u_min, numbers.u_max
         self._dead_zone = numbers.dead_zone
-        self._load = _Load.of(numbers)
+        # Where the load changes: of a level x there remains (1 - p) x in the mean, and its
+        # variance remains the same.
+        self._stays = 1.0 - np.minimum(LOAD_INTERVAL / numbers.disturbance_interval, 1.0)
+        uniform = np.square(numbers.disturbance_amplitude) / 3.0
+        self._step_variance = uniform * (1.0 - np.square(self._stays))
+        self._walk_variance = LOAD_INTERVAL * numbers.disturbance_walk_variance
         self._drifts = parameters.drifts
         # The state: y(k), y(k-1), ...; xi(k), xi(k-1), ...; the steps of the load and its walk.
         self._n_y = max(len(parameters.a) - 1, 1)
@@ -126,19 +124,18 @@ class PredictiveController:
 
     def _transition(self, k: int, model: _Model) -> tuple[Array, Array]:
         """Return what moves the state from k - 1 to k, and the covariance of what is added."""
-        load = self._load
         changes = k % LOAD_INTERVAL == 0
         F = np.zeros((self._num_envs, self._size, self._size))
         xi, steps, walk = np.zeros((3, self._num_envs, self._size))
         F[:, :-2, :-2], xi[:, :-2] = model.state_space(self._p.c)
-        F[:, -2, -2] = load.stays if changes else 1.0
+        F[:, -2, -2] = self._stays if changes else 1.0
         F[:, -1, -1] = 1.0
         F[:, 0, -2:] = model.load[:, np.newaxis] * F[:, [-2, -1], [-2, -1]]
         steps[:, 0], steps[:, -2] = model.load, 1.0
         walk[:, 0], walk[:, -1] = model.load, 1.0
         Q = _outer(xi, self._numbers.noise_variance + TINY)
         if changes:
-            Q = Q + _outer(steps, load.steps) + _outer(walk, load.walk)
+            Q = Q + _outer(steps, self._step_variance) + _outer(walk, self._walk_variance)
         return F, Q
 
     def _predict(self) -> Array:
@@ -156,7 +153,7 @@ class PredictiveController:
             zip(ahead, models, moved.sum(axis=2).T, strict=True)
         ):
             if k % LOAD_INTERVAL == 0:
-                steps = steps * self._load.stays
+                steps = steps * self._stays
             output = flow + model.load * (steps + walk)
             for j in range(len(self._p.a) - 1):
                 output = output + model.alpha[:, j] * outputs[-1 - j]
@@ -212,26 +209,6 @@ class _Model(Coefficients):
         for j in range(HORIZON):
             G[:, j:, j] = response[:, : HORIZON - j]
         return cls(**vars(now), G=G, Q=G.transpose(0, 2, 1) @ G)
-
-
-@dataclass(frozen=True)
-class _Load:
-    """How the load goes on at a change: what of the steps stays, and the variances added."""
-
-    stays: Array
-    steps: Array
-    walk: Array
-
-    @classmethod
-    def of(cls, numbers: PlantNumbers[Array]) -> _Load:
-        jump = np.minimum(LOAD_INTERVAL / numbers.disturbance_interval, 1.0)
-        level = np.square(numbers.disturbance_amplitude) / 3.0  # uniform
-        # Of a level x there remains (1 - p) x in the mean, and its variance remains the same.
-        return cls(
-            1.0 - jump,
-            level * (1.0 - np.square(1.0 - jump)),
-            LOAD_INTERVAL * numbers.disturbance_walk_variance,
-        )
 
 
 def drawn_numbers(parameters: Parameters, num_envs: int, seed: int) -> PlantNumbers[Array]:

@@ -60,19 +60,9 @@ class ControllerOptions:
 
 
 def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEntry]:
-    """Return the controllers that options ask for.
+    """Return controllers by name: some of the roster, then a user's own.
 
-    Parameters
-    ----------
-    names
-        Of the roster, with spaces or commas between them.
-    own
-        A user's own, each `NAME=MODULE:FACTORY` or `NAME=ALGORITHM:FILE.zip`.
-
-    Returns
-    -------
-    dict of RosterEntry
-        By name, those of the roster first.
+    The latter are given as `NAME=MODULE:FACTORY` or `NAME=ALGORITHM:FILE.zip`.
 
     Raises
     ------

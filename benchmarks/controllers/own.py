@@ -29,18 +29,15 @@ def _made(made_by: Callable[..., Agent], plant: Parameters, runs: int, seed: int
 
 
 def own_factory(location: str) -> Factory:
-    """Import a user's factory and try it out.
+    """Import a user's factory, `module:factory`, and try it out.
 
-    Parameters
-    ----------
-    location
-        `module:factory`. The factory is called with keyword arguments, those of the following
-        that it has: `num_envs` (runs in the batch), `seed` (run i is to use `seed + i`),
-        `u_min`, `u_max` (t/h) and `parameters` (all arguments of the environment). It returns
-        an object with `reset()` and `act(observations) -> actions`. Its attribute
-        `observation`, if it has one, is a dict of the environment's `*_window` arguments, and
-        gives the controller the observation that it wants. Its attributes `prior_knowledge`,
-        `parameters` and `samples` fill its row in the report's table of costs.
+    It is called with keyword arguments, those of the following that it has: `num_envs` (runs
+    in the batch), `seed` (run i is to use `seed + i`), `u_min`, `u_max` (t/h) and `parameters`
+    (all arguments of the environment). It returns an object with `reset()` and
+    `act(observations) -> actions`. Its attribute `observation`, if it has one, is a dict of the
+    environment's `*_window` arguments, and gives the controller the observation that it wants.
+    Its attributes `prior_knowledge`, `parameters` and `samples` fill its row in the report's
+    table of costs.
 
     Raises
     ------

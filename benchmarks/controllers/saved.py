@@ -23,13 +23,9 @@ LIBRARIES = "stable_baselines3", "sb3_contrib"
 
 
 def policies(location: str) -> list[Factory]:
-    """Return a factory for each saved policy.
+    """Return a factory for each saved policy of a location, such as `PPO:model.zip`.
 
-    Parameters
-    ----------
-    location
-        `ALGORITHM:FILE.zip`, such as `PPO:model.zip`; the file may be a pattern, `runs/*.zip`.
-        Loading a zip runs the code that is in it.
+    The file may be a pattern, `runs/*.zip`. Loading a zip runs the code that is in it.
 
     Raises
     ------
@@ -97,14 +93,8 @@ def _made(
 class SavedPolicy:
     """A policy as a controller, deterministic.
 
-    Parameters
-    ----------
-    model
-        It has `predict`.
-    actuator
-        Turns wanted flows into actions, if the policy moves them; see `IncrementalAction`.
-    runs
-        How many plants.
+    The actuator turns wanted flows into actions, if the policy moves them; see
+    `IncrementalAction`.
     """
 
     def __init__(self, model: Any, actuator: Actuator | None, runs: int) -> None:
