@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, Final, NoReturn
 
@@ -92,35 +93,21 @@ def is_count(value: Any, minimum: int = 0) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= minimum
 
 
-def number(name: str, value: Any, allowed: str = "a number within +-1e9") -> float:
-    """Return any number, never as -0."""
-    if not is_number(value):
-        reject(name, value, allowed)
-    return float(value) + 0.0
+def _number_that(holds: Callable[[float], bool], allowed: str) -> Callable[[str, Any], float]:
+    """Return a check that takes a number for which something holds, and never returns -0."""
+
+    def checked(name: str, value: Any) -> float:
+        if not is_number(value) or not holds(value):
+            reject(name, value, allowed)
+        return float(value) + 0.0
+
+    return checked
 
 
-def not_negative(name: str, value: Any) -> float:
-    """Return a number of at least 0."""
-    allowed = "a number from 0 to 1e9"
-    if number(name, value, allowed) < 0:
-        reject(name, value, allowed)
-    return float(value)
-
-
-def positive(name: str, value: Any) -> float:
-    """Return a number above 0."""
-    allowed = "a number above 0, up to 1e9"
-    if number(name, value, allowed) <= 0:
-        reject(name, value, allowed)
-    return float(value)
-
-
-def at_least_1(name: str, value: Any) -> float:
-    """Return a number of at least 1."""
-    allowed = "a number from 1 to 1e9"
-    if number(name, value, allowed) < 1:
-        reject(name, value, allowed)
-    return float(value)
+number = _number_that(lambda value: True, "a number within +-1e9")
+not_negative = _number_that(lambda value: value >= 0, "a number from 0 to 1e9")
+positive = _number_that(lambda value: value > 0, "a number above 0, up to 1e9")
+at_least_1 = _number_that(lambda value: value >= 1, "a number from 1 to 1e9")
 
 
 def count(name: str, value: Any, minimum: int, maximum: int) -> int:
@@ -130,14 +117,8 @@ def count(name: str, value: Any, minimum: int, maximum: int) -> int:
     return int(value)
 
 
-def samples(name: str, value: Any) -> int:
-    """Return how many samples are kept."""
-    return count(name, value, 0, LONGEST)
-
-
-def duration(name: str, value: Any) -> int:
-    """Return for how many samples something lasts, at least 1."""
-    return count(name, value, 1, LARGEST)
+samples = partial(count, minimum=0, maximum=LONGEST)  # that are kept
+duration = partial(count, minimum=1, maximum=LARGEST)  # in samples
 
 
 def numbers(
@@ -175,12 +156,14 @@ def polynomial(name: str, value: Any) -> tuple[float, ...]:
 
 def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     """Return a kind of set point, a constant, or one number a sample."""
-    if isinstance(value, str) and value in SETPOINTS:
-        return value
     allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
     if isinstance(value, list | tuple):
         return numbers(name, value, allowed)
-    return number(name, value, allowed)
+    if is_number(value):
+        return number(name, value)
+    if not isinstance(value, str) or value not in SETPOINTS:
+        reject(name, value, allowed)
+    return value
 
 
 def reward(name: str, value: Any) -> str:

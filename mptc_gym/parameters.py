@@ -36,9 +36,6 @@ class Argument:
         Its unit, "" if there is none.
     meaning
         What the tables of arguments say about it.
-    draw
-        If it can be a range: which of the draws at a reset it takes. Once released, this number
-        never changes, as it is part of what a seed means. A new argument takes the next number.
     linear
         Whether the plant is (28) and (29) whatever its value: linear between the limits. An
         analysis that supposes this refuses any other argument that is not at its default.
@@ -48,12 +45,11 @@ class Argument:
     check: checks.Check
     unit: str
     meaning: str
-    draw: int | None
     linear: bool
 
     def checked(self, name: str, value: Any) -> Any:
         """Return a valid value in plain Python types; ValueError, naming it, otherwise."""
-        check = self.check if self.draw is None else checks.or_range(self.check)
+        check = checks.or_range(self.check) if name in PLANT_NUMBERS else self.check
         return check(name, checks.plain(value))
 
     @property
@@ -64,23 +60,17 @@ class Argument:
     def row(self, name: str) -> str:
         """Return its row in a Markdown table of arguments."""
         default = repr(self.default).replace("'", '"')
-        star = "" if self.draw is None else "*"
+        star = "*" if name in PLANT_NUMBERS else ""
         unit = f", {self.unit}" if self.unit else ""
         return f"| `{name}` | {default}{star} | {self.meaning}{unit} |"
 
 
 def _argument(
-    default: Any,
-    check: checks.Check,
-    unit: str,
-    meaning: str,
-    *,
-    draw: int | None = None,
-    linear: bool = False,
+    default: Any, check: checks.Check, unit: str, meaning: str, *, linear: bool = False
 ) -> Any:
     """Declare an argument: a field of a dataclass that carries an `Argument`."""
-    declared = Argument(default, check, unit, meaning, draw, linear)
-    return field(default=default, metadata={"argument": declared})
+    argument = Argument(default, check, unit, meaning, linear)
+    return field(default=default, metadata={"argument": argument})
 
 
 _linear = partial(_argument, linear=True)  # one that leaves the plant (28) and (29)
@@ -91,75 +81,58 @@ class PlantNumbers(Generic[Value]):
     """The numbers of a plant that can differ from episode to episode.
 
     As arguments they are a `Number` each: a number, or a range to draw from. During an episode
-    they are a float each for one plant, and an array each for many.
+    they are a float each for one plant, and an array each for many. Field i takes draw i of a
+    reset, which is part of what a seed means: the order never changes, and new ones come last.
     """
 
-    delay: Value = _linear(
-        18, checks.samples, "samples", "transport delay d of the plant (28)", draw=0
-    )
+    delay: Value = _linear(18, checks.samples, "samples", "transport delay d of the plant (28)")
     dead_zone: Value = _linear(
-        5.0, checks.not_negative, "t/h", "half width of the actuator's dead zone (29)", draw=1
+        5.0, checks.not_negative, "t/h", "half width of the actuator's dead zone (29)"
     )
     u_min: Value = _linear(
-        -10.0, checks.number, "t/h", "lower limit of the actuator, U_min in (29)", draw=2
+        -10.0, checks.number, "t/h", "lower limit of the actuator, U_min in (29)"
     )
     u_max: Value = _linear(
-        10.0, checks.number, "t/h", "upper limit of the actuator, U_max in (29)", draw=3
+        10.0, checks.number, "t/h", "upper limit of the actuator, U_max in (29)"
     )
     noise_variance: Value = _linear(
-        0.0, checks.not_negative, "degC^2", "R, the variance of xi in (28)", draw=4
+        0.0, checks.not_negative, "degC^2", "R, the variance of xi in (28)"
     )
     measurement_noise_variance: Value = _linear(
         0.0,
         checks.not_negative,
         "degC^2",
         "variance of the transmitter's white noise, which observations show and rewards do not",
-        draw=5,
     )
     disturbance_amplitude: Value = _linear(
         0.0,
         checks.not_negative,
         "degC",
         "largest level of the load disturbance's steps, up or down",
-        draw=6,
     )
     disturbance_interval: Value = _linear(
         150.0,
         checks.at_least_1,
         "samples",
         "mean interval between these steps; below 10 it is 10",
-        draw=7,
     )
     disturbance_walk_variance: Value = _linear(
         0.0,
         checks.not_negative,
         "degC^2",
         "variance that the load disturbance's random walk adds a sample",
-        draw=8,
     )
     gain_factor: Value = _linear(
-        1.0,
-        checks.positive,
-        "",
-        "steady-state gain, as a multiple of that of `a` and `b`",
-        draw=9,
+        1.0, checks.positive, "", "steady-state gain, as a multiple of that of `a` and `b`"
     )
     time_constant_factor: Value = _linear(
-        1.0,
-        checks.positive,
-        "",
-        "dominant time constant, as a multiple of that of `a`",
-        draw=10,
+        1.0, checks.positive, "", "dominant time constant, as a multiple of that of `a`"
     )
     gain_drift: Value = _linear(
-        1.0, checks.positive, "", "factor by which the gain changes in `drift_samples`", draw=11
+        1.0, checks.positive, "", "factor by which the gain changes in `drift_samples`"
     )
     time_constant_drift: Value = _linear(
-        1.0,
-        checks.positive,
-        "",
-        "factor by which the time constant changes in `drift_samples`",
-        draw=12,
+        1.0, checks.positive, "", "factor by which the time constant changes in `drift_samples`"
     )
 
     def chosen(self, names: Sequence[str]) -> dict[str, Value]:
@@ -320,29 +293,27 @@ class Parameters(PlantNumbers[Number]):
 
     def _check_dynamics(self) -> None:
         """Refuse a change of dynamics that A has no meaning for."""
-        name = "time_constant_factor"
         if self.changes_time_constant:
-            names = f"{name}, time_constant_drift"
-            given = self.time_constant_factor, self.time_constant_drift
+            refuse = partial(
+                reject,
+                "time_constant_factor, time_constant_drift",
+                (self.time_constant_factor, self.time_constant_drift),
+            )
             pole = slowest_pole(self.a)
             if pole is None:
-                reject(names, given, "1 for this a, which has no pole")
+                refuse("1 for this a, which has no pole")
             if pole.imag != 0.0:
-                reject(names, given, "1 for this a, whose slowest poles are complex")
-            rate = 1.0 - pole.real
+                refuse("1 for this a, whose slowest poles are complex")
             if not 0.0 < pole.real < 1.0:
-                reject(
-                    names,
-                    given,
-                    f"1 for this a, whose slowest pole, {pole.real:g}, is not between 0 and 1",
+                refuse(
+                    f"1 for this a, whose slowest pole, {pole.real:g}, is not between 0 and 1"
                 )
+            rate = 1.0 - pole.real
             drift = self.range_of("time_constant_drift")[0]
-            if self.range_of(name)[0] * min(drift, 1.0) < rate:
-                reject(
-                    names,
-                    given,
+            if self.range_of("time_constant_factor")[0] * min(drift, 1.0) < rate:
+                refuse(
                     f"such that the factor is never below {rate:g}, where the slowest pole "
-                    "comes to 0",
+                    "comes to 0"
                 )
         if self.is_disturbed and not self.is_stable:
             reject(
@@ -415,20 +386,14 @@ class Parameters(PlantNumbers[Number]):
         return max(abs(float(level)) for level in levels)
 
 
-def places_of_draws() -> Mapping[str, int]:
-    """Return which draw each plant number takes, once it is sure that no two take the same."""
-    places = {each.name: each.metadata["argument"].draw for each in fields(PlantNumbers)}
-    if len(set(places.values())) < len(places) or not set(places.values()) <= set(range(DRAWS)):
-        raise TypeError(f"each plant number needs a draw of its own below {DRAWS}: {places}")
-    return MappingProxyType(places)
-
-
 ARGUMENTS: Final[Mapping[str, Argument]] = MappingProxyType(
     {each.name: each.metadata["argument"] for each in fields(Parameters)}
 )
 """What is declared of each argument, by name."""
 
-PLANT_NUMBERS: Final = places_of_draws()
+PLANT_NUMBERS: Final[Mapping[str, int]] = MappingProxyType(
+    {each.name: place for place, each in enumerate(fields(PlantNumbers))}
+)
 """The arguments that can be a range, by name, and which draw of a reset each takes."""
 
 

@@ -20,11 +20,6 @@ class Ranges:
     Every plant number has a draw of its own, whether it is a range or not. So one more range
     changes nothing in what the others give.
 
-    Parameters
-    ----------
-    parameters
-        Uses the plant numbers.
-
     Attributes
     ----------
     names : tuple of str
@@ -45,44 +40,33 @@ class Ranges:
             **{name: np.array(low) for name, low in lows.items()}
         )
         self._places = [PLANT_NUMBERS[name] for name in self.names]
-        self._lows = np.array([lows[name] for name in self.names], float)
-        highs = np.array([parameters.range_of(name)[1] for name in self.names], float)
-        self._types = [int if ARGUMENTS[name].is_integer else float for name in self.names]
-        self._whole = np.array([each is int for each in self._types], np.bool_)
+        self._lows, highs = (
+            np.array([parameters.range_of(n) for n in self.names]).reshape(-1, 2).T
+        )
+        self._whole = np.array([ARGUMENTS[name].is_integer for name in self.names], np.bool_)
         self._widths = highs - self._lows + self._whole
 
     def draw(self, streams: Sequence[EpisodeStream]) -> PlantNumbers[Values]:
         """Begin an episode of each stream, and draw its numbers.
 
-        Returns
-        -------
-        PlantNumbers of ndarray
-            What is a range has the shape (len(streams),), anything else the shape ().
+        What is a range has the shape (len(streams),), anything else the shape ().
         """
         if not self._draws:
             return self.given_arrays
         draws = np.empty((len(streams), DRAWS))
         for stream, row in zip(streams, draws, strict=True):
             stream.next_episode().random(out=row)
-        drawn = zip(self.names, self._types, self._scaled(draws).T, strict=True)
+        offsets = draws[:, self._places] * self._widths
+        offsets[:, self._whole] = np.floor(offsets[:, self._whole])
+        drawn = zip(self.names, self._whole, (self._lows + offsets).T, strict=True)
         return replace(
-            self.given_arrays, **{name: values.astype(type_) for name, type_, values in drawn}
+            self.given_arrays,
+            **{name: values.astype(int if whole else float) for name, whole, values in drawn},
         )
 
     def draw_one(self, stream: EpisodeStream) -> PlantNumbers[float]:
         """Begin an episode of a stream, and draw its numbers."""
-        if not self._draws:
-            return self.given
-        drawn = self._scaled(stream.next_episode().random(DRAWS)).tolist()
-        numbers = zip(self.names, self._types, drawn, strict=True)
-        return replace(self.given, **{name: type_(value) for name, type_, value in numbers})
-
-    def _scaled(self, draws: Values) -> Values:
-        """Bring draws of all plant numbers, from 0 to 1, to the ranges: shape (..., ranges)."""
-        offsets: Values = draws[..., self._places] * self._widths
-        offsets[..., self._whole] = np.floor(offsets[..., self._whole])
-        offsets += self._lows
-        return offsets
+        return numbers_of_plant(self.draw([stream]), 0) if self._draws else self.given
 
 
 def numbers_of_plant(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:

@@ -3,7 +3,7 @@
 from hypothesis import strategies as st
 
 from mptc_gym import checks
-from mptc_gym.parameters import ARGUMENTS
+from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS
 
 few = st.floats(-0.3, 0.3)
 tails = st.lists(few, max_size=3).map(lambda tail: [1.0, *tail])
@@ -33,7 +33,7 @@ BY_NAME = {  # what fits together, and readings that are not always at the end o
 def _strategy(name, argument):
     """Return a strategy for an argument, and for ranges of it where they are valid."""
     numbers = BY_NAME[name] if name in BY_NAME else BY_CHECK[argument.check]
-    if argument.draw is None:
+    if name not in PLANT_NUMBERS:
         return numbers
     return numbers | st.lists(numbers, min_size=2, max_size=2).map(sorted)
 

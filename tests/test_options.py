@@ -1,6 +1,5 @@
 """What is off by default: transmitter noise, disturbance, other dynamics, fouling, ranges."""
 
-from dataclasses import field, make_dataclass, replace
 from pathlib import Path
 
 import gymnasium
@@ -44,21 +43,6 @@ class TestDeclarations:
         draws = np.random.Generator(np.random.PCG64(stream)).random(32)
         assert info["delay"] == 3 + int(4 * draws[0])
         assert info["time_constant_drift"] == 1.0 + 2.0 * draws[12]
-
-    @pytest.mark.parametrize("draw", [0, 32])
-    def test_two_cannot_take_the_same_draw_nor_one_beyond_the_last(self, draw, monkeypatch):
-        declared = replace(parameters.ARGUMENTS["gain_drift"], draw=draw)
-        faulty = make_dataclass(
-            "Faulty",
-            [("delay", int), ("gain_drift", float)],
-            namespace={
-                "delay": field(default=1, metadata={"argument": parameters.ARGUMENTS["delay"]}),
-                "gain_drift": field(default=1.0, metadata={"argument": declared}),
-            },
-        )
-        monkeypatch.setattr(parameters, "PlantNumbers", faulty)
-        with pytest.raises(TypeError, match="a draw of its own below 32"):
-            parameters.places_of_draws()
 
     def test_the_page_has_the_table_of_arguments(self):
         # If this fails, put in what mptc_gym.parameters.argument_table() returns now.
