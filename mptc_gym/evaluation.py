@@ -11,13 +11,13 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import gymnasium
 import numpy as np
-from gymnasium import wrappers
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import SyncVectorEnv, VectorEnv
+from gymnasium.wrappers import NormalizeObservation
 from numpy.typing import NDArray
 
 from mptc_gym.checks import MOST_PLANTS, count, reject
@@ -46,10 +46,7 @@ _NO_MATTER: Final = *WINDOWS, "reward", "error_scale", "move_weight"
 _ACTING: Final = "a function, or an object with predict or with act"
 _BATCH: Final = 100  # episodes that run side by side
 _RESAMPLES: Final = 2000  # of the bootstrap
-_NATIVE: Final[tuple[list[Any], ...]] = (
-    [],
-    [IncrementalAction],
-)  # wrappers that a batch can have
+_INCREMENTAL: Final = f"{IncrementalAction.__module__}:{IncrementalAction.__name__}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -183,61 +180,53 @@ valve travel 0 t/h; 100 episodes, all alike
     make = _maker(env, arguments)
     single = make()
     parameters = _parameters(single)
-    _check_scale(single)
     with closing(single):
         _check_fit(policy, single, parameters)
-        if isinstance(env, str) and hasattr(policy, "observation_space"):
-            _check_known(policy)
+        of_model = isinstance(env, str) and hasattr(policy, "observation_space")
+        if of_model and trained_on(policy) is None:
+            warnings.warn(
+                "policy does not say how it was trained: its actions are taken for flows, not "
+                "for changes of the flow. Save it by mptc_gym.sb3.save, or give env as an "
+                "EnvSpec with the wrappers of its training",
+                stacklevel=2,
+            )
         name = single.spec.id if single.spec else type(single.unwrapped).__name__
         samples = (single.spec and single.spec.max_episode_steps) or SAMPLES
-        batch = native_batch(single) or partial(_side_by_side, make)
+        batch = native_batch(single) or (lambda n: SyncVectorEnv([make] * n))
     seeds = range(first, first + episodes)
     errors, travels, samples = _run(batch, partial(acting, policy), seeds, samples)
-    found: dict[str, Any] = {
-        "env": name,
-        "mean_error": float(errors.mean()),
-        "travel": float(travels.mean()),
-        "errors": errors,
-        "travels": travels,
-        "seeds": seeds,
-    }
     least = least_errors(parameters, samples, seeds)
     if least is None:
-        return Evaluation(**found, missing=_missing(parameters))
-    rest = action_from_command(0.0, parameters.u_min, parameters.u_max)
-    batch = partial(MiddlePointVectorEnv, **dataclasses.asdict(parameters))
-    idle, _, _ = _run(batch, lambda: lambda seen: np.full((len(seen), 1), rest), seeds, samples)
-    gained, possible = idle - errors, idle - least
-    return Evaluation(
-        **found,
-        least_possible=float(least.mean()),
-        multiple=found["mean_error"] / float(least.mean()),
-        score=float(gained.mean() / possible.mean()),
-        interval=_interval(gained, possible),
-        least=least,
-        scores=gained / possible,
-    )
+        bound: dict[str, Any] = {"missing": _missing(parameters)}
+    else:
+        rest = action_from_command(0.0, parameters.u_min, parameters.u_max)
+        batch = partial(MiddlePointVectorEnv, **dataclasses.asdict(parameters))
+        idle, _, _ = _run(
+            batch, lambda: lambda seen: np.full((len(seen), 1), rest), seeds, samples
+        )
+        gained, possible = idle - errors, idle - least
+        bound = {
+            "least_possible": float(least.mean()),
+            "multiple": float(errors.mean() / least.mean()),
+            "score": float(gained.mean() / possible.mean()),
+            "interval": _interval(gained, possible),
+            "least": least,
+            "scores": gained / possible,
+        }
+    mean_error, travel = float(errors.mean()), float(travels.mean())
+    return Evaluation(name, mean_error, travel, errors, travels, seeds, **bound)
 
 
 def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values | None:
     """Return the least possible mean error of episodes, degC, as the package keeps it.
 
-    Parameters
-    ----------
-    parameters
-        The environment's arguments.
-    samples
-        N, of an episode.
-    seeds
-        Of the episodes.
-
     Returns
     -------
     ndarray, shape (episodes,), or None
-        None if the package does not have it. Where noise and load alone are drawn, it is the
-        same for all episodes, and there for any seeds.
+        None if the package does not have it for N = `samples` and these seeds. Where noise and
+        load alone are drawn, it is the same for all episodes, and there for any seeds.
     """
-    least = next((each for case, each in _kept() if case == _case(parameters)), None)
+    least = _kept().get(_case(parameters))
     if least is None or samples != SAMPLES:
         return None
     if len(least) == 1:
@@ -247,11 +236,11 @@ def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values |
 
 
 @cache
-def _kept() -> list[tuple[Parameters, Values]]:
+def _kept() -> dict[Parameters, Values]:
     """Return the bounds that `python -m benchmarks.limits --package` has written, by case."""
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
     cases = json.loads(text)["cases"].values()
-    return [(_case(Parameters(**case["arguments"])), np.array(case["least"])) for case in cases]
+    return {_case(Parameters(**case["arguments"])): np.array(case["least"]) for case in cases}
 
 
 def _case(parameters: Parameters) -> Parameters:
@@ -262,12 +251,11 @@ def _case(parameters: Parameters) -> Parameters:
 
 def _missing(parameters: Parameters) -> str:
     """Return how to come by a bound that the package does not have."""
-    case, defaults = _case(parameters), Parameters()
-    values = {name: getattr(case, name) for name in ARGUMENTS}
+    case = dataclasses.asdict(_case(parameters))
     options = "".join(
         f" --set {name}={value if isinstance(value, str) else json.dumps(value)}"
-        for name, value in values.items()
-        if value != getattr(defaults, name)
+        for name, value in case.items()
+        if value != ARGUMENTS[name].default
     ).replace(", ", ",")
     return f"no bound is kept for this case: python -m benchmarks.limits{options}"
 
@@ -275,11 +263,9 @@ def _missing(parameters: Parameters) -> str:
 def _interval(gained: Values, possible: Values) -> tuple[float, float]:
     """Return the 95 % interval of a quotient of means, by drawing episodes with replacement."""
     generator, n = np.random.default_rng(0), len(gained)
-    drawn = np.empty(_RESAMPLES)
-    for i in range(_RESAMPLES):
-        which = generator.integers(n, size=n)
-        drawn[i] = gained[which].mean() / possible[which].mean()
-    low, high = np.quantile(drawn, (0.025, 0.975))
+    drawn = (generator.integers(n, size=n) for _ in range(_RESAMPLES))
+    quotients = [gained[which].mean() / possible[which].mean() for which in drawn]
+    low, high = np.quantile(quotients, (0.025, 0.975))
     return float(low), float(high)
 
 
@@ -291,8 +277,7 @@ def _maker(env: Any, arguments: dict[str, Any]) -> Callable[[], gymnasium.Env[An
         reject("env", env, "an id, an EnvSpec or a function that makes an environment")
     if arguments:
         raise ValueError(f"{', '.join(arguments)} must be given in the function that is env")
-    make: Callable[[], gymnasium.Env[Any, Any]] = env
-    return make
+    return cast("Callable[[], gymnasium.Env[Any, Any]]", env)
 
 
 def make_one(env: str | EnvSpec, arguments: dict[str, Any]) -> gymnasium.Env[Any, Any]:
@@ -305,22 +290,21 @@ def make_one(env: str | EnvSpec, arguments: dict[str, Any]) -> gymnasium.Env[Any
 
 
 def _parameters(single: gymnasium.Env[Any, Any]) -> Parameters:
-    """Return the arguments of an environment of this package."""
+    """Return the arguments of an environment of this package.
+
+    An environment whose observations would be scaled otherwise than in training is refused.
+    """
     inner = getattr(single, "unwrapped", None)
     if not isinstance(inner, MiddlePointEnv):
         reject("env", single, "a MiddlePointEnv, in wrappers or not")
-    return inner.parameters
-
-
-def _check_scale(single: gymnasium.Env[Any, Any]) -> None:
-    """Refuse an environment whose observations would be scaled otherwise than in training."""
     while isinstance(single, gymnasium.Wrapper):
-        if isinstance(single, wrappers.NormalizeObservation):
+        if isinstance(single, NormalizeObservation):
             raise ValueError(
                 "env must not be in NormalizeObservation, whose statistics would begin anew: "
                 "train in VecNormalize and save by mptc_gym.sb3.save, or scale by fixed numbers"
             )
         single = single.env
+    return inner.parameters
 
 
 def _check_fit(policy: Any, single: gymnasium.Env[Any, Any], parameters: Parameters) -> None:
@@ -357,17 +341,6 @@ def _check_fit(policy: Any, single: gymnasium.Env[Any, Any], parameters: Paramet
             )
 
 
-def _check_known(policy: Any) -> None:
-    """Warn of a model that was trained nobody knows how."""
-    if trained_on(policy) is None:
-        warnings.warn(
-            "policy does not say how it was trained: its actions are taken for flows, not for "
-            "changes of the flow. Save it by mptc_gym.sb3.save, or give env as an EnvSpec with "
-            "the wrappers of its training",
-            stacklevel=3,
-        )
-
-
 def trained_on(policy: Any) -> EnvSpec | None:
     """Return the spec of the environment that a policy was trained on, if that is known.
 
@@ -386,20 +359,12 @@ def trained_on(policy: Any) -> EnvSpec | None:
 def normaliser_of(policy: Any) -> Callable[[NDArray[Any]], NDArray[Any]] | None:
     """Return what normalises the observations of a policy as in its training.
 
-    Returns
-    -------
-    callable or None
-        None if it was trained without, or with one of rewards alone.
-
-    Raises
-    ------
-    ValueError
-        If its statistics are lost.
+    It is None if it was trained without, or with one of rewards alone; and a ValueError if its
+    statistics are lost.
     """
     live = getattr(policy, "get_vec_normalize_env", lambda: None)()
     if live is not None:
-        normalise: Callable[[NDArray[Any]], NDArray[Any]] = live.normalize_obs
-        return normalise
+        return cast("Callable[[NDArray[Any]], NDArray[Any]]", live.normalize_obs)
     space = getattr(policy, "observation_space", None)
     kept = getattr(space, "normalised", None)
     if kept is None:
@@ -426,42 +391,24 @@ def action_wrappers(spec: EnvSpec) -> list[WrapperSpec]:
 def native_batch(single: gymnasium.Env[Any, Any]) -> Batch | None:
     """Return how to make many of an environment that step at once.
 
-    Returns
-    -------
-    callable or None
-        Called with their number, and with an autoreset mode if need be. None if there is no
-        such batch: for another environment, one without a spec, and in other wrappers than
-        `IncrementalAction`.
+    It is called with their number, and with an `autoreset_mode` if need be. It is None if there
+    is no such batch: for another environment, one without a spec, and in other wrappers than
+    `IncrementalAction`.
     """
-    chain, inner = [], single
-    while isinstance(inner, gymnasium.Wrapper):
-        chain.append(type(inner))
-        inner = inner.env
-    plain = {wrappers.OrderEnforcing, wrappers.PassiveEnvChecker, wrappers.TimeLimit}
-    others = [each for each in chain if each not in plain]
-    spec = single.spec
-    if type(inner) is not MiddlePointEnv or spec is None or others not in _NATIVE:
+    inner, spec = single.unwrapped, single.spec
+    if type(inner) is not MiddlePointEnv or spec is None:
         return None
-    limit, arguments = spec.max_episode_steps, dataclasses.asdict(inner.parameters)
-    of_wrapper = [w.kwargs for w in spec.additional_wrappers if w.name == "IncrementalAction"]
-
-    def batch(
-        n: int, autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP
-    ) -> VectorEnv[Any, Any, Any]:
-        plants: VectorEnv[Any, Any, Any] = MiddlePointVectorEnv(
-            n, max_episode_steps=limit, autoreset_mode=autoreset_mode, **arguments
-        )
-        for kwargs in of_wrapper:
-            plants = VectorIncrementalAction(plants, **(kwargs or {}))
+    added = spec.additional_wrappers
+    if [each.entry_point for each in added] not in ([], [_INCREMENTAL]):
+        return None
+    arguments = dataclasses.asdict(inner.parameters)
+    plants: Batch = partial(
+        MiddlePointVectorEnv, max_episode_steps=spec.max_episode_steps, **arguments
+    )
+    if not added:
         return plants
-
-    return batch
-
-
-def _side_by_side(
-    make: Callable[[], gymnasium.Env[Any, Any]], n: int
-) -> VectorEnv[Any, Any, Any]:
-    return SyncVectorEnv([make] * n)
+    moves = added[0].kwargs or {}
+    return lambda n, **mode: VectorIncrementalAction(plants(n, **mode), **moves)
 
 
 def acting(policy: Any) -> Act:
@@ -473,12 +420,10 @@ def acting(policy: Any) -> Act:
     if callable(getattr(policy, "act", None)):
         if callable(getattr(policy, "reset", None)):
             policy.reset()
-        act: Act = policy.act
-        return act
+        return cast("Act", policy.act)
     if not callable(policy):
         reject("policy", policy, _ACTING)
-    function: Act = policy
-    return function
+    return cast("Act", policy)
 
 
 def _predicting(policy: Any) -> Act:
@@ -509,25 +454,11 @@ def _predicting(policy: Any) -> Act:
 def _run(
     batch: Batch, start: Callable[[], Act], seeds: range, samples: int
 ) -> tuple[Values, Values, int]:
-    """Run one episode a seed.
+    """Run one episode a seed, of N = `samples`, or less if the environments truncate before.
 
-    Parameters
-    ----------
-    batch
-        Makes so many environments.
-    start
-        Begins a batch of episodes, and returns how to act in it.
-    seeds
-        Of the episodes.
-    samples
-        N, if the environments do not truncate before.
-
-    Returns
-    -------
-    errors, travels
-        Mean |e(k)| over k = 1 to N, degC, and how far the valve moves, t/h, of each episode.
-    samples
-        N.
+    `batch` makes so many environments, and `start` begins their episodes and returns how to
+    act. Returned are the mean |e(k)| over k = 1 to N, degC, and how far the valve moves, t/h,
+    both of each episode, and N.
     """
     errors, travels = np.empty(len(seeds)), np.empty(len(seeds))
     for first in range(0, len(seeds), _BATCH):

@@ -70,11 +70,6 @@ class Dynamics:
     divided by t as well, the steady-state gain B(1) / A(1) is g times the given one if B is
     multiplied by g / t. Drifts take g and t from their factors to `gain_drift` and
     `time_constant_drift` times those, linearly over `drift_samples`.
-
-    Parameters
-    ----------
-    parameters
-        Uses `a`, `drift_samples` and which factors and drifts are not 1.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -96,15 +91,7 @@ class Dynamics:
         return share * (share < 1.0) + (share >= 1.0)  # at most 1, of arrays of any library
 
     def factors(self, numbers: PlantNumbers[Any], age: Any) -> tuple[Any, Any]:
-        """Return g and t.
-
-        Parameters
-        ----------
-        numbers
-            The plant numbers, floats, or arrays or tensors for many plants.
-        age
-            k, one number, or an array or tensor.
-        """
+        """Return g and t at k = `age`, of floats, or of arrays or tensors for many plants."""
         share = self.share(age)
         gain, time_constant = numbers.gain_factor, numbers.time_constant_factor
         return (
@@ -115,11 +102,8 @@ class Dynamics:
     def coefficients(self, gain: Any, time_constant: Any) -> tuple[list[Any], Any, Any]:
         """Return what (28) has for g and t.
 
-        Returns
-        -------
-        list, Any, Any
-            The coefficients of A from z^-1 on with their signs changed; what B is multiplied
-            with; and A(1).
+        These are the coefficients of A from z^-1 on with their signs changed, what B is
+        multiplied with, and A(1).
         """
         alpha: list[Any] = list(self._alpha)
         if self._quotient is not None:
@@ -139,17 +123,7 @@ class Plant:
     cases. The intended meaning is: a command inside the dead zone has no effect, and any other
     is limited to [U_min, U_max]. A command on the edge of the dead zone passes.
 
-    Parameters
-    ----------
-    parameters
-        Uses `b`, and what `Dynamics` does.
-    numbers
-        The plant numbers of the episode.
-
-    Attributes
-    ----------
-    factors : tuple of float
-        Gain and time constant, as multiples of those that A and B have.
+    `factors` are gain and time constant, as multiples of those that A and B have.
     """
 
     def __init__(self, parameters: Parameters, numbers: PlantNumbers[float]) -> None:
@@ -229,17 +203,7 @@ class Plant:
 class PlantBatch:
     """Many plants side by side: `Plant` in arrays.
 
-    Parameters
-    ----------
-    parameters
-        Uses `b`, the plant numbers, and what `Dynamics` does.
-    num_envs
-        n, number of plants.
-
-    Attributes
-    ----------
-    factors : tuple of ndarray
-        As those of `Plant`; shape (n,) if they drift or are drawn, otherwise ().
+    `factors` are as those of `Plant`: of shape (n,) if they drift or are drawn, otherwise ().
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
@@ -289,15 +253,7 @@ class PlantBatch:
             self._taken = np.zeros(self._response.shape, np.intp)  # places within the window
 
     def reset(self, which: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
-        """Bring some of the plants to rest, with new numbers.
-
-        Parameters
-        ----------
-        which
-            Their indices.
-        numbers
-            Their plant numbers; those that are drawn have the shape (len(which),).
-        """
+        """Bring some of the plants to rest, with new numbers: if drawn, one for each."""
         self._inputs[:, which] = 0.0
         self._response[:, which] = 0.0
         for outputs in self._outputs:

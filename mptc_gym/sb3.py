@@ -18,7 +18,7 @@ import json
 import os
 import time
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -106,7 +106,7 @@ def make_vec_env(
         raise ValueError(f"wrapper must be IncrementalAction, got {single}")
     spec = single.spec
     single.close()
-    plants = GymnasiumVecEnv(batch(n_envs, AutoresetMode.SAME_STEP), spec=spec)
+    plants = GymnasiumVecEnv(batch(n_envs, autoreset_mode=AutoresetMode.SAME_STEP), spec=spec)
     plants.seed(seed)
     return plants
 
@@ -153,11 +153,10 @@ class GymnasiumVecEnv(VecEnv):
                 raise ValueError(f"batches must have the same spaces, got {batches}")
         self.batches = batches
         self.infos: dict[str, Any] = {}
-        sizes = [batch.num_envs for batch in batches]
-        starts = np.cumsum([0, *sizes]).tolist()
-        self._parts = list(itertools.starmap(slice, itertools.pairwise(starts)))
+        starts = np.cumsum([0, *(batch.num_envs for batch in batches)]).tolist()
+        self._parts = list(zip(batches, map(slice, starts, starts[1:]), strict=True))
         self.spec = spec
-        super().__init__(sum(sizes), observation_space, action_space)
+        super().__init__(starts[-1], observation_space, action_space)
         if spec is not None:
             observation_space.trained_on = spec.to_json()  # type: ignore[attr-defined]
         self._began = time.time()
@@ -168,18 +167,14 @@ class GymnasiumVecEnv(VecEnv):
         """Reset all environments, with the seeds that were set by `seed`."""
         if any(self._options):
             raise ValueError(f"options must be empty, got {self._options!r}")
-        observations, infos = zip(
-            *(
-                # It takes a seed for each environment, whatever its annotation says.
-                batch.reset(seed=cast("int", list(self._seeds[part])))
-                for batch, part in zip(self.batches, self._parts, strict=True)
-            ),
-            strict=True,
-        )
-        self.infos = _joined(infos)
+        resets = [
+            # It takes a seed for each environment, whatever its annotation says.
+            batch.reset(seed=cast("int", list(self._seeds[part])))
+            for batch, part in self._parts
+        ]
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0
-        return np.concatenate(observations)
+        return self._joined(resets)[0]
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Take note of the actions, shape (num_envs, action size)."""
@@ -187,42 +182,43 @@ class GymnasiumVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step with them."""
-        steps = [
-            batch.step(self._actions[part])
-            for batch, part in zip(self.batches, self._parts, strict=True)
-        ]
-        observations, rewards, terminated, truncated = map(
-            np.concatenate, list(zip(*steps, strict=True))[:4]
-        )
+        steps = [batch.step(self._actions[part]) for batch, part in self._parts]
+        observations, rewards, terminated, truncated = self._joined(steps)
         ended = terminated | truncated
         self._returns += rewards
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in ended]
         if ended.any():
             last = [
-                found["final_obs"] if "final_obs" in found else [None] * len(part_ended)
-                for *_, part_ended, found in steps
+                each
+                for *_, flags, found in steps
+                for each in found.get("final_obs", itertools.repeat(None, len(flags)))
             ]
-            lasts = list(itertools.chain.from_iterable(last))
             seconds = round(time.time() - self._began, 6)
             for i in np.flatnonzero(ended).tolist():
+                length = int(self._lengths[i])
                 infos[i] = {
-                    "terminal_observation": lasts[i],
+                    "terminal_observation": last[i],
                     "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                    "episode": {
-                        "r": float(self._returns[i]),
-                        "l": int(self._lengths[i]),
-                        "t": seconds,
-                    },
+                    "episode": {"r": float(self._returns[i]), "l": length, "t": seconds},
                 }
             self._returns[ended], self._lengths[ended] = 0.0, 0
-        self.infos = _joined([found for *_, found in steps])
         return observations, rewards.astype(np.float32), ended, infos
+
+    def _joined(self, returned: list[tuple[Any, ...]]) -> list[NDArray[Any]]:
+        """Put what the batches returned one after the other, the infos in `infos`."""
+        *arrays, infos = zip(*returned, strict=True)
+        self.infos = {
+            name: np.concatenate([each[name] for each in infos])
+            for name in set.intersection(*map(set, infos))
+            if isinstance(infos[0][name], np.ndarray)
+        }
+        return [np.concatenate(each) for each in arrays]
 
     def get_images(self) -> list[NDArray[np.uint8]]:
         """Return a picture of each environment, if the batch has the mode "rgb_array"."""
-        pictures = itertools.chain.from_iterable(batch.render() or () for batch in self.batches)
-        return cast("list[NDArray[np.uint8]]", list(pictures))
+        pictures: Any = [batch.render() or () for batch in self.batches]
+        return list(itertools.chain(*pictures))
 
     def close(self) -> None:
         """Close the batches."""
@@ -257,16 +253,6 @@ class GymnasiumVecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
 
-def _joined(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Put the arrays of several batches one after the other."""
-    names = set.intersection(*map(set, infos))
-    return {
-        name: np.concatenate([each[name] for each in infos])
-        for name in names
-        if isinstance(infos[0][name], np.ndarray)
-    }
-
-
 def save(model: BaseAlgorithm, path: str | Path) -> None:
     """Save a model with the spec of what it was trained on, whole or not at all.
 
@@ -292,29 +278,24 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     partial = path.with_name(f".{path.stem}.{os.getpid()}.zip")
     # Models save their space with all its attributes.
     space: Any = model.observation_space
-    model.observation_space = copy.deepcopy(space)
-    vars(model.observation_space).update(trained_on=spec.to_json(), **_statistics(model))
+    kept: Any = copy.deepcopy(space)
+    kept.trained_on = spec.to_json()
+    normaliser = model.get_vec_normalize_env()
+    if normaliser is not None and normaliser.norm_obs:
+        statistics = cast("RunningMeanStd", normaliser.obs_rms)
+        kept.normalised = {
+            "mean": statistics.mean.tolist(),
+            "var": statistics.var.tolist(),
+            "epsilon": normaliser.epsilon,
+            "clip_obs": normaliser.clip_obs,
+        }
+    model.observation_space = kept
     try:
         model.save(partial)
         partial.replace(path)
     finally:
         model.observation_space = space
         partial.unlink(missing_ok=True)
-
-
-def _statistics(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return what a model has to know of its VecNormalize, in a form for JSON."""
-    normaliser = model.get_vec_normalize_env()
-    if normaliser is None or not normaliser.norm_obs:
-        return {}
-    rms = cast("RunningMeanStd", normaliser.obs_rms)
-    kept = {
-        "mean": rms.mean.tolist(),
-        "var": rms.var.tolist(),
-        "epsilon": normaliser.epsilon,
-        "clip_obs": normaliser.clip_obs,
-    }
-    return {"normalised": kept}
 
 
 def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any) -> EnvSpec:
@@ -336,14 +317,16 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
     ValueError
         If it is not known how the policy was trained.
     """
-    trained = _saved_spec(policy) if isinstance(policy, str | Path) else trained_on(policy)
+    if isinstance(policy, str | Path):
+        name, trained = str(policy), _saved_spec(policy)
+    else:
+        name, trained = type(policy).__name__, trained_on(policy)
     if trained is None:
-        reject(
-            "policy",
-            str(policy) if isinstance(policy, str | Path) else type(policy).__name__,
+        allowed = (
             "one that knows how it was trained: train it on mptc_gym.sb3.make_vec_env, or save "
-            "it by mptc_gym.sb3.save",
+            "it by mptc_gym.sb3.save"
         )
+        reject("policy", name, allowed)
     windows: dict[str, Any] = {n: trained.kwargs[n] for n in WINDOWS if n in trained.kwargs}
     single = make_one(env, {**windows, **arguments})
     spec = single.spec

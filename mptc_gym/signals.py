@@ -37,23 +37,14 @@ class EpisodeStream:
 
     Episode j begins j * 2**64 draws into the stream, whatever earlier episodes have used. So
     the j-th episode after a seed meets the same draws however long the ones before it were.
-
-    Parameters
-    ----------
-    entropy, spawn_key, pool_size
-        Of the `SeedSequence` that starts the stream. It is made with the first episode: many
-        plants have streams that are never used.
-
-    Attributes
-    ----------
-    generator : numpy.random.Generator
-        That of the present episode.
+    The `SeedSequence` with these arguments, which starts the stream, is made with the first
+    episode: many plants have streams that are never used.
     """
 
     # Without a dict each, the streams of 100,000 plants take little memory.
     __slots__ = ("_episode", "_origin", "_seeds", "generator")
 
-    generator: np.random.Generator
+    generator: np.random.Generator  # of the present episode
 
     def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
         self._seeds = entropy, spawn_key, pool_size
@@ -119,15 +110,7 @@ def is_silent(name: str, parameters: Parameters) -> bool:
 
 
 class Noise:
-    """Coloured noise: C(z^-1) xi(k) of (28), where xi is 0 up to k = 0.
-
-    Parameters
-    ----------
-    name
-        "noise" or "measurement_noise".
-    parameters
-        Uses the variance of that name, and `c`.
-    """
+    """Coloured noise, C(z^-1) xi(k) of (28), or the transmitter's, by name; 0 at k = 0."""
 
     def __init__(self, name: str, parameters: Parameters) -> None:
         self._name = name
@@ -154,21 +137,9 @@ class Noise:
 
 
 class NoiseBatch:
-    """`Noise` for many plants, each to the bit what it is alone.
+    """`Noise` for many plants, each to the bit what it is alone; `block` samples at a time.
 
-    Parameters
-    ----------
-    name, parameters
-        As for `Noise`.
-    num_envs
-        Number of plants.
-    block
-        Samples made at a time.
-
-    Attributes
-    ----------
-    silent : bool
-        Whether it is always 0.
+    `silent` says whether it is always 0.
     """
 
     def __init__(self, name: str, parameters: Parameters, num_envs: int, block: int) -> None:
@@ -190,7 +161,7 @@ class NoiseBatch:
     def reset(
         self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
     ) -> Values:
-        """Begin an episode of some plants, given by indices, with the streams of each."""
+        """Begin an episode of some plants, with the streams of each."""
         if not self.silent:
             if not self._alike:
                 deviations = np.sqrt(getattr(numbers, self._variance))
@@ -245,11 +216,6 @@ def _coloured(colour: Sequence[float] | Values, draws: Values) -> Values:
 class Levels:
     """How the set point goes on: through levels, each held for a number of samples.
 
-    Parameters
-    ----------
-    parameters
-        Uses `setpoint`, `setpoint_amplitude` and `setpoint_period`.
-
     Attributes
     ----------
     random : bool
@@ -277,20 +243,17 @@ class Levels:
             self.values = [kind] if isinstance(kind, float) else list(kind)
             self.lengths = [1] * (len(self.values) - 1) + [FOREVER]
 
-    def draw(self, generator: np.random.Generator) -> tuple[float, int]:
-        """Draw a level, degC, and how many samples it is held for."""
+    def next(self, place: int, generator: np.random.Generator | None) -> tuple[float, int]:
+        """Return the level at a place, or draw one, degC, and for how many samples it holds."""
+        if generator is None:
+            place %= len(self.values)
+            return self.values[place], self.lengths[place]
         level = generator.uniform(-self.amplitude, self.amplitude)
         return level, int(generator.integers(self.shortest, self.longest, endpoint=True))
 
 
 class SetPoint:
-    """The set point y_d(k).
-
-    Parameters
-    ----------
-    parameters
-        Uses what `Levels` does.
-    """
+    """The set point y_d(k)."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._levels = Levels(parameters)
@@ -307,19 +270,12 @@ class SetPoint:
         values: list[float] = []
         while len(values) < samples:
             if self._left == 0:
-                self._next_level()
+                self._level, self._left = self._levels.next(self._place, self._generator)
+                self._place += 1
             length = min(self._left, samples - len(values))
             values += [self._level] * length
             self._left -= length
         return values
-
-    def _next_level(self) -> None:
-        levels = self._levels
-        if self._generator is not None:
-            self._level, self._left = levels.draw(self._generator)
-        else:
-            self._level, self._left = levels.values[self._place], levels.lengths[self._place]
-            self._place = (self._place + 1) % len(levels.values)
 
 
 class _LevelsBatch:
@@ -351,15 +307,7 @@ class _LevelsBatch:
 
 
 class SetPointBatch(_LevelsBatch):
-    """`SetPoint` for many plants, each to the bit what it is alone.
-
-    Parameters
-    ----------
-    parameters
-        Uses what `Levels` does.
-    num_envs
-        Number of plants.
-    """
+    """`SetPoint` for many plants, each to the bit what it is alone."""
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         super().__init__(num_envs)
@@ -372,7 +320,7 @@ class SetPointBatch(_LevelsBatch):
     def reset(
         self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
     ) -> Values:
-        """Begin an episode of some plants, given by indices, with the streams of each."""
+        """Begin an episode of some plants, with the streams of each."""
         if self._levels.random:
             for i, own in zip(which.tolist(), streams, strict=True):
                 self._generators[i] = own.setpoint.next_episode()
@@ -385,7 +333,7 @@ class SetPointBatch(_LevelsBatch):
         which = np.flatnonzero(due)
         if self._levels.random:
             for i in which.tolist():
-                self._now[i], length = self._levels.draw(self._generators[i])
+                self._now[i], length = self._levels.next(0, self._generators[i])
                 self._changes[i] += length
         else:
             places = self._places[which]
@@ -401,11 +349,6 @@ class Disturbance:
     variance asks for; the sum of many is normal all the same. With a probability of
     `LOAD_INTERVAL / disturbance_interval` the other part jumps to a new level, uniform within
     +-`disturbance_amplitude`.
-
-    Parameters
-    ----------
-    parameters
-        Whether there is any.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -433,13 +376,7 @@ class Disturbance:
 
 
 class DisturbanceBatch(_LevelsBatch):
-    """`Disturbance` for many plants, each to the bit what it is alone.
-
-    Parameters
-    ----------
-    num_envs
-        Number of plants.
-    """
+    """`Disturbance` for many plants, each to the bit what it is alone."""
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs)
@@ -454,7 +391,7 @@ class DisturbanceBatch(_LevelsBatch):
     def reset(
         self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
     ) -> Values:
-        """Begin an episode of some plants, given by indices, with the streams of each."""
+        """Begin an episode of some plants, with the streams of each."""
         for i, own in zip(which.tolist(), streams, strict=True):
             self._generators[i] = own.plant.generator
         for column, values in enumerate(_shape(numbers)):
@@ -495,21 +432,10 @@ def _shape(numbers: PlantNumbers[Any]) -> tuple[Any, Any, Any]:
 
 
 def _disturbance(draws: Values, shapes: Values, last: Values) -> tuple[Values, Values]:
-    """Make disturbances of uniform draws.
+    """Make disturbances w, shape (plants, changes), of uniform draws, (plants, changes, 3).
 
-    Parameters
-    ----------
-    draws
-        Shape (plants, changes, 3).
-    shapes
-        As of `_shape`, shape (plants, 3).
-    last
-        The levels before, of the steps and of the walk, shape (plants, 2).
-
-    Returns
-    -------
-    ndarray, ndarray
-        w, shape (plants, changes), and the last levels of its two parts, shape (plants, 2).
+    `shapes` is as of `_shape`, shape (plants, 3). `last` are the levels before, of the steps
+    and of the walk, shape (plants, 2); the new ones are returned, too.
     """
     amplitude, probability, width = (shapes[:, [i]] for i in range(3))
     walk = np.hstack((last[:, 1:], (2.0 * draws[..., 0] - 1.0) * width)).cumsum(axis=1)[:, 1:]
