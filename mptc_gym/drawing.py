@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache, lru_cache
-from itertools import islice
 
 import numpy as np
 import pygame
@@ -39,30 +38,25 @@ _FINER = 4  # times as large as it is shown, words are drawn
 
 
 class Panel:
-    """A part of the picture with axes of its own, in pixels.
-
-    Parameters
-    ----------
-    top, bottom
-        Where it is.
-    record
-        What is drawn, and the time axis.
-    axis
-        From bottom to top.
-    """
+    """A part of the picture with axes of its own, from `top` to `bottom`, in pixels."""
 
     def __init__(self, top: int, bottom: int, record: Record, axis: Axis) -> None:
         self.top, self.bottom = top, bottom
         self.record, self.axis = record, axis
         self.rect = pygame.Rect(_LEFT, top, _RIGHT - _LEFT + 1, bottom - top + 1)
-        self._first = record.first
         self._sample = (_RIGHT - _LEFT) / record.span
         # Samples k, k = first on, and the place where the next one will be.
         self.xs = [self.x(k) for k in range(record.first, record.k + 2)]
 
     def x(self, k: float) -> float:
         """Return where sample k lies."""
-        return _LEFT + (k - self._first) * self._sample
+        return _LEFT + (k - self.record.first) * self._sample
+
+    def minutes(self) -> Iterator[tuple[float, float]]:
+        """Yield the full minutes, or so, and where they lie."""
+        per_minute = 60.0 / self.record.sampling_interval
+        for minute in self.record.minutes.ticks():
+            yield minute, self.x(minute * per_minute)
 
     def y(self, value: float) -> float:
         """Return where a value lies."""
@@ -84,15 +78,7 @@ def frame(record: Record) -> NDArray[np.uint8]:
 
 
 def show(record: Record, fps: float) -> None:
-    """Show a picture in the window, which is opened if need be.
-
-    Parameters
-    ----------
-    record
-        What to draw.
-    fps
-        Waits so long that there are no more pictures a second than this.
-    """
+    """Show a picture in the window, which is opened if need be, at most `fps` a second."""
     pygame.display.init()
     screen = pygame.display.get_surface()
     if screen is None or screen.get_size() != SIZE:
@@ -130,10 +116,7 @@ def draw(record: Record) -> pygame.Surface:
 
 
 def flow_at(record: Record, point: tuple[int, int]) -> float | None:
-    """Return the flow that a point of a record's picture stands for, t/h.
-
-    It is None for a point outside the panel of flows.
-    """
+    """Return the flow that a point of a picture stands for, t/h; None outside its panel."""
     panel = _flow_panel(record)
     if not panel.rect.collidepoint(point):
         return None
@@ -153,12 +136,8 @@ def _paper() -> pygame.Surface:
 
 
 def _header(surface: pygame.Surface, record: Record) -> None:
-    colours = {
-        "set point": SETPOINT,
-        "temperature": TEMPERATURE,
-        "command": COMMAND,
-        "applied": APPLIED,
-    }
+    colours = {"set point": SETPOINT, "temperature": TEMPERATURE}
+    colours |= {"command": COMMAND, "applied": APPLIED}
     pygame.draw.rect(surface, _PANEL, (0, 0, SIZE[0], 66))
     pygame.draw.line(surface, _FRAME, (0, 66), (SIZE[0], 66))
     for i, (name, value) in enumerate(record.readings.items()):
@@ -173,8 +152,7 @@ def _header(surface: pygame.Surface, record: Record) -> None:
 def _temperatures(surface: pygame.Surface, panel: Panel) -> None:
     _ground(surface, panel, "temperature, °C")
     record = panel.record
-    setpoints = panel.ys(sample[0] for sample in record.samples)
-    outputs = panel.ys(sample[1] for sample in record.samples)
+    setpoints, outputs, _, _ = map(panel.ys, zip(*record.samples, strict=True))
     surface.set_clip(panel.rect)
     _dashes(surface, SETPOINT, panel, setpoints[:-1])
     _curve(surface, TEMPERATURE, list(zip(panel.xs, outputs, strict=False)))
@@ -182,12 +160,8 @@ def _temperatures(surface: pygame.Surface, panel: Panel) -> None:
     _edge(surface, panel)
     dot = _dot(TEMPERATURE)
     surface.blit(dot, dot.get_rect(center=_pixel((panel.x(record.k), outputs[-1]))))
-    _names(
-        surface,
-        panel,
-        ("set point", SETPOINT, setpoints[-1]),
-        ("temperature", TEMPERATURE, outputs[-1]),
-    )
+    ends = ("set point", SETPOINT, setpoints[-1]), ("temperature", TEMPERATURE, outputs[-1])
+    _names(surface, panel, *ends)
 
 
 def _flows(surface: pygame.Surface, panel: Panel) -> None:
@@ -210,8 +184,7 @@ def _flows(surface: pygame.Surface, panel: Panel) -> None:
     pygame.draw.line(surface, _FRAME, (_LEFT, zero), (_RIGHT, zero))
 
     # An input is held from its sample to the next. The first entry is of before the episode.
-    commands = panel.ys(sample[2] for sample in islice(record.samples, 1, None))
-    applied = panel.ys(sample[3] for sample in islice(record.samples, 1, None))
+    _, _, commands, applied = (panel.ys(each[1:]) for each in zip(*record.samples, strict=True))
     if applied:
         if record.in_transit:
             still = _steps(panel, applied[-record.in_transit :])
@@ -232,10 +205,7 @@ def _flows(surface: pygame.Surface, panel: Panel) -> None:
 def _ground(surface: pygame.Surface, panel: Panel, title: str) -> None:
     """Draw what lies behind the lines: the panel, its grid and its tick labels."""
     surface.fill(_PANEL, panel.rect)
-    record = panel.record
-    per_minute = 60.0 / record.sampling_interval
-    for minute in record.minutes.ticks():
-        x = panel.x(minute * per_minute)
+    for _, x in panel.minutes():
         pygame.draw.line(surface, _GRID, (x, panel.top), (x, panel.bottom))
     for value in panel.axis.ticks():
         y = panel.y(value)
@@ -264,13 +234,11 @@ def _bracket(surface: pygame.Surface, panel: Panel, left: float, right: float) -
 
 
 def _time_axis(surface: pygame.Surface, panel: Panel) -> None:
-    record = panel.record
-    per_minute = 60.0 / record.sampling_interval
-    for minute in record.minutes.ticks():
-        x, y = panel.x(minute * per_minute), panel.bottom
+    y = panel.bottom
+    for minute, x in panel.minutes():
         pygame.draw.line(surface, _FRAME, (x, y), (x, y + 5))
         _write(surface, f"{minute:.6g}", _SMALL, FAINT, midtop=(x, y + 9))
-    _write(surface, "time, min", _SMALL, _INK, topleft=(_RIGHT + 24, panel.bottom + 9))
+    _write(surface, "time, min", _SMALL, _INK, topleft=(_RIGHT + 24, y + 9))
 
 
 def _legend(surface: pygame.Surface, has_dead_zone: bool) -> None:

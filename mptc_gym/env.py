@@ -370,9 +370,6 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         DependencyNotInstalled
             If there is no pygame, for any mode but "ansi".
         """
-        if self.render_mode is None:
-            rendering.warn_no_mode()
-            return None
         return rendering.render(self.render_mode, self._record, self.metadata["render_fps"])
 
     def close(self) -> None:

@@ -35,25 +35,14 @@ def warn_no_mode() -> None:
     )
 
 
-def render(mode: str, record: Record | None, fps: float) -> Frame | str | None:
-    """Make a picture: return it, or show it in a window.
+def render(mode: str | None, record: Record | None, fps: float) -> Frame | str | None:
+    """Make a picture in a mode: return it, or show it in a window, at most `fps` a second.
 
-    Parameters
-    ----------
-    mode
-        "rgb_array", "human" or "ansi".
-    record
-        What to draw; None before the first reset.
-    fps
-        Pictures a second that a window shows at most.
-
-    Raises
-    ------
-    ResetNeeded
-        If there is no record.
-    DependencyNotInstalled
-        If there is no pygame, for any mode but "ansi".
+    See `MiddlePointEnv.render`.
     """
+    if mode is None:
+        warn_no_mode()
+        return None
     if record is None:
         raise ResetNeeded("call reset before render")
     if mode == "ansi":
@@ -88,18 +77,16 @@ def _drawing() -> ModuleType:
 
 def text(record: Record) -> str:
     """Return a picture in text: set point -, temperature *; command +, applied #."""
-    columns = range(_TEXT_COLUMNS)
-    picks = [record.first + round(c * record.span / (len(columns) - 1)) for c in columns]
-    samples = list(record.samples)
-    shown = [samples[j - record.first] for j in picks if j <= record.k]
-    in_transit = [j > record.k - record.in_transit for j in picks if j <= record.k]
+    places = [round(c * record.span / (_TEXT_COLUMNS - 1)) for c in range(_TEXT_COLUMNS)]
+    places = [place for place in places if record.first + place <= record.k]
+    in_transit = [record.first + place > record.k - record.in_transit for place in places]
 
     temperatures = _Grid(record.temperatures, rows=11)
     flows = _Grid(record.flows, rows=9)
-    dead_zone = record.plant.dead_zone
-    for column in columns:
-        flows.fill(column, -dead_zone, dead_zone, ":")
-    for column, (setpoint, output, command, applied) in enumerate(shown):
+    flows.fill(-record.plant.dead_zone, record.plant.dead_zone, ":")
+    samples = list(record.samples)
+    for column, place in enumerate(places):
+        setpoint, output, command, applied = samples[place]
         temperatures.put(column, setpoint, "-")
         temperatures.put(column, output, "*")
         flows.put(column, command, "+")
@@ -134,11 +121,12 @@ class _Grid:
     def put(self, column: int, value: float, character: str) -> None:
         self._rows[self._row(value)][column] = character
 
-    def fill(self, column: int, low: float, high: float, character: str) -> None:
+    def fill(self, low: float, high: float, character: str) -> None:
         """Fill the rows whose middle lies between two values."""
-        for row in range(len(self._rows)):
-            if low < self._value(row) < high:
-                self._rows[row][column] = character
+        for row, characters in enumerate(self._rows):
+            share = 1.0 - row / (len(self._rows) - 1)
+            if low < self._axis.low + share * (self._axis.high - self._axis.low) < high:
+                characters[:] = character * _TEXT_COLUMNS
 
     def lines(self) -> list[str]:
         labels = {self._row(tick): f"{tick:.6g}" for tick in self._axis.ticks()}
@@ -149,7 +137,3 @@ class _Grid:
 
     def _row(self, value: float) -> int:
         return round((1.0 - self._axis.share(value)) * (len(self._rows) - 1))
-
-    def _value(self, row: int) -> float:
-        share = 1.0 - row / (len(self._rows) - 1)
-        return self._axis.low + share * (self._axis.high - self._axis.low)
