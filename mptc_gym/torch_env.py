@@ -331,17 +331,7 @@ class MiddlePointTorchEnv(BatchEnv):
 
 
 class _Window:
-    """The observations of all plants.
-
-    Parameters
-    ----------
-    windows
-        Sizes of the blocks of an observation: set points, errors, outputs, actions.
-    zeros
-        Zeros of the device and type to use, shape (n,).
-    differentiable
-        Whether gradients reach past actions.
-    """
+    """The observations of all plants, with past actions that gradients reach or not."""
 
     def __init__(self, windows: Sequence[int], zeros: Tensor, differentiable: bool) -> None:
         *self._windows, self._past_actions = windows
@@ -359,10 +349,7 @@ class _Window:
     def reset(
         self, taken: int, which: Tensor | None, setpoint: Tensor, rest_action: Tensor
     ) -> None:
-        """Begin an episode of some plants at rest: y_d(0), and the action of no flow.
-
-        `taken` is how many samples of the block have passed; the others are dropped.
-        """
+        """Begin an episode of some plants at rest, once `taken` samples of a block are over."""
         for rows, w, newest in zip(
             self._rows, self._windows, (setpoint, setpoint, self._zeros), strict=True
         ):

@@ -24,16 +24,8 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     """Return the flow u_a that the actuator applies, (29), t/h.
 
     Its gradient with respect to the command is 1 up to the limits, straight through the dead
-    zone as if there were none, and 0 beyond the limits.
-
-    Parameters
-    ----------
-    command
-        u, t/h, shape (n,).
-    edge
-        The largest magnitude of a command without effect.
-    u_min, u_max
-        The limits, t/h, both floats or both of shape (n,).
+    zone as if there were none, and 0 beyond the limits. `edge` is the largest magnitude of a
+    command without effect. The limits are both floats, or both of shape (n,).
     """
     alike = isinstance(edge, float) and isinstance(u_min, float) and isinstance(u_max, float)
     if alike and not command.requires_grad and u_min <= 0.0 <= u_max:
@@ -64,19 +56,7 @@ class TorchPlants:
 
     Because of the delay d, the outputs of the d + 1 samples after an action follow from the
     actions so far, whatever comes next. So they are worked out in a block, d being the shortest
-    delay that can be drawn.
-
-    Parameters
-    ----------
-    parameters
-        Uses `a`, `b`, the delay, and what `Dynamics` does.
-    episodes
-        The present ones.
-
-    Attributes
-    ----------
-    most_samples : int
-        How many samples can be worked out at once.
+    delay that can be drawn: `most_samples` at most.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
@@ -90,10 +70,7 @@ class TorchPlants:
         self._order = len(parameters.a) - 1  # of A
 
     def reset(self, which: Tensor | None) -> None:
-        """Bring some plants to rest, or all, with the numbers of the present episodes.
-
-        `which` says whether each is, shape (n,), bool; None for all.
-        """
+        """Bring some plants to rest, or all, with the numbers of the present episodes."""
         numbers, zeros = self._episodes.numbers, self._zeros
         self._now: tuple[Any, Any] | None = None  # factors, and what (28) has for them
         plants = PlantNumbers(**numbers)
@@ -143,18 +120,8 @@ class TorchPlants:
     ) -> tuple[Tensor, list[tuple[Number, Number]]]:
         """Work out the next samples, once the action before them has been applied.
 
-        Parameters
-        ----------
-        samples
-            How many, at most `most_samples`.
-        noise, load
-            n and w of these samples, degC, shape (samples, n), if there are any.
-
-        Returns
-        -------
-        Tensor, list of tuple
-            y, degC, shape (samples, n); and of each sample gain and time constant, as multiples
-            of those that A and B have.
+        n and w of these samples, if there are any, and y have the shape (samples, n), degC.
+        Gain and time constant of each, as multiples of those of A and B, are returned, too.
         """
         rows, all_factors = self._past(), []
         response = self._response(samples)
@@ -198,21 +165,17 @@ class TorchPlants:
 
     def _stretches(self, samples: int) -> list[tuple[int, int]]:
         """Return from which to which sample the dynamics of no plant change."""
-        begins = [0]
-        if self._drifts:
-            begins += filter(self._changes_after, range(1, samples))
+        clock = self._episodes.clock
+        begins = [0, *(k for k in range(1, samples) if self._changes_at(clock + k))]
         return list(zip(begins, [*begins[1:], samples], strict=True))
 
-    def _changes_after(self, samples: int) -> bool:
-        """Whether a plant's drifting dynamics change so many samples into the block."""
-        clock = self._episodes.clock + samples
-        return clock % DRIFT_INTERVAL in self._episodes.phases
+    def _changes_at(self, clock: int) -> bool:
+        """Whether the drifting dynamics of a plant change at a sample."""
+        return self._drifts and clock % DRIFT_INTERVAL in self._episodes.phases
 
     def _drifted(self, clock: int) -> tuple[Any, Any]:
         """Return gain and time constant at a sample, and what (28) has for them."""
-        if self._now is None or (
-            self._drifts and clock % DRIFT_INTERVAL in self._episodes.phases
-        ):
+        if self._now is None or self._changes_at(clock):
             factors: tuple[Any, ...] = self._factors
             if self._drifts:
                 age = self._episodes.age(clock)

@@ -10,7 +10,7 @@ episode begins is dropped.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,17 +45,10 @@ def as_tensor(values: Any, like: Tensor) -> Tensor | None:
 class Episodes:
     """What signals and plants know of the present episodes, and where random numbers are from.
 
-    Parameters
-    ----------
-    parameters
-        Uses the plant numbers.
-    zeros
-        Zeros of the device and type to use, shape (n,).
-
     Attributes
     ----------
     zeros : Tensor
-        Those.
+        Zeros of the device and type to use, shape (n,).
     generator : torch.Generator
         Where all draws come from.
     numbers : dict
@@ -134,26 +127,8 @@ class Episodes:
         return (drawn.floor() if whole else drawn).clamp(max=high)
 
 
-class Signal(Protocol):
-    """What all of them can do; see the beginning of this file."""
-
-    def reset(self, which: Tensor | None) -> Tensor:
-        """Begin an episode of some plants."""
-
-    def next(self, samples: int) -> Tensor:
-        """Return the next samples."""
-
-
 class Noise:
-    """Coloured noise: C(z^-1) xi(k) of (28), where xi is 0 up to k = 0.
-
-    Parameters
-    ----------
-    name, parameters
-        As for `mptc_gym.signals.Noise`.
-    episodes
-        The present ones.
-    """
+    """Coloured noise, by name, as `mptc_gym.signals.Noise`."""
 
     def __init__(self, name: str, parameters: Parameters, episodes: Episodes) -> None:
         self._variance, self._c = f"{name}_variance", tuple(colour_of(name, parameters))
@@ -188,15 +163,7 @@ class Noise:
 
 
 class RandomSetPoint:
-    """A set point that holds each random level for a random number of samples.
-
-    Parameters
-    ----------
-    levels
-        How large they are, and how long they hold.
-    episodes
-        The present ones.
-    """
+    """A set point that holds each random level for a random number of samples."""
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
         self._levels, self._episodes = levels, episodes
@@ -254,15 +221,7 @@ class RandomSetPoint:
 
 
 class RepeatedSetPoint:
-    """A set point that is not random.
-
-    Parameters
-    ----------
-    levels
-        What is repeated.
-    episodes
-        The present ones.
-    """
+    """A set point that repeats its levels."""
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
         self._episodes = episodes
@@ -284,13 +243,7 @@ class RepeatedSetPoint:
 
 
 class Disturbance:
-    """The load disturbance of `mptc_gym.signals.Disturbance`: steps and a walk.
-
-    Parameters
-    ----------
-    episodes
-        The present ones; a load changes by their plant numbers of that moment.
-    """
+    """The load disturbance of `mptc_gym.signals.Disturbance`: steps and a walk."""
 
     def __init__(self, episodes: Episodes) -> None:
         self._episodes = episodes
@@ -353,13 +306,8 @@ def _reached(now: Tensor, change: Tensor) -> Tensor:
 class Handed:
     """A signal that is handed in instead of being drawn; or a plant number, by `reset` alone.
 
-    Parameters
-    ----------
-    values
-        Shape (episodes, samples, n). After the last episode comes the first one again, and
-        after the last sample the last value is held.
-    episodes
-        The present ones.
+    The values have the shape (episodes, samples, n). After the last episode comes the first one
+    again, and after the last sample the last value is held.
     """
 
     def __init__(self, values: Tensor, episodes: Episodes) -> None:
@@ -381,6 +329,9 @@ class Handed:
         return self._values.flatten(0, 1).gather(0, rows)
 
 
+Signal = Noise | RandomSetPoint | RepeatedSetPoint | Disturbance | Handed
+
+
 def drawn_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal]:
     """Return the signals of an environment by name, but for noise that is always 0."""
     levels = Levels(parameters)
@@ -399,10 +350,7 @@ def handed_signals(
 ) -> tuple[dict[str, Handed], int | None]:
     """Check signals and plant numbers that are handed in.
 
-    Returns
-    -------
-    dict, int or None
-        Them, and the last sample that all signals have, None if there are none.
+    Returns them, and the last sample that all signals have, None if there are none.
     """
     n, ranges = len(episodes.zeros), parameters.ranges
     names = {*SIGNALS, *ranges}
@@ -417,31 +365,24 @@ def handed_signals(
         values = as_tensor(given, episodes.zeros)
         if values is None:
             reject(path, given, "numbers")
-        shape = (n,) if name in ranges else ("samples", n)
-        if values.ndim == len(shape):
+        shape, dimensions = (f"({n},)", 1) if name in ranges else (f"(samples, {n})", 2)
+        if values.ndim == dimensions:
             values = values[None]
-        if values.ndim != len(shape) + 1 or values.shape[-1] != n or not values.numel():
-            shown = str(shape).replace("'", "")
+        if values.ndim != dimensions + 1 or values.shape[-1] != n or not values.numel():
             raise ValueError(
-                f"{path} must have the shape {shown}, or one more dimension before, of "
+                f"{path} must have the shape {shape}, or one more dimension before, of "
                 f"episodes, got {tuple(values.shape)}"
             )
         if not values.isfinite().all():
             raise ValueError(f"{path} must be finite")
         if name in ranges:
-            _check_range(path, given, values, parameters.range_of(name), name)
+            ends = parameters.range_of(name)
+            low, high = values.new_tensor(ends)
+            whole = not ARGUMENTS[name].is_integer or bool((values == values.round()).all())
+            if not (whole and bool(((low <= values) & (values <= high)).all())):
+                reject(path, given, f"within its range, {list(ends)}")
             values = values[:, None]
         else:
             lengths.append(values.shape[1])
         handed[name] = Handed(values, episodes)
     return handed, min(lengths) - 1 if lengths else None
-
-
-def _check_range(
-    path: str, given: Any, values: Tensor, ends: tuple[float, float], name: str
-) -> None:
-    """Refuse plant numbers that could not have been drawn."""
-    low, high = values.new_tensor(ends)
-    whole = not ARGUMENTS[name].is_integer or bool((values == values.round()).all())
-    if not (whole and bool(((low <= values) & (values <= high)).all())):
-        reject(path, given, f"within its range, {list(ends)}")

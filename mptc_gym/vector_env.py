@@ -303,13 +303,6 @@ class _Window:
 
     They lie in a row, one after the other, from a place on that moves back by one each step. So
     all blocks of samples move on by one, and only their first elements have to be written.
-
-    Parameters
-    ----------
-    windows
-        Sizes of the blocks of an observation: set points, errors, outputs, actions.
-    num_envs
-        Number of plants.
     """
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
