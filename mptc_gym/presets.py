@@ -53,12 +53,6 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
 """
 
 IDS: Final[dict[str, str]] = {
-    "paper": "MiddlePoint-v0",
-    "dead-zone-7": "MiddlePointDeadZone7-v0",
-    "noisy": "MiddlePointNoisy-v0",
-    "disturbed": "MiddlePointDisturbed-v0",
-    "fouling": "MiddlePointFouling-v0",
-    "randomised": "MiddlePointRandomised-v0",
-    "hard": "MiddlePointHard-v0",
-}
+    name: f"MiddlePoint{name.title().replace('-', '')}-v0" for name in PRESETS
+} | {"paper": "MiddlePoint-v0"}
 """The id of each preset: `gymnasium.make(IDS["noisy"])`, with arguments on top if need be."""

@@ -282,7 +282,12 @@ class MiddlePointTorchEnv(BatchEnv):
         if seed is not None and not (is_count(seed) and seed < 1 << 63):
             reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
         if "reset_mask" not in options:
-            self._hand_in(options.get("signals"))
+            # Signals and plant numbers instead of draws, if there are any.
+            self._handed, self._last = handed_signals(
+                options.get("signals"), self.parameters, self._episodes
+            )
+            of_signals = {name: each for name, each in self._handed.items() if name in SIGNALS}
+            self._signals = {**self._drawn, **of_signals}
         elif "signals" in options:
             raise ValueError("options['signals'] needs a reset of all plants, not of some")
         if seed is not None:
@@ -290,15 +295,6 @@ class MiddlePointTorchEnv(BatchEnv):
             self._episodes.generator.manual_seed(self._seed)
         elif self._seed is None:
             self._seed = self._episodes.generator.seed()
-
-    def _hand_in(self, signals: Any) -> None:
-        """Take signals and plant numbers instead of draws, if there are any."""
-        handed_in: tuple[dict[str, Handed], int | None] = {}, None
-        if signals is not None:
-            handed_in = handed_signals(signals, self.parameters, self._episodes)
-        self._handed, self._last = handed_in
-        handed = {name: each for name, each in self._handed.items() if name in SIGNALS}
-        self._signals = {**self._drawn, **handed}
 
     def _checked_actions(self, actions: Any) -> Tensor:
         given = actions
@@ -317,17 +313,13 @@ class MiddlePointTorchEnv(BatchEnv):
             if not math.isfinite(plain.dot(plain).item()) and not plain.isfinite().all():
                 reject("actions", actions, "finite")
         if self._last is not None:
-            self._check_signals(self._last)
+            going = self._starts if self._ended is None else self._starts[~self._ended]
+            if len(going) and self._clock + 1 - int(going.min()) > self._last:
+                raise ValueError(
+                    f"options['signals'] end at sample {self._last} of an episode, and the "
+                    "step goes beyond"
+                )
         return a
-
-    def _check_signals(self, last: int) -> None:
-        """Refuse a step beyond the last sample that is handed in."""
-        going = self._starts if self._ended is None else self._starts[~self._ended]
-        if len(going) and self._clock + 1 - int(going.min()) > last:
-            raise ValueError(
-                f"options['signals'] end at sample {last} of an episode, and the step goes "
-                "beyond"
-            )
 
 
 class _Window:

@@ -348,10 +348,12 @@ def drawn_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signa
 def handed_signals(
     signals: Any, parameters: Parameters, episodes: Episodes
 ) -> tuple[dict[str, Handed], int | None]:
-    """Check signals and plant numbers that are handed in.
+    """Check signals and plant numbers that are handed in, if there are any.
 
     Returns them, and the last sample that all signals have, None if there are none.
     """
+    if signals is None:
+        return {}, None
     n, ranges = len(episodes.zeros), parameters.ranges
     names = {*SIGNALS, *ranges}
     if not parameters.is_disturbed:

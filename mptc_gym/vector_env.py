@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from mptc_gym import rendering
 from mptc_gym.batch import BatchEnv, Infos, Mask
-from mptc_gym.checks import is_count, many_actions, reject
+from mptc_gym.checks import is_count, many_actions, plain, reject
 from mptc_gym.env import MiddlePointEnv
-from mptc_gym.parameters import PlantNumbers, spelt_out
+from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
 from mptc_gym.record import Record
@@ -219,7 +219,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
         return observations, rewards, self._nobody.copy(), self._nobody.copy(), infos
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
-        which = np.flatnonzero(mask)
+        which, parameters = np.flatnonzero(mask), self.parameters
         streams = [self._streams[i] for i in which.tolist()]
         numbers = self._ranges.draw([each.plant for each in streams])
         self._plants.reset(which, numbers)
@@ -231,26 +231,18 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
         self._actions[which] = rest_action
         self._shown.reset(which, setpoint, rest_action)
         if self.render_mode is not None:
-            self._begin_records(which, numbers, setpoint)
+            for j, i in enumerate(which.tolist()):
+                own, interval = numbers_of_plant(numbers, j), parameters.sampling_interval
+                self._records[i] = Record(own, interval, float(setpoint[j]))
 
         first = {"setpoint": setpoint, "error": setpoint}
         first |= numbers.chosen(self._ranges.names)
         for name, factors in zip(self._factors, self._plants.factors, strict=False):
             first[name] = factors[which]
-        return {name: self._of_all(which, values) for name, values in first.items()}
-
-    def _of_all(self, which: Indices, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of some plants in an array of all, 0 elsewhere."""
-        of_all = np.zeros(self.num_envs, values.dtype)
-        of_all[which] = values
+        of_all = {name: np.zeros(self.num_envs, each.dtype) for name, each in first.items()}
+        for name, values in first.items():
+            of_all[name][which] = values
         return of_all
-
-    def _begin_records(
-        self, which: Indices, numbers: PlantNumbers[Values], setpoint: Values
-    ) -> None:
-        for j, (i, first) in enumerate(zip(which.tolist(), setpoint.tolist(), strict=True)):
-            own = numbers_of_plant(numbers, j)
-            self._records[i] = Record(own, self.parameters.sampling_interval, first)
 
     def _observations(self) -> Observations:
         return self._shown.present().copy()
@@ -278,16 +270,16 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
         n = self.num_envs
         if seed is None:
             return [None] * n
-        seeds: list[int | None] = []
-        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
-            seeds = list(range(int(seed), int(seed) + n))
-        elif isinstance(seed, list | tuple) or (
-            isinstance(seed, np.ndarray) and seed.ndim == 1
+        seeds: Any = plain(seed)
+        if is_count(seeds):
+            seeds = [*range(int(seeds), int(seeds) + n)]
+        if (
+            not isinstance(seeds, list | tuple)
+            or len(seeds) != n
+            or not all(each is None or is_count(each) for each in seeds)
         ):
-            seeds = list(seed)
-        if len(seeds) != n or not all(s is None or is_count(s) for s in seeds):
             reject("seed", seed, f"an integer of at least 0, or a list of {n} of them or None")
-        return [None if s is None else int(s) for s in seeds]
+        return [None if each is None else int(each) for each in seeds]
 
     def _checked_actions(self, actions: Any) -> Values:
         a = many_actions(actions, self.num_envs)
