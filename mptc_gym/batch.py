@@ -29,15 +29,7 @@ FACTORS = ("gain_factor", "time_constant_factor")
 
 
 class BatchEnv(VectorEnv[Array, Array, Array]):
-    """n plants that advance together, without what depends on the library of their arrays.
-
-    Parameters
-    ----------
-    num_envs, max_episode_steps, autoreset_mode
-        See `MiddlePointVectorEnv`.
-    arguments
-        Of the plants.
-    """
+    """n plants that advance together, without what depends on the library of their arrays."""
 
     def __init__(
         self,
@@ -150,10 +142,7 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
         return observations, rewards, terminations, truncations, infos
 
     def _end(self, observations: Array, rewards: Array, infos: Infos) -> tuple[Array, ...]:
-        """Do what the end of an episode asks for.
-
-        Returns observations, rewards and truncations, and changes the infos.
-        """
+        """Do what the end of an episode asks for, also to the infos; return what it changes."""
         ended = self._clock - self._starts >= self._limit
         flags = self._flags(ended)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:

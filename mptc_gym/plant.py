@@ -39,19 +39,8 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 
     Rounding to float32 can move a command from the edge of the dead zone into it, where nothing
     is applied: float32(0.7) stands for 6.99999988 t/h. Such an action is moved outwards by the
-    smallest step that float32 has near 1.
-
-    Parameters
-    ----------
-    command
-        u, t/h; any shape, as the other arguments, with which it is broadcast.
-    u_min, u_max, dead_zone
-        Of the actuator, t/h.
-
-    Returns
-    -------
-    ndarray, float32
-        Actions; the actuator passes each command that it would pass unrounded.
+    smallest step that float32 has near 1, so that the actuator passes each command that it
+    would pass unrounded. All arguments are in t/h and broadcast.
     """
     command, half_range = np.asarray(command, float), (u_max - u_min) / 2.0
     action = np.asarray(action_from_command(command, u_min, u_max)).astype(np.float32)
@@ -209,16 +198,11 @@ class PlantBatch:
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         # In arithmetic with arrays, an array of one number costs less than a number. In
         # comparisons, an array of full length costs still less.
-        self._drawn = parameters.ranges
+        self._num_envs, self._drawn = num_envs, parameters.ranges
+        shapes = {name: num_envs if name in self._drawn else () for name in PLANT_NUMBERS}
         self._numbers: PlantNumbers[Values] = PlantNumbers(
-            **{
-                name: np.full(
-                    num_envs if name in self._drawn else (), parameters.range_of(name)[0], float
-                )
-                for name in PLANT_NUMBERS
-            }
+            **{n: np.full(s, parameters.range_of(n)[0], float) for n, s in shapes.items()}
         )
-        self._num_envs = num_envs
         self._update_actuator()
 
         self._dynamics = Dynamics(parameters)

@@ -22,19 +22,11 @@ FARTHEST = 1e12  # degC; what is beyond, or not a number, is drawn at the edge
 
 @dataclass(frozen=True)
 class Axis:
-    """A range with ticks at round numbers.
-
-    Attributes
-    ----------
-    low, high
-        Its ends.
-    step
-        From tick to tick.
-    """
+    """A range with ticks at round numbers."""
 
     low: float
     high: float
-    step: float
+    step: float  # from tick to tick
 
     def ticks(self) -> Iterator[float]:
         """Yield the round numbers within the range."""
@@ -48,17 +40,7 @@ class Axis:
 
 
 class Record:
-    """The last samples of an episode that begins at rest.
-
-    Parameters
-    ----------
-    plant
-        The plant's numbers in this episode.
-    sampling_interval
-        s.
-    setpoint
-        y_d(0), degC.
-    """
+    """The last samples of an episode that begins at rest with the set point y_d(0), degC."""
 
     def __init__(
         self, plant: PlantNumbers[float], sampling_interval: float, setpoint: float

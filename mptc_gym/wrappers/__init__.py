@@ -131,19 +131,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
 class Actuator:
     """What the wrappers know of an actuator, and how they make it apply a flow.
 
-    Parameters
-    ----------
-    numbers
-        `dead_zone`, `u_min` and `u_max`, t/h: floats, or arrays for many plants.
-    max_move, undo_dead_zone
-        Of the wrapper.
-
-    Attributes
-    ----------
-    move
-        How far an action of 1 moves the wanted flow, t/h.
-    u_min, u_max
-        The limits, t/h.
+    `numbers` are its `dead_zone`, `u_min` and `u_max`, t/h: floats, or arrays for many plants.
     """
 
     def __init__(
@@ -151,10 +139,9 @@ class Actuator:
     ) -> None:
         own, self.u_min, self.u_max = (numbers[name] for name in NUMBERS)
         half_range = (self.u_max - self.u_min) / 2.0
-        self.move = max_move * half_range
+        self.move = max_move * half_range  # of the wanted flow by an action of 1, t/h
         self._undoes = undo_dead_zone is not False
-        z = own if undo_dead_zone is True else undo_dead_zone
-        self._zone = z
+        self._zone = z = own if undo_dead_zone is True else undo_dead_zone
         # A limit within the dead zone is reached by a command on its edge, which (29) limits.
         self._above, self._below = (
             np.maximum(limit - z, 0.0) / np.where(limit > 0.0, limit, 1.0)

@@ -81,7 +81,11 @@ class IncrementalAction(VectorActionWrapper):
         """Move the wanted flows by actions, shape (num_envs, 1), and step the environments."""
         if self._flows is None:
             raise ResetNeeded("call reset before step")
-        flows = self._moved(self._flows, actions)
+        moves = many_actions(actions, self.num_envs)
+        moves[self._ended] = 0.0  # ignored
+        if not np.isfinite(moves).all():
+            reject("actions", actions, "finite")
+        flows = self._actuator.moved(self._flows, moves)
         returned = self.env.step(self._actuator.action(flows).astype(np.float32)[:, np.newaxis])
         _, _, terminations, truncations, infos = returned
         self._flows = flows
@@ -92,14 +96,6 @@ class IncrementalAction(VectorActionWrapper):
         if self._mode is AutoresetMode.NEXT_STEP:
             self._ended = ended
         return returned
-
-    def _moved(self, flows: NDArray[np.float64], actions: Any) -> NDArray[np.float64]:
-        """Return the wanted flows after these actions."""
-        moves = many_actions(actions, self.num_envs)
-        moves[self._ended] = 0.0  # ignored
-        if not np.isfinite(moves).all():
-            reject("actions", actions, "finite")
-        return self._actuator.moved(flows, moves)
 
     def _restart(self, begun: NDArray[np.bool_], infos: dict[str, Any]) -> None:
         """Want no flow where an episode has begun, and note what was drawn for it."""
