@@ -11,7 +11,7 @@ from agents import PIController
 from benchmarks.controllers import engineered
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.step_test import step_test
-from benchmarks.identify.margins import margins
+from benchmarks.identify.margins import Loop
 from benchmarks.limits import __main__ as limits
 from benchmarks.limits import frontier, least_possible
 from benchmarks.loop import linear
@@ -87,7 +87,7 @@ ANALYSES = {
     "Smith": lambda **p: engineered.smith(Parameters(**p), 1, 0),
     "self-tuning": lambda **p: engineered.self_tuning(Parameters(**p), 1, 0),
     "MPC": lambda **p: PredictiveController(Parameters(**p), 1),
-    "margins": lambda **p: margins(PIController(), Parameters(**p)),
+    "margins": lambda **p: Loop(PIController(), Parameters(**p)),
     "by hand": lambda **p: touched_plants(30, p)[0],
 }
 

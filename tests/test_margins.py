@@ -9,7 +9,7 @@ from scipy import signal
 
 from agents import PIController, SmithPredictor
 from agents.pi import SEARCHED_GAINS
-from benchmarks.identify.margins import Loop, margins
+from benchmarks.identify.margins import Loop
 from mptc_gym import Parameters
 
 STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of the paper's plant
@@ -35,10 +35,8 @@ def controllers():
 def test_agreement_with_python_control(plant, name):
     parameters = Parameters(**PLANTS[plant])
     controller = controllers()[name]
-    found = margins(controller, parameters)
-
-    interval = parameters.sampling_interval
-    loop = Loop.of(controller, parameters)
+    loop = Loop(controller, parameters)
+    found, interval = loop.margins, parameters.sampling_interval
     size = max(len(loop.numerator), len(loop.denominator))
     system = control.tf(
         np.pad(loop.numerator, (0, size - len(loop.numerator))),
@@ -77,7 +75,7 @@ def test_transfer_function_is_what_the_controller_does(name):
 
 def closed(controller, parameters, factor=1.0, delay=0):
     """Return the late over the early amplitude of the free response of a loop."""
-    loop = Loop.of(controller, parameters)
+    loop = Loop(controller, parameters)
     numerator = np.concatenate([np.zeros(delay), factor * loop.numerator])
     denominator = np.pad(loop.denominator, (0, len(numerator)))[: len(numerator)]
     response = signal.lfilter(numerator, denominator + numerator, np.eye(1, 6000)[0])
@@ -86,7 +84,7 @@ def closed(controller, parameters, factor=1.0, delay=0):
 
 def test_gain_and_delay_margins_are_where_the_loop_begins_to_grow():
     controller = PIController.simc(**STEP_TEST)
-    found = margins(controller, Parameters())
+    found = Loop(controller, Parameters()).margins
     assert closed(controller, Parameters(), 0.97 * found.gain) < 0.5
     assert closed(controller, Parameters(), 1.03 * found.gain) > 2.0
     samples = found.delay / 8.0
@@ -95,7 +93,7 @@ def test_gain_and_delay_margins_are_where_the_loop_begins_to_grow():
 
 
 def test_unstable_loop_has_no_margins():
-    found = margins(PIController(kp=8.0, ki=0.5), Parameters())
+    found = Loop(PIController(kp=8.0, ki=0.5), Parameters()).margins
     assert not found.stable
     assert math.isnan(found.gain)
 
@@ -105,5 +103,5 @@ def test_other_direction_has_the_same_margins():
     shown = {**STEP_TEST, "gain": -STEP_TEST["gain"]}
     for make in (PIController.simc, SmithPredictor):
         more = {"closed_loop_time_constant": 80.0}
-        ours = margins(make(**STEP_TEST, **more), Parameters())
-        assert margins(make(**shown, **more), mirrored) == ours
+        ours = Loop(make(**STEP_TEST, **more), Parameters()).margins
+        assert Loop(make(**shown, **more), mirrored).margins == ours

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+from numpy.lib.stride_tricks import sliding_window_view
 
 from benchmarks.identify.armax import Array, Flags
 from benchmarks.identify.log import Log
@@ -30,11 +31,10 @@ def at_one_rate(log: Log) -> Log:
     first = int(np.bincount(known % rate).argmax()) if rate in RATES else 0
     if rate not in RATES or np.mean(known % rate == first) < 0.95:
         return log
-    rows = np.arange(first, len(log.flow) - rate + 1, rate)
 
     def mean(values: Array) -> Array:
         """Return means from each temperature to the next."""
-        means: Array = values[rows[:, np.newaxis] + np.arange(rate)].mean(axis=1)
+        means: Array = sliding_window_view(values, rate)[first::rate].mean(axis=1)
         return means
 
     note = (
@@ -43,7 +43,7 @@ def at_one_rate(log: Log) -> Log:
     )
     return Log(
         mean(log.flow),
-        log.temperature[rows],
+        log.temperature[first : len(log.flow) - rate + 1 : rate],
         rate * log.sampling_interval,
         [*log.notes, note],
         {name: mean(each) for name, each in log.disturbances.items()},

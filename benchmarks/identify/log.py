@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -14,18 +15,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.identify.options import Columns
+from benchmarks.identify.options import UNITS, Columns
 
 Array = NDArray[np.float64]
-Units = dict[str, tuple[float, float]]
-
-# By unit: factor to the units of the plant (s, t/h, degC), and what is added then.
-TIME_UNITS: Units = {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)}
-FLOW_UNITS: Units = dict.fromkeys(("t/h", "%"), (1.0, 0.0))
-FLOW_UNITS |= {"kg/s": (3.6, 0.0), "kg/h": (1e-3, 0.0)}
-TEMPERATURE_UNITS: Units = dict.fromkeys(("degC", "°C", "C"), (1.0, 0.0))
-TEMPERATURE_UNITS |= {"K": (1.0, -273.15)}
-TEMPERATURE_UNITS |= dict.fromkeys(("degF", "°F", "F"), (5 / 9, -160 / 9))
 
 DAY_FIRST = r"^(\d\d)\.(\d\d)\.(\d{4})\b"
 CHUNK = 200_000  # rows that are read at once
@@ -90,39 +82,41 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) 
     columns = columns or Columns()
     if columns.sampling_interval is not None and not columns.sampling_interval > 0:
         raise ValueError(f"sampling_interval must be above 0, got {columns.sampling_interval}")
-    layout = _Layout(path, columns)
-    kept: deque[Array] = deque()
+    file = _File(path, columns)
     clock = _Clock(columns.sampling_interval)
+    kept: deque[pd.DataFrame] = deque()
     read = 0
     with tqdm(unit="row", unit_scale=True, desc="reading", delay=PROGRESS_AFTER) as progress:
-        for times, table in layout.tables():
-            read += len(table)
-            kept.append(clock.spread(times, table, first_line=read - len(table) + 2))
+        for table in file.pieces():
+            times = table.pop(file.time) if file.time else None
+            kept.append(table if times is None else clock.spread(times, table))
             while len(kept) > 1 and sum(map(len, kept)) - len(kept[0]) >= rows:
                 kept.popleft()
+            read += len(table)
             progress.update(len(table))
     if clock.interval is None or not read:
         raise ValueError(
             f"{path} is too short: {read} rows, and hundreds are needed, while the flow moves"
         )
-    notes = [*layout.notes, *clock.notes]
+    notes = ["The flow is in %: read % wherever t/h is said."] if file.in_percent else []
+    notes += clock.notes
     if read > rows:
         notes.append(f"Of the {read:,} rows, the last {rows:,} are used (--rows).")
-    found = dict(zip(layout.names, np.concatenate(kept)[-rows:].T, strict=True))
-    flow, temperature = (found.pop(layout.names[i]) for i in (0, 1))
+    found = {str(name): each.to_numpy() for name, each in pd.concat(kept)[-rows:].items()}
+    flow, temperature = (found.pop(name) for name in list(found)[:2])
     flow, disturbances = _held(flow), {name: _held(each) for name, each in found.items()}
     notes += _missing({"flow": flow, "temperature": temperature, **disturbances})
     return Log(flow, temperature, clock.interval, notes, disturbances)
 
 
-class _Layout:
-    """Separator, decimal mark, columns and units of a file."""
+class _File:
+    """A file with a heading: its separator, decimal mark, columns and units."""
 
     def __init__(self, path: Path, columns: Columns) -> None:
         self.path = path
         try:
             with path.open(encoding="utf-8-sig", errors="replace") as file:
-                heading, *lines = [line for line, _ in zip(file, range(50), strict=False)]
+                heading, *lines = itertools.islice(file, 50)
         except ValueError as error:
             raise ValueError(f"{path} is empty") from error
         except OSError as error:
@@ -137,29 +131,20 @@ class _Layout:
             "skipinitialspace": True,
             "skip_blank_lines": False,
         }
-        names = [str(name) for name in self._read(nrows=0).columns]
-        wanted: list[tuple[str, Units, str | None, str, str]] = [
-            (columns.flow, FLOW_UNITS, columns.flow_unit, "t/h", "flow"),
-            (columns.temperature, TEMPERATURE_UNITS, columns.temperature_unit, "degC",
-             "temperature"),
-        ]  # fmt: skip
-        wanted += [(each, {}, None, "", "disturbance") for each in columns.disturbance]
+        wanted = [("flow", columns.flow), ("temperature", columns.temperature)]
+        wanted += [("disturbance", each) for each in columns.disturbance]
         if columns.sampling_interval is None:
-            wanted.append((columns.time, TIME_UNITS, columns.time_unit, "s", "time"))
-        found = [self._find(name, names, option) for name, *_, option in wanted]
+            wanted.append(("time", columns.time))
+        names = [str(name) for name in self._read(nrows=0).columns]
+        found = [self._find(name, names, option) for option, name in wanted]
         if len(set(found)) < len(found):
             raise ValueError(f"each column can be one thing only, got {', '.join(found)}")
         self._scales = {
-            name: _scale(name, units, unit, default, option)
-            for name, (_, units, unit, default, option) in zip(found, wanted, strict=True)
+            name: UNITS[option][_unit(name, option, columns)] if option in UNITS else (1.0, 0.0)
+            for name, (option, _) in zip(found, wanted, strict=True)
         }
-        self.notes = (
-            ["The flow is in %: read % wherever t/h is said."]
-            if _unit(found[0], columns.flow_unit, "t/h") == "%"
-            else []
-        )
-        self._time = found.pop() if columns.sampling_interval is None else None
-        self.names = found
+        self.in_percent = _unit(found[0], "flow", columns) == "%"
+        self.time = found[-1] if wanted[-1][0] == "time" else None
 
     def _read(self, **options: Any) -> Any:
         try:
@@ -168,9 +153,9 @@ class _Layout:
         except pd.errors.ParserError as error:
             raise self._not_a_table(error) from error
 
-    def _not_a_table(self, error: Exception) -> ValueError:
+    def _not_a_table(self, reason: object) -> ValueError:
         return ValueError(
-            f"{self.path} is not a table: {str(error).strip()}. With decimal commas, "
+            f"{self.path} is not a table: {str(reason).strip()}. With decimal commas, "
             "the separator must be a semicolon or a tab, or the numbers in quotes"
         )
 
@@ -188,49 +173,42 @@ class _Layout:
             )
         return alike[0]
 
-    def tables(self) -> Iterator[tuple[Array | None, Array]]:
-        """Return the file piece by piece: times, s, and flow, temperature and disturbances."""
-        line = 2
+    def pieces(self) -> Iterator[pd.DataFrame]:
+        """Return the file piece by piece: flow, temperature, disturbances and time, if any."""
         try:
             with self._read(chunksize=CHUNK) as chunks:
                 for chunk in chunks:
                     if not isinstance(chunk.index, pd.RangeIndex):
-                        raise self._not_a_table(ValueError("lines longer than the heading"))
-                    values = [self._numbers(chunk[name], line) for name in self.names]
-                    times = (
-                        None if self._time is None else self._numbers(chunk[self._time], line)
+                        raise self._not_a_table("lines longer than the heading")
+                    yield pd.DataFrame(
+                        {name: self._numbers(chunk[name]) for name in self._scales}
                     )
-                    line += len(chunk)
-                    yield times, np.column_stack(values)
         except pd.errors.ParserError as error:
             raise self._not_a_table(error) from error
 
-    def _numbers(self, column: Any, line: int) -> Array:
+    def _numbers(self, column: Any) -> Any:
+        """Return a column in the units of the plant."""
+        is_time = column.name == self.time
         factor, offset = self._scales[column.name]
-        is_time = column.name == self._time
-        numbers = column
-        if not pd.api.types.is_numeric_dtype(column):
+        texts = column
+        if not pd.api.types.is_numeric_dtype(column) and self._format["decimal"] == ",":
+            texts = column.astype(str).str.replace(",", ".")  # pandas has left all as they are
+        values = pd.to_numeric(texts, errors="coerce").astype(np.float64)
+        if is_time and values.isna().any():
+            # Where points are between the numbers, the day comes first.
+            iso = column.astype(str).str.replace(DAY_FIRST, r"\3-\2-\1", regex=True)
+            dates = pd.to_datetime(iso, errors="coerce", format="ISO8601", utc=True)
+            if dates.notna().all():
+                return (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
+        bad = ~(values.abs() < LARGEST) & (column.notna() | is_time)
+        if bad.any():
+            number, advice = "a number", ". Leave the cell empty where it is not known"
             if is_time:
-                # Where points are between the numbers, the day comes first.
-                iso = column.astype(str).str.replace(DAY_FIRST, r"\3-\2-\1", regex=True)
-                dates = pd.to_datetime(iso, errors="coerce", format="ISO8601", utc=True)
-                if dates.notna().all():
-                    since = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
-                    return np.asarray(since, np.float64)
-            numbers = pd.to_numeric(column, errors="coerce")
-        values = np.asarray(numbers.to_numpy(dtype=np.float64, na_value=np.nan))
-        allowed = column.isna().to_numpy() & (not is_time)
-        bad = np.flatnonzero(~(np.abs(values) < LARGEST) & ~allowed)
-        if len(bad):
-            date = (
-                ", or a date such as 2026-01-31T12:00:00 or 31.01.2026 12:00:00"
-                if is_time
-                else ""
-            )
+                number += ", or a date such as 2026-01-31T12:00:00 or 31.01.2026 12:00:00"
+                advice = ""
             raise ValueError(
-                f"{self.path}, line {line + bad[0]}: {column.name} must be a number{date}, got "
-                f"{str(column.iloc[bad[0]])!r}"
-                + ("" if is_time else ". Leave the cell empty where it is not known")
+                f"{self.path}, line {bad.idxmax() + 2}: {column.name} must be {number}, got "
+                f"{str(column[bad.idxmax()])!r}{advice}"
             )
         return factor * values + offset
 
@@ -241,68 +219,58 @@ class _Clock:
     def __init__(self, interval: float | None) -> None:
         self.interval = interval
         self.notes: list[str] = []
-        self._last: Array = np.zeros(0)
+        self._last = pd.Series(dtype=np.float64)
 
-    def spread(self, times: Array | None, table: Array, first_line: int) -> Array:
+    def spread(self, times: pd.Series[float], table: pd.DataFrame) -> pd.DataFrame:
         """Return the values of a piece, a row a sample."""
-        if times is None:
-            return table
-        line = first_line + 1 - len(self._last)  # of the row after the first step
-        known = np.concatenate([self._last, times])
-        steps, self._last = np.diff(known), known[-1:]
+        known = pd.concat([self._last, times])
+        self._last = known.iloc[-1:]
+        steps = known.diff().iloc[1:]
         if not len(steps):
             return table
-        back = np.flatnonzero(steps <= 0)
-        if len(back):
+        if (steps <= 0).any():
+            row = (steps <= 0).idxmax()
             raise ValueError(
-                f"line {line + back[0]}: the time must increase, and goes from "
-                f"{known[back[0]]:g} s by {steps[back[0]]:g} s. Sort the rows, and leave out "
-                "those that are there twice; or give --sampling-interval if the times are wrong"
+                f"line {row + 2}: the time must increase, and goes from {known[row - 1]:g} s "
+                f"by {steps[row]:g} s. Sort the rows, and leave out those that are there "
+                "twice; or give --sampling-interval if the times are wrong"
             )
         if self.interval is None:
-            self.interval = float(f"{np.median(steps):.6g}")
+            self.interval = float(f"{steps.median():.6g}")
         ratio = steps / self.interval
-        whole = np.maximum(np.round(ratio), 1.0)
-        uneven = np.flatnonzero(np.abs(ratio - whole) > UNEVEN)
-        if len(uneven):
+        whole = ratio.round().clip(lower=1.0)
+        uneven = (ratio - whole).abs() > UNEVEN
+        if uneven.any():
+            row = uneven.idxmax()
             raise ValueError(
-                f"line {line + uneven[0]}: the time steps are unequal, {steps[uneven[0]]:g} s "
-                f"here where most are {self.interval:g} s. Resample the log to equal steps, or "
-                "give --sampling-interval if the times are wrong"
+                f"line {row + 2}: the time steps are unequal, {steps[row]:g} s here where most "
+                f"are {self.interval:g} s. Resample the log to equal steps, or give "
+                "--sampling-interval if the times are wrong"
             )
-        for gap in np.flatnonzero(whole > 1):
-            missing = int(whole[gap]) - 1
-            rows = f"{missing} rows are" if missing > 1 else "1 row is"
+        for row, count in whole[whole > 1].items():
+            rows = f"{count - 1:.0f} rows are" if count > 2 else "1 row is"
             if len(self.notes) < 3:
-                self.notes.append(f"Before line {line + gap}, {rows} missing.")
+                self.notes.append(f"Before line {row + 2}, {rows} missing.")
             elif len(self.notes) == 3:
                 self.notes.append("More rows are missing later.")
-        counts = np.minimum(whole, LONGEST_GAP).astype(np.intp)
-        new = len(times) - len(steps)  # the first row of the file has no step before it
-        places = np.concatenate([np.zeros(new, np.intp), np.cumsum(counts) - 1 + new])
-        result = np.full((int(places[-1]) + 1, table.shape[1]), np.nan)
-        result[places] = table
-        return result
+        # The first row of the file has no step before it.
+        counts = whole.clip(upper=LONGEST_GAP).reindex(table.index, fill_value=1.0)
+        places = counts.cumsum().astype(int) - 1
+        return table.set_axis(places).reindex(range(places.iloc[-1] + 1))
 
 
-def _scale(
-    name: str, units: Units, given: str | None, default: str, option: str
-) -> tuple[float, float]:
-    if not units:
-        return 1.0, 0.0
-    unit = _unit(name, given, default)
+def _unit(name: str, quantity: str, columns: Columns) -> str:
+    """Return the unit that an option or a heading's brackets say."""
+    units = UNITS[quantity]
+    bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", name)
+    said = bracket.group(1) if bracket else next(iter(units))
+    unit: str = getattr(columns, f"{quantity}_unit") or said
     if unit not in units:
         raise ValueError(
             f"the unit of {name!r} must be one of {', '.join(units)}, got {unit!r}. Say it "
-            f"with --{option}-unit"
+            f"with --{quantity}-unit"
         )
-    return units[unit]
-
-
-def _unit(name: str, given: str | None, default: str) -> str:
-    """Return the unit that an option or a heading's brackets say."""
-    bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", name)
-    return given or (bracket.group(1) if bracket else default)
+    return unit
 
 
 def _missing(columns: dict[str, Array]) -> list[str]:

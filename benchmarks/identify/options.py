@@ -19,10 +19,24 @@ from benchmarks.lib.options import (
     options,
 )
 
+# By quantity and unit, the usual one first: the factor to the units of the plant, s, t/h and
+# degC, and what is added then.
+UNITS: dict[str, dict[str, tuple[float, float]]] = {
+    "time": {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)},
+    "flow": {"t/h": (1.0, 0.0), "kg/s": (3.6, 0.0), "kg/h": (1e-3, 0.0), "%": (1.0, 0.0)},
+    "temperature": {
+        **dict.fromkeys(("degC", "°C", "C"), (1.0, 0.0)),
+        "K": (1.0, -273.15),
+        **dict.fromkeys(("degF", "°F", "F"), (5 / 9, -160 / 9)),
+    },
+}
 
-def _unit(what: str, units: str) -> Parameter:
-    names = units.split()
-    return choice(names, f"Unit of the {what} (default: that in the heading, else {names[0]})")
+
+def _unit(quantity: str) -> Parameter:
+    names = list(UNITS[quantity])
+    return choice(
+        names, f"Unit of the {quantity} (default: that in the heading, else {names[0]})"
+    )
 
 
 @options
@@ -40,11 +54,9 @@ class Columns:
     """Column of a measured disturbance (repeatable)."""
     sampling_interval: Positive | None = None
     """s from one row to the next; the column of the times is not read then."""
-    time_unit: Annotated[str | None, _unit("time", "s ms min h")] = None
-    flow_unit: Annotated[str | None, _unit("flow", "t/h kg/s kg/h %")] = None
-    temperature_unit: Annotated[str | None, _unit("temperature", "degC °C C K degF °F F")] = (
-        None
-    )
+    time_unit: Annotated[str | None, _unit("time")] = None
+    flow_unit: Annotated[str | None, _unit("flow")] = None
+    temperature_unit: Annotated[str | None, _unit("temperature")] = None
 
 
 @options

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.controllers.step_test import StepTest
+from benchmarks.identify.armax import Array
+from benchmarks.identify.margins import Loop
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import step_band
-from benchmarks.lib.drawing import COLOURS, drawn
-
-Array = NDArray[np.float64]
+from benchmarks.lib.drawing import COLOURS, colours, drawn
 
 LAGS = 40  # of the autocorrelation
 LONGEST = 5_000  # samples of a step response that is drawn
 SHOWN = 3_000  # rows of a log: more cannot be told apart
 
 
-def autocorrelation(errors: Array, lags: int = LAGS) -> Array:
-    """Return the autocorrelation of the errors that are known, from lag 0 on."""
+def autocorrelation(errors: Array) -> Array:
+    """Return the autocorrelation of the errors that are known, from lag 0 to `LAGS`."""
     known = np.isfinite(errors)
     centred = np.where(known, errors - np.mean(errors[known]), 0.0)
-    pairs = [np.sum(centred[lag:] * centred[: len(centred) - lag]) for lag in range(lags + 1)]
+    pairs = [np.sum(centred[lag:] * centred[: len(centred) - lag]) for lag in range(LAGS + 1)]
     result: Array = np.array(pairs) / pairs[0]
     return result
 
@@ -56,16 +56,15 @@ def plot_log(model: Model, path: Path) -> None:
 
 def plot_residuals(model: Model, path: Path) -> None:
     """Draw the prediction errors and their autocorrelation."""
-    known = np.isfinite(model.errors)
     correlation = autocorrelation(model.errors)
-    chance = 1.96 / np.sqrt(known.sum())
-    minutes = np.arange(len(model.errors)) * model.plant.sampling_interval / 60.0
+    chance = 1.96 / np.sqrt(np.isfinite(model.errors).sum())
+    errors = model.errors[:SHOWN]
+    minutes = np.arange(len(errors)) * model.plant.sampling_interval / 60.0
     with drawn(path, 10, 3.6) as figure:
         left, right = figure.subplots(1, 2)
-        left.plot(minutes[:SHOWN], model.errors[:SHOWN], color=COLOURS[0], linewidth=0.6)
+        left.plot(minutes, errors, color=COLOURS[0], linewidth=0.6)
         left.set(xlabel="time (min)", ylabel="prediction error (°C)")
-        lags = np.arange(1, len(correlation))
-        right.bar(lags, correlation[1:], width=0.5, color=COLOURS[0])
+        right.bar(np.arange(1, LAGS + 1), correlation[1:], width=0.5, color=COLOURS[0])
         right.axhspan(
             -chance, chance, color="0.5", alpha=0.2, linewidth=0, label="by chance, 95 %"
         )
@@ -97,3 +96,27 @@ def plot_step(model: Model, tested: StepTest, path: Path) -> None:
         )  # fmt: skip
         axes.set(xlabel="time after the step (min)", ylabel="temperature (°C per t/h)")
         axes.legend()
+
+
+def plot_margins(loops: Mapping[str, Loop], path: Path) -> None:
+    """Draw loops, by their names, around -1, and how much they amplify a disturbance."""
+    palette = colours(list(loops))
+    turn = np.linspace(0.0, 2.0 * np.pi, 200)
+    with drawn(path, 10, 4.2) as figure:
+        plane, sensitivity = figure.subplots(1, 2)
+        for name, loop in loops.items():
+            values, color = loop.response, palette[name]
+            plane.plot(values.real, values.imag, color=color, label=name)
+            sensitivity.loglog(loop.frequency, 1.0 / np.abs(1.0 + values), color=color)
+        for peak, style in ((1.6, "--"), (2.0, ":")):
+            plane.plot(
+                -1 + np.cos(turn) / peak, np.sin(turn) / peak, style, color="0.4",
+                linewidth=1, label=f"Ms = {peak:g}",
+            )  # fmt: skip
+        plane.plot(-1, 0, "k+")
+        plane.set(xlim=(-2.2, 0.8), ylim=(-1.5, 1.5), aspect="equal")
+        plane.set(xlabel="Re L", ylabel="Im L", title="the loop around -1")
+        plane.legend(fontsize="small", loc="upper left")
+        sensitivity.axhline(1.0, color="0.4", linewidth=1)
+        sensitivity.set_ylim(bottom=0.02)
+        sensitivity.set(xlabel="frequency (rad/s)", title="amplification of a disturbance |S|")

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.identify import plots
-from benchmarks.identify.margins import Loop, plot_margins
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import plant_arguments
 from benchmarks.identify.tuning import Recommended, recommended, reduced
@@ -45,13 +44,14 @@ def report(model: Model, out: Path) -> list[Section]:
     """
     arguments = plant_arguments(model)
     parameters = Parameters(**arguments)
-    step = reduced(model.plant, model.plant.sampling_interval)
+    step = reduced(model.plant)
     plots.plot_log(model, out / "log.png")
     plots.plot_residuals(model, out / "residuals.png")
     plots.plot_step(model, step, out / "step.png")
     tuned = {} if fault(model) else recommended(model, parameters)
+    found = {name: each for name, each in tuned.items() if each}
     sections = [
-        _found(model, tuned),
+        _found(model, found),
         Section(
             "The log and the model",
             ["The model is given the flow alone, over the whole log."],
@@ -70,17 +70,16 @@ def report(model: Model, out: Path) -> list[Section]:
             pictures=["step.png"],
         ),
     ]
-    if fault(model):
-        return sections
-    sections.append(_controllers(tuned, parameters, out))
-    if any(each.controller for each in tuned.values()):
-        sections.append(_on_the_plant(tuned, arguments))
+    if tuned:
+        sections.append(_controllers(tuned, out))
+    if found:
+        sections.append(_on_the_plant(found, arguments))
     return sections
 
 
 def fault(model: Model) -> str:
     """Return why a model should not be used; empty if it should."""
-    share, rival = model.held_out.model, model.held_out.impulse_response
+    share, rival = model.held_out
     if share < rival - BEHIND:
         return "it explains clearly less than an impulse response does: its form does not fit"
     gain = model.estimates["gain"]
@@ -93,14 +92,9 @@ def fault(model: Model) -> str:
 
 def headline(model: Model) -> str:
     """Return how much the model explains, and whether it should be used."""
-    share, rival = (
-        f"{100 * max(each, 0.0):.1f} %"
-        for each in (model.held_out.model, model.held_out.impulse_response)
-    )
-    known = ", ".join(model.known)
-    verdict = f"**The model should not be used:** {why}. Nothing is recommended." if (
-        why := fault(model)
-    ) else ""  # fmt: skip
+    share, rival = (f"{100 * max(each, 0.0):.1f} %" for each in model.held_out)
+    known, why = ", ".join(model.known), fault(model)
+    verdict = f"**The model should not be used:** {why}. Nothing is recommended." if why else ""
     return (
         f"Fitted to the first two thirds of the log, the model explains {share} of the "
         f"temperature's variance in the last third, by simulation from the flow"
@@ -109,14 +103,14 @@ def headline(model: Model) -> str:
     ).strip()
 
 
-def _found(model: Model, tuned: dict[str, Recommended]) -> Section:
+def _found(model: Model, found: dict[str, Recommended]) -> Section:
+    interval = model.plant.sampling_interval
     text = [
         headline(model),
         *(
-            f"Recommended: {name} with Kp = {controller.kp:.4g} t/h per °C and an integral "
-            f"time of {controller.kp / controller.ki * model.plant.sampling_interval:.3g} s."
-            for name, each in tuned.items()
-            if (controller := each.controller)
+            f"Recommended: {name} with Kp = {each.controller.kp:.4g} t/h per °C and an "
+            f"integral time of {each.controller.kp / each.controller.ki * interval:.3g} s."
+            for name, each in found.items()
         ),
         *model.notes,
         "All numbers are deviations from the operating point: a flow of "
@@ -175,10 +169,10 @@ def _residuals(model: Model) -> Section:
     )
 
 
-def _controllers(tuned: dict[str, Recommended], parameters: Parameters, out: Path) -> Section:
+def _controllers(tuned: dict[str, Recommended | None], out: Path) -> Section:
     text, rows, loops = [], [], {}
     for name, each in tuned.items():
-        if each.controller is None or each.margins is None:
+        if each is None:
             text.append(
                 f"{name}: not recommended. However slow it is made, Ms is above 2 with one in "
                 "twenty of the plants that the log leaves possible."
@@ -190,13 +184,17 @@ def _controllers(tuned: dict[str, Recommended], parameters: Parameters, out: Pat
                 "by the rule, for Ms to be at most 2 with 95 % of the plants that the log "
                 "leaves possible."
             )
-        loops[name] = Loop.of(each.controller, parameters)
-        kp, ki = f"{each.controller.kp:.4g}", f"{each.controller.ki:.4g}"
-        found = each.margins
-        rows.append((
-            name, kp, ki, f"{found.gain:.2f}", f"{found.phase:.1f}", f"{found.delay:.0f}",
-            f"{found.sensitivity:.2f}", f"{each.worst:.2f}",
-        ))  # fmt: skip
+        loops[name], found = each.loop, each.loop.margins
+        rows.append({
+            "controller": name,
+            "Kp (t/h per °C)": f"{each.controller.kp:.4g}",
+            "Ki (t/h per °C and sample)": f"{each.controller.ki:.4g}",
+            "gain margin": f"{found.gain:.2f}",
+            "phase margin (°)": f"{found.phase:.1f}",
+            "delay margin (s)": f"{found.delay:.0f}",
+            "Ms": f"{found.sensitivity:.2f}",
+            "Ms, 95 %": f"{each.worst:.2f}",
+        })  # fmt: skip
     text.append(
         "u = -Kp e - Ki (sum of e). By rule, SIMC's PI has its closed-loop time constant at "
         "the delay, the Smith predictor at half the plant's time constant. The margins are "
@@ -205,39 +203,28 @@ def _controllers(tuned: dict[str, Recommended], parameters: Parameters, out: Pat
         "most that the loop amplifies a disturbance; the last column has what 95 % of the "
         "possible plants stay below."
     )
-    columns = [
-        "controller", "Kp (t/h per °C)", "Ki (t/h per °C and sample)", "gain margin",
-        "phase margin (°)", "delay margin (s)", "Ms", "Ms, 95 %",
-    ]  # fmt: skip
-    if loops:
-        plot_margins(loops, out / "margins.png")
-    return Section(
-        "Recommended controllers",
-        text,
-        pd.DataFrame(rows, columns=columns) if rows else None,
-        ["margins.png"] if loops else [],
-    )
+    if not loops:
+        return Section("Recommended controllers", text)
+    plots.plot_margins(loops, out / "margins.png")
+    return Section("Recommended controllers", text, pd.DataFrame(rows), ["margins.png"])
 
 
-def _on_the_plant(tuned: dict[str, Recommended], arguments: dict[str, Any]) -> Section:
+def _on_the_plant(found: dict[str, Recommended], arguments: dict[str, Any]) -> Section:
     parameters = Parameters(**arguments)
     samples = max(SAMPLES, 2 * parameters.setpoint_period)
-    rows = []
     unaware, bound = _bounds(arguments, samples)
-    for name, each in tuned.items():
-        if each.controller is None:
-            continue
-        plants = make_plants(RUNS, samples, **arguments)
-        run = rollout(plants, each.controller, samples, SEED)
+    rows = []
+    for name, each in found.items():
+        run = rollout(make_plants(RUNS, samples, **arguments), each.controller, samples, SEED)
         mean = float(mean_error(run).mean())
-        moves = travel(run).mean()
         turns = reversals(run.applied, parameters.sampling_interval).mean()
-        of_least = f"{mean / unaware:.2f}" if unaware > 0.0 else ""
-        rows.append((name, f"{mean:.4g}", of_least, f"{moves:.0f}", f"{turns:.2f}"))
-    columns = [
-        "controller", "mean |e| (°C)", "of the least possible", "valve travel (t/h)",
-        "reversals a minute",
-    ]  # fmt: skip
+        rows.append({
+            "controller": name,
+            "mean |e| (°C)": f"{mean:.4g}",
+            "of the least possible": f"{mean / unaware:.2f}" if unaware > 0.0 else "",
+            "valve travel (t/h)": f"{travel(run).mean():.0f}",
+            "reversals a minute": f"{turns:.2f}",
+        })  # fmt: skip
     return Section(
         "On the identified plant",
         [
@@ -246,7 +233,7 @@ def _on_the_plant(tuned: dict[str, Recommended], arguments: dict[str, Any]) -> S
             "benchmarks.compare --plant plant.json`. It sets these two by two points of the "
             "step response in place of areas, so that its numbers differ a little."
         ],
-        pd.DataFrame(rows, columns=columns),
+        pd.DataFrame(rows),
     )
 
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy import integrate
+from scipy import integrate, signal
 
 from agents import PIController, SmithPredictor
 from benchmarks.controllers.step_test import StepTest
 from benchmarks.identify.armax import Array
-from benchmarks.identify.margins import Margins, margins, ratio
+from benchmarks.identify.margins import Linear, Loop
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import settling
 from benchmarks.loop.linear import LinearModel
@@ -32,22 +32,22 @@ class Recommended:
     Attributes
     ----------
     controller
-        None if none was found.
-    margins
-        Of the loop with the identified plant.
+        Linear between the limits.
+    loop
+        That with the identified plant.
     worst
-        Ms that 95 % of the possible plants stay below; infinite if they are not stable.
+        Ms that 95 % of the possible plants stay below.
     slowed
         By which factor the closed loop is slower than by the rule.
     """
 
-    controller: PIController | SmithPredictor | None
-    margins: Margins | None
+    controller: PIController | SmithPredictor
+    loop: Loop
     worst: float
     slowed: float
 
 
-def reduced(plant: LinearModel, interval: float) -> StepTest:
+def reduced(plant: LinearModel) -> StepTest:
     """Return a model of first order with delay that has the plant's whole response.
 
     By areas (K. J. Astrom and T. Hagglund, "PID Controllers", 2nd edition, 1995, section 2.4):
@@ -58,10 +58,8 @@ def reduced(plant: LinearModel, interval: float) -> StepTest:
     ----------
     plant
         Stable, with a gain other than 0.
-    interval
-        s between samples.
     """
-    samples = 3 * settling(plant) + 10
+    samples, interval = 3 * settling(plant) + 10, plant.sampling_interval
     shape = plant.step_response(samples) / plant.gain
     total = max(float(np.sum(1.0 - shape)) - 0.5, 0.0)  # samples, with lines between them
     under = integrate.cumulative_trapezoid(shape, initial=0.0)
@@ -76,14 +74,13 @@ def reduced(plant: LinearModel, interval: float) -> StepTest:
     )
 
 
-def recommended(model: Model, parameters: Parameters) -> dict[str, Recommended]:
+def recommended(model: Model, parameters: Parameters) -> dict[str, Recommended | None]:
     """Return a PI controller by SIMC's rule and a Smith predictor, by name.
 
     Each is slowed until Ms is at most 2 with the identified plant and with 95 % of those that
-    the log leaves possible.
+    the log leaves possible. It is None if that is not to be had.
     """
-    interval = model.plant.sampling_interval
-    step = reduced(model.plant, interval)
+    step = reduced(model.plant)
     limits: dict[str, Any] = {"u_min": model.u_min, "u_max": model.u_max}
 
     def pi(slowed: float) -> PIController:
@@ -92,7 +89,7 @@ def recommended(model: Model, parameters: Parameters) -> dict[str, Recommended]:
         )
 
     def smith(slowed: float) -> SmithPredictor:
-        wanted = slowed * max(step.time_constant / 2.0, interval)
+        wanted = slowed * max(step.time_constant / 2.0, step.sampling_interval)
         return SmithPredictor(
             **asdict(step),
             closed_loop_time_constant=float(f"{wanted:.3g}"),
@@ -103,67 +100,53 @@ def recommended(model: Model, parameters: Parameters) -> dict[str, Recommended]:
     stable = [p for p in model.possible if np.max(np.abs(p.poles), initial=0.0) < 1.0]
     # A plant that settles in the log is stable; if most of what is possible is not, it did not.
     known = len(stable) > len(model.possible) / 2
-    plants = Plants([model.plant, *stable], max(settling(model.plant), 1))
-    return {
-        "PI, SIMC": _slowed(pi, plants, known, parameters),
-        "Smith": _slowed(smith, plants, known, parameters),
-    }
+    plants = Plants([model.plant, *stable])
 
+    def slowed(
+        make: Callable[[float], PIController | SmithPredictor],
+    ) -> Recommended | None:
+        for times in range(SLOWEST if known else 0):
+            controller = make(SLOWER**times)
+            own, *peaks = plants.sensitivity(controller)
+            worst = float(np.quantile(peaks, SHARE, method="higher"))
+            if max(worst, own) <= MOST_SENSITIVE:
+                loop = Loop(controller, parameters)
+                if loop.margins.sensitivity <= MOST_SENSITIVE:
+                    return Recommended(controller, loop, worst, SLOWER**times)
+        return None
 
-def _slowed(
-    make: Callable[[float], PIController | SmithPredictor],
-    plants: Plants,
-    known: bool,
-    parameters: Parameters,
-) -> Recommended:
-    worst = math.inf
-    for times in range(SLOWEST if known else 0):
-        slowed = SLOWER**times
-        controller = make(slowed)
-        peaks = plants.sensitivity(*controller.transfer())
-        worst = float(np.quantile(peaks[1:], SHARE, method="higher"))
-        if max(worst, float(peaks[0])) <= MOST_SENSITIVE:
-            found = margins(controller, parameters)
-            if found.sensitivity <= MOST_SENSITIVE:
-                return Recommended(controller, found, worst, slowed)
-    return Recommended(None, None, worst, math.nan)
+    return {"PI, SIMC": slowed(pi), "Smith": slowed(smith)}
 
 
 class Plants:
-    """The frequency responses of stable plants.
+    """The frequency responses of stable plants, of which the first says how slow they are."""
 
-    Parameters
-    ----------
-    plants
-        At least one.
-    settling
-        How long the first of them takes to settle, samples.
-    """
-
-    def __init__(self, plants: Sequence[LinearModel], settling: int) -> None:
-        slowest = 0.01 / settling
+    def __init__(self, plants: list[LinearModel]) -> None:
+        slowest = 0.01 / max(settling(plants[0]), 1)
         turns = 8 * (max(plant.delay + len(plant.b) for plant in plants) + 50)
-        self._back = np.exp(-1j * np.union1d(
+        self._at = np.union1d(
             np.geomspace(slowest, np.pi, 400), np.linspace(np.pi / turns, np.pi, turns)
-        ))  # fmt: skip
+        )
+        back = np.exp(-1j * self._at)
         self._responses = np.array([
-            ratio(plant.b, plant.a, self._back) * self._back ** (plant.delay + 1)
+            signal.freqz(plant.b, plant.a, self._at)[1] * back ** (plant.delay + 1)
             for plant in plants
         ])  # fmt: skip
 
-    def sensitivity(self, numerator: Array, denominator: Array) -> Array:
+    def sensitivity(self, controller: Linear) -> Array:
         """Return Ms of each plant with a controller, infinite where the loop is not stable.
 
         1 + L begins at -90 degrees, for the integrator, and ends real. By Nyquist's criterion
         the loop is stable if it does so without a turn around 0, and the controller has no
         poles beyond the unit circle.
         """
-        poles = np.abs(np.roots(denominator))
-        beyond = int(np.sum(poles > 1.0 + 1e-6))
-        difference = 1.0 + self._responses * ratio(numerator, denominator, self._back)
+        numerator, denominator = controller.transfer()
+        if np.any(np.abs(np.roots(denominator)) > 1.0 + 1e-6):
+            return np.full(len(self._responses), np.inf)
+        of_controller = signal.freqz(numerator, denominator, self._at)[1]
+        difference = 1.0 + self._responses * of_controller
         steps = np.angle(difference[:, 1:] / difference[:, :-1])
         start = np.angle(difference[:, 0])
-        stable = (start < 0.0) & (np.abs(start + steps.sum(axis=1)) < 1.0) & (beyond == 0)
+        stable = (start < 0.0) & (np.abs(start + steps.sum(axis=1)) < 1.0)
         peaks = 1.0 / np.abs(difference).min(axis=1)
-        result: Array = np.where(stable, peaks, np.inf)
-        return result
+        return np.where(stable, peaks, np.inf)

@@ -30,7 +30,7 @@ from benchmarks.lib.command_line import out_folder
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import share
 from benchmarks.lib.storage import write_text
-from benchmarks.lib.tables import on_screen, write_csv
+from benchmarks.lib.tables import groups, on_screen, write_csv
 from benchmarks.loop.designs import Arguments, random_design
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
@@ -51,6 +51,18 @@ KINDS = {
 }
 RIVALS = ("this one", "SysIdentPy", "impulse response")
 TELLING = 2.0  # t/h, dead zones that are counted
+PARTS = ("true", "found", "low", "high")  # of each estimate
+# Of which estimate, and how far it may be off; None asks whether its interval covers the truth.
+QUESTIONS: dict[str, tuple[str, float | None]] = {
+    "delay within one sample": ("delay", 1.0),
+    "gain within 10 %": ("gain", 0.1),
+    "time constant within 20 %": ("time_constant", 0.2),
+    "dead zone within 1 t/h": ("dead_zone", 1.0),
+    "interval of the delay covers": ("delay", None),
+    "interval of the gain covers": ("gain", None),
+    "interval of the time constant covers": ("time_constant", None),
+    "interval of the dead zone covers": ("dead_zone", None),
+}
 
 
 def synthetic_plants(
@@ -99,19 +111,16 @@ def synthetic_log(plant: Arguments, samples: int, seed: int, kind: str = "steps"
     while len(levels) < samples:
         held = int(generator.integers(HELD[0], HELD[1], endpoint=True))
         levels += [float(generator.uniform(*LEVELS))] * held
-    setpoint: dict[str, Any] = {}
-    if kind == "loop":
-        setpoint = {"setpoint": "random", "setpoint_amplitude": 5.0}
-    env = gymnasium.make("MiddlePoint-v0", max_episode_steps=samples, **plant, **setpoint)
+    moving: dict[str, Any] = {"setpoint": "random", "setpoint_amplitude": 5.0}
+    arguments = plant | moving if kind == "loop" else plant
+    env = gymnasium.make("MiddlePoint-v0", max_episode_steps=samples, **arguments)
     observation, info = env.reset(seed=int(generator.integers(2**31)))
     controller = simc_pi(Parameters(**plant))
     flow, temperature = np.empty(samples), np.empty(samples)
-    for k in range(samples):
+    for k, level in enumerate(levels[:samples]):
         temperature[k] = info["output"]
-        action = np.array([levels[k] / 10.0], np.float32)
-        if kind == "loop":
-            action = np.asarray(controller.act(observation), np.float32)
-        observation, *_, info = env.step(action)
+        action = controller.act(observation) if kind == "loop" else [level / 10.0]
+        observation, *_, info = env.step(np.array(action, np.float32))
         flow[k] = info["command"]
     if kind == "meter":
         flow += generator.normal(0.0, METER, samples)
@@ -126,9 +135,9 @@ def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict
     Returns
     -------
     dict
-        `seconds` of processor time, and of each estimate its truth, its value and the ends of
-        its interval; `refused`, why, if the log could not tell. `explained`, `delays` and
-        `gains` are those of `RIVALS`.
+        `seconds` of processor time, and `refused`, why the log could not tell. If it could, of
+        each estimate its truth, its value and the ends of its interval, by `PARTS`; and of each
+        of `RIVALS` the share that it explains, its delay and its gain.
     """
     true = nominal(Parameters(**plant))
     truths = {
@@ -141,24 +150,31 @@ def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict
     log = synthetic_log(plant, samples, seed, kind)
     began = time.process_time()
     try:
-        model = identify(log, DATA_SHEET)
+        model, refused = identify(log, DATA_SHEET), ""
     except CannotTellError as error:
-        return {"seconds": time.process_time() - began, "refused": str(error)}
-    result: dict[str, Any] = {"seconds": time.process_time() - began, "refused": ""}
+        model, refused = None, str(error)
+    result: dict[str, Any] = {"seconds": time.process_time() - began, "refused": refused}
+    if model is None:
+        return result
     for name, truth in truths.items():
-        found = model.estimates[name]
-        result[name] = [truth, found.value, found.low, found.high]
-    delay, gain, share = narmax(log)
+        for part, value in zip(PARTS, (truth, *model.estimates[name]), strict=True):
+            result[f"{name}_{part}"] = value
     last = np.arange(samples) >= samples * 2 // 3
-    _, of_response = of_impulse_response([log.flow], log.temperature, ~last)
-    result["explained"] = [model.held_out.model, share, model.held_out.impulse_response]
-    result["delays"] = [model.estimates["delay"].value, delay, math.nan]
-    result["gains"] = [model.estimates["gain"].value, gain, of_response]
+    _, gain = of_impulse_response([log.flow], log.temperature, ~last)
+    found = model.estimates
+    answers = (
+        (model.held_out.model, found["delay"].value, found["gain"].value),
+        narmax(log),
+        (model.held_out.impulse_response, math.nan, gain),
+    )
+    for rival, answer in zip(RIVALS, answers, strict=True):
+        for what, value in zip(("explained", "delay", "gain"), answer, strict=True):
+            result[f"{what}, {rival}"] = value
     return result
 
 
 def narmax(log: Log) -> tuple[float, float, float]:
-    """Return delay, gain and the share explained of the last third, by SysIdentPy.
+    """Return the share explained of the last third, delay and gain, by SysIdentPy.
 
     Its linear NARX model has three past outputs and 61 past flows to choose from, by orthogonal
     least squares and the Bayesian information criterion (W. R. Lacerda Junior et al., Journal
@@ -184,24 +200,26 @@ def narmax(log: Log) -> tuple[float, float, float]:
     codes, values = narx.final_model[:, 0], narx.theta[:, 0]
     flows = codes > 2000
     if not flows.any():
-        return math.nan, 0.0, share_of_last
+        return share_of_last, math.nan, 0.0
     past = float(values[(codes > 1000) & (codes < 2000)].sum())
     gain = float(values[flows].sum()) / (1.0 - past)
-    return float(codes[flows].min() - 2001), gain, share_of_last
+    return share_of_last, float(codes[flows].min() - 2001), gain
 
 
 def execute(options: options.Options, console: Console) -> str:
     """Run the study and print its tables."""
     out = out_folder(options.out)
-    tasks: dict[str, Callable[[], Any]] = {}
-    plants: list[tuple[str, Arguments]] = []
-    for kind in KINDS:
+    plants = {
+        f"{kind} {i}": (kind, options.seed * 1_000_000 + i, plant)
+        for kind in KINDS
         for i, plant in enumerate(
             synthetic_plants(options.logs, options.seed, options.samples, kind)
-        ):
-            seed = options.seed * 1_000_000 + i
-            tasks[f"{kind} {i}"] = partial(task, plant, options.samples, seed, kind)
-            plants.append((kind, plant))
+        )
+    }
+    tasks: dict[str, Callable[[], Any]] = {
+        name: partial(task, plant, options.samples, seed, kind)
+        for name, (kind, seed, plant) in plants.items()
+    }
     for i in range(options.plants or 0):
         tasks[f"plant {i}"] = partial(loops.task, i, options.seed)
     key = fingerprint(
@@ -212,108 +230,81 @@ def execute(options: options.Options, console: Console) -> str:
         logs=options.logs,
     )
     results = options.fan_out.open().run(tasks, out / "tasks" / key, title="logs")
-    found = list(results.values())
-    found, of_loops = found[: len(plants)], found[len(plants) :]
-    by_kind = {
-        kind: [each for (own, _), each in zip(plants, found, strict=True) if own == kind]
-        for kind in KINDS
-    }
-    rows = [_row(*plant, each) for plant, each in zip(plants, found, strict=True)]
-    write_csv(out / "identify_study.csv", pd.DataFrame(rows))
-    seconds = np.array([each["seconds"] for each in found])
+    found = pd.DataFrame(
+        {"kind": kind, **plant, **results.pop(name)}
+        for name, (kind, _, plant) in plants.items()
+    )
+    write_csv(out / "identify_study.csv", _rounded(found))
     closing = (
         f"{options.logs} logs a kind of {options.samples} samples, seed {options.seed}. Those "
         "that are refused are wrong estimates. Processor time of a log: median "
-        f"{np.median(seconds):.1f} s, longest {seconds.max():.1f} s."
+        f"{found['seconds'].median():.1f} s, longest {found['seconds'].max():.1f} s."
     )
-    tables = [table(by_kind), beside_rivals(by_kind)]
+    if results:
+        closing = f"{loops.counted(list(results.values()))}\n\n{closing}"
+    tables = [table(found), beside_rivals(found)]
     text = [each.to_markdown(index=False, disable_numparse=True) for each in tables]
-    if of_loops:
-        closing = f"{loops.counted(of_loops)}\n\n{closing}"
     write_text(out / "identify_study.md", "\n\n".join([*text, f"{closing}\n"]))
     for each in tables:
         console.print(on_screen(each))
     return f"{closing} The tables are in {out}/"
 
 
-# Of which estimate, and how far it may be off; None asks whether its interval covers the truth.
-QUESTIONS: dict[str, tuple[str, float | None]] = {
-    "delay within one sample": ("delay", 1.0),
-    "gain within 10 %": ("gain", 0.1),
-    "time constant within 20 %": ("time_constant", 0.2),
-    "dead zone within 1 t/h": ("dead_zone", 1.0),
-    "interval of the delay covers": ("delay", None),
-    "interval of the gain covers": ("gain", None),
-    "interval of the time constant covers": ("time_constant", None),
-    "interval of the dead zone covers": ("dead_zone", None),
-}
+def _rounded(found: pd.DataFrame) -> pd.DataFrame:
+    """Return what is kept of each log, with no more digits than tell something."""
+    kept = found.drop(columns=found.filter(regex="^([abc]|(delay|gain), .*)$").columns)
+    for digits, names in ((6, f"_({'|'.join(PARTS)})$"), (4, "^explained, ")):
+        for name, values in kept.filter(regex=names).items():
+            kept[name] = [float(f"{value:.{digits}g}") for value in values]
+    return kept
 
 
-def _is_right(name: str, limit: float | None, found: dict[str, Any]) -> bool:
-    truth, value, low, high = found[name]
-    if limit is None:
-        slack = 1e-9 * abs(truth)
-        return bool(low - slack <= truth <= high + slack)
-    absolute = name in ("delay", "dead_zone")
-    return bool((abs(value - truth) if absolute else abs(value / truth - 1.0)) <= limit)
-
-
-def table(by_kind: dict[str, list[dict[str, Any]]]) -> pd.DataFrame:
+def table(found: pd.DataFrame) -> pd.DataFrame:
     """Return how often estimates are right and intervals cover, by the kind of log.
 
     Dead zones are counted from `TELLING` on. A log that is refused is a wrong estimate, and
     has no interval.
     """
-    rows = []
-    for question, (name, limit) in QUESTIONS.items():
-        row = {"how often": question}
-        for kind, found in by_kind.items():
-            flags = [
-                not each["refused"] and _is_right(name, limit, each)
-                for each in found
-                if (each["refused"] and limit is not None)
-                or (not each["refused"] and (name != "dead_zone" or each[name][0] >= TELLING))
-            ]
-            row[kind] = ""
-            if flags:
-                counted = share(np.array(flags, dtype=np.bool_))
-                low, high = 100 * counted.low, 100 * counted.high
-                row[kind] = f"{100 * counted.value:.0f} % [{low:.0f}, {high:.0f}]"
-        rows.append(row)
-    refused = {kind: str(sum(bool(each["refused"]) for each in found))
-               for kind, found in by_kind.items()}  # fmt: skip
-    shown: pd.DataFrame = pd.DataFrame([*rows, {"how often": "refused", **refused}])
-    return shown
+    shown = {
+        kind: [
+            *(_share(*question, logs) for question in QUESTIONS.values()),
+            str((logs["refused"] != "").sum()),
+        ]
+        for kind, logs in groups(found, "kind")
+    }
+    return pd.DataFrame({"how often": [*QUESTIONS, "refused"], **shown})
 
 
-def beside_rivals(by_kind: dict[str, list[dict[str, Any]]]) -> pd.DataFrame:
+def _share(name: str, limit: float | None, found: pd.DataFrame) -> str:
+    """Return how often an estimate is right, with the interval of this share."""
+    truth, value, low, high = (found[f"{name}_{part}"] for part in PARTS)
+    counted = truth.notna() & ((name != "dead_zone") | (truth >= TELLING))
+    if limit is None:
+        slack = 1e-9 * truth.abs()
+        right = (low - slack <= truth) & (truth <= high + slack)
+    else:
+        counted |= truth.isna()  # it is refused
+        absolute = name in ("delay", "dead_zone")
+        right = (value - truth if absolute else value / truth - 1.0).abs() <= limit
+    if not counted.any():
+        return ""
+    ends = share(right[counted].to_numpy(np.bool_))
+    return f"{100 * ends.value:.0f} % [{100 * ends.low:.0f}, {100 * ends.high:.0f}]"
+
+
+def beside_rivals(found: pd.DataFrame) -> pd.DataFrame:
     """Return the same of the rivals: gain within 10 %, and the median share explained."""
     rows = []
-    for kind, found in by_kind.items():
-        answers = [each for each in found if not each["refused"]]
-        for i, rival in enumerate(RIVALS):
-            near = [abs(each["gains"][i] / each["gain"][0] - 1.0) <= 0.1 for each in answers]
-            delays = [abs(each["delays"][i] - each["delay"][0]) <= 1.0 for each in answers]
-            shares = [each["explained"][i] for each in answers]
+    for kind, logs in groups(found[found["refused"] == ""], "kind"):
+        for rival in RIVALS:
+            near = (logs[f"gain, {rival}"] / logs["gain_true"] - 1.0).abs() <= 0.1
+            delays = logs[f"delay, {rival}"] - logs["delay_true"]
+            within = f"{100 * (delays.abs() <= 1.0).mean():.0f} %"
             rows.append({
                 "log": kind,
                 "method": rival,
-                "explained, median": f"{100 * np.median(shares):.1f} %",
-                "gain within 10 %": f"{100 * np.mean(near):.0f} %",
-                "delay within one sample": f"{100 * np.mean(delays):.0f} %" if i < 2 else "",
+                "explained, median": f"{100 * np.median(logs[f'explained, {rival}']):.1f} %",
+                "gain within 10 %": f"{100 * near.mean():.0f} %",
+                "delay within one sample": "" if rival == "impulse response" else within,
             })  # fmt: skip
-    shown: pd.DataFrame = pd.DataFrame(rows)
-    return shown
-
-
-def _row(kind: str, plant: Arguments, found: dict[str, Any]) -> dict[str, Any]:
-    numbers = {name: value for name, value in plant.items() if not isinstance(value, list)}
-    row = {"kind": kind, **numbers, "seconds": found["seconds"], "refused": found["refused"]}
-    if found["refused"]:
-        return row
-    for name in ("delay", "dead_zone", "gain", "time_constant", "noise_variance"):
-        for part, value in zip(("true", "found", "low", "high"), found[name], strict=True):
-            row[f"{name}_{part}"] = float(f"{value:.6g}")
-    for rival, value in zip(RIVALS, found["explained"], strict=True):
-        row[f"explained, {rival}"] = float(f"{value:.4g}")
-    return row
+    return pd.DataFrame(rows)

@@ -10,7 +10,7 @@ from scipy import signal
 
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
-from benchmarks.identify.margins import margins
+from benchmarks.identify.margins import Loop
 from benchmarks.identify.plant import plant_arguments
 from benchmarks.identify.tuning import MOST_SENSITIVE, recommended
 from mptc_gym import Parameters
@@ -65,8 +65,8 @@ def task(number: int, seed: int) -> dict[str, float | str]:
     tuned = recommended(model, Parameters(**plant_arguments(model)))
     found: dict[str, float | str] = {"refused": ""}
     for name, each in tuned.items():
-        if each.controller is not None:
-            on_plant = margins(each.controller, Parameters(**plant))
+        if each:
+            on_plant = Loop(each.controller, Parameters(**plant)).margins
             found[name] = on_plant.sensitivity if on_plant.stable else math.inf
     return found
 

@@ -111,7 +111,7 @@ def controllers(model: Model) -> dict[str, Controller]:
         COURSE["kp"], COURSE["ki"], anti_windup=True, u_min=-HEATER, u_max=100.0 - HEATER
     )
     tuned = recommended(model, parameters)
-    found = {name: each.controller for name, each in tuned.items() if each.controller}
+    found = {name: each.controller for name, each in tuned.items() if each}
     return {**found, "nn-smith": nn_smith(parameters), "PI, course": course}
 
 
