@@ -1,6 +1,5 @@
 """The bounds against independent computations, and the controllers that come near them."""
 
-import itertools
 import json
 from dataclasses import replace
 
@@ -116,32 +115,6 @@ class TestSetPointChanges:
         # y(2) = v, y(3) = v / 2 + 1, so the errors are v and 0.5 - v / 2: least for v = 0.
         assert best_plan(setpoint, **FIRST_ORDER).value == pytest.approx(0.5)
 
-    @pytest.mark.parametrize(("before", "after"), [(0.0, 5.0), (5.0, -5.0), (-4.0, 6.0)])
-    def test_no_input_of_many_does_better(self, before, after, rng):
-        # Bang-bang inputs with one switch of level, the shape that optimal ones have, and
-        # random ones, on the plant itself.
-        samples = 120
-        least = change(before, after, samples)
-        gain = sum(CALM.b) / sum(CALM.a)
-        steady, end = before / gain, after / gain
-        full = CALM.u_max if end > steady else CALM.u_min
-        tried = []
-        for switch, level in itertools.product(range(10, 60), (1.0, 0.9, 0.5, 0.0)):
-            u = np.full(samples, end)
-            u[:switch] = full
-            u[switch] = level * full + (1 - level) * end
-            tried.append(u)
-        tried += list(rng.uniform(-10, 10, (50, samples)))
-        y = self.responses(np.array(tried) - steady) + before
-        found = np.abs(after - y).sum(axis=1)
-        assert found.min() >= least * (1 - 1e-6)
-        assert found.min() == pytest.approx(least, rel=0.01)
-
-    @staticmethod
-    def responses(u):
-        delayed = np.hstack([np.zeros((len(u), CALM.delay)), u])[:, : u.shape[1]]
-        return signal.lfilter([0.0, *CALM.b], CALM.a, delayed)
-
     def test_a_short_time_leaves_no_choice(self):
         assert change(0.0, 5.0, 19) == pytest.approx(95.0)
 
@@ -158,10 +131,9 @@ class TestSetPointChanges:
         found = least_possible(kind="reference", folder=None, **case).value
         assert found == pytest.approx(mae, abs=1.5e-4)
 
-    @pytest.mark.parametrize("period", [38, 76, 100])
+    @pytest.mark.parametrize("period", [38, 100])
     def test_there_is_no_reference_for_holds_too_short_to_settle(self, period):
-        complaint = "setpoint must be held until the plant has settled"
-        with pytest.raises(ValueError, match=complaint):
+        with pytest.raises(ValueError, match="must be held until the plant has settled"):
             least_possible(samples=600, kind="reference", folder=None, setpoint_period=period)
 
 
@@ -289,10 +261,9 @@ class TestUnknown:
     @pytest.mark.parametrize("R", [0.0, 0.3])
     def test_the_load_against_many_draws(self, k, R, rng):
         load = {
-            "disturbance_amplitude": 3.0,
-            "disturbance_interval": 25.0,
+            "disturbance_amplitude": 3.0, "disturbance_interval": 25.0,
             "disturbance_walk_variance": 0.02,
-        }
+        }  # fmt: skip
         bound = unknown(course_of(620, noise_variance=R, **load)).of(k, k + 1)
         draws, p = 40_000, 0.4
         old = rng.uniform(-3.0, 3.0, draws)  # the level at the last sample that can be known
@@ -341,13 +312,15 @@ class TestNews:
         law = News(parameters, of_plant, unknown(of_plant))
         plants = make_plants(runs, samples, **RANDOM)
         setpoints = rollout(plants, PIController(0.0, 0.0), samples, seed=1).setpoint
-        starts = [np.array([0, *(np.flatnonzero(np.diff(s)) + 1)]) for s in setpoints.T]
         penalties = np.array([law.penalty(s) for s in setpoints.T])
-        ages = np.array(
-            [np.arange(samples) - np.repeat(b, np.diff([*b, samples])) for b in starts]
-        )
+        starts = [np.r_[0, np.flatnonzero(np.diff(s)) + 1] for s in setpoints.T]
+        ages = [np.arange(samples) - np.repeat(b, np.diff([*b, samples])) for b in starts]
         assert np.abs(penalties).mean() > 0.05
-        for known in (np.ones_like(penalties), setpoints.T, np.sign(setpoints.T) * (ages > 30)):
+        for known in (
+            np.ones_like(penalties),
+            setpoints.T,
+            np.sign(setpoints.T) * (np.array(ages) > 30),
+        ):
             sums = (penalties * known).sum(axis=1)
             assert abs(sums.mean()) < 4 * sums.std() / np.sqrt(runs)
             assert sums.std() > 1.0
@@ -403,18 +376,15 @@ class TestLeastPossible:
         assert least_possible(samples=1200, kind="preview", folder=None).value < found
         assert found < 0.7 * least_possible(samples=1200).value
 
-    def test_with_load_and_transmitter_noise_the_predictive_controller_comes_within_a_tenth(
-        self,
-    ):
+    def test_with_load_and_transmitter_noise_mpc_comes_within_a_tenth(self):
         least = least_possible(samples=1200, kind="reference", **PRESETS["disturbed"])
         found = errors(MPC, 40, 1200, **PRESETS["disturbed"])
         assert 1.0 < found.mean() / least.value < 1.1
 
     def test_they_hold_for_those_who_read_the_transmitter(self):
         noisy = {"setpoint": 5.0, "noise_variance": 0.5, "delay": 2}
-        least = least_possible(
-            samples=600, folder=None, measurement_noise_variance=100.0, **noisy
-        )
+        reads = {**noisy, "measurement_noise_variance": 100.0}
+        least = least_possible(samples=600, folder=None, **reads)
         assert "reads the transmitter and not the true output" in least.holds_for
         # One that reads the true output does better.
         assert beats(errors(MPC, 40, 600, **noisy), least)
@@ -429,9 +399,8 @@ class TestLeastPossible:
         np.testing.assert_allclose(found, least.episodes, rtol=0.02)
 
     def test_what_is_left_alone_stays_at_rest(self):
-        least = least_possible(
-            samples=100, folder=None, u_min=-12.0, u_max=6.0, dead_zone=0.0, setpoint=4.0
-        )
+        plant = {"u_min": -12.0, "u_max": 6.0, "dead_zone": 0.0, "setpoint": 4.0}
+        least = least_possible(samples=100, folder=None, **plant)
         assert least.idle == least.idle_low == pytest.approx(4.0, abs=1e-12)
 
     def test_score(self):
@@ -528,15 +497,10 @@ class TestPredictiveController:
         least = minimum_variance(Parameters(noise_variance=0.5, **plant))
         assert runs.output[100:].var() == pytest.approx(least, rel=0.03)
 
-    def test_it_holds_what_the_dead_zone_does_not_let_through(self):
-        # 2 degC needs 2.9 t/h, inside the dead zone: it switches between 0 and the edge.
-        runs = run_mpc(1, 600, setpoint=2.0)
-        assert runs.output[300:].mean() == pytest.approx(2.0, abs=0.05)
-        assert set(np.unique(runs.applied[300:].round(3))) <= {0.0, -5.0}
-
     @pytest.mark.parametrize(
         ("plant", "setpoint"),
         [
+            ({}, 2.0),  # 2 degC needs 2.9 t/h, inside the dead zone
             ({"dead_zone": 7.0}, 2.0),  # no float32 action commands 7 t/h, nor 4.1
             ({"dead_zone": 4.1}, 1.0),
             ({"dead_zone": 7.0, "u_min": -6.0}, 2.0),  # -7 brings about -6, and -6 nothing

@@ -1,7 +1,6 @@
 """The linear model against the environment, and what refuses a plant that is not linear."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -111,10 +110,3 @@ def test_every_analysis_refuses_an_argument_that_is_not_declared_linear(analysis
     ANALYSES[analysis]()
     with pytest.raises(ValueError, match=r"^temperature_span must be 50\.0 .* got 49\.0"):
         ANALYSES[analysis](temperature_span=49.0)
-
-
-def test_no_analysis_sets_up_the_plant_again():
-    benchmarks = Path(linear.__file__).parents[1]
-    users = {file for file in benchmarks.rglob("*.py") if "Dynamics" in file.read_text()}
-    # A training takes the coefficients of many plants as tensors.
-    assert users == {benchmarks / "loop/linear.py", benchmarks / "train/through_plant.py"}

@@ -61,15 +61,6 @@ class TestForward:
         assert np.abs(expected).min() < 0.9  # not all at the limits
         assert network.act(x) == pytest.approx(expected, abs=1e-6)
 
-    def test_a_batch_is_what_its_members_are_alone(self):
-        x = np.random.default_rng(1).uniform(-20, 20, size=(300, 5)).astype(np.float32)
-        network = policy()
-        batch = network.act(x)
-        assert batch.shape == (300, 1)
-        assert batch.dtype == np.float32
-        alone = np.array([network.act(row) for row in x])
-        assert np.abs(batch - alone).max() < 1e-6
-
     def test_actions_stay_within_the_limits(self):
         assert np.abs(policy().act(np.full((1, 5), 1e9))) == 1.0
 
@@ -83,9 +74,6 @@ class TestForward:
         message = r"^observation must .*5[ ,].*environment needs the network's `observation`"
         with pytest.raises(ValueError, match=message):
             policy().act(np.zeros(size))
-
-    def test_observation_names_every_window(self):
-        assert policy().observation == {**WINDOWS, "error_window": 0}
 
 
 class TestIncrements:

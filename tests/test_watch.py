@@ -112,20 +112,6 @@ def test_a_window_shows_the_run(screen, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_closing_the_window_ends_it(screen, monkeypatch):
-    show = drawing.show
-
-    def closed_at_the_fifth(record, fps):
-        show(record, fps)
-        if len(screen) == 5:
-            pygame.event.post(pygame.event.Event(pygame.QUIT))
-
-    monkeypatch.setattr(drawing, "show", closed_at_the_fifth)
-    assert main(["--speed", "500"]) == 0
-    assert len(screen) == 5
-    assert not pygame.display.get_init()
-
-
 def test_interrupted(tmp_path, monkeypatch, capsys):
     def stop(*_):
         raise KeyboardInterrupt
@@ -172,6 +158,13 @@ def hands_on(screen, monkeypatch):
         return screen
 
     return install
+
+
+def test_closing_the_window_ends_it(hands_on):
+    screen = hands_on({4: lambda: post(pygame.QUIT)})
+    assert main(["--speed", "500"]) == 0
+    assert len(screen) == 5
+    assert not pygame.display.get_init()
 
 
 # A bound takes seconds, and is tested where it is made.

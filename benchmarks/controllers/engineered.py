@@ -26,17 +26,20 @@ from mptc_gym.plant import action_from_command
 
 
 class Nothing:
-    """Leaves the valve at 0 t/h, given the actuator's limits, t/h."""
+    """Leaves the valve where it is, at 0 t/h at first, given the actuator's limits, t/h."""
 
     def __init__(self, u_min: float = -10.0, u_max: float = 10.0) -> None:
-        self._action = np.float32(action_from_command(0.0, u_min, u_max))
+        self.u_min, self.u_max = u_min, u_max
+        self.flow = 0.0  # t/h
 
     def reset(self) -> None:
-        """Do nothing."""
+        """Put the valve back to 0 t/h."""
+        self.flow = 0.0
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions of 0 t/h, shape (runs, 1)."""
-        return np.full((len(observation), 1), self._action, np.float32)
+        """Return the action of the flow, shape (runs, 1)."""
+        action = action_from_command(self.flow, self.u_min, self.u_max)
+        return np.full((len(observation), 1), action, np.float32)
 
 
 def limits(plant: Parameters) -> dict[str, Any]:

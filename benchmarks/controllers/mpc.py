@@ -63,6 +63,8 @@ class PredictiveController:
         lag = np.arange(len(parameters.b))
         self._shows = self._delay[:, np.newaxis, np.newaxis] + lag - ahead[:, np.newaxis] + 1
         self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON)
+        self._models: dict[int, _Model] = {}  # by age, samples
+        self._model(0)  # which refuses a plant that is not linear
         self.reset()
 
     def reset(self) -> None:
@@ -74,7 +76,6 @@ class PredictiveController:
         # u(k-1), u(k-2), ..., after a 0 that stands for inputs to come.
         self._inputs = np.zeros((n, 1 + int(self._delay.max()) + len(self._p.b)))
         self._plan = np.zeros((HORIZON, n))
-        self._models = {0: self._made(0)}  # by age, samples
 
     def act(self, observation: Array) -> NDArray[np.float32]:
         """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
@@ -166,11 +167,8 @@ class PredictiveController:
         """Return the plant's coefficients for the step to sample k."""
         age = k // DRIFT_INTERVAL * DRIFT_INTERVAL if self._drifts else 0
         if age not in self._models:
-            self._models[age] = self._made(age)
+            self._models[age] = _Model.of(coefficients(self._p, self._numbers, age))
         return self._models[age]
-
-    def _made(self, age: int) -> _Model:
-        return _Model.of(coefficients(self._p, self._numbers, age))
 
     def _optimise(
         self, Q: Array, target: Array, start: Array, first: Array | None = None

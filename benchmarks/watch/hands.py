@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-import numpy as np
 import pygame
-from numpy.typing import NDArray
 
+from benchmarks.controllers.engineered import Nothing
 from mptc_gym.drawing import flow_at
-from mptc_gym.plant import action_from_command
 from mptc_gym.record import Record
 
 HELP = (
@@ -32,24 +30,14 @@ class Closed(Exception):  # noqa: N818 (no error)
     """The window has been closed."""
 
 
-class Hands:
+class Hands(Nothing):
     """A controller whose flow comes from keys and mouse."""
 
     def __init__(self, u_min: float, u_max: float, speed: float) -> None:
-        self.u_min, self.u_max = u_min, u_max  # t/h
+        super().__init__(u_min, u_max)
         self.speed = speed  # samples a second
-        self.flow = 0.0  # the command, t/h
         self.setpoint = self.load = 0.0  # what has been added to both by hand, degC
         self.paused = False  # whether the plant is to stand still
-
-    def reset(self) -> None:
-        """Let go of the flow."""
-        self.flow = 0.0
-
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the action of the present flow, shape (runs, 1)."""
-        action = action_from_command(self.flow, self.u_min, self.u_max)
-        return np.full((len(observation), 1), action, np.float32)
 
     def take(self, events: Iterable[Any], record: Record) -> None:
         """Do what events of pygame ask for, in a window that shows the record.
