@@ -168,13 +168,7 @@ def _descend(optimizer: torch.optim.Optimizer, loss: Any) -> None:
 
 def policy_of(actor: Actor) -> Any:
     """Return an actor as a function of observations, for `mptc_gym.evaluate`."""
-
-    @torch.no_grad()
-    def policy(observations: np.ndarray) -> np.ndarray:
-        actions: np.ndarray = actor.act(torch.as_tensor(observations)).numpy()
-        return actions
-
-    return policy
+    return lambda observations: actor.act(torch.as_tensor(observations)).detach().numpy()
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -199,17 +193,14 @@ def main(arguments: list[str] | None = None) -> int:
     about = dataset.storage.metadata
     idle, least = about["idle_error"], about["least_possible_error"]
     data, high = Transitions.of(dataset), dataset.observation_space.high
-    print(
-        f"{options.data}: the data's own mean |e| {about['behaviour_error']:.3f} degC, ", end=""
-    )
-    print(f"least possible {least:.3f}, idle {idle:.3f}")
+    own = f"the data's own mean |e| {about['behaviour_error']:.3f} degC"
+    print(f"{options.data}: {own}, least possible {least:.3f}, idle {idle:.3f}")
     for name, alpha in (("behaviour cloning", 0.0), ("TD3+BC", Arguments.alpha)):
         settings = Arguments(steps=options.steps, alpha=alpha)
         for seed in range(options.seeds):
             policy = policy_of(learn(data, high, settings, seed))
-            found = mptc_gym.evaluate(
-                policy, dataset.env_spec, episodes=len(about["evaluation_seeds"])
-            )
+            episodes = len(about["evaluation_seeds"])
+            found = mptc_gym.evaluate(policy, dataset.env_spec, episodes=episodes)
             print(f"{name}, seed {seed}: {found}", flush=True)
     return 0
 

@@ -119,10 +119,12 @@ def estimate(
     return advantages
 
 
-def train(arguments: Arguments) -> Agent:
+def train(arguments: Annotated[Arguments, Parameter(name="*")] = DEFAULTS) -> Agent:
     """Train a policy and return it."""
     torch.manual_seed(arguments.seed)
     device = arguments.device
+    if device == "cpu":
+        torch.set_num_threads(1)  # the networks are too small for more
     # In mode "SameStep" every step is one of the plant. In "NextStep" each episode would bring
     # one that only resets, whose action and reward mean nothing and would have to be masked.
     plants = MiddlePointTorchEnv(
@@ -185,17 +187,10 @@ def train(arguments: Arguments) -> Agent:
     return agent
 
 
-def run(arguments: Annotated[Arguments, Parameter(name="*")] = DEFAULTS) -> None:
-    """Train on as many cores as it takes."""
-    if arguments.device == "cpu":
-        torch.set_num_threads(1)  # the networks are too small for more
-    train(arguments)
-
-
 def main(words: list[str] | None = None) -> None:
     """Train with the arguments of a command line, without the program's name."""
     app = App(help=__doc__, version_flags=())
-    app.default(run)
+    app.default(train)
     app(words, result_action="return_value")
 
 

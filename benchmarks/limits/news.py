@@ -41,14 +41,7 @@ THRESHOLDS = 8  # that stand for the noise in the guess
 class News:
     """The law of random set points, and the guess for it on one course.
 
-    Parameters
-    ----------
-    parameters
-        With `setpoint="random"`.
-    course
-        The plant. The guess takes its dynamics at the start.
-    unknown
-        What no command can answer in time.
+    The guess takes the dynamics of the plant at the start of the course.
     """
 
     def __init__(self, parameters: Parameters, course: Course, unknown: Unknown) -> None:
@@ -105,16 +98,14 @@ class News:
         penalties: Array = (self._course.flow_response() * surprise).sum(axis=0)
         return penalties
 
-    def _expected(
-        self, ages: NDArray[np.intp], now: int, stay: Array | float, change: Array
-    ) -> Array:
+    def _expected(self, ages: NDArray[np.intp], now: int, stay: Array, change: Array) -> Array:
         """Return the mean of g at later ages of a level that is held at age `now`."""
         # The next level begins at one of these ages, each as probable as the others.
         first, last = max(self._shortest, now + 1), self._longest
         count = last - first + 1
         gone = np.clip((ages - first + 1) / count, 0.0, 1.0)
         recent, old = ages - first, ages - last - 1
-        expected: Array = (1.0 - gone) * (stay[ages] if isinstance(stay, np.ndarray) else stay)
+        expected: Array = (1.0 - gone) * stay[ages]
         expected += np.where(recent >= 0, change[np.maximum(recent, 0)], 0.0) / count
         expected -= np.where(old >= 0, change[np.maximum(old, 0)], 0.0) / count
         # After one more change g is positive as often as negative: levels are symmetric.
