@@ -130,12 +130,11 @@ class TestOwnControllers:
         code = (
             "class Mine:\n"
             "    def __init__(self, {}): self.given = {}\n"
-            "    def reset(self): pass\n"
-            "    def act(self, o): return 0.0 * o[:, :1]\n"
+            "    reset = dict\n"
+            "    act = lambda self, o: 0.0 * o[:, :1]\n"
         )
-        some = own_factory(
-            written(code.format("num_envs, seed, parameters, gain=2", "locals()"))
-        )
+        named = code.format("num_envs, seed, parameters, gain=2", "locals()")
+        some = own_factory(written(named))
         given = some({"delay": 3}, 3, 7).given
         assert (given["num_envs"], given["seed"], given["gain"]) == (3, 7, 2)
         assert given["parameters"].delay == 3
@@ -154,33 +153,20 @@ class TestOwnControllers:
             chosen([], [f"mine={location}"])
 
     @pytest.mark.parametrize(
-        ("code", "complaint"),
+        ("body", "complaint"),
         [
-            ("class Mine:\n    def act(self, o): return [[0.0]] * len(o)", "reset"),
-            ("class Mine:\n    observation = 3", "observation of .* must be a dict"),
-            (
-                "class Mine:\n    observation = 'window'",
-                "observation of .* must be a dict",
-            ),
-            (
-                "class Mine:\n    observation = ['error_window']",
-                "observation of .* must be a d",
-            ),
-            ("class Mine:\n    observation = {'dead_zone': 0.0}", "out of .* got 'dead_zone'"),
-            (
-                "class Mine:\n    def reset(self): pass\n    def act(self, o): return 0.0",
-                r"shape \(2, 6\).*got shape \(\)",
-            ),
-            (
-                "class Mine:\n    def reset(self): pass\n"
-                "    def act(self, o): return float(o[0]) * 0",
-                "it raised TypeError",
-            ),
+            ("act = lambda self, o: [[0.0]] * len(o)", "reset"),
+            ("observation = 3", "observation of .* must be a dict"),
+            ("observation = 'window'", "observation of .* must be a dict"),
+            ("observation = ['error_window']", "observation of .* must be a dict"),
+            ("observation = {'dead_zone': 0.0}", "out of .* got 'dead_zone'"),
+            ("reset = dict; act = lambda self, o: 0.0", r"shape \(2, 6\).*got shape \(\)"),
+            ("reset = dict; act = lambda self, o: float(o)", "it raised TypeError"),
         ],
     )
-    def test_bad_ones(self, code, complaint, written):
+    def test_bad_ones(self, body, complaint, written):
         with pytest.raises(UsageError, match=complaint):
-            chosen([], [f"mine={written(code)}"])
+            chosen([], [f"mine={written('class Mine: ' + body)}"])
 
 
 @pytest.fixture(scope="module")
@@ -225,11 +211,9 @@ class TestSavedPolicies:
         pattern = [f"mine=PPO:{zips / 'velocity-*.zip'}"]
         for texts in (both, pattern):
             (entry,) = chosen([], texts).values()
-            files = [member.provenance["file"] for member in entry.members()]
-            assert files == ["velocity-0.zip", "velocity-1.zip"]
-        assert (
-            entry.members()[0].provenance["sha256"] != entry.members()[1].provenance["sha256"]
-        )
+            about = [member.provenance for member in entry.members()]
+            assert [each["file"] for each in about] == ["velocity-0.zip", "velocity-1.zip"]
+            assert about[0]["sha256"] != about[1]["sha256"]
 
     @pytest.mark.parametrize(
         ("location", "complaint"),
