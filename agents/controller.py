@@ -191,9 +191,7 @@ class Controller(ABC):
             raise ValueError(f"observation must be finite, got {observation!r}")
         now, before = values.shape[:-1], self._loops_before
         if now != before and before is not None:
-            was, given = (
-                f"a batch of {each[0]}" if each else "one loop" for each in (before, now)
-            )
+            was, given = (f"a batch of {n[0]}" if n else "one loop" for n in (before, now))
             raise ValueError(
                 f"observation must be of {was}, as those before it, until reset; got {given}"
             )

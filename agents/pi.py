@@ -136,9 +136,8 @@ class PIController(Controller):
         command = -self.kp * error - self.ki * total  # Section 5
         if self.anti_windup:
             drive = -self.ki * error  # what this error adds to the command from now on
-            outward = (command > self.u_max) & (drive > 0) | (command < self.u_min) & (
-                drive < 0
-            )
+            above, below = command > self.u_max, command < self.u_min
+            outward = above & (drive > 0) | below & (drive < 0)
             total = np.where(outward, self._sum, total)
             command = -self.kp * error - self.ki * total
         self._sum = total

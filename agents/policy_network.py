@@ -38,21 +38,15 @@ ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
 
 @dataclass(frozen=True)
 class Increments:
-    """Velocity form: the network's output changes the valve's position, which is kept here.
-
-    Attributes
-    ----------
-    max_move
-        By how much an output of 1 changes the position in one sample. Positions reach from -1
-        to 1, as actions do.
-    dead_zone
-        t/h. If it is above 0, positions are spread over the flows outside the dead zone: just
-        above 0 stands for its upper edge and just below 0 for its lower one. If it is 0, a
-        position is an action.
-    """
+    """Velocity form: the network's output changes the valve's position, which is kept here."""
 
     max_move: float
+    """By how much an output of 1 changes the position in one sample. Positions reach from -1 to
+    1, as actions do."""
     dead_zone: float = 0.0
+    """t/h. If it is above 0, positions are spread over the flows outside the dead zone: just
+    above 0 stands for its upper edge and just below 0 for its lower one. If it is 0, a position
+    is an action."""
 
     def __post_init__(self) -> None:
         check_number("max_move", self.max_move, 0)
@@ -126,10 +120,9 @@ class PolicyNetwork(Controller):
         if not isinstance(provenance, Mapping | None):
             raise ValueError(f"provenance must be None or a dict, got {provenance!r}")
         dead_zone = 0.0 if increments is None else increments.dead_zone
-        super().__init__(
-            n_obs=sum(self.observation.values()), u_min=u_min, u_max=u_max, dead_zone=dead_zone
-        )
-        if dead_zone >= min(-self.u_min, self.u_max) and dead_zone > 0.0:
+        n_obs = sum(self.observation.values())
+        super().__init__(n_obs=n_obs, u_min=u_min, u_max=u_max, dead_zone=dead_zone)
+        if dead_zone > 0.0 and dead_zone >= min(-self.u_min, self.u_max):
             raise ValueError(
                 f"increments.dead_zone must be inside the limits {u_min!r} and {u_max!r}, "
                 f"got {dead_zone!r}"
@@ -221,17 +214,13 @@ class PolicyNetwork(Controller):
         *hidden, (last_W, last_b) = self.layers
         for W, b in hidden:
             x = ACTIVATIONS[self.activation](x @ W.T + b)
-        output = np.clip(x @ last_W[0] + last_b[0], -1.0, 1.0)
-        if self.increments is None:
-            command: Values = self.u_min + (output + 1.0) * (self.u_max - self.u_min) / 2.0
-            return command
-        return self._move(output, self.increments)
-
-    def _move(self, output: Values, increments: Increments) -> Values:
-        """Move the valve, and return its flow, t/h."""
-        before = 0.0 if self._position is None else self._position
-        self._position = position = np.clip(before + increments.max_move * output, -1.0, 1.0)
-        edge = increments.dead_zone
+        position: Values = np.clip(x @ last_W[0] + last_b[0], -1.0, 1.0)
+        edge = 0.0
+        if self.increments is not None:
+            before = 0.0 if self._position is None else self._position
+            moved = before + self.increments.max_move * position
+            self._position = position = np.clip(moved, -1.0, 1.0)
+            edge = self.increments.dead_zone
         if edge == 0.0:
             return self.u_min + (position + 1.0) * (self.u_max - self.u_min) / 2.0
         limit = np.where(position > 0.0, self.u_max, -self.u_min)

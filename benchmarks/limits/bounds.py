@@ -41,7 +41,7 @@ from benchmarks.limits.news import News
 from benchmarks.limits.programme import Plan, plan
 from benchmarks.limits.reference import SMOOTH, TAIL, reference
 from benchmarks.limits.unknown import Unknown, unknown
-from benchmarks.loop.linear import Course, check_linear, course
+from benchmarks.loop.linear import Course, course
 from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
@@ -146,7 +146,6 @@ def least_possible(
         for the kind "reference" if a set point changes before the plant has settled.
     """
     parameters = Parameters(**arguments)
-    check_linear(parameters)
     for name, count in (("samples", samples), ("episodes", episodes)):
         if not isinstance(count, int) or count < 1:
             raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
@@ -226,7 +225,6 @@ def frontier(
         by descending travel; at the end a valve that does not move.
     """
     parameters = Parameters(**arguments)
-    check_linear(parameters)
     kind = kind or theorem(parameters)
     cases, idle = _draw(parameters, samples, episodes, seed)
     points = []

@@ -53,18 +53,19 @@ GRADIENTS, BACKWARD = 1024, 300  # plants, and samples
 PEER_STEPS = 100  # of each environment of EnvPool and gymnax
 INSTALL_PEERS = "pip install envpool gymnax six"
 REFERENCE = "CartPole-v1"
-SINGLE: dict[str, tuple[str, dict[str, Any]]] = {
-    REFERENCE: (REFERENCE, {}),
-    "Pendulum-v1": ("Pendulum-v1", {}),
-    "MiddlePoint-v0": ("MiddlePoint-v0", {}),
-    "MiddlePoint-v0, R = 0.5": ("MiddlePoint-v0", NOISE),
-    "MiddlePoint-v0, 20 past actions": ("MiddlePoint-v0", {"action_window": 20}),
+# Arguments, by the environment's id and what is special about it.
+SINGLE: dict[str, dict[str, Any]] = {
+    REFERENCE: {},
+    "Pendulum-v1": {},
+    "MiddlePoint-v0": {},
+    "MiddlePoint-v0, R = 0.5": NOISE,
+    "MiddlePoint-v0, 20 past actions": {"action_window": 20},
 }
-VECTOR: dict[str, tuple[str, dict[str, Any]]] = {
-    REFERENCE: (REFERENCE, {}),
-    "MiddlePoint-v0": ("MiddlePoint-v0", {}),
-    "MiddlePoint-v0, R = 0.5": ("MiddlePoint-v0", NOISE),
-    "MiddlePoint-v0, hard": ("MiddlePoint-v0", PRESETS["hard"]),  # everything is on
+VECTOR: dict[str, dict[str, Any]] = {
+    REFERENCE: {},
+    "MiddlePoint-v0": {},
+    "MiddlePoint-v0, R = 0.5": NOISE,
+    "MiddlePoint-v0, hard": PRESETS["hard"],  # everything is on
 }
 
 
@@ -91,11 +92,9 @@ def execute(options: Options, console: Console) -> str:
             MiddlePointTorchEnv(1, device=options.device)
         show(f"Steps a second on {options.device}", on_device(options.device, rounds))
         return f"Medians of {rounds} rounds."
-    single = [_single(name, env, **arguments) for name, (env, arguments) in SINGLE.items()]
-    drawn = [
-        _single(name, name, FRAMES, render_mode="rgb_array")
-        for name in (REFERENCE, "MiddlePoint-v0")
-    ]
+    single = [_single(name, **arguments) for name, arguments in SINGLE.items()]
+    pictured = REFERENCE, "MiddlePoint-v0"
+    drawn = [_single(name, FRAMES, render_mode="rgb_array") for name in pictured]
     learners = f"Plants with R = 0.5 and NNs that learn, one each: {EPISODE} samples together"
     policy = "Through the plant: a policy of two layers of 64, forward and backward"
     show("One environment, from gymnasium.make", compare(single, rounds))
@@ -165,11 +164,11 @@ def _memory(env: Any) -> int:
     return size
 
 
-def _single(name: str, env_id: str, steps: int = SINGLE_STEPS, **arguments: Any) -> Case:
+def _single(name: str, steps: int | None = None, **arguments: Any) -> Case:
     """Return one environment, with a picture of each step if it has a render mode."""
-    env = gymnasium.make(env_id, **arguments)
+    env = gymnasium.make(name.partition(",")[0], **arguments)
     env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(steps)]
+    actions = [env.action_space.sample() for _ in range(steps or SINGLE_STEPS)]
     draws = env.render_mode is not None
 
     def run() -> None:
@@ -181,12 +180,13 @@ def _single(name: str, env_id: str, steps: int = SINGLE_STEPS, **arguments: Any)
             if draws:
                 env.render()
 
-    return Case(name, run, steps)
+    return Case(name, run, len(actions))
 
 
 def _vector(n: int) -> Iterable[Case]:
     """Yield vector environments; a call is one of our episodes, with its reset."""
-    for name, (env_id, arguments) in VECTOR.items():
+    for name, arguments in VECTOR.items():
+        env_id, _, _ = name.partition(",")
         envs = gymnasium.make_vec(
             env_id, n, vectorization_mode="vector_entry_point", **arguments
         )
