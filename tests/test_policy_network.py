@@ -82,13 +82,6 @@ class TestIncrements:
         actions = [float(network.act([0.0])[0]) for _ in range(4)]
         assert actions == pytest.approx([0.4, 0.8, 1.0, 1.0])
 
-    def test_reset_forgets_the_position(self):
-        network = constant(-0.5, increments=Increments(max_move=0.8))
-        first = network.act([[0.0], [0.0]])
-        network.act([[0.0], [0.0]])
-        network.reset()
-        assert np.array_equal(network.act([[0.0], [0.0]]), first)
-
     def test_the_dead_zone_is_stepped_over(self):
         # Positions 0.2, 0.4, ...: of the 5 t/h beyond the dead zone's edge of 5 t/h.
         up = constant(0.5, increments=Increments(max_move=0.4, dead_zone=5.0))

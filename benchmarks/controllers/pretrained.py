@@ -37,6 +37,7 @@ def trained(network: PolicyNetwork, plant: Parameters, runs: int, seed: int) -> 
                 f"for a policy that undoes it, got {zone}"
             )
         controller.increments = replace(controller.increments, dead_zone=zone)
+        controller.dead_zone = zone
     return controller
 
 
