@@ -25,12 +25,11 @@ class NotSolvedError(RuntimeError):
 
 
 class Programme(NamedTuple):
-    """Equations in blocks, a row of matrices each, with costs and bounds for each column."""
+    """Equations in blocks, a row of matrices each; and cost, low and high of the unknowns."""
 
     rows: list[list[Any]]
     right: list[Array]
-    cost: list[Array]
-    bounds: list[Array]
+    unknowns: list[Array]
 
 
 @dataclass(frozen=True)
@@ -149,7 +148,6 @@ def _solve(
     samples = len(setpoint)
     n = samples - 1 - start
     eye, nothing = sparse.eye_array(n), sparse.csr_array((n, n))
-    ones, zeros = np.ones(n), np.zeros(n)
 
     # (28) without noise: A y = B u, rows from start + 1 on; what is past goes to the right.
     A = sparse.eye_array(samples) - _lagged(course.alpha, samples, 1)
@@ -167,12 +165,15 @@ def _solve(
     pieces = [(s, sign, length) for s, length in zip(slopes, lengths.T, strict=True)
               for sign in (1.0, -1.0)]  # fmt: skip
 
-    # Columns: y, u, the pieces; then the moves up and down, if they have a price.
-    cost = [zeros, zeros if penalty is None else penalty[start:-1]]
-    cost += [max(slope, least_slope) * ones for slope, _, _ in pieces]
-    bounds = [_bounds(-np.inf * ones, np.inf * ones)]
-    bounds += [_bounds(course.low * ones, course.high * ones)]
-    bounds += [_bounds(zeros, length) for _, _, length in pieces]
+    def unknowns(cost: Any, low: Any, high: Any) -> Array:
+        return np.column_stack([np.broadcast_to(each, n) for each in (cost, low, high)])
+
+    # y, u, the pieces; then the moves up and down, if they have a price.
+    columns = [
+        unknowns(0.0, -np.inf, np.inf),
+        unknowns(0.0 if penalty is None else penalty[start:-1], course.low, course.high),
+        *(unknowns(max(slope, least_slope), 0.0, length) for slope, _, length in pieces),
+    ]
     rows = [
         [A, -B, *[nothing] * len(pieces)],
         [eye, nothing, *(sign * eye for _, sign, _ in pieces)],
@@ -185,9 +186,8 @@ def _solve(
         first = np.zeros(n)
         first[0] = flow[start - 1] if start else 0.0
         right.append(first)
-        cost += [price * ones] * 2
-        bounds += [_bounds(zeros, np.inf * ones)] * 2
-    programme = Programme(rows, right, cost, bounds)
+        columns += [unknowns(price, 0.0, np.inf)] * 2
+    programme = Programme(rows, right, columns)
     ways = [_as_recursion, _as_response]
     if np.any(np.abs(np.roots(course.beta[start])) > 1.0):
         ways.reverse()
@@ -213,11 +213,12 @@ def _as_recursion(programme: Programme, **solver: Any) -> tuple[Array | None, st
     Where a zero of B lies outside the unit circle, the flow that belongs to an output grows
     without end: solvers that try outputs at will fail, or end at what is not the optimum.
     """
+    unknowns = np.concatenate(programme.unknowns)
     solved = optimize.linprog(
-        np.concatenate(programme.cost),
+        unknowns[:, 0],
         A_eq=sparse.vstack([sparse.hstack(row) for row in programme.rows]).tocsc(),
         b_eq=np.concatenate(programme.right),
-        bounds=np.concatenate(programme.bounds),
+        bounds=unknowns[:, 1:],
         **solver,
     )
     return (solved.x if solved.success else None), solved.message
@@ -225,14 +226,14 @@ def _as_recursion(programme: Programme, **solver: Any) -> tuple[Array | None, st
 
 def _as_response(programme: Programme, **solver: Any) -> tuple[Array | None, str]:
     """Solve for the flows alone, with each output the sum of what the flows do to it."""
-    rows, right, cost, bounds = programme
+    rows, right, unknowns = programme
     A, B = rows[0][0].toarray(), -rows[0][1].toarray()
     alone = linalg.solve_triangular(A, right[0], lower=True)
     G = linalg.solve_triangular(A, B, lower=True)
     G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
     second = [sparse.csr_array(G), *rows[1][2:]]
     reduced = [second, *(row[1:] for row in rows[2:])]
-    of_flows = Programme(reduced, [right[1] - alone, *right[2:]], cost[1:], bounds[1:])
+    of_flows = Programme(reduced, [right[1] - alone, *right[2:]], unknowns[1:])
     solved, why = _as_recursion(of_flows, **solver)
     if solved is None:
         return None, why
@@ -247,7 +248,3 @@ def _lagged(coefficients: Array, samples: int, lag: int) -> sparse.sparray:
     diagonals = [coefficients[lag + i : samples, i] for i in inside]
     offsets = [-(lag + i) for i in inside]
     return sparse.diags_array(diagonals, offsets=offsets, shape=(samples, samples))
-
-
-def _bounds(low: Array, high: Array) -> Array:
-    return np.column_stack([low, high])
