@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 
 from agents.controller import MOST, Values, check_number
@@ -100,9 +101,7 @@ class SmithPredictor(PIController):
         ahead[-1] -= 1.0
         outgoing = np.convolve(integral, model[1])
         returning = np.convolve(np.convolve(pi, model[0]), ahead)
-        shorter, denominator = sorted((outgoing, returning), key=len)
-        denominator[: len(shorter)] += shorter
-        return np.convolve(pi, model[1]), denominator
+        return np.convolve(pi, model[1]), polyadd(outgoing, returning)
 
     def _control(self, observation: Array) -> Values:
         if not self._model:

@@ -12,7 +12,6 @@ from PIL import Image
 from scipy import signal
 
 from agents import PIController
-from benchmarks.train import ppo
 from benchmarks.watch import command as watch
 from benchmarks.watch import rivals
 from benchmarks.watch.__main__ import main
@@ -20,7 +19,6 @@ from mptc_gym import PRESETS, MiddlePointEnv, Parameters, drawing
 from mptc_gym.plant import Plant
 from mptc_gym.ranges import Ranges
 from tests.conftest import run, run_closed
-from tests.small_training import SMALL
 
 SAMPLES = 40
 
@@ -130,8 +128,7 @@ def test_a_controller_of_one_s_own(capsys):
     assert own.split("error ")[1][:5] == capsys.readouterr().out.split("error ")[1][:5]
 
 
-def test_a_policy(monkeypatch, capsys):
-    monkeypatch.setattr(ppo, "PPOArguments", lambda: SMALL)
+def test_a_policy(capsys):
     assert main(["--agent", "ppo", "--video", "film.gif"]) == 0
     assert "PPO on square wave" in capsys.readouterr().out
 

@@ -67,20 +67,12 @@ def features(parameters: Parameters) -> NDArray[np.float64]:
     shape (inputs, observation_size).
     """
     size, (error, _, action) = parameters.observation_size, parameters.heads
-    rows: list[NDArray[np.float64]] = []
-
-    def add(factor: float, *elements: int) -> None:
-        """Add an element, or the difference of two."""
-        rows.append(np.zeros(size))
-        rows[-1][list(elements)] = [factor, -factor][: len(elements)]
-
-    add(1.0, error)
-    add(0.2, 0)
-    add(1.0, action)
-    for factor, first, last in ((0.1, 0, error), (0.5, error, action), (2.0, action, size)):
-        for newer in range(first, last - 1):
-            add(factor, newer, newer + 1)
-    return np.array(rows)
+    one = np.eye(size)
+    changes = [
+        factor * (one[first : last - 1] - one[first + 1 : last])  # the newer less the older
+        for factor, first, last in ((0.1, 0, error), (0.5, error, action), (2.0, action, size))
+    ]
+    return np.vstack([one[error], 0.2 * one[0], one[action], *changes])
 
 
 class FixedFeatures(BaseFeaturesExtractor):
