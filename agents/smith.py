@@ -34,10 +34,8 @@ class SmithPredictor(PIController):
     dead_zone
         The actuator's, t/h: commands within it are 0 to the model, those on its edge have an
         effect. 0 if it is not known.
-    error_index
-        Where the observation holds e(k), degC.
-    u_min, u_max
-        The actuator's limits, t/h: to the model the command stays within them.
+    error_index, u_min, u_max
+        As for `PIController`; to the model the command stays within the limits.
 
     Raises
     ------

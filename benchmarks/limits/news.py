@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.limits.reference import held
 from benchmarks.limits.unknown import Unknown
 from benchmarks.loop.linear import Coefficients, Course
+from benchmarks.loop.metrics import held
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]

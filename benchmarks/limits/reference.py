@@ -11,14 +11,13 @@ below it.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.limits.programme import Plan, plan
 from benchmarks.limits.unknown import Unknown
 from benchmarks.loop.linear import Course
+from benchmarks.loop.metrics import held
 
 Array = NDArray[np.float64]
 
@@ -26,20 +25,6 @@ SETTLED = 0.05  # of the flow's range: how much a flow that has settled may move
 TAIL = 60  # samples more than the lag that a plan looks beyond the end of a hold
 LEVEL = 0.001  # least slope of an error that counts in plans, so that they end at the set point
 SMOOTH = 1e-4  # price of a t/h of travel, so that of equal plans the quiet one is taken
-
-
-def held(setpoint: Array) -> list[tuple[int, int]]:
-    """Return the first sample of each stretch of constant set point, and the one after it."""
-    changes = np.flatnonzero(np.diff(setpoint)) + 1
-    return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
-
-
-def steady_stretches(setpoint: Array) -> NDArray[np.bool_]:
-    """Return which samples lie in the second half of the time that a set point is held."""
-    steady = np.zeros(len(setpoint), dtype=bool)
-    for start, stop in held(setpoint):
-        steady[(start + stop) // 2 : stop] = True
-    return steady
 
 
 def reference(

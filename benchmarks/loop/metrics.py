@@ -78,11 +78,9 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
 
 def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]:
     """ITAE (degC samples^2), overshoot (share) and settling time (samples) of one run."""
-    changes = np.flatnonzero(np.diff(setpoint, prepend=0.0))
-    bounds = np.unique(np.r_[0, changes, len(setpoint)])
     itae, overshoot, settling = 0.0, 0.0, 0.0
     before = 0.0  # the set point before k = 0
-    for start, stop in itertools.pairwise(bounds):
+    for start, stop in held(setpoint):
         error = setpoint[start:stop] - output[start:stop]
         itae += float(np.arange(stop - start) @ np.abs(error))
         change = setpoint[start] - before
@@ -94,6 +92,20 @@ def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]
         last = outside[-1] if len(outside) else -1
         settling = max(settling, math.inf if last == stop - start - 1 else float(last + 1))
     return itae, overshoot, settling
+
+
+def held(setpoint: Array) -> list[tuple[int, int]]:
+    """Return the first sample of each stretch of constant set point, and the one after it."""
+    changes = np.flatnonzero(np.diff(setpoint)) + 1
+    return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
+
+
+def steady_stretches(setpoint: Array) -> NDArray[np.bool_]:
+    """Return which samples lie in the second half of the time that a set point is held."""
+    steady = np.zeros(len(setpoint), dtype=bool)
+    for start, stop in held(setpoint):
+        steady[(start + stop) // 2 : stop] = True
+    return steady
 
 
 def mean_error(trajectory: Trajectory) -> Array:

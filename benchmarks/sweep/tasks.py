@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from benchmarks.controllers.records import Factory
 from benchmarks.limits import least_possible
-from benchmarks.limits.reference import steady_stretches
 from benchmarks.loop.designs import Arguments
-from benchmarks.loop.metrics import measure
+from benchmarks.loop.metrics import measure, steady_stretches
 from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
