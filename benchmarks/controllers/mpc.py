@@ -5,18 +5,16 @@ It shows how near the bounds of `benchmarks.limits` a controller can come.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import action_from_command
 from benchmarks.loop.linear import Coefficients, coefficients
-from benchmarks.loop.rollout import make_plants
+from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
-from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import DRIFT_INTERVAL
-from mptc_gym.ranges import Ranges
 from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
@@ -207,19 +205,6 @@ class _Model(Coefficients):
         for j in range(HORIZON):
             G[:, j:, j] = response[:, : HORIZON - j]
         return cls(**vars(now), G=G, Q=G.transpose(0, 2, 1) @ G)
-
-
-def drawn_numbers(parameters: Parameters, num_envs: int, seed: int) -> PlantNumbers[Array]:
-    """Return the plant numbers of each loop, as the environment draws them."""
-    numbers = Ranges(parameters).given_arrays.chosen(tuple(PLANT_NUMBERS))
-    if parameters.ranges:
-        plants = make_plants(num_envs, 1, **asdict(parameters))
-        _, info = plants.reset(seed=seed)
-        plants.close()
-        numbers |= {name: np.array(info[name]) for name in parameters.ranges}
-    return PlantNumbers(
-        **{name: np.broadcast_to(value, num_envs).copy() for name, value in numbers.items()}
-    )
 
 
 def _cost(Q: Array, target: Array, plan: Array) -> Array:

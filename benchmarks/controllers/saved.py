@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.controllers.mpc import drawn_numbers
 from benchmarks.controllers.records import Cost, Factory
+from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
 from mptc_gym.evaluation import WINDOWS, acting
 from mptc_gym.parameters import ARGUMENTS

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +42,12 @@ from benchmarks.limits.programme import Plan, plan
 from benchmarks.limits.reference import SMOOTH, TAIL, reference
 from benchmarks.limits.unknown import Unknown, unknown
 from benchmarks.loop.linear import Course, course
-from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.rollout import drawn_numbers, make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
 from mptc_gym.parameters import PlantNumbers
 from mptc_gym.plant import action_from_command
-from mptc_gym.ranges import Ranges, numbers_of_plant
+from mptc_gym.ranges import numbers_of_plant
 
 Array = NDArray[np.float64]
 
@@ -259,9 +259,9 @@ class _Case:
 class _Idle:
     """Leaves the valve at 0 t/h."""
 
-    def __init__(self, numbers: PlantNumbers[Array], runs: int) -> None:
+    def __init__(self, numbers: PlantNumbers[Array]) -> None:
         action = action_from_command(0.0, numbers.u_min, numbers.u_max)
-        self._actions = np.full((runs, 1), np.reshape(action, (-1, 1)))
+        self._actions = np.asarray(action)[:, np.newaxis]
 
     def reset(self) -> None:
         """Do nothing."""
@@ -287,11 +287,9 @@ def _draw(
     """Return episodes as the environment draws them, and mean |e| with the valve left alone."""
     count = episodes if _is_drawn(parameters) else 1
     runs = episodes if is_random(parameters) else 1
+    numbers = drawn_numbers(parameters, runs, seed)
     plants = make_plants(runs, samples + 1, **asdict(parameters))
-    _, info = plants.reset(seed=seed)
-    drawn_numbers = {name: np.array(info[name]) for name in parameters.ranges}
-    numbers = replace(Ranges(parameters).given_arrays, **drawn_numbers)
-    trajectory = rollout(plants, _Idle(numbers, runs), samples + 1, seed)
+    trajectory = rollout(plants, _Idle(numbers), samples + 1, seed)
     plants.close()
     cases = []
     for i in range(count):

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-import mptc_gym  # noqa: F401 (registers the environment)
+from mptc_gym import Parameters  # which registers the environment
+from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
+from mptc_gym.ranges import Ranges
+
+Array = NDArray[np.float64]
 
 
 class Agent(Protocol):
@@ -27,17 +31,17 @@ class Agent(Protocol):
 class Trajectory:
     """What happened in a batch of runs; every array has shape (samples, runs)."""
 
-    setpoint: NDArray[np.float64]
+    setpoint: Array
     """y_d(k), degC."""
-    output: NDArray[np.float64]
+    output: Array
     """y(k), degC."""
-    command: NDArray[np.float64]
+    command: Array
     """u(k), t/h."""
-    applied: NDArray[np.float64]
+    applied: Array
     """u_a(k), t/h."""
-    noise: NDArray[np.float64]
+    noise: Array
     """n(k), degC."""
-    error: NDArray[np.float64]
+    error: Array
     """e(k + 1), degC: that of the reward of sample k. Every mean error is over k = 1 to N."""
 
 
@@ -45,6 +49,19 @@ def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vect
     """Make a batch of plants whose episodes last `samples` samples."""
     return gymnasium.make_vec(
         "MiddlePoint-v0", num_envs=num_envs, max_episode_steps=samples, **arguments
+    )
+
+
+def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[Array]:
+    """Return the plant numbers of each run, as the environment draws them: shape (runs,)."""
+    numbers = Ranges(parameters).given_arrays.chosen(tuple(PLANT_NUMBERS))
+    if parameters.ranges:
+        plants = make_plants(runs, 1, **asdict(parameters))
+        _, info = plants.reset(seed=seed)
+        plants.close()
+        numbers |= {name: np.array(info[name]) for name in parameters.ranges}
+    return PlantNumbers(
+        **{name: np.broadcast_to(value, runs).copy() for name, value in numbers.items()}
     )
 
 
