@@ -10,19 +10,42 @@ import numpy as np
 import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
-from benchmarks.identify.armax import Array, Flags
+from benchmarks.identify.armax import Array, Orders
+from benchmarks.identify.likelihood import Likelihood
 from benchmarks.identify.log import Log
+from benchmarks.identify.options import Knowledge
 
 SPIKE = 8.0  # robust deviations that a sample must stick out from its neighbours
 STANDSTILL = 20  # samples in a row with the same temperature, of one that else moves
 MOST_SPIKES = 0.03  # share of the rows
-JUMP = 8.0  # deviations of its noise, from which a change of a held flow is surely a step
+FLOW_JUMP = 8.0  # deviations of its noise, from which a change of a held flow is surely a step
 STEP = 5.0  # standard errors, from which a difference of means is one
 SHORTEST_HOLD = 10  # samples
 RATES = range(2, 61)  # rows for each temperature
+TO_FORESEE = Orders(2, 6, 2)  # so that a fast response is not taken for a spike
+OUTLYING = 6.0  # robust deviations of prediction errors, from which a suspect is a spike
+PLAIN = 24.0  # deviations that a suspect without a prediction sticks out, to be a spike
+JUMP, MOST_JUMPS = 24.0, 3  # robust deviations of a jump of the sensor; how many are mended
 
 
-def at_one_rate(log: Log) -> Log:
+def cleaned(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
+    """Return the log as it can be fitted, with a note of all that was mended.
+
+    Parameters
+    ----------
+    log
+        What was recorded.
+    knowledge
+        What is known.
+    given
+        The orders, if they are known.
+    """
+    log = without_noise_of_held_flow(_at_one_rate(without_standstill(log)))
+    log = _without_spikes(log, knowledge, given or TO_FORESEE)
+    return _without_jumps(log, knowledge, given)
+
+
+def _at_one_rate(log: Log) -> Log:
     """Return the log at the rate of its temperatures, if only every n-th row has one."""
     known = np.flatnonzero(np.isfinite(log.temperature))
     if len(known) < 2 or 2 * len(known) > len(log.temperature) + 1:
@@ -41,21 +64,25 @@ def at_one_rate(log: Log) -> Log:
         f"Only one row in {rate} has a temperature. The log is fitted at these rows, "
         f"{rate * log.sampling_interval:g} s apart, with the mean of the flow between them."
     )
-    return Log(
-        mean(log.flow),
-        log.temperature[first : len(log.flow) - rate + 1 : rate],
-        rate * log.sampling_interval,
-        [*log.notes, note],
-        {name: mean(each) for name, each in log.disturbances.items()},
+    return log.mended(
+        note,
+        flow=mean(log.flow),
+        temperature=log.temperature[first : len(log.flow) - rate + 1 : rate],
+        sampling_interval=rate * log.sampling_interval,
+        disturbances={name: mean(each) for name, each in log.disturbances.items()},
     )
+
+
+def deviation(values: Array) -> float:
+    """Return the standard deviation of values around 0 that outliers do not move."""
+    return 1.4826 * float(np.nanmedian(np.abs(values)))
 
 
 def without_noise_of_held_flow(log: Log) -> Log:
     """Return the log with the means of the flow while it is held, if it is held, but noisy."""
     flow = log.flow
     moves = np.diff(flow)
-    known = moves[np.isfinite(moves)]
-    spread = 1.4826 * float(np.median(np.abs(known))) / np.sqrt(2.0) if len(known) else 0.0
+    spread = deviation(moves) / math.sqrt(2.0) if np.isfinite(moves).any() else 0.0
     if spread == 0.0:  # it stands still in most samples
         return log
     steps = _steps(flow, spread)
@@ -76,7 +103,7 @@ def without_noise_of_held_flow(log: Log) -> Log:
         "taken as the flow meter's: the means of the stretches are used."
     )
     error = noise / math.sqrt(float(np.median(long)))
-    return replace(log, flow=means, flow_error=error, notes=[*log.notes, note])
+    return log.mended(note, flow=means, flow_error=error)
 
 
 def _steps(flow: Array, spread: float) -> list[int]:
@@ -86,7 +113,7 @@ def _steps(flow: Array, spread: float) -> list[int]:
     is parted where the means before and after differ most for their errors, until none do.
     """
     moves = np.diff(flow)
-    found = (np.flatnonzero(~(np.abs(moves) < JUMP * spread)) + 1).tolist()
+    found = (np.flatnonzero(~(np.abs(moves) < FLOW_JUMP * spread)) + 1).tolist()
     open_ones = list(itertools.pairwise([0, *found, len(flow)]))
     while open_ones:
         start, stop = open_ones.pop()
@@ -114,22 +141,10 @@ def without_standstill(log: Log) -> Log:
         f"In {int(stuck.sum())} rows the temperature stands still to the last digit, and moves "
         "elsewhere: they are left out, as those of a sensor that was stuck."
     )
-    return replace(
-        log, temperature=np.where(stuck, np.nan, temperature), notes=[*log.notes, note]
-    )
+    return log.mended(note, temperature=np.where(stuck, np.nan, temperature))
 
 
-def without_jump(log: Log, row: int, height: float) -> Log:
-    """Return the log with a jump taken from all later temperatures, and a note."""
-    note = (
-        f"At sample {row + 1} the temperature jumps by {height:.3g} °C, which no flow "
-        "explains: it is subtracted from there on. See whether the sensor was changed."
-    )
-    temperature = log.temperature - np.where(np.arange(len(log.flow)) >= row, height, 0.0)
-    return replace(log, temperature=temperature, notes=[*log.notes, note])
-
-
-def protrusion(log: Log) -> Array:
+def _protrusion(log: Log) -> Array:
     """Return how far temperatures stick out from those before and after, in deviations.
 
     It is 0 for all but the furthest ones, of which `MOST_SPIKES` may be above `SPIKE`.
@@ -138,22 +153,59 @@ def protrusion(log: Log) -> Array:
     apart = (series - series.rolling(7, center=True, min_periods=3).median()).abs()
     known = np.unique(log.temperature[np.isfinite(log.temperature)])
     finest = float(np.min(np.diff(known))) if len(known) > 1 else 0.0
-    scale = max(1.4826 * float(np.nanmedian(apart)), finest, 1e-3 * float(np.ptp(known)))
+    scale = max(deviation(apart.to_numpy()), finest, 1e-3 * float(np.ptp(known)))
     found = apart.fillna(0.0).to_numpy(dtype=np.float64) / max(scale, 1e-300)
     least = np.sort(found)[-max(int(MOST_SPIKES * len(found)), 1)]
     return np.where(found >= max(least, SPIKE), found, 0.0)
 
 
-def without(log: Log, spikes: Flags) -> Log:
-    """Return the log with these temperatures missing, and a note."""
-    if not spikes.any():
+def _without_spikes(log: Log, knowledge: Knowledge, orders: Orders) -> Log:
+    """Return the log without its spikes: suspects that no answer to the flow explains."""
+    apart = _protrusion(log)
+    found = apart > 0.0
+    if not found.any():
         return log
+    likelihood = Likelihood(log, knowledge, orders)
+    errors = np.abs(likelihood.errors(likelihood.first_fits([orders])[0]))
+    # The first rows have no prediction: they go with the others, if those are spikes all. The
+    # second sample of a spike may follow from the first.
+    outlying, known = errors > OUTLYING * deviation(errors), np.isfinite(errors)
+    outlying |= ~known & (apart > PLAIN) & bool(outlying[found & known].all())
+    runs = np.cumsum(np.diff(found, prepend=False))
+    spikes = found & np.isin(runs, runs[found & outlying])
     count = int(spikes.sum())
+    if not count:
+        return log
     rows = ", ".join(str(row + 1) for row in np.flatnonzero(spikes)[:5])
-    more = ", ..." if count > 5 else ""
-    note = (
-        f"{count} {'spikes' if count > 1 else 'spike'} of the temperature "
-        f"{'are' if count > 1 else 'is'} left out (samples {rows}{more})."
-    )
-    temperature = np.where(spikes, np.nan, log.temperature)
-    return replace(log, temperature=temperature, notes=[*log.notes, note])
+    what = "spikes of the temperature are" if count > 1 else "spike of the temperature is"
+    note = f"{count} {what} left out (samples {rows}{', ...' if count > 5 else ''})."
+    return log.mended(note, temperature=np.where(spikes, np.nan, log.temperature))
+
+
+def _without_jumps(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
+    """Return the log without jumps of its sensor: moves that neither flow nor noise explain."""
+    orders = replace(given or TO_FORESEE, walk=True)
+    for _ in range(MOST_JUMPS):
+        moves = np.diff(log.temperature, prepend=np.nan)
+        scale = deviation(moves) if np.isfinite(moves).any() else 0.0
+        if scale == 0.0 or not np.nanmax(np.abs(moves)) > JUMP * scale:
+            return log
+        likelihood = Likelihood(log, knowledge, given or replace(orders, a=3))
+        place = likelihood.scan(replace(orders, c=0), np.zeros(0), likelihood.gaps())[0]
+        errors = likelihood.errors(likelihood.fit(place, orders))
+        if not np.isfinite(errors).any():
+            return log
+        row = int(np.nanargmax(np.abs(errors)))
+        height, least = float(errors[row]), JUMP * deviation(errors)
+        large = np.flatnonzero(np.abs(errors) > least)
+        # Many of them are the plant's own: its gain is not the same everywhere.
+        many = np.sum(np.diff(large) > TO_FORESEE.b) >= MOST_JUMPS
+        if many or not min(abs(height), abs(moves[row])) > least:
+            return log
+        note = (
+            f"At sample {row + 1} the temperature jumps by {height:.3g} °C, which no flow "
+            "explains: it is subtracted from there on. See whether the sensor was changed."
+        )
+        later = np.arange(len(log.flow)) >= row
+        log = log.mended(note, temperature=log.temperature - np.where(later, height, 0.0))
+    return log

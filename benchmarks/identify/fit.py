@@ -10,14 +10,7 @@ from scipy import stats
 
 from benchmarks.identify import simulation
 from benchmarks.identify.armax import Orders
-from benchmarks.identify.cleaning import (
-    at_one_rate,
-    protrusion,
-    without,
-    without_jump,
-    without_noise_of_held_flow,
-    without_standstill,
-)
+from benchmarks.identify.cleaning import cleaned
 from benchmarks.identify.likelihood import Fit, Gap, Likelihood
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError, HeldOut, Model
@@ -28,7 +21,6 @@ from benchmarks.loop.linear import LinearModel
 
 OWN_LAGS = 0.6, 0.75, 0.85, 0.92, 0.96  # poles of the plant that are not poles of the noise
 FIRST_ORDERS = Orders(2, 1, 2)  # to look for the delay with, before the orders are known
-TO_FORESEE = Orders(2, 6, 2)  # so that a fast response is not taken for a spike
 OF_A, OF_B, OF_C = (1, 2, 3), (1, 2, 3, 6, 12), (0, 1, 3)
 LONG = 3  # coefficients of B: more are a response of any form
 WORTH_A_FIT = 7  # orders that are fitted, of those that come out best with a common C
@@ -37,9 +29,6 @@ CLOSE = 12.0  # of criteria: orders that far behind take no part
 WORSE = 1.2  # times the least share that is left open: what is more takes no part
 WEAK = 100.0  # twice the log likelihood, below which a log may be the wrong way round
 CHANCE = 0.01  # that a flow without effect is taken for one with effect
-OUTLYING = 6.0  # robust deviations of prediction errors, from which a suspect is a spike
-JUMP, MOST_JUMPS = 24.0, 3  # robust deviations of a jump of the sensor; how many are mended
-PLAIN = 24.0  # deviations that a suspect without a prediction sticks out, to be a spike
 SLOW = 3.0  # time constants that a log should hold
 
 
@@ -73,11 +62,9 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
         raise ValueError(
             f"--orders: A and B must have at least 1 coefficient, got {(given.a, given.b)}"
         )
-    log = without_noise_of_held_flow(at_one_rate(without_standstill(log)))
-    log = _without_spikes(log, knowledge, given or TO_FORESEE)
-    log = _without_jumps(log, knowledge, given)
+    log = cleaned(log, knowledge, given)
     likelihood = Likelihood(log, knowledge, given or Orders(max(OF_A), max(OF_B), 0))
-    fits = _first(likelihood, [given]) if given else _fits(likelihood)
+    fits = likelihood.first_fits([given]) if given else _fits(likelihood)
     _check_answer(likelihood, fits[0])
     fits, held_out = _tried(likelihood, fits)
     posterior = Posterior(likelihood, fits)
@@ -102,66 +89,10 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
     return model
 
 
-def _without_spikes(log: Log, knowledge: Knowledge, orders: Orders) -> Log:
-    """Return a log without its spikes: suspects that no answer to the flow explains."""
-    apart = protrusion(log)
-    found = apart > 0.0
-    if not found.any():
-        return log
-    likelihood = Likelihood(log, knowledge, orders)
-    errors = np.abs(likelihood.errors(_first(likelihood, [orders])[0]))
-    scale = 1.4826 * float(np.nanmedian(errors))
-    # The first rows have no prediction: they go with the others, if those are spikes all. The
-    # second sample of a spike may follow from the first.
-    outlying, known = errors > OUTLYING * scale, np.isfinite(errors)
-    outlying |= ~known & (apart > PLAIN) & bool(outlying[found & known].all())
-    runs = np.cumsum(np.diff(found, prepend=False))
-    return without(log, found & np.isin(runs, runs[found & outlying]))
-
-
-def _without_jumps(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
-    """Return a log without jumps of its sensor: moves that neither flow nor noise explain."""
-    orders = replace(given or TO_FORESEE, walk=True)
-    for _ in range(MOST_JUMPS):
-        moves = np.diff(log.temperature, prepend=np.nan)
-        scale = 1.4826 * float(np.nanmedian(np.abs(moves))) if np.isfinite(moves).any() else 0.0
-        if scale == 0.0 or not np.nanmax(np.abs(moves)) > JUMP * scale:
-            return log
-        likelihood = Likelihood(log, knowledge, given or replace(orders, a=max(OF_A)))
-        place = likelihood.scan(replace(orders, c=0), np.zeros(0), likelihood.gaps())[0]
-        errors = likelihood.errors(likelihood.fit(place, orders))
-        if not np.isfinite(errors).any():
-            return log
-        row = int(np.nanargmax(np.abs(errors)))
-        least = JUMP * 1.4826 * float(np.nanmedian(np.abs(errors)))
-        large = np.flatnonzero(np.abs(errors) > least)
-        # Many of them are the plant's own: its gain is not the same everywhere.
-        many = np.sum(np.diff(large) > TO_FORESEE.b) >= MOST_JUMPS
-        if many or not min(abs(errors[row]), abs(moves[row])) > least:
-            return log
-        log = without_jump(log, row, float(errors[row]))
-    return log
-
-
-def _first(likelihood: Likelihood, tried: list[Orders]) -> list[Fit]:
-    """Return fits of orders, the best first, and find the delays of known disturbances."""
-    orders = tried[0]
-    place = likelihood.scan(replace(orders, c=0), np.zeros(0), likelihood.gaps())[0]
-    if likelihood.known:
-        c = likelihood.fit(place, orders).c
-        likelihood.place_known(place, orders, c)
-    fits = []
-    for each in tried:
-        c = likelihood.fit(place, each).c
-        best = likelihood.scan(each, c, likelihood.gaps())[0]
-        fits.append(likelihood.fit(best, each, c))
-    return likelihood.ranked(fits)
-
-
 def _fits(likelihood: Likelihood) -> list[Fit]:
     """Return fits of all orders that are worth it, by their criterion, the best first."""
     scanned = []
-    for base in _first(likelihood, [FIRST_ORDERS, replace(FIRST_ORDERS, walk=True)]):
+    for base in likelihood.first_fits([FIRST_ORDERS, replace(FIRST_ORDERS, walk=True)]):
         for a, b in itertools.product(OF_A, OF_B):
             orders = Orders(a, b, 2, base.orders.walk)
             place = likelihood.scan(orders, base.c, [base.place.gap])[0]
@@ -264,7 +195,7 @@ def _gained_when_swapped(likelihood: Likelihood) -> float:
             Log(log.temperature, log.flow, log.sampling_interval),
             Knowledge(longest_delay=longest_delay), FIRST_ORDERS,
         )  # fmt: skip
-        return swapped.gained(_first(swapped, [FIRST_ORDERS])[0])
+        return swapped.gained(swapped.first_fits([FIRST_ORDERS])[0])
     except ValueError:
         return 0.0
 

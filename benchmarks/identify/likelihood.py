@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -218,6 +218,17 @@ class Likelihood:
         fits = [self.fit(place, orders, each) for each in starts]
         return min(fits, key=lambda fit: fit.place.deviance)
 
+    def first_fits(self, tried: list[Orders]) -> list[Fit]:
+        """Return fits of orders, the best first, and find the delays of known disturbances."""
+        place = self.scan(replace(tried[0], c=0), np.zeros(0), self.gaps())[0]
+        if self.known:
+            self._place_known(place, tried[0], self.fit(place, tried[0]).c)
+        fits = []
+        for orders in tried:
+            c = self.fit(place, orders).c
+            fits.append(self.fit(self.scan(orders, c, self.gaps())[0], orders, c))
+        return self.ranked(fits)
+
     def white(self, table: Array, c: Array, orders: Orders) -> Array:
         """Return columns whitened by C, in the rows that count."""
         return self.rows.whitened(table, c, orders.walk)[self.rows.counts]
@@ -270,7 +281,7 @@ class Likelihood:
         ]
         return sorted(found, key=lambda place: place.deviance)
 
-    def place_known(self, place: Place, orders: Orders, c: Array) -> None:
+    def _place_known(self, place: Place, orders: Orders, c: Array) -> None:
         """Find the delay of each known disturbance, with all else as it is."""
         delays = range(self.knowledge.longest_delay + 1)
         for i, known in enumerate(self.known):

@@ -6,7 +6,7 @@ import itertools
 import re
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,10 @@ class Log:
     notes: list[str] = field(default_factory=list)
     disturbances: dict[str, Array] = field(default_factory=dict)
     flow_error: float = 0.0
+
+    def mended(self, note: str, **changes: Any) -> Log:
+        """Return the log with something changed, and a note that says what."""
+        return replace(self, notes=[*self.notes, note], **changes)
 
 
 def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) -> Log:

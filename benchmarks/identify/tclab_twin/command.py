@@ -1,15 +1,10 @@
 """Identify a plant that no one here wrote, TCLab's digital twin, and control it.
 
-`python -m benchmarks.identify.tclab_twin`, after `pip install tclab`. The lab is a
-small heater with a sensor, for teaching; its package holds a simulation of it, with four
-temperatures inside, a sensor that counts in steps of 0.32 degC, and noise. Here heater 1, in
-percent, stands for the flow. The page
-
-1. moves the heater in steps and records what the sensor shows,
-2. identifies (28) from the record,
-3. tunes a PI controller by SIMC's rule and a Smith predictor from the result, and tells the
-   network for every plant a step test of it,
-4. and runs them on the twin, beside the PI tuning that courses with this lab hand out.
+`python -m benchmarks.identify.tclab_twin`, after `pip install tclab`. The lab is a small heater
+with a sensor, for teaching; its package holds a simulation of it, with four temperatures
+inside, a sensor that counts in steps of 0.32 degC, and noise. Here heater 1, in percent, stands
+for the flow. (28) is identified from steps of the heater, and the controllers that are tuned
+from it run on the twin, beside the PI tuning that courses with this lab hand out.
 """
 
 from __future__ import annotations
@@ -44,7 +39,9 @@ EACH = 200  # samples that a set point is held
 
 # Kc = 6 %/degC and tau_I = 75 s, without derivative action: the PI controller in the PID lesson
 # of the course that came with the hardware (J. D. Hedengren, APMonitor), and widely used since.
-COURSE = {"kp": -6.0, "ki": -6.0 * INTERVAL / 75.0}
+COURSE = PIController(
+    kp=-6.0, ki=-6.0 * INTERVAL / 75.0, anti_windup=True, u_min=-HEATER, u_max=100.0 - HEATER
+)
 
 
 class Twin:
@@ -107,12 +104,9 @@ def model_of(log: Log) -> Model:
 def controllers(model: Model) -> dict[str, Controller]:
     """Return those that are tuned from the model, and the course's."""
     parameters = Parameters(**plant_arguments(model))
-    course = PIController(
-        COURSE["kp"], COURSE["ki"], anti_windup=True, u_min=-HEATER, u_max=100.0 - HEATER
-    )
     tuned = recommended(model, parameters)
     found = {name: each.controller for name, each in tuned.items() if each}
-    return {**found, "nn-smith": nn_smith(parameters), "PI, course": course}
+    return {**found, "nn-smith": nn_smith(parameters), "PI, course": COURSE}
 
 
 def run(controller: Controller, seed: int = 1) -> NDArray[np.float64]:
