@@ -219,7 +219,7 @@ class TestCommand:
         assert not set(networks[0]) & set(networks[1])
 
     def test_interrupted(self, tmp_path, monkeypatch, capsys):
-        def stop(_):
+        def stop(*_):
             raise KeyboardInterrupt
 
         interrupted = dict(claims.CLAIMS)
@@ -237,7 +237,7 @@ class TestCommand:
             def run_nn(self, samples, **arguments):
                 return super().run_nn(300 if name == "direction-only" else samples, **arguments)
 
-        results = claims.CLAIMS[name].examine(Short(4, 500))
+        results = claims.examined(claims.CLAIMS[name], Short(4, 500))
         assert (verdict(results.findings) is Verdict.UNTESTABLE) is (name == "figures")
         for finding in results.findings:
             estimate = finding.estimate

@@ -83,7 +83,7 @@ class TestCells:
         # Two stretches, of 1, 3 and of 10, 10, 10, 16: variances 1 and 6.75.
         error = np.array([[9.0], [1.0], [3.0], [9.0], [10.0], [10.0], [10.0], [16.0], [9.0]])
         steady = np.array([0, 1, 1, 0, 1, 1, 1, 1, 0], dtype=bool)
-        assert tasks._swing(error, steady) == pytest.approx([np.sqrt(7.75 / 2)])
+        assert tasks.swing(error, steady) == pytest.approx([np.sqrt(7.75 / 2)])
 
     def test_the_limit_is_that_of_the_plant(self):
         nominal = limit_task(NOMINAL, 1200)["mae"]
@@ -215,7 +215,7 @@ class TestFindings:
         return pd.DataFrame(rows)
 
     def test_differences(self):
-        table = report._differences(self.runs(), report.LEARNING, "late").set_index("plants")
+        table = report.differences(self.runs(), report.LEARNING, "late").set_index("plants")
         pair = "NN - PI, SIMC"
         assert table.loc["no drift", pair] == "-0.500; 100 %"
         assert table.loc["gain falls to less than 0.8 times", pair].startswith("-0.500")
@@ -226,6 +226,6 @@ class TestFindings:
         assert table.loc["gain stays within 0.8 to 1.25 times", pair] == ""
 
     def test_overview(self):
-        table = report._overview(self.runs()).set_index("controller")
+        table = report.overview(self.runs()).set_index("controller")
         assert table.loc["NN, frozen", "ratio, median"] == "2.000"
         assert table.loc["NN", "oscillates (%)"] == "5.0"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from benchmarks.claims import examinations as examine
 from benchmarks.claims.examinations import PAPER_PI, SEARCHED_PI
 from benchmarks.claims.runs import hidden_nodes, longer_windows
@@ -50,7 +52,7 @@ CLAIMS: dict[str, Claim] = {
             "The NN is much better than the PI controller with the paper's gains",
             f"Kp = {PAPER_PI[0]:g}, Ki = {PAPER_PI[1]:g}. Much better: the mean error is "
             "smaller by a fifth or more, in the same noise.",
-            examine.versus_pi(PAPER_PI),
+            partial(examine.versus_pi, PAPER_PI),
         ),
         Claim(
             "nn-against-searched-pi",
@@ -59,7 +61,7 @@ CLAIMS: dict[str, Claim] = {
             "searched gains, too",
             f"Kp = {SEARCHED_PI[0]:g}, Ki = {SEARCHED_PI[1]:g}, searched with the same budget "
             "as the network's gains. Otherwise as above.",
-            examine.versus_pi(SEARCHED_PI),
+            partial(examine.versus_pi, SEARCHED_PI),
         ),
         Claim(
             "direction",
@@ -74,7 +76,7 @@ CLAIMS: dict[str, Claim] = {
             "Six hidden nodes are no better than three",
             "With the same gains, and with gains in proportion: half as large for the weights "
             "and thresholds of hidden nodes. Better: the mean error is smaller by 5 % or more.",
-            examine.against_the_paper([hidden_nodes(6)]),
+            partial(examine.against_the_paper, [hidden_nodes(6)]),
         ),
         Claim(
             "more-inputs",
@@ -83,7 +85,7 @@ CLAIMS: dict[str, Claim] = {
             "Six and twenty set points and errors, not three; with the same gains, and with "
             "gains in proportion: for the weights of the inputs smaller by as much as there "
             "are more inputs. Better: as above.",
-            examine.against_the_paper([longer_windows(n) for n in (6, 20)]),
+            partial(examine.against_the_paper, [longer_windows(n) for n in (6, 20)]),
         ),
         Claim(
             "reliability",

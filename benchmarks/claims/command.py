@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
-import pandas as pd
 from rich.console import Console
 
 from benchmarks.claims import verdicts
@@ -28,30 +25,28 @@ def execute(options: Options, console: Console) -> str:
     """Examine the claims and write the verdicts."""
     chosen = known("CLAIM", options.claims or list(CLAIMS), list(CLAIMS))
     made = provenance_line("claims", origin())
-    out_folder(options.out)
+    out = out_folder(options.out)
     batch = Batch(options.runs, SEED)
     first = sorted(chosen, key=lambda name: name != LONGEST)
-    tasks = {name: partial(CLAIMS[name].examine, batch) for name in first}
-    examined: dict[str, verdicts.Claim] = {}
-    claims: list[verdicts.Claim] = []
+    tasks = {name: partial(examined, CLAIMS[name], batch) for name in first}
+    done: dict[str, verdicts.Claim] = {}
     try:
         for name, results in options.fan_out.open().stream(tasks, "claims"):
-            examined[name] = replace(CLAIMS[name], findings=results.findings)
-            claims = [examined[n] for n in chosen if n in examined]
-            write(options.out, claims, results.tables, made)
+            done[name] = replace(CLAIMS[name], findings=results.findings)
+            claims = [done[each] for each in chosen if each in done]
+            write_csv(out / "claims.csv", verdicts.table(claims))
+            write_text(out / "claims.md", verdicts.markdown(claims, made))
+            for picture, table in results.tables.items():
+                write_csv(out / f"{picture}.csv", table)
+                PLOTS[picture](table, out / f"{picture}.png")
     finally:
-        if claims:
-            overview = verdicts.overview(claims)
-            console.print(on_screen(overview[["claim", "verdict"]]))
-    return f"All numbers are in {options.out}/claims.md and claims.csv"
+        if done:
+            console.print(on_screen(verdicts.overview(claims)))
+    return f"All numbers are in {out}/claims.md and claims.csv"
 
 
-def write(
-    out: Path, claims: Sequence[verdicts.Claim], tables: dict[str, pd.DataFrame], made: str
-) -> None:
-    """Write the verdicts so far, and the tables and pictures of the latest claim."""
-    write_csv(out / "claims.csv", verdicts.table(claims))
-    write_text(out / "claims.md", verdicts.markdown(claims, made))
-    for name, table in tables.items():
-        write_csv(out / f"{name}.csv", table)
-        PLOTS[name](table, out / f"{name}.png")
+def examined(claim: verdicts.Claim, batch: Batch) -> verdicts.Results:
+    """Return what comes out when a claim is examined."""
+    results = verdicts.Results()
+    claim.examine(batch, results)
+    return results

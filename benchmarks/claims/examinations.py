@@ -22,7 +22,7 @@ from benchmarks.claims.runs import (
     with_gains,
 )
 from benchmarks.claims.verdicts import OFTEN, Results
-from benchmarks.lib.statistics import Estimate, exact, median, quantile, share
+from benchmarks.lib.statistics import Estimate, exact, median, share
 from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.scenarios import SETPOINTS as CASES
 from mptc_gym import PRESETS, Parameters
@@ -50,9 +50,8 @@ def ratio(errors: NDArray[np.float64], reference: NDArray[np.float64]) -> Estima
     return median(ratios) if len(ratios) > 1 else exact(ratios[0])
 
 
-def convergence(batch: Batch) -> Results:
+def convergence(batch: Batch, results: Results) -> None:
     """Find when the weights converge."""
-    results = Results()
     times = {}
     for name, arguments, samples in SETPOINTS:
         network = batch.network()
@@ -65,18 +64,14 @@ def convergence(batch: Batch) -> Results:
         times[name] = converged_at(np.array(weights))
         soon = f"weights converged within {SOON} samples, {name}"
         results.ask_share(soon, times[name] <= SOON, often=True)
-        for p in (0.1, 0.5, 0.9):
-            quantity = f"time until the weights have converged, {name}, {p:.0%} of draws"
-            results.ask(quantity, quantile(times[name], p), "samples")
+        results.ask_time(f"time until the weights have converged, {name}", times[name])
         never = f"weights not converged when the run ends, {name}"
         results.ask_share(never, np.isinf(times[name]))
     results.tables["convergence"] = pd.DataFrame(times)
-    return results
 
 
-def dead_zone(batch: Batch) -> Results:
+def dead_zone(batch: Batch, results: Results) -> None:
     """Find what a dead zone of 7 t/h costs."""
-    results = Results()
     for name, arguments, samples in SETPOINTS:
         small = batch.run_nn(samples, **arguments)
         large = batch.run_nn(samples, **arguments, dead_zone=7.0)
@@ -90,12 +85,10 @@ def dead_zone(batch: Batch) -> Results:
             results.ask(
                 f"mean error, dead zone {zone} t/h, {name}", median(mean_error(runs)), "°C"
             )
-    return results
 
 
-def noise(batch: Batch) -> Results:
+def noise(batch: Batch, results: Results) -> None:
     """Find whether the network works under noise."""
-    results = Results()
     samples, steady = 1200, slice(-600, None)
     idle = batch.run_pi(0.0, 0.0, samples, setpoint=0.0, **NOISY)
     runs = batch.run_nn(samples, **CONSTANT, **NOISY)
@@ -115,12 +108,10 @@ def noise(batch: Batch) -> Results:
     results.ask(
         "standard deviation of y without control", median(idle.output[steady].std(axis=0)), "°C"
     )
-    return results
 
 
-def pi_gains(batch: Batch) -> Results:
+def pi_gains(batch: Batch, results: Results) -> None:
     """Find how the paper's PI controller behaves, and what other Kp do to it."""
-    results = Results()
     kp = PAPER_PI[0]
     samples = 1200
     paper = batch.run_pi(*PAPER_PI, samples, **CONSTANT)
@@ -164,7 +155,6 @@ def pi_gains(batch: Batch) -> Results:
         exact(min(largest_pole(gain, KI) for gain in gains)),
     )
     results.tables["pi_gains"] = pd.DataFrame(rows)
-    return results
 
 
 def largest_pole(kp: float, ki: float) -> float:
@@ -174,86 +164,62 @@ def largest_pole(kp: float, ki: float) -> float:
     A(z^-1) (1 - z^-1) - z^-d B(z^-1) (Kp (1 - z^-1) + Ki).
     """
     plant = Parameters()
-    integral = [1.0, -1.0]
     delay = int(plant.range_of("delay")[0])
-    feedback = np.convolve([*[0.0] * (delay + 1), *plant.b], [kp + ki, -kp])
-    characteristic = -feedback
-    open_loop = np.convolve(plant.a, integral)
+    characteristic = -np.convolve([*[0.0] * (delay + 1), *plant.b], [kp + ki, -kp])
+    open_loop = np.convolve(plant.a, [1.0, -1.0])
     characteristic[: len(open_loop)] += open_loop
     return float(np.abs(np.roots(characteristic)).max())
 
 
-def versus_pi(gains: tuple[float, float]) -> Callable[[Batch], Results]:
-    """Return an examination of the network against a PI controller with these gains."""
-
-    def examine(batch: Batch) -> Results:
-        results = Results()
-        for noise_name, noise_arguments in (("", {}), (", R = 0.5 °C²", NOISY)):
-            for name, setpoint, samples in SETPOINTS:
-                arguments = {**setpoint, **noise_arguments}
-                nn = mean_error(batch.run_nn(samples, **arguments))
-                pi = mean_error(batch.run_pi(*gains, samples, **arguments))
-                case = f"{name}{noise_name}"
-                results.ask(
-                    f"mean error of the NN as a multiple of the PI's, {case}", ratio(nn, pi),
-                    at_most=1 - MUCH,
-                )  # fmt: skip
-                results.ask_share(f"the NN is better, {case}", nn < pi)
-        nn = mean_error(batch.run_nn(1200, dead_zone=7.0))
-        pi = mean_error(batch.run_pi(*gains, 1200, dead_zone=7.0))
-        results.ask("the same ratio, square wave, dead zone 7 t/h", ratio(nn, pi))
-        return results
-
-    return examine
+def versus_pi(gains: tuple[float, float], batch: Batch, results: Results) -> None:
+    """Compare the network with a PI controller that has these gains."""
+    for noise_name, noise_arguments in (("", {}), (", R = 0.5 °C²", NOISY)):
+        for name, setpoint, samples in SETPOINTS:
+            arguments = {**setpoint, **noise_arguments}
+            nn = mean_error(batch.run_nn(samples, **arguments))
+            pi = mean_error(batch.run_pi(*gains, samples, **arguments))
+            case = f"{name}{noise_name}"
+            results.ask(
+                f"mean error of the NN as a multiple of the PI's, {case}", ratio(nn, pi),
+                at_most=1 - MUCH,
+            )  # fmt: skip
+            results.ask_share(f"the NN is better, {case}", nn < pi)
+    nn = mean_error(batch.run_nn(1200, dead_zone=7.0))
+    pi = mean_error(batch.run_pi(*gains, 1200, dead_zone=7.0))
+    results.ask("the same ratio, square wave, dead zone 7 t/h", ratio(nn, pi))
 
 
-def direction(batch: Batch) -> Results:
+def direction(batch: Batch, results: Results) -> None:
     """Find what the wrong direction does."""
-    results = Results()
     runs = batch.run(batch.network(direction=1), 600, **CONSTANT)
-    beyond = np.abs(runs.output) > 0.9 * reachable()
+    plant = Parameters()
+    reachable = abs(sum(plant.b) / sum(plant.a)) * plant.range_of("u_max")[1]  # degC
+    beyond = np.abs(runs.output) > 0.9 * reachable
     when = np.where(beyond.any(axis=0), np.argmax(beyond, axis=0), np.inf)
     soon = f"y beyond 90 % of what the flow can do, either way, within {SOON} samples"
     results.ask_share(soon, when <= SOON, often=True)
     late = "the same when the run ends, after 600 samples"
     results.ask_share(late, beyond[-1], often=True)
     results.ask_share("the same, on the wrong side", runs.output[-1] < 0)
-    for p in (0.1, 0.5, 0.9):
-        results.ask(
-            f"time until y is beyond it, {p:.0%} of draws", quantile(when, p), "samples"
-        )
-    return results
+    results.ask_time("time until y is beyond it", when)
 
 
-def reachable() -> float:
-    """Return the largest steady temperature that the flow can hold, degC."""
-    plant = Parameters()
-    return abs(sum(plant.b) / sum(plant.a)) * plant.range_of("u_max")[1]
+def against_the_paper(networks: Sequence[Network], batch: Batch, results: Results) -> None:
+    """Compare other networks with that of the paper."""
+    for case, arguments, samples in (*SETPOINTS, ("square wave, R = 0.5 °C²", NOISY, 1200)):
+        paper = mean_error(batch.run_nn(samples, **arguments))
+        for network, slower in itertools.product(networks, (False, True)):
+            controller = with_gains(batch, network, slower=slower)
+            runs = batch.run(controller, samples, **arguments, **network.windows)
+            results.ask(
+                f"mean error with {network.name}, {GAINS[slower]}, as a multiple of that "
+                f"of the paper's network, {case}",
+                ratio(mean_error(runs), paper), at_least=1 - NOTABLE,
+            )  # fmt: skip
 
 
-def against_the_paper(networks: Sequence[Network]) -> Callable[[Batch], Results]:
-    """Return an examination of other networks beside that of the paper."""
-
-    def examine(batch: Batch) -> Results:
-        results = Results()
-        for case, arguments, samples in (*SETPOINTS, ("square wave, R = 0.5 °C²", NOISY, 1200)):
-            paper = mean_error(batch.run_nn(samples, **arguments))
-            for network, slower in itertools.product(networks, (False, True)):
-                controller = with_gains(batch, network, slower=slower)
-                runs = batch.run(controller, samples, **arguments, **network.windows)
-                results.ask(
-                    f"mean error with {network.name}, {GAINS[slower]}, as a multiple of that "
-                    f"of the paper's network, {case}",
-                    ratio(mean_error(runs), paper), at_least=1 - NOTABLE,
-                )  # fmt: skip
-        return results
-
-    return examine
-
-
-def node_failure(batch: Batch) -> Results:
+def node_failure(batch: Batch, results: Results) -> None:
     """Find how networks of several sizes recover from the failure of a hidden node."""
-    results = Results()
     for slower, stuck_at in itertools.product((False, True), (0, 1)):
         error = {}
         for nodes in (3, 6, 12):
@@ -276,12 +242,10 @@ def node_failure(batch: Batch) -> Results:
                     f"the same as a multiple of that with 3 nodes, {case}",
                     ratio(error[nodes], error[3]), at_most=1 - NOTABLE,
                 )  # fmt: skip
-    return results
 
 
-def changing_plant(batch: Batch) -> Results:
+def changing_plant(batch: Batch, results: Results) -> None:
     """Find whether weights must keep learning when the plant changes."""
-    results = Results()
     network = batch.network()
     batch.run(network, 1200, **SQUARE)
     learnt = network.weights
@@ -306,12 +270,10 @@ def changing_plant(batch: Batch) -> Results:
         results.ask(f"mean error of frozen weights, {name}", median(error[False]), "°C")
         useless = f"frozen weights do no better than no control, {name}"
         results.ask_share(useless, error[False] >= 5.0)
-    return results
 
 
-def other_plants(batch: Batch) -> Results:
+def other_plants(batch: Batch, results: Results) -> None:
     """Find on which plants of the same direction the same gains work."""
-    results = Results()
     nominal = {"delay": 18, "gain": 1.0, "time_constant": 1.0}
     delays, time_constants = (9, 18, 27, 36), (0.5, 1.0, 2.0)
     # The gain changes the flow that a set point needs. With too much gain that lies inside the
@@ -364,9 +326,7 @@ def other_plants(batch: Batch) -> Results:
     results.tables["other_plants"] = pd.DataFrame(
         [{**row, "settled": row["settled"].value} for row in rows]
     )
-    return results
 
 
-def nothing(_: Batch) -> Results:
-    """Return no findings: the paper does not say enough for a test."""
-    return Results()
+def nothing(batch: Batch, results: Results) -> None:
+    """Find nothing: the paper does not say enough for a test."""

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.lib.drawing import COLOURS, colours, drawn
+from benchmarks.lib.tables import groups
 from benchmarks.loop.metrics import METRICS
 
 
@@ -33,9 +34,7 @@ def plot_pi_gains(errors: pd.DataFrame, path: Path) -> None:
     """Draw the mean error of PI controllers over Kp, one line for each case."""
     with drawn(path, 9, 4) as figure:
         axes = figure.subplots()
-        for (name, rows), colour in zip(
-            errors.groupby("setpoint", sort=False), COLOURS, strict=False
-        ):
+        for (name, rows), colour in zip(groups(errors, "setpoint"), COLOURS, strict=False):
             axes.plot(rows["kp"], rows["mean_error"], ".-", color=colour, label=name)
         axes.set_ylim(bottom=0)
         axes.set_xlabel("Kp (t/h per °C), with the paper's Ki = 0.3")

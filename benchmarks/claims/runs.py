@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,18 +21,11 @@ STILL = 100  # the last samples of a run, in which weights that have converged d
 
 @dataclass(frozen=True)
 class Batch:
-    """Runs side by side, each with initial weights and noise of its own.
-
-    Attributes
-    ----------
-    runs
-        How many.
-    seed
-        Run i has the seed `seed + i`.
-    """
+    """Runs side by side, each with initial weights and noise of its own."""
 
     runs: int
     seed: int = 0
+    """Run i has the seed `seed + i`."""
 
     def network(self, **gains: Any) -> DirectNNController:
         """Return a network for each run, with gains that are not the defaults."""
@@ -62,29 +55,23 @@ class Batch:
 
 @dataclass(frozen=True)
 class Network:
-    """A network that is not the paper's.
-
-    Attributes
-    ----------
-    name
-        What sets it apart.
-    controller, windows
-        Arguments of the controller, and of the environment that feeds it.
-    slower
-        Gains that are in proportion: each with a factor to the default. The more terms a sum
-        has, the faster it moves when the weights of all of them learn with the same gain.
-    """
+    """A network that is not the paper's."""
 
     name: str
+    """What sets it apart."""
     controller: dict[str, Any]
-    windows: dict[str, Any] = field(default_factory=dict)
-    slower: dict[str, float] = field(default_factory=dict)
+    """Arguments of the controller."""
+    windows: dict[str, Any]
+    """Arguments of the environment that feeds it."""
+    slower: dict[str, float]
+    """Gains that are in proportion: each with a factor to the default. The more terms a sum
+    has, the faster it moves when the weights of all of them learn with the same gain."""
 
 
 def hidden_nodes(count: int) -> Network:
     """Return the paper's network with another number of hidden nodes."""
     slower = dict.fromkeys(("eta", "eta_1", "eta_theta"), 3 / count)
-    return Network(f"{count} hidden nodes", {"n_hidden": count}, slower=slower)
+    return Network(f"{count} hidden nodes", {"n_hidden": count}, {}, slower)
 
 
 def longer_windows(length: int) -> Network:
@@ -113,22 +100,13 @@ def flat(weights: Weights) -> NDArray[np.float32]:
 
 
 def converged_at(weights: NDArray[np.floating]) -> Array:
-    """Return when weights have converged.
+    """Return when weights have converged, in samples, shape (runs,).
 
     That is the first sample from which on their distance to where they end, by the Euclidean
     norm, is at most `BAND` times the distance they had to travel from their start. Weights that
-    get there only in the last `STILL` samples have not converged: the run's end might be
-    anywhere on their way.
-
-    Parameters
-    ----------
-    weights
-        Before each sample, shape (samples, runs, n).
-
-    Returns
-    -------
-    ndarray, shape (runs,)
-        Samples, infinite where the weights have not converged.
+    get there only in the last `STILL` samples have not converged, which is infinite: the run's
+    end might be anywhere on their way. `weights` are those before each sample, shape
+    (samples, runs, n).
     """
     distance = np.linalg.norm(weights - weights[-1], axis=2)
     outside = distance > BAND * distance[0]

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.lib.statistics import Estimate, share
+from benchmarks.lib.statistics import Estimate, quantile, share
 
 if TYPE_CHECKING:
     from benchmarks.claims.runs import Batch
@@ -31,26 +31,15 @@ class Verdict(str, Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One number, and what a claim asks of it.
-
-    Attributes
-    ----------
-    quantity
-        What was measured.
-    estimate
-        What came out.
-    unit
-        Its unit.
-    at_least, at_most
-        The criterion: bounds that the number must keep. Without one the number is there to be
-        read, and has no part in the verdict.
-    """
+    """One number, and what a claim asks of it."""
 
     quantity: str
     estimate: Estimate
     unit: str = ""
     at_least: float = -math.inf
     at_most: float = math.inf
+    """Bounds that the number must keep. Without one it is there to be read, and has no part in
+    the verdict."""
 
     @property
     def criterion(self) -> str:
@@ -104,6 +93,11 @@ class Results:
         at_least = 100 * OFTEN if often else -math.inf
         self.ask(quantity, in_percent, "% of draws", at_least=at_least)
 
+    def ask_time(self, quantity: str, samples: NDArray[np.float64]) -> None:
+        """Note when something happens, in 10, 50 and 90 % of the draws; infinite for never."""
+        for p in (0.1, 0.5, 0.9):
+            self.ask(f"{quantity}, {p:.0%} of draws", quantile(samples, p), "samples")
+
 
 def verdict(findings: Iterable[Finding]) -> Verdict:
     """Judge a claim by what was found.
@@ -121,30 +115,19 @@ def verdict(findings: Iterable[Finding]) -> Verdict:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, how it is examined, and what came out.
-
-    Attributes
-    ----------
-    name
-        Short, for options.
-    section
-        Where the paper makes it.
-    statement
-        The claim in a few words.
-    method
-        How it is tested.
-    examine
-        Runs what must be run.
-    findings
-        What came out, once it has been examined.
-    """
+    """A claim of the paper, how it is examined, and what came out."""
 
     name: str
+    """Short, for options."""
     section: str
+    """Where the paper makes it."""
     statement: str
     method: str
-    examine: Callable[[Batch], Results]
+    """How it is tested."""
+    examine: Callable[[Batch, Results], object]
+    """Runs what must be run."""
     findings: Sequence[Finding] = ()
+    """What came out, once it has been examined."""
 
     @property
     def verdict(self) -> Verdict:
@@ -175,8 +158,8 @@ def table(claims: Sequence[Claim]) -> pd.DataFrame:
 
 def overview(claims: Sequence[Claim]) -> pd.DataFrame:
     """Return the verdicts: one row for each claim."""
-    rows = [(claim.name, claim.statement, claim.verdict.value) for claim in claims]
-    return pd.DataFrame(rows, columns=["name", "claim", "verdict"])
+    rows = [(claim.statement, claim.verdict.value) for claim in claims]
+    return pd.DataFrame(rows, columns=["claim", "verdict"])
 
 
 def write_number(value: float) -> str:
@@ -187,43 +170,33 @@ def write_number(value: float) -> str:
     return f"{value:,.{digits}f}"
 
 
-def _section(claim: Claim) -> str:
-    rows = [
-        {
-            "measured": finding.quantity + (f" ({finding.unit})" if finding.unit else ""),
-            "value": write_number(finding.estimate.value),
-            "95 % interval": _interval(finding.estimate),
-            "asked": finding.criterion,
-            "shown": f"**{finding.shown}**" if finding.shown == "no" else finding.shown,
-        }
-        for finding in claim.findings
-    ]
-    parts = [
-        f"## {claim.statement}: {claim.verdict.value}",
-        f"{claim.section}. {claim.method}",
-    ]
-    if rows:
-        parts.append(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True))
-    return "\n\n".join(parts)
-
-
-def _interval(estimate: Estimate) -> str:
-    if estimate.runs == 1:
-        return "exact"
-    return f"{write_number(estimate.low)} to {write_number(estimate.high)}"
-
-
 def markdown(claims: Sequence[Claim], made: str) -> str:
     """Return all verdicts as a Markdown page, with a line on how they were made."""
-    return "\n\n".join(
-        [
-            "# The paper's claims",
-            made,
-            "Every number rests on independent draws of initial weights and "
-            "noise. What a claim asks of a number counts as shown if the whole 95 % interval "
-            "keeps it. A claim holds if all that it asks is shown, and in part if some is.",
-            overview(claims).drop(columns="name").to_markdown(index=False),
-            *(_section(claim) for claim in claims),
-            "",
-        ]
-    )
+    parts = [
+        "# The paper's claims",
+        made,
+        "Every number rests on independent draws of initial weights and "
+        "noise. What a claim asks of a number counts as shown if the whole 95 % interval "
+        "keeps it. A claim holds if all that it asks is shown, and in part if some is.",
+        overview(claims).to_markdown(index=False),
+    ]
+    for claim in claims:
+        parts.append(f"## {claim.statement}: {claim.verdict.value}")
+        parts.append(f"{claim.section}. {claim.method}")
+        if claim.findings:
+            rows = pd.DataFrame(map(_row, claim.findings))
+            parts.append(rows.to_markdown(index=False, disable_numparse=True))
+    return "\n\n".join([*parts, ""])
+
+
+def _row(finding: Finding) -> dict[str, str]:
+    value, low, high, runs = vars(finding.estimate).values()
+    return {
+        "measured": finding.quantity + (f" ({finding.unit})" if finding.unit else ""),
+        "value": write_number(value),
+        "95 % interval": (
+            "exact" if runs == 1 else f"{write_number(low)} to {write_number(high)}"
+        ),
+        "asked": finding.criterion,
+        "shown": f"**{finding.shown}**" if finding.shown == "no" else finding.shown,
+    }

@@ -28,24 +28,16 @@ LONG = ("mpc", "nn-self-tuning", "ppo", "self-tuning", "nn-smith")
 
 @dataclass(frozen=True)
 class Case:
-    """What a controller did in a scenario.
-
-    Attributes
-    ----------
-    runs
-        One row for each run of each member.
-    responses
-        Percentiles over the runs, one row for each sample.
-    again
-        Mean |e| in a second run with what was learnt, degC, if there was one.
-    seconds
-        How long the runs took.
-    """
+    """What a controller did in a scenario."""
 
     runs: pd.DataFrame
+    """One row for each run of each member."""
     responses: pd.DataFrame
+    """Percentiles over the runs, one row for each sample."""
     again: float | None
+    """Mean |e| in a second run with what was learnt, degC, if there was one."""
     seconds: float
+    """How long the runs took."""
 
 
 def run_case(scenario: Scenario, agent: str, members: Sequence[Factory], runs: int) -> Case:
@@ -79,28 +71,19 @@ def run_case(scenario: Scenario, agent: str, members: Sequence[Factory], runs: i
 
 @dataclass
 class Comparison:
-    """Controllers, scenarios, and what is known of them so far.
-
-    Attributes
-    ----------
-    scenarios
-        What the controllers run on, by name.
-    controllers
-        The members of each, by name.
-    count
-        How many runs of each there are: the episodes of `mptc_gym.evaluate`, from the first on.
-    cases
-        What has finished, by scenario and controller.
-    scales, frontiers
-        What errors, and errors for a given travel of the valve, are measured against.
-    """
+    """Controllers, scenarios, and what is known of them so far."""
 
     scenarios: Mapping[str, Scenario]
     controllers: Mapping[str, Sequence[Factory]]
+    """The members of each."""
     count: int
+    """How many runs of each there are: the first episodes of `mptc_gym.evaluate`."""
     cases: dict[tuple[str, str], Case] = field(default_factory=dict)
+    """What has finished, by scenario and controller."""
     scales: dict[str, Scale] = field(default_factory=dict)
+    """What the errors of a scenario are measured against."""
     frontiers: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    """The same for a given travel of the valve; see `travel_frontier`."""
 
     def run(self, fan_out: FanOut) -> Iterator[Case]:
         """Run all, and yield each case when it has finished.

@@ -27,22 +27,15 @@ TOLERANCE = 1e-4  # relative error that a bound may have
 
 @dataclass(frozen=True)
 class Scale:
-    """What the errors of a scenario are measured against.
-
-    Attributes
-    ----------
-    least
-        The least possible error that applies, of the kind "reference" or "news" where the set
-        point changes, or "preview"; see `benchmarks.limits`.
-    preview
-        The least possible error of any controller at all.
-    drawn
-        Whether runs differ: whether anything is random.
-    """
+    """What the errors of a scenario are measured against."""
 
     least: LeastPossible
+    """The least possible error that applies, of the kind "reference" or "news" where the set
+    point changes, or "preview"; see `benchmarks.limits`."""
     preview: LeastPossible
+    """The least possible error of any controller at all."""
     drawn: bool
+    """Whether runs differ: whether anything is random."""
 
 
 def scale_of(scenario: Scenario, runs: int) -> Scale:

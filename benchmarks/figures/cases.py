@@ -10,45 +10,24 @@ from mptc_gym import PRESETS, Parameters
 
 @dataclass(frozen=True)
 class Case:
-    """What is run for one or more figures.
-
-    Attributes
-    ----------
-    title
-        For headings.
-    arguments
-        Arguments of the environment.
-    nodes
-        Hidden nodes of the network; None for the paper's PI controller.
-    """
+    """What is run for one or more figures."""
 
     title: str
     arguments: dict[str, Any] = field(default_factory=dict)
+    """Arguments of the environment."""
     nodes: int | None = 3
+    """Hidden nodes of the network; None for the paper's PI controller."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure of the paper.
-
-    Attributes
-    ----------
-    number
-        The paper's.
-    case
-        What is run: a name in `CASES`.
-    signals
-        What it shows, from top to bottom: "output" stands for set point and temperature.
-    """
+    """One figure of the paper."""
 
     number: int
     case: str
+    """What is run: a name in `CASES`."""
     signals: tuple[str, ...] = ("output",)
-
-    @property
-    def file(self) -> str:
-        """Name of its picture."""
-        return f"figure_{self.number:02d}.png"
+    """What it shows, from top to bottom: "output" stands for set point and temperature."""
 
     @property
     def title(self) -> str:

@@ -9,9 +9,9 @@ from tqdm import tqdm
 
 from agents import PIController
 from benchmarks.claims.runs import Batch
-from benchmarks.figures import plots
-from benchmarks.figures.cases import CASES, FIGURES, Case
+from benchmarks.figures.cases import CASES, FIGURES
 from benchmarks.figures.options import Options
+from benchmarks.figures.plots import plot_figures
 from benchmarks.lib.command_line import out_folder
 from benchmarks.lib.tables import percentiles, write_csv
 from benchmarks.loop.metrics import mean_error
@@ -24,32 +24,21 @@ SAMPLES = 1200
 
 def execute(options: Options, console: Console) -> str:
     """Run the cases and draw the figures."""
-    out_folder(options.out)
+    out, batch = out_folder(options.out), Batch(options.runs, SEED)
     curves: dict[str, pd.DataFrame] = {}
-    for name in tqdm(CASES, unit="case"):
-        trajectory = run(CASES[name], Batch(options.runs, SEED))
-        curves[name] = summarise(trajectory)
-        write_csv(options.out / f"{name}.csv", curves[name])
+    for name, case in tqdm(CASES.items(), unit="case"):
+        agent = PIController() if case.nodes is None else batch.network(n_hidden=case.nodes)
+        curves[name] = summarise(batch.run(agent, SAMPLES, **case.arguments))
+        write_csv(out / f"{name}.csv", curves[name])
         for figure in FIGURES:
             if figure.case == name:
-                plots.plot_figures([figure], curves, options.out / figure.file)
-    plots.plot_figures(FIGURES, curves, options.out / "figures.png")
-    return f"Figures 5 to 12, their sheet figures.png and their data: {options.out}/"
-
-
-def run(case: Case, batch: Batch) -> Trajectory:
-    """Run the whole batch."""
-    agent = PIController() if case.nodes is None else batch.network(n_hidden=case.nodes)
-    return batch.run(agent, SAMPLES, **case.arguments)
+                plot_figures([figure], curves, out / f"figure_{figure.number:02d}.png")
+    plot_figures(FIGURES, curves, out / "figures.png")
+    return f"Figures 5 to 12, their sheet figures.png and their data: {out}/"
 
 
 def summarise(trajectory: Trajectory) -> pd.DataFrame:
     """Return the set point, and each signal in a typical run and over all, row by sample.
-
-    Parameters
-    ----------
-    trajectory
-        The runs, all with the same set point.
 
     Returns
     -------
@@ -61,7 +50,7 @@ def summarise(trajectory: Trajectory) -> pd.DataFrame:
     typical = np.argsort(error, kind="stable")[(len(error) - 1) // 2]
     columns = {
         "time_s": np.arange(len(trajectory.setpoint)) * Parameters().sampling_interval,
-        "setpoint": trajectory.setpoint[:, 0],
+        "setpoint": trajectory.setpoint[:, 0],  # that of all runs
     }
     for signal in ("output", "command", "noise"):
         values = getattr(trajectory, signal)

@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from benchmarks.figures.cases import Figure
-from benchmarks.lib.drawing import COLOURS, drawn
+from benchmarks.lib.drawing import COLOURS, draw_actuator, drawn
 
 _SIGNALS = {
     "output": ("temperature y (°C)", COLOURS[0]),
@@ -24,14 +24,7 @@ def plot_figures(
 ) -> None:
     """Draw figures of the paper: one, or a sheet of several in two columns.
 
-    Parameters
-    ----------
-    figures
-        Each signal of a figure has axes of its own.
-    curves
-        What `summarise` returns, by case.
-    path
-        The PNG file to write.
+    Each signal of a figure has axes of its own. The curves are those of `summarise`, by case.
     """
     axes_of = [(figure, signal) for figure in figures for signal in figure.signals]
     columns = min(2, len(figures))
@@ -41,11 +34,10 @@ def plot_figures(
         grid = sheet.subplots(rows, columns, sharex=True, squeeze=False)
         for axes, (figure, signal) in zip(grid.flat, axes_of, strict=False):
             _draw_signal(axes, figure, signal, curves[figure.case])
-        used, unused = grid.flat[: len(axes_of)], grid.flat[len(axes_of) :]
-        for axes in used[-columns:]:  # the lowest of each column
+        for axes in grid.flat[: len(axes_of)][-columns:]:  # the lowest of each column
             axes.tick_params(labelbottom=True)
             axes.set_xlabel("time (min)")
-        for axes in unused:
+        for axes in grid.flat[len(axes_of) :]:
             axes.set_visible(False)
 
 
@@ -64,11 +56,7 @@ def _draw_signal(axes: Axes, figure: Figure, signal: str, curves: pd.DataFrame) 
             minutes, curves["setpoint"], "k--", linewidth=1, where="post", label="set point"
         )
     if signal == "command":
-        parameters = figure.parameters
-        zone, _ = parameters.range_of("dead_zone")
-        axes.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0, label="dead zone")
-        for limit in (parameters.range_of("u_min")[0], parameters.range_of("u_max")[1]):
-            axes.axhline(limit, color="0.4", linestyle=":", linewidth=1)
+        draw_actuator(axes, figure.parameters)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
     axes.set_xlim(0, minutes.max())

@@ -34,36 +34,20 @@ _INTERVAL = re.compile(r" (\([^()]* to [^()]*\))")
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report.
-
-    Attributes
-    ----------
-    title
-        Its heading; "" for none.
-    text
-        What there is to say, in paragraphs.
-    table
-        All cells are text.
-    pictures
-        Names of PNG files in the report's folder.
-    """
+    """A part of a report."""
 
     title: str
+    """Its heading; "" for none."""
     text: Sequence[str] = ()
+    """What there is to say, in paragraphs."""
     table: pd.DataFrame | None = None
+    """All cells are text."""
     pictures: Sequence[str] = ()
+    """Names of PNG files in the report's folder."""
 
 
 def provenance_line(command: str, origin: Mapping[str, Any]) -> str:
-    """Return when, from which commit and by which command a report was made.
-
-    Parameters
-    ----------
-    command
-        Name of the command of `benchmarks`.
-    origin
-        Holds `started` and `commit`.
-    """
+    """Return when, from which commit and by which command of `benchmarks` a report was made."""
     called = sys.argv[1:] if command in sys.argv[0] else []
     commit = origin["commit"]  # a hash of 40 digits, and "-dirty" perhaps
     line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])

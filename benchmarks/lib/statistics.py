@@ -18,17 +18,7 @@ RESAMPLES = 2000  # of a bootstrap
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its confidence interval.
-
-    Attributes
-    ----------
-    value
-        The estimate.
-    low, high
-        Ends of the interval.
-    runs
-        Number of runs.
-    """
+    """A number with its confidence interval, from a number of runs."""
 
     value: float
     low: float

@@ -25,7 +25,6 @@ from benchmarks.sweep.tasks import agent_task, limit_task
 from mptc_gym import Parameters
 
 SEED = 0  # of a plant's first run
-SPANS_OF = {"random": SPANS, "wide": WIDE}
 NOTHING = "nothing"  # the controller that sets the scale
 
 
@@ -33,10 +32,11 @@ def execute(options: Options, console: Console) -> str:
     """Run the sweep and write what it finds."""
     controllers = chosen(options.agents, options.controllers.agent)
     nominal = options.plant.chosen().arguments
-    drawn = options.plants, options.design_seed, options.samples
-    differing = (
-        grid() if options.design == "grid" else random_design(*drawn, SPANS_OF[options.design])
-    )
+    if options.design == "grid":
+        differing = grid()
+    else:
+        spans = SPANS if options.design == "random" else WIDE
+        differing = random_design(options.plants, options.design_seed, options.samples, spans)
     plants = [{**nominal, **plant} for plant in differing]
     for plant in plants:
         with blame(f"--design {options.design}"):
@@ -60,8 +60,7 @@ def execute(options: Options, console: Console) -> str:
     for name, factories in members.items():
         results |= training.fan_out.run(
             {
-                # Every plant has its own member, in turn: how much they differ shows in the
-                # maps.
+                # Every plant has a member, in turn: how much they differ shows in the maps.
                 f"{name} {i}": partial(
                     agent_task, factories[i % len(factories)], nominal, plant, **common
                 )

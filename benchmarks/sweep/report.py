@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,24 +41,17 @@ def table(
 ) -> pd.DataFrame:
     """Return one row for each run: the plant, the measures, and how they compare.
 
-    Parameters
-    ----------
-    plants
-        What each plant of the sweep differs in from the nominal one.
-    agents
-        The controllers.
-    results
-        Of all tasks by name: "limit I", "nothing I" and "AGENT I" for plant I.
+    A plant is what it differs in from the nominal one. The results are those of all tasks by
+    name: "limit I", "nothing I" and "AGENT I" for plant I.
     """
     rows = []
     for i, plant in enumerate(plants):
         limit = results[f"limit {i}"]["mae"]
         nothing = pd.DataFrame(results[f"nothing {i}"])
         for agent in agents:
-            task = pd.DataFrame(results[f"{agent} {i}"])
-            task.insert(0, "plant", i)
-            task.insert(1, "agent", agent)
-            task.insert(2, "run", range(len(task)))
+            measures = pd.DataFrame(results[f"{agent} {i}"])
+            about = pd.DataFrame({"plant": i, "agent": agent, "run": range(len(measures))})
+            task = pd.concat([about, measures], axis=1)
             task["limit"] = np.nan if limit is None else limit
             task["ratio"] = task["mae"] / task["limit"]
             # The same noise with no control, which sets both scales.
@@ -86,6 +78,15 @@ QUESTIONS = (
         "drift_adapting.png",
     ),
 )
+OVERVIEW_TEXT = (
+    "Ratio: mean error as a multiple of the least possible error, median and 90th percentile "
+    "over the plants (the median run of each). Travel: of the valve in a run, the median. "
+    "Oscillates: on steady stretches the standard deviation of the error is "
+    f"{OSCILLATES:g} °C larger than with no control at all. The actuator is limited and the "
+    "plant stable, so that an unstable loop comes to no more than that. Useless: the mean "
+    "error is no smaller than with no control. Both are shares of the runs. PPO's policies "
+    "take the plants in turn."
+)
 DIFFERENCES_TEXT = (
     "Differences of the mean error (°C), run by run in the same noise, with 95 % intervals "
     "over plants and runs: below 0 the first of the two is better. At the end: the share "
@@ -94,51 +95,32 @@ DIFFERENCES_TEXT = (
 
 
 def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
-    """Draw the maps and return the sections of the report.
-
-    Parameters
-    ----------
-    runs
-        One row for each run.
-    out
-        Where to write the maps.
-    design
-        "grid", "random" or "wide".
-    """
-    picture = "map.png" if design == "grid" else "plants.png"
-    sections = [
-        Section(
-            "How many plants each controller works on",
-            [
-                "Ratio: mean error as a multiple of the least possible error, median and 90th "
-                "percentile over the plants (the median run of each). Travel: of the valve in "
-                "a run, the median. Oscillates: on steady stretches the standard deviation of "
-                f"the error is {OSCILLATES:g} °C larger than with no control at all. The "
-                "actuator is limited and the plant stable, so that an unstable loop comes to "
-                "no more than that. Useless: the mean error is no smaller than with no "
-                "control. Both are shares of the runs. PPO's policies take the plants in turn."
-            ],
-            _overview(runs),
-            [picture],
-        )
-    ]
+    """Draw the maps of a "grid", "random" or "wide" design, and return the report."""
+    title = "How many plants each controller works on"
     if design == "grid":
-        maps.plot_grid(runs, out / picture)
-        return sections
-    maps.plot_plants(runs, out / picture)
+        maps.plot_grid(runs, out / "map.png")
+        return [Section(title, [OVERVIEW_TEXT], overview(runs), ["map.png"])]
+    maps.plot_plants(runs, out / "plants.png")
+    sections = [Section(title, [OVERVIEW_TEXT], overview(runs), ["plants.png"])]
     for title, text, pairs, picture in QUESTIONS:
         asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
         if not asked:
             continue
         maps.plot_drift(runs, asked[0], out / picture)
-        for measure, when in MEASURES.items():
-            heading, said = f"{title} Mean error {when}", [text, DIFFERENCES_TEXT]
-            sections.append(Section(heading, said, _differences(runs, asked, measure)))
-        sections[-1] = replace(sections[-1], pictures=[picture])
+        sections += [
+            Section(
+                f"{title} Mean error {when}",
+                [text, DIFFERENCES_TEXT],
+                differences(runs, asked, measure),
+                [picture] if measure == "late" else [],
+            )
+            for measure, when in MEASURES.items()
+        ]
     return sections
 
 
-def _overview(runs: pd.DataFrame) -> pd.DataFrame:
+def overview(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return one row for each controller; see `OVERVIEW_TEXT`."""
     rows = []
     for agent, group in groups(runs, "agent"):
         ratio = group.groupby("plant")["ratio"].median().dropna()
@@ -155,9 +137,10 @@ def _overview(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _differences(
+def differences(
     runs: pd.DataFrame, pairs: Sequence[tuple[str, str]], measure: str
 ) -> pd.DataFrame:
+    """Return one row for each group of plants, one column for each pair of controllers."""
     drifting = runs[runs["gain_drift"].notna()]
     groups = {"no drift": runs[runs["gain_drift"].isna()], "all that drift": drifting}
     for name, column, low, high in GROUPS:

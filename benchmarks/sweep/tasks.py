@@ -32,22 +32,9 @@ def limit_task(plant: Arguments, samples: int) -> dict[str, float | None]:
 def agent_task(
     factory: Factory, nominal: Arguments, plant: Arguments, samples: int, runs: int, seed: int
 ) -> dict[str, list[float]]:
-    """Run a controller on a plant that it was not made for.
+    """Run a controller that is made for the nominal plant, and told about it, on another.
 
-    Parameters
-    ----------
-    factory
-        Makes the controller.
-    nominal
-        The plant that it is made for, and told about.
-    plant
-        The plant that it runs on.
-    samples
-        Length of a run.
-    runs
-        How many; run i has the noise, and the initial weights, of seed `seed + i`.
-    seed
-        The first.
+    Run i has the noise, and the initial weights, of seed `seed + i`.
 
     Returns
     -------
@@ -59,22 +46,24 @@ def agent_task(
     case = {**plant, **SETPOINT}
     plants = make_plants(runs, samples, **factory.arguments(case))
     trajectory = rollout(plants, controller, samples, seed)
-    error = trajectory.setpoint - trajectory.output
     steady = steady_stretches(trajectory.setpoint[:, 0])
     measures = {
         **measure(trajectory, Parameters(**case)),
         "late": np.abs(trajectory.error[samples // 2 :]).mean(axis=0),
-        "swing": _swing(error, steady),
+        "swing": swing(trajectory.setpoint - trajectory.output, steady),
     }
     return {name: values.tolist() for name, values in measures.items()}
 
 
-def _swing(error: NDArray[np.float64], steady: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the deviation of the error within each stretch, in the mean square of all."""
+def swing(error: NDArray[np.float64], steady: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the deviation of the error within each stretch, in the mean square of all.
+
+    The error has the shape (samples, runs), `steady` the shape (samples,).
+    """
     edges = np.flatnonzero(np.diff(steady, prepend=False, append=False))
     variances = [
         error[start:stop].var(axis=0)
         for start, stop in zip(edges[::2], edges[1::2], strict=True)
     ]
-    swing: NDArray[np.float64] = np.sqrt(np.mean(variances, axis=0))
-    return swing
+    deviation: NDArray[np.float64] = np.sqrt(np.mean(variances, axis=0))
+    return deviation
