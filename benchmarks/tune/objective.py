@@ -53,20 +53,10 @@ def score(
     penalty: float = Tuning.penalty,
     plant: Mapping[str, Any] | None = None,
 ) -> dict[str, float]:
-    """Judge a controller on the tuning scenarios.
+    """Judge a controller on the tuning scenarios, each of so many runs.
 
-    Parameters
-    ----------
-    factory
-        Makes the controller.
-    runs
-        Of each scenario.
-    first_run
-        Seed of the first; every scenario has seeds of its own.
-    penalty
-        For failing to settle, degC.
-    plant
-        Arguments of the environment, if it is not the paper's plant.
+    `first_run` is the seed of the first; every scenario has seeds of its own. The penalty,
+    degC, is for failing to settle. A plant that is not the paper's is given by its arguments.
 
     Returns
     -------

@@ -15,8 +15,7 @@ import pandas as pd
 from optuna.distributions import BaseDistribution, FloatDistribution
 from tqdm import tqdm
 
-from benchmarks.controllers.records import RosterEntry, Tuning
-from benchmarks.controllers.roster import ROSTER, label
+from benchmarks.controllers.records import RosterEntry
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import code, fingerprint
 from benchmarks.lib.storage import seal, unseal, write_text
@@ -31,29 +30,22 @@ DIGITS = 3  # significant, of the gains that are proposed
 
 def _score(
     controller: RosterEntry,
-    gains: dict[str, float],
     runs: int,
     first_run: int,
     plant: Mapping[str, Any],
+    gains: dict[str, float],
     *,
     final: bool,
     member: int,
 ) -> dict[str, float]:
-    tuning = tuning_of(controller)
+    tuning = controller.tuning
+    assert tuning is not None
     if tuning.train is None:
         (factory,) = controller.members()
         factory = replace(factory, make=partial(factory.make, **gains))
     else:
         factory = tuning.train(**gains, final=final, member=member)
     return score(factory, runs, first_run, tuning.penalty, plant)
-
-
-def tuning_of(controller: RosterEntry) -> Tuning:
-    """Return how a controller's gains are searched; ValueError if they are not."""
-    if controller.tuning is None:
-        tuned = ", ".join(name for name, each in ROSTER.items() if each.tuning)
-        raise ValueError(f"no gains of {controller.name!r} to search; there are {tuned}")
-    return controller.tuning
 
 
 class Search:
@@ -88,40 +80,32 @@ class Search:
         fan_out: FanOut,
         plant: Mapping[str, Any] | None = None,
     ) -> None:
+        assert controller.tuning is not None
         self.path = folder / f"{controller.name}.csv"
-        self._plant = dict(plant or {})
-        self._runs = runs
+        self._kept = self.path.with_suffix(".json")
         self._controller = controller
+        self._tuning = controller.tuning
+        self._runs = runs
         self._fan_out = fan_out
-        self._tuning = tuning_of(controller)
+        self._plant = dict(plant or {})
         space = self._tuning.space
         self._space: dict[str, BaseDistribution] = {
             name: FloatDistribution(*ends, log=True) for name, ends in space.items()
         }
-        self._study = optuna.create_study()
-        self._rows: list[dict[str, float]] = []
-        # In the form in which JSON gives it back.
-        self._settings = json.loads(
-            json.dumps(
-                {
-                    "runs": runs,
-                    "plant": self._plant,
-                    "seed": SEED,
-                    "first run": FIRST_RUN,
-                    "space": {name: list(ends) for name, ends in space.items()},
-                    "scenarios": {
-                        s.name: [s.samples, first, s.arguments] for s, first in SCENARIOS
-                    },
-                    "penalty": self._tuning.penalty,
-                    "startup": self._tuning.startup,
-                    "Optuna": optuna.__version__,
-                    "code": self._code(),
-                }
-            )
-        )
-        self._kept = self.path.with_suffix(".json")
-        for row in self._earlier():
-            self._add(row)
+        settings = {
+            "runs": runs,
+            "plant": self._plant,
+            "seed": SEED,
+            "first run": FIRST_RUN,
+            "space": space,
+            "scenarios": {s.name: [s.samples, first, s.arguments] for s, first in SCENARIOS},
+            "penalty": self._tuning.penalty,
+            "startup": self._tuning.startup,
+            "Optuna": optuna.__version__,
+            "code": self._code(),
+        }
+        self._settings = json.loads(json.dumps(settings))  # in the form in which it comes back
+        self._rows = self._earlier()
 
     def _code(self) -> str:
         """Return a hash of the code that makes and judges the controller."""
@@ -133,7 +117,8 @@ class Search:
 
     def _earlier(self) -> list[dict[str, float]]:
         """Return the trials that are kept, if they are of this search."""
-        begin_anew = f"remove {self.path} and {self._kept}, or choose another folder"
+        files = f"{self.path} and {self._kept}"
+        begin_anew = f"to begin anew, remove {files}, or choose another folder"
         try:
             kept = unseal(self._kept.read_text(encoding="utf-8"))
             earlier, rows = kept["settings"], kept["trials"]
@@ -141,18 +126,15 @@ class Search:
             if self.path.exists():
                 raise ValueError(
                     f"{self._kept}, which {self.path} goes on from, is missing: bring it back; "
-                    f"or, to begin anew, {begin_anew}"
+                    f"or, {begin_anew}"
                 ) from error
             return []
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"{self._kept} is damaged ({error}): to begin anew, {begin_anew}"
-            ) from error
+            raise ValueError(f"{self._kept} is damaged ({error}): {begin_anew}") from error
         changed = [name for name in self._settings if self._settings[name] != earlier.get(name)]
         if changed:
             raise ValueError(
-                f"{self._kept} is of a search with other {', '.join(changed)}: to begin anew, "
-                f"{begin_anew}"
+                f"{self._kept} is of a search with other {', '.join(changed)}: {begin_anew}"
             )
         return list(rows)
 
@@ -161,52 +143,48 @@ class Search:
         """One row a trial: the gains, and what `score` says of them."""
         return pd.DataFrame(self._rows)
 
-    def _add(self, row: dict[str, float]) -> None:
-        gains = {name: row[name] for name in self._space}
-        self._study.add_trial(
-            optuna.trial.create_trial(
-                params=gains, distributions=self._space, value=row["objective"]
-            )
-        )
-        self._rows.append(row)
-
     def run(self, trials: int) -> None:
         """Try gains until `trials` have been tried in all."""
         with tqdm(total=trials, initial=len(self._rows), desc=self._controller.name) as bar:
             while len(self._rows) < trials:
-                self._add(self._try())
+                gains = self._next()
+                (judged,) = self._judge([gains], self._runs, FIRST_RUN, final=False)
+                self._rows.append({**gains, **judged})
                 write_text(self._kept, seal({"settings": self._settings, "trials": self._rows}))
                 write_csv(self.path, self.trials)
-                bar.set_postfix(best=f"{self._study.best_value:.3f}")
+                bar.set_postfix(best=f"{self.trials['objective'].min():.3f}")
                 bar.update()
 
-    def _try(self) -> dict[str, float]:
-        # The sampler starts anew from the search's seed and the trial's number, so that a
-        # search that was interrupted goes on as it would have gone.
-        seed = SEED * 1_000_000 + len(self._rows)
+    def _next(self) -> dict[str, float]:
+        """Return the gains to try next.
+
+        The sampler starts anew from the search's seed and the trial's number, so that a search
+        that was interrupted goes on as it would have gone.
+        """
         sampler = optuna.samplers.TPESampler(
-            seed=seed, n_startup_trials=self._tuning.startup, multivariate=True
+            seed=SEED * 1_000_000 + len(self._rows),
+            n_startup_trials=self._tuning.startup,
+            multivariate=True,
         )
-        asking = optuna.create_study(sampler=sampler)
-        asking.add_trials(self._study.trials)
-        gains = asking.ask(self._space).params
-        return {**gains, **self._judge([gains], self._runs, FIRST_RUN, final=False)[0]}
+        study = optuna.create_study(sampler=sampler)
+        for row in self._rows:
+            gains = {name: row[name] for name in self._space}
+            study.add_trial(
+                optuna.trial.create_trial(
+                    params=gains, distributions=self._space, value=row["objective"]
+                )
+            )
+        return study.ask(self._space).params
 
     def _judge(
         self, candidates: list[dict[str, float]], runs: int, first_run: int, *, final: bool
     ) -> list[dict[str, float]]:
         """Return, for each of the candidates, the mean of its members' scores."""
         members = self._tuning.members[final]
+        settings = self._controller, runs, first_run, self._plant
         tasks = {
             f"candidate {i}, member {member}": partial(
-                _score,
-                self._controller,
-                gains,
-                runs,
-                first_run,
-                self._plant,
-                final=final,
-                member=member,
+                _score, *settings, gains, final=final, member=member
             )
             for i, gains in enumerate(candidates)
             for member in range(members)
@@ -221,14 +199,10 @@ class Search:
         ]
 
     def report(self, trials: int) -> pd.DataFrame:
-        """Judge the best gains again, rounded and on new runs, and write them, best first.
+        """Judge the best of so many trials again, rounded and on new runs, and write them.
 
         The best gains of a search owe some of their result to luck; new runs show how much.
-
-        Parameters
-        ----------
-        trials
-            How many of the trials count.
+        They are returned, too, best first.
         """
         best = self.trials.head(trials).nsmallest(self._tuning.finalists, "objective")
         candidates = [
@@ -236,13 +210,9 @@ class Search:
             for _, trial in best.iterrows()
         ]
         again = self._judge(candidates, FINAL_RUNS, FINAL_FIRST_RUN, final=True)
-        rows: list[dict[str, Any]] = [
-            {**gains, **judged, "in the search": objective}
-            for gains, judged, objective in zip(
-                candidates, again, best["objective"], strict=True
-            )
-        ]
-        table = pd.DataFrame(rows).sort_values("objective", ignore_index=True)
+        table = pd.concat([pd.DataFrame(candidates), pd.DataFrame(again)], axis=1)
+        table["in the search"] = best["objective"].to_numpy()
+        table = table.sort_values("objective", ignore_index=True)
         write_text(self.path.with_suffix(".md"), self._page(table, trials))
         return table
 
@@ -256,7 +226,7 @@ class Search:
         penalty = self._tuning.penalty
         return "\n\n".join(
             [
-                f"# Gains: {label(self._controller.name)}",
+                f"# Gains: {self._controller.label}",
                 f"By `python -m benchmarks.tune {self._controller.name} --trials {trials} "
                 f"--runs {self._runs}`. In each scenario: the median over runs of the mean "
                 f"absolute error, °C. The objective is their mean, plus {penalty:g} °C times "
