@@ -16,14 +16,7 @@ import pandas as pd
 from rich.console import Console
 
 import mptc_gym
-from benchmarks.datasets.history import (
-    BEHAVIOURS,
-    PLANTS,
-    History,
-    arguments_of,
-    record,
-    scale,
-)
+from benchmarks.datasets.history import BEHAVIOURS, PLANTS, History, arguments_of, record, scale
 from benchmarks.datasets.options import SAMPLES, Options
 from benchmarks.lib.command_line import UsageError, known, out_folder
 from benchmarks.lib.tables import on_screen
@@ -57,18 +50,15 @@ def execute(options: Options, console: Console) -> str:
             f"{VARIABLE}: {error.filename} cannot be written to: {error.strerror}"
         ) from error
     out_folder(root, VARIABLE)
+    given = options.episodes
     for name in ids:
         needed = len(BEHAVIOURS[IDS[name][1]])  # one for each controller
-        if options.episodes < needed:
-            raise UsageError(
-                f"--episodes: episodes must be at least {needed} for {name}, "
-                f"got {options.episodes}"
-            )
+        if given < needed:
+            text = f"episodes must be at least {needed} for {name}, got {given}"
+            raise UsageError(f"--episodes: {text}")
     rows = []
     for name in ids:
-        plant, behaviour = IDS[name]
-        history = record(plant, behaviour, options.episodes)
-        judged_by = scale(plant)
+        history, judged_by = record(*IDS[name], given), scale(IDS[name][0])
         write(name, history, judged_by)
         rows.append(
             {
@@ -88,36 +78,41 @@ def execute(options: Options, console: Console) -> str:
 def write(name: str, history: History, judged_by: Evaluation) -> None:
     """Write a data set, whole or not at all, in place of one that has its name.
 
-    Parameters
-    ----------
-    name
-        Its id, `namespace/name-v0`.
-    history
-        Its episodes.
-    judged_by
-        Goes into its metadata.
+    The name is its id, `namespace/name-v0`. What it is judged by goes into its metadata.
     """
     from minari.storage import get_dataset_path
 
     root, place = get_dataset_path(), get_dataset_path(name)
     # Minari does not list what is in a hidden folder.
     with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as partial:
-        _create(Path(partial), name, history, judged_by)
+        with _datasets_at(partial):
+            _create(name, history, judged_by)
         if place.exists():
             shutil.rmtree(place)
         place.parent.mkdir(parents=True, exist_ok=True)
         (Path(partial) / name).replace(place)
 
 
-def _create(root: Path, name: str, history: History, judged_by: Evaluation) -> None:
-    """Make a data set in a folder of its own."""
+@contextmanager
+def _datasets_at(root: str) -> Iterator[None]:
+    """Have Minari keep data sets in a folder; it takes none as an argument."""
+    kept = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = root
+    try:
+        yield
+    finally:
+        del os.environ[VARIABLE]
+        if kept is not None:
+            os.environ[VARIABLE] = kept
+
+
+def _create(name: str, history: History, judged_by: Evaluation) -> None:
     import minari
     from minari.data_collector import EpisodeBuffer
 
     assert judged_by.least is not None
     arguments = arguments_of(history.plant)
     env = gymnasium.make("MiddlePoint-v0", max_episode_steps=SAMPLES, **arguments)
-    ended = [False] * (SAMPLES - 1) + [True]
     episodes = [
         EpisodeBuffer(
             seed=seed,
@@ -125,7 +120,7 @@ def _create(root: Path, name: str, history: History, judged_by: Evaluation) -> N
             actions=actions,
             rewards=rewards,
             terminations=[False] * SAMPLES,
-            truncations=ended,
+            truncations=[False] * (SAMPLES - 1) + [True],
             infos={},
         )
         for seed, observations, actions, rewards in zip(
@@ -133,7 +128,7 @@ def _create(root: Path, name: str, history: History, judged_by: Evaluation) -> N
         )
     ]
     controllers = ", ".join(dict.fromkeys(history.controllers))
-    with _datasets_at(root), warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what it is not told: an address
         dataset = minari.create_dataset_from_buffers(
             name,
@@ -163,16 +158,3 @@ def _create(root: Path, name: str, history: History, judged_by: Evaluation) -> N
     dataset.storage.update_episode_metadata(
         [{"controller": controller} for controller in history.controllers]
     )
-
-
-@contextmanager
-def _datasets_at(root: Path) -> Iterator[None]:
-    """Have Minari keep data sets in a folder; it takes none as an argument."""
-    kept = os.environ.get(VARIABLE)
-    os.environ[VARIABLE] = str(root)
-    try:
-        yield
-    finally:
-        del os.environ[VARIABLE]
-        if kept is not None:
-            os.environ[VARIABLE] = kept

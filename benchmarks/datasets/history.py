@@ -38,30 +38,19 @@ ARGUMENTS = {
 
 @dataclass(frozen=True)
 class History:
-    """Episodes of one plant, each under one controller.
-
-    Attributes
-    ----------
-    plant
-        A name in `PRESETS`.
-    controllers
-        Name of the controller of each episode.
-    seeds
-        Of each episode: what `reset(seed=...)` takes.
-    observations
-        Shape (episodes, SAMPLES + 1, n_obs), float32; from k = 0 on.
-    actions
-        Shape (episodes, SAMPLES, 1), float32, within [-1, 1].
-    rewards
-        -|e(k+1)|, degC, shape (episodes, SAMPLES), float64.
-    """
+    """Episodes of one plant, each under one controller."""
 
     plant: str
+    """A name in `PRESETS`."""
     controllers: list[str]
+    """Of each episode, as the seeds are."""
     seeds: list[int]
     observations: NDArray[np.float32]
+    """Shape (episodes, SAMPLES + 1, n_obs); from k = 0 on."""
     actions: NDArray[np.float32]
+    """Shape (episodes, SAMPLES, 1), within [-1, 1]."""
     rewards: NDArray[np.float64]
+    """-|e(k+1)|, degC, shape (episodes, SAMPLES)."""
 
     @property
     def error(self) -> float:
@@ -85,48 +74,35 @@ def arguments_of(plant: str) -> dict[str, Any]:
 
 
 def record(plant: str, behaviour: str, episodes: int = EPISODES, seed: int = SEED) -> History:
-    """Log a plant under one or several controllers.
+    """Log one of `PLANTS` under one or several controllers, as `BEHAVIOURS` name them.
 
-    Parameters
-    ----------
-    plant
-        One of `PLANTS`.
-    behaviour
-        A name in `BEHAVIOURS`.
-    episodes
-        How many; episode i is the one that the environment draws with seed `seed + i`.
-    seed
-        Of the first episode.
+    Episode i is the one that the environment draws with seed `seed + i`.
 
     Raises
     ------
     ValueError
         If there is no such plant or behaviour, or no episode for one of its controllers.
     """
-    for name, value, known in (
-        ("plant", plant, PLANTS),
-        ("behaviour", behaviour, tuple(BEHAVIOURS)),
-    ):
-        if value not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    known = {"plant": (plant, PLANTS), "behaviour": (behaviour, BEHAVIOURS)}
+    for argument, (value, values) in known.items():
+        if value not in values:
+            raise ValueError(f"{argument} must be one of {', '.join(values)}, got {value!r}")
     names = BEHAVIOURS[behaviour]
     if episodes < len(names):
         raise ValueError(f"episodes must be at least {len(names)}, got {episodes!r}")
-    controllers = [names[i % len(names)] for i in range(episodes)]
-    seeds = [seed + i for i in range(episodes)]
     arguments = arguments_of(plant)
     size = Parameters(**arguments).observation_size
     history = History(
         plant,
-        controllers,
-        seeds,
+        [names[i % len(names)] for i in range(episodes)],
+        [seed + i for i in range(episodes)],
         np.empty((episodes, SAMPLES + 1, size), np.float32),
         np.empty((episodes, SAMPLES, 1), np.float32),
         np.empty((episodes, SAMPLES)),
     )
     for j, name in enumerate(names):
         which = slice(j, episodes, len(names))
-        own = seeds[which]
+        own = history.seeds[which]
         plants = _Recorder(make_plants(len(own), SAMPLES, **arguments), own)
         (factory,) = ROSTER[name].members()
         controller = factory.in_service(arguments, len(own), seed)
@@ -158,15 +134,14 @@ class _Recorder(VectorWrapper):
         self.rewards: list[NDArray[np.float64]] = []
 
     def reset(self, **_: Any) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        observations, infos = self.env.reset(seed=self._seeds)  # type: ignore[arg-type]
-        self.observations.append(observations)
-        return observations, infos
+        found = self.env.reset(seed=self._seeds)  # type: ignore[arg-type]
+        self.observations.append(found[0])
+        return found
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         # Beyond +-1 the actuator saturates, so that this changes nothing that the plant does.
-        taken = np.clip(actions, -1.0, 1.0).astype(np.float32)
-        observations, rewards, terminations, truncations, infos = self.env.step(taken)
-        self.observations.append(observations)
-        self.actions.append(taken)
-        self.rewards.append(rewards)
-        return observations, rewards, terminations, truncations, infos
+        self.actions.append(np.clip(actions, -1.0, 1.0).astype(np.float32))
+        found = self.env.step(self.actions[-1])
+        self.observations.append(found[0])
+        self.rewards.append(found[1])
+        return found
