@@ -23,22 +23,14 @@ from benchmarks.lib.storage import ROOT, versions
 
 PACKAGES = ("agents", "benchmarks")  # whose code counts
 SAMPLES = 60  # of each trajectory
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def fingerprint(*modules: str, **shaped_by: Any) -> str:
-    """Return a name for what modules compute.
+    """Return sixteen hexadecimal digits that name what modules compute.
 
-    Parameters
-    ----------
-    *modules
-        Their names. What they import of `agents` and `benchmarks` counts, too.
-    **shaped_by
-        All else that shapes the result, in a form for JSON.
-
-    Returns
-    -------
-    str
-        Sixteen hexadecimal digits.
+    What they import of `agents` and `benchmarks` counts, too, and all else that shapes the
+    result, in a form for JSON.
     """
     everything = {
         **shaped_by,
@@ -84,18 +76,9 @@ def code(module: str) -> str:
     """Return a hash of a module's code without comments, docstrings and layout."""
     tree = _tree(module)
     for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list) and body and _is_docstring(body[0]):
-            node.body = body[1:] or [ast.Pass()]  # type: ignore[attr-defined]
+        if isinstance(node, DOCUMENTED) and ast.get_docstring(node) is not None:
+            del node.body[0]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
-
-
-def _is_docstring(node: ast.AST) -> bool:
-    return (
-        isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )
 
 
 @cache
@@ -117,8 +100,7 @@ def _tree(module: str) -> ast.Module:
 
 
 def _file(module: str) -> Path | None:
-    if module.partition(".")[0] not in PACKAGES:
-        return None
     path = ROOT.joinpath(*module.split("."))
-    candidates = (path.with_suffix(".py"), path / "__init__.py")
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    files = (path.with_suffix(".py"), path / "__init__.py")
+    ours = module.partition(".")[0] in PACKAGES
+    return next((file for file in files if ours and file.is_file()), None)

@@ -61,18 +61,9 @@ def reads(
     *,
     many: int = 0,
 ) -> Parameter:
-    """Return how to read a number, or several.
+    """Return how to read a number within limits, or `many` of them.
 
-    Parameters
-    ----------
-    kind
-        Makes a number of a text.
-    what
-        Names what it must be in messages.
-    least, most
-        Its limits.
-    many
-        How many numbers there are; 0 for a single one.
+    `kind` makes a number of a text; `what` names what it must be in messages.
     """
 
     def convert(text: str) -> Any:
@@ -95,14 +86,14 @@ def reads(
 
 def choice(names: Collection[str], text: str) -> Parameter:
     """Return how to read one of the names that a help text lists."""
+    listed = ", ".join(names)
 
-    def convert(_type: object, tokens: Sequence[Token]) -> str:
-        text = tokens[0].value
-        if text not in names:
-            raise ValueError(f"no {text!r}; there are {', '.join(names)}")
-        return text
+    def convert(_: object, tokens: Sequence[Token]) -> str:
+        if tokens[0].value not in names:
+            raise ValueError(f"no {tokens[0].value!r}; there are {listed}")
+        return tokens[0].value
 
-    return Parameter(converter=convert, n_tokens=1, help=f"{text}: {', '.join(names)}.")
+    return Parameter(converter=convert, n_tokens=1, help=f"{text}: {listed}.")
 
 
 Count = Annotated[int, reads(int, "an integer of at least 1", 1, 1_000_000_000)]
@@ -145,21 +136,10 @@ class _Help(DefaultFormatter):
 
 
 def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | None:
-    """Read a command line; None if it asked for help, which is printed then.
+    """Read what was given to a program into a dataclass of options.
 
-    Parameters
-    ----------
-    declared
-        A dataclass of options. Its docstring is the description in the help.
-    program
-        What is called.
-    given
-        The rest of the command line.
-
-    Raises
-    ------
-    UsageError
-        If an option is unknown, or its value does not fit.
+    The docstring of the dataclass is the description in the help. If that was asked for, it is
+    printed, and None comes back. An option that does not fit is a `UsageError`.
     """
     paragraphs = (inspect.getdoc(declared) or "").split("\n\n")
     app = App(

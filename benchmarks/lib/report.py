@@ -7,7 +7,7 @@ import html
 import re
 import shlex
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,13 +116,6 @@ def _html(folder: Path, title: str, sections: Sequence[Section], made: str) -> s
 
 def _html_table(table: pd.DataFrame) -> str:
     """Return a table in HTML, with intervals small and below their numbers."""
-
-    def row(tag: str, texts: Iterable[object]) -> str:
-        cells = [
-            _INTERVAL.sub(r'<span class="interval">\1</span>', html.escape(str(text)))
-            for text in texts
-        ]
-        return f"<tr>{''.join(f'<{tag}>{cell}</{tag}>' for cell in cells)}</tr>"
-
-    body = "".join(row("td", each) for each in table.itertuples(index=False))
-    return f"<table><thead>{row('th', table.columns)}</thead><tbody>{body}</tbody></table>"
+    with pd.option_context("display.max_colwidth", None):
+        text = table.to_html(index=False, border=0)
+    return _INTERVAL.sub(r'<span class="interval">\1</span>', text)
