@@ -3,6 +3,7 @@
 import _pyio
 import errno
 import io
+import itertools
 import json
 import math
 import os
@@ -32,6 +33,7 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage, tables
 from benchmarks.lib.drawing import drawn
 from benchmarks.lib.report import Section, write_report
+from benchmarks.lib.statistics import Estimate
 from benchmarks.limits import least_possible
 from benchmarks.loop.metrics import METRICS, measure
 from benchmarks.loop.rollout import Trajectory, make_plants, rollout
@@ -67,19 +69,20 @@ class TestMeasures:
         values = measured(trajectory([0, -4, -4], [9, 0, -5]))
         assert values["overshoot"] == pytest.approx(25)
 
-    def test_settling(self):
-        # Within 5 % of 10 from the third sample after the change on.
-        assert measured(trajectory([10] * 5, [0, 9.6, 9.49, 9.51, 10.5]))["settling_time"] == 3
-        # Of two changes the longer counts: 1 sample, then 2.
-        two = trajectory([10, 10, 10, 0, 0, 0], [0, 10, 10, 10, 10, 0])
-        assert measured(two)["settling_time"] == 2
-
     @pytest.mark.parametrize(
-        "output", [[0, 10, 10, 9, 0, 0], [0, 10, 10, 10, 1, 2], [0, 0, 0, 0, 0, 0]]
+        ("setpoint", "output", "time"),
+        [
+            # Within 5 % of 10 from the third sample after the change on.
+            ([10] * 5, [0, 9.6, 9.49, 9.51, 10.5], 3),
+            # Of two changes the longer counts: 1 sample, then 2.
+            ([10, 10, 10, 0, 0, 0], [0, 10, 10, 10, 10, 0], 2),
+            ([10, 10, 10, 10, 0, 0], [0, 10, 10, 9, 0, 0], math.inf),
+            ([10, 10, 10, 10, 0, 0], [0, 10, 10, 10, 1, 2], math.inf),
+            ([10, 10, 10, 10, 0, 0], [0, 0, 0, 0, 0, 0], math.inf),
+        ],
     )
-    def test_not_settled(self, output):
-        runs = trajectory([10, 10, 10, 10, 0, 0], output)
-        assert measured(runs)["settling_time"] == math.inf
+    def test_settling(self, setpoint, output, time):
+        assert measured(trajectory(setpoint, output))["settling_time"] == time
 
     def test_input_by_hand(self):
         commands = [6, 4.9, 5, -12, -10, -4]
@@ -105,17 +108,23 @@ class TestMeasures:
 
 
 class TestTables:
-    def test_percentiles(self):
-        values = tables.percentiles(np.arange(11.0))
-        assert values == {"median": 5.0, "p10": 1.0, "p90": 9.0}
+    @pytest.mark.parametrize(
+        ("values", "expected"),
+        [(np.arange(11.0), (5.0, 1.0, 9.0)), ([1.0, 2.0, 3.0, np.inf], (3.0, 2.0, np.inf))],
+        ids=["all settle", "some do not"],
+    )
+    def test_percentiles(self, values, expected):
+        found = tables.percentiles(np.array(values))
+        assert found == dict(zip(("median", "p10", "p90"), expected, strict=True))
 
-    def test_percentiles_of_some_that_do_not_settle(self):
-        values = tables.percentiles(np.array([1.0, 2.0, 3.0, np.inf]))
-        assert values == {"median": 3.0, "p10": 2.0, "p90": np.inf}
-
-    def test_not_settled_is_written_in_words(self):
-        table = compare_tables.for_csv(pd.DataFrame({"a": ["x", "y"], "s": [1.5, np.inf]}))
-        assert table.to_csv(index=False) == "a,s\nx,1.5\ny,not settled\n"
+    def test_of_numbers_and_estimates_in_csv(self):
+        columns = {
+            "a": ["x", "y"],
+            "s": [1.5, np.inf],
+            "e": [Estimate(2.0, 1.0, 3.0, 4), np.nan],
+        }
+        table = compare_tables.for_csv(pd.DataFrame(columns)).to_csv(index=False)
+        assert table == "a,s,e,e_low,e_high\nx,1.5,2.0,1.0,3.0\ny,not settled,,,\n"
 
 
 def some_runs(**errors):
@@ -233,33 +242,23 @@ class TestScenarios:
         assert all(name == scenario.name for name, scenario in SCENARIOS.items())
 
 
-def test_a_wrong_shape_of_actions_is_named():
+def acting(actions):
+    """Return a controller that always acts like this."""
     agent = PIController()
-    agent.act = lambda observation: np.zeros(3)
+    agent.act = lambda observation: np.array(actions)
+    return agent
+
+
+def test_a_wrong_shape_of_actions_is_named():
     with pytest.raises(ValueError, match=r"shape \(2, 1\), got \(3,\)"):
-        rollout(make_plants(2, 10), agent, 10, seed=0)
+        rollout(make_plants(2, 10), acting([0.0, 0.0, 0.0]), 10, seed=0)
 
 
-class Constant:
-    """Always the same action."""
-
-    def __init__(self, action):
-        self.action = action
-
-    def reset(self):
-        """Nothing to forget."""
-
-    def act(self, observation):
-        return np.full((len(observation), 1), self.action, np.float32)
-
-
-class TestRollout:
-    def test_samples_line_up(self):
-        plants = make_plants(2, 50, setpoint=5.0)
-        runs = rollout(plants, Constant(-1.0), 50, seed=0)
-        assert np.all(runs.command == -10.0)  # u(0) is in row 0 ...
-        assert np.all(runs.output[:19] == 0.0)
-        assert np.all(runs.output[19] == pytest.approx(0.456))  # ... and shows in row 19
+def test_samples_line_up():
+    runs = rollout(make_plants(2, 50, setpoint=5.0), acting([[-1.0], [-1.0]]), 50, seed=0)
+    assert np.all(runs.command == -10.0)  # u(0) is in row 0 ...
+    assert np.all(runs.output[:19] == 0.0)
+    assert np.all(runs.output[19] == pytest.approx(0.456))  # ... and shows in row 19
 
 
 class TestStorage:
@@ -457,9 +456,7 @@ class TestCompare:
         assert row in re.sub(" +", " ", (tmp_path / "report.md").read_text())
 
     def test_ppo_is_trained_once(self, tmp_path, monkeypatch, capsys):
-        monkeypatch.setattr(
-            ppo.PPOArguments, "__init__", _with_defaults(ppo.PPOArguments.__init__, SMALL)
-        )
+        monkeypatch.setattr(ppo, "PPOArguments", lambda: SMALL)
         monkeypatch.setattr(ppo, "POLICIES", 2)
         options = ("--agents", "ppo", "--scenarios", "constant", "--runs", 1)
         options += ("--training-steps", 256)
@@ -475,16 +472,11 @@ class TestCompare:
         runs = pd.read_csv(tmp_path / "one/runs.csv")
         assert list(runs["policy"]) == [0, 1]
 
-        with monkeypatch.context() as patch:
-            patch.setattr(ppo_training.PPO, "learn", None)  # training again would raise
-            assert run_compare(tmp_path / "two", *options) == 0
-        assert (tmp_path / "one/runs.csv").read_text() == (
-            tmp_path / "two/runs.csv"
-        ).read_text()
-        with monkeypatch.context() as patch:
-            patch.setattr(ppo_training.PPO, "learn", None)
-            assert run_compare(tmp_path / "three", *options, "--retrain") == 1
-            assert "policy.npz: TypeError" in capsys.readouterr().out
+        monkeypatch.setattr(ppo_training.PPO, "learn", None)  # training again would raise
+        assert run_compare(tmp_path / "two", *options) == 0
+        pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "two/runs.csv"), runs)
+        assert run_compare(tmp_path / "three", *options, "--retrain") == 1
+        assert "policy.npz: TypeError" in capsys.readouterr().out
 
     def test_the_example_of_the_page(self, tmp_path, monkeypatch):
         readme = (ROOT / "benchmarks/compare/README.md").read_text(encoding="utf-8")
@@ -514,12 +506,10 @@ class TestCompare:
         }  # fmt: skip
 
     def run_and_stop(self, out, monkeypatch, error, after):
-        calls = 0
+        calls = itertools.count()
 
         def stopped(*arguments):
-            nonlocal calls
-            calls += 1
-            if calls > after:
+            if next(calls) >= after:
                 raise error
             return rollout(*arguments)
 
@@ -688,10 +678,3 @@ class TestOtherPlants:
         assert main([*options, "--set", "delay=30"]) == 0
         (folder,) = (tmp_path / "results").iterdir()
         assert folder.name == "compare-pi-constant-delay-30-1-runs"
-
-
-def _with_defaults(init, defaults):
-    def initialise(self, **given):
-        init(self, **(vars(defaults) | given))
-
-    return initialise

@@ -1,7 +1,5 @@
 """Offline data sets: what was logged can be replayed, and scored on an absolute scale."""
 
-import json
-
 import gymnasium
 import numpy as np
 import pytest
@@ -9,7 +7,7 @@ import pytest
 from agents import PIController
 from benchmarks.datasets import history
 from benchmarks.datasets.__main__ import main
-from mptc_gym import PRESETS, evaluate
+from mptc_gym import evaluate
 from mptc_gym.plant import action_from_command
 from tests.conftest import python
 
@@ -39,10 +37,8 @@ def test_the_recorded_actions_give_the_recorded_observations(name, minari, tmp_p
             observation, reward, terminated, truncated, _ = env.step(action)
             assert np.array_equal(observation, episode.observations[k + 1])
             assert reward == episode.rewards[k]
-            assert (terminated, truncated) == (
-                episode.terminations[k],
-                episode.truncations[k],
-            )
+            ended = episode.terminations[k], episode.truncations[k]
+            assert (terminated, truncated) == ended
         assert truncated
 
 
@@ -85,7 +81,6 @@ def test_the_hash_is_of_the_content_and_the_same_in_every_process():
 def test_the_scale_is_of_the_episodes_it_names():
     judged_by = history.scale("paper", episodes=2)
     arguments = history.arguments_of("paper")
-    assert arguments.items() >= PRESETS["paper"].items()
     # By hand, one plant after the other, with the valve left alone and with a good controller.
     idle, smith = [], history.record("paper", "smith", 2, judged_by.seeds[0])
     for seed in judged_by.seeds:
@@ -96,11 +91,6 @@ def test_the_scale_is_of_the_episodes_it_names():
     assert judged_by.mean_error == pytest.approx(np.mean(idle))
     assert 0.0 < judged_by.least_possible < smith.error < judged_by.mean_error
     assert not set(judged_by.seeds) & set(range(history.SEED, history.SEED + 10_000))
-
-
-@pytest.mark.parametrize("plant", history.PLANTS)
-def test_every_plant_has_a_scale(plant):
-    assert history.scale(plant).score == pytest.approx(0.0)
 
 
 def test_the_metadata_scores_a_learner(minari):
@@ -159,9 +149,3 @@ def test_bad_names_are_named():
         history.record("hard", "pi")
     with pytest.raises(ValueError, match="behaviour must be one of pi"):
         history.record("paper", "expert")
-
-
-def test_the_arguments_are_json():
-    for plant in history.PLANTS:
-        arguments = history.arguments_of(plant)
-        assert json.loads(json.dumps(arguments)) == arguments

@@ -43,6 +43,11 @@ def run_tune(out, controller="pi", trials=6, jobs=1):
     return main([controller, *options])
 
 
+def assert_the_same(one, other):
+    for name in ("pi.csv", "pi.md"):
+        assert (one / name).read_text() == (other / name).read_text()
+
+
 def made(name, **gains):
     """Return the factory of a controller, with these gains."""
     (factory,) = ROSTER[name].members()
@@ -121,11 +126,10 @@ class TestSearch:
         self, tmp_path, monkeypatch, capsys
     ):
         run_tune(tmp_path / "whole")
-        calls, score = [], tune.score
+        calls, score = iter(range(5)), tune.score
 
         def stop_at_the_fifth(*arguments):
-            calls.append(0)
-            if len(calls) == 5:
+            if next(calls) == 4:
                 raise KeyboardInterrupt
             return score(*arguments)
 
@@ -135,20 +139,14 @@ class TestSearch:
         assert "Interrupted" in capsys.readouterr().out
         assert len(pd.read_csv(tmp_path / "halves/pi.csv")) == 4
         assert run_tune(tmp_path / "halves") == 0
-        for name in ("pi.csv", "pi.md"):
-            whole, halves = (
-                (tmp_path / folder / name).read_text() for folder in ("whole", "halves")
-            )
-            assert whole == halves
+        assert_the_same(tmp_path / "whole", tmp_path / "halves")
 
     def test_side_by_side_is_one_after_the_other(self, tmp_path, monkeypatch):
         # Other processes have the scenarios as they are.
         monkeypatch.setattr(objective, "SCENARIOS", tune.SCENARIOS)
         for jobs in (1, 2):
             run_tune(tmp_path / str(jobs), jobs=jobs)
-        for name in ("pi.csv", "pi.md"):
-            one, two = ((tmp_path / str(jobs) / name).read_text() for jobs in (1, 2))
-            assert one == two
+        assert_the_same(tmp_path / "1", tmp_path / "2")
 
     def test_it_learns_from_its_trials(self, tmp_path):
         # Otherwise other scores would bring the same gains.

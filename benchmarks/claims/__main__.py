@@ -1,10 +1,8 @@
 """Test the paper's claims: `python -m benchmarks.claims --help`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command("claims", interrupted="the claims that are done are kept.")
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))

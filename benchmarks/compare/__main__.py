@@ -1,10 +1,8 @@
 """Compare controllers, all of them on the same noise: `python -m benchmarks.compare --help`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command("compare", width=190)
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))

@@ -75,14 +75,8 @@ def travel_frontier(scenario: Scenario) -> list[tuple[float, float]]:
 def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) -> pd.DataFrame:
     """Return one row for each scenario and agent: estimates with 95 % intervals.
 
-    Parameters
-    ----------
-    runs
-        One row a run, with `scenario`, `agent`, `policy`, `seed` and `mae`.
-    scales
-        The least possible errors of each scenario.
-    reference
-        The agent that the others are compared with, run by run.
+    There is one row a run, with `scenario`, `agent`, `policy`, `seed` and `mae`. The reference
+    is the agent that the others are compared with, run by run.
 
     Returns
     -------

@@ -1,10 +1,8 @@
 """Draw counterparts of the paper's figures: `python -m benchmarks.figures --help`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command("figures", interrupted="the figures that are done are kept.")
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))

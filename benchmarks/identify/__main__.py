@@ -1,10 +1,8 @@
 """Find a plant and its controllers from a log: `python -m benchmarks.identify --help`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command("identify", interrupted="nothing is written.")
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))

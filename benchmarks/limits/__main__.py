@@ -1,10 +1,8 @@
 """Print what no controller can do better: `python -m benchmarks.limits --help`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command("limits", width=180, interrupted="bounds that are known are kept.")
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))

@@ -1,10 +1,8 @@
 """Measure the speed of the environments: `python -m benchmarks.speed --help`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command("speed", width=130, interrupted="nothing is kept.")
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))

@@ -1,7 +1,5 @@
 """Run controllers on other plants: `python -m benchmarks.sweep --help`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command(
@@ -9,4 +7,4 @@ main = command(
 )
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))

@@ -1,10 +1,8 @@
 """Train the networks that control: `python -m benchmarks.train --help`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command("train", interrupted="the same command trains what is missing.")
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))

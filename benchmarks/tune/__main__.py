@@ -1,10 +1,8 @@
 """Search a controller's gains: `python -m benchmarks.tune --help`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command("tune", interrupted="the same command goes on from here.")
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))

@@ -1,10 +1,8 @@
 """Watch a controller at work, or take its place: `python -m benchmarks.watch --help`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command("watch", interrupted="nothing is kept.")
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))

@@ -1,10 +1,8 @@
 """Identify TCLab's twin and control it: `python -m benchmarks.identify.tclab_twin`."""
 
-import sys
-
 from benchmarks.lib.command_line import command
 
 main = command("identify.tclab_twin", interrupted="nothing is kept.")
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main(None))
