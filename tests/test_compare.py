@@ -230,18 +230,6 @@ class TestReport:
         assert "http" not in html  # nothing is fetched
 
 
-class TestScenarios:
-    def test_the_cases_of_the_paper(self):
-        plants = {
-            (s.parameters.dead_zone, s.parameters.noise_variance) for s in SCENARIOS.values()
-        }
-        assert plants == {(5.0, 0.0), (7.0, 0.0), (5.0, 0.5)}
-        assert {s.parameters.setpoint for s in SCENARIOS.values()} == {"square", 5.0}
-        disturbed = [name for name, s in SCENARIOS.items() if s.parameters.is_disturbed]
-        assert disturbed == ["load"]
-        assert all(name == scenario.name for name, scenario in SCENARIOS.items())
-
-
 def acting(actions):
     """Return a controller that always acts like this."""
     agent = PIController()

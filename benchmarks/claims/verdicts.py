@@ -44,11 +44,8 @@ class Finding:
     @property
     def criterion(self) -> str:
         """What is asked, in words; empty if nothing is."""
-        asked = []
-        if self.at_least > -math.inf:
-            asked.append(f"at least {self.at_least:g}")
-        if self.at_most < math.inf:
-            asked.append(f"at most {self.at_most:g}")
+        bounds = {"at least": self.at_least, "at most": self.at_most}
+        asked = [f"{name} {bound:g}" for name, bound in bounds.items() if math.isfinite(bound)]
         return " and ".join(asked)
 
     @property

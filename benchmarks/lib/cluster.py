@@ -114,14 +114,19 @@ def _answer(task: Callable[[], Any], here: dict[str, str]) -> tuple[Any, str, bo
     ]
     if other:
         return None, f"A node would compute other numbers: it has {', '.join(other)}", True
-    try:
-        return task(), "", False
-    except Exception:
-        # As text, since not every exception survives the way to another process.
-        return None, traceback.format_exc(), False
+    return *attempt(task), False
 
 
 _versions = cache(versions)
+
+
+def attempt(task: Callable[[], Any]) -> tuple[Any, str]:
+    """Run a task; return its result, and what went wrong, if anything."""
+    try:
+        return task(), ""
+    except Exception:
+        # As text, since not every exception survives the way to another process.
+        return None, traceback.format_exc()
 
 
 def _pack(folder: Path) -> None:

@@ -11,7 +11,6 @@ import json
 import os
 import threading
 import time
-import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
@@ -168,7 +167,7 @@ class FanOut:
                     del away[key]
                     yield key, None, f"{lost}\nIts worker was lost each time.", True
         for key in here:
-            yield *_answer(key, tasks[key]), False
+            yield key, *cluster.attempt(tasks[key]), False
 
     def _in_processes(self, tasks: Tasks, started: list[str]) -> Iterator[tuple[str, Any, str]]:
         """Run tasks, yield their answers as they come, and note which were handed out."""
@@ -205,17 +204,10 @@ def _as_json(task: Callable[[], Any]) -> str:
     return json.dumps(task())
 
 
-def _answer(
-    key: str, task: Callable[[], Any], parent: int | None = None
-) -> tuple[str, Any, str]:
+def _answer(key: str, task: Callable[[], Any], parent: int) -> tuple[str, Any, str]:
     """Run a task; return its name, its result, and what went wrong, if anything."""
-    if parent is not None:
-        _end_with(parent)
-    try:
-        return key, task(), ""
-    except Exception:
-        # As text, since not every exception survives the way to another process.
-        return key, None, traceback.format_exc()
+    _end_with(parent)
+    return key, *cluster.attempt(task)
 
 
 @cache

@@ -16,32 +16,20 @@ from benchmarks.loop.scenarios import Scenario
 # an untrained controller, and two that show what comes after learning.
 SCENARIOS: tuple[tuple[Scenario, int], ...] = (
     (Scenario("constant", "constant set point", 600, {"setpoint": 4.8}), 0),
-    (
-        Scenario(
-            "dead zone", "square wave, dead zone 6.5 t/h", 1280,
-            {"setpoint_amplitude": 5.1, "setpoint_period": 640, "dead_zone": 6.5},
-        ),
-        0,
-    ),
-    (
-        Scenario(
-            "noise", "square wave, R = 0.4 °C²", 1040,
-            {"setpoint_amplitude": 4.9, "setpoint_period": 520, "noise_variance": 0.4},
-        ),
-        0,
-    ),
-    (
-        Scenario(
-            "learnt", "square wave", 2240, {"setpoint_amplitude": 5.2, "setpoint_period": 560}
-        ),
-        1120,
-    ),
-    (
-        Scenario(
-            "learnt, slow", "square wave", 1920,
-            {"setpoint_amplitude": 5.4, "setpoint_period": 640},
-        ),
-        1280,
+    *(
+        (
+            Scenario(
+                name, f"square wave{more}", samples,
+                {"setpoint_amplitude": amplitude, "setpoint_period": period, **plant},
+            ),
+            first,
+        )
+        for name, more, samples, first, amplitude, period, plant in (
+            ("dead zone", ", dead zone 6.5 t/h", 1280, 0, 5.1, 640, {"dead_zone": 6.5}),
+            ("noise", ", R = 0.4 °C²", 1040, 0, 4.9, 520, {"noise_variance": 0.4}),
+            ("learnt", "", 2240, 1120, 5.2, 560, {}),
+            ("learnt, slow", "", 1920, 1280, 5.4, 640, {}),
+        )
     ),
 )  # fmt: skip
 
