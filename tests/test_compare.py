@@ -379,7 +379,7 @@ class TestCompare:
         )
         monkeypatch.syspath_prepend(tmp_path)
         options = (
-            "--agents", "nn", "pi", "--agent", "mine=locked:make", "--runs", 2,
+            "--agents", "nn", "pi", "--agent", "bounds=locked:make", "--runs", 2,
             "--scenarios", "constant-noise", "constant",
         )  # fmt: skip
         for jobs in (1, 2):
@@ -387,7 +387,7 @@ class TestCompare:
         for name in ("runs.csv", "summary.csv", "estimates.csv", "constant-noise.csv"):
             one, two = ((tmp_path / str(jobs) / name).read_bytes() for jobs in (1, 2))
             assert one == two
-            assert b"mine" in one
+            assert b"bounds" in one
 
     def test_a_picture_that_cannot_be_drawn_is_a_sentence(self, tmp_path, monkeypatch):
         def fails(*arguments):

@@ -169,11 +169,17 @@ class TestSweep:
         }  # fmt: skip
         assert (tmp_path / "map.png").stat().st_size > 1000
 
-    def test_a_nominal_plant_with_a_list(self, tmp_path, monkeypatch):
+    def test_a_nominal_plant_with_a_list_and_a_controller_of_any_name(
+        self, tmp_path, monkeypatch
+    ):
         monkeypatch.setattr(command, "report", lambda *_: [])
-        given = ["--set", "b=[-0.03,-0.02,-0.01]", "--plants", 2]
-        assert run_sweep(tmp_path, "--design", "random", *given, "--agents", "pi") == 0
-        assert len(pd.read_csv(tmp_path / "runs.csv")) == 4
+        given = ["--set", "b=[-0.03,-0.02,-0.01]", "--plants", 2, "--agents", "pi"]
+        own = ["--agent", "limit=agents:PIController"]
+        assert run_sweep(tmp_path, "--design", "random", *given, *own) == 0
+        runs = pd.read_csv(tmp_path / "runs.csv").set_index("agent")
+        assert (len(runs.loc["pi"]), len(runs.loc["limit"])) == (4, 4)
+        assert list(runs.loc["pi", "ratio"]) == list(runs.loc["limit", "ratio"])
+        assert (runs["ratio"] != 1.0).all()
 
     def test_a_failed_task_is_named_and_the_others_are_kept(
         self, tmp_path, capsys, monkeypatch

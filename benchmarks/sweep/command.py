@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -48,7 +49,7 @@ def execute(options: Options, console: Console) -> str:
     members = {name: entry.members(training) for name, entry in known.items()}
     began = time.perf_counter()
     of_limits = fingerprint(limit_task.__module__, plants=plants, samples=options.samples)
-    results = training.fan_out.run(
+    limits = training.fan_out.run(
         {
             f"limit {i}": partial(limit_task, plant, options.samples)
             for i, plant in enumerate(plants)
@@ -56,6 +57,7 @@ def execute(options: Options, console: Console) -> str:
         out / "tasks" / of_limits,
         title="limit",
     )
+    results: dict[str, Any] = {}
     common = {"samples": options.samples, "runs": options.runs, "seed": SEED}
     for name, factories in members.items():
         results |= training.fan_out.run(
@@ -72,7 +74,7 @@ def execute(options: Options, console: Console) -> str:
         )
     seconds = time.perf_counter() - began
 
-    runs = table(differing, list(controllers), results)
+    runs = table(differing, list(controllers), limits, results)
     sections = report(runs, out, options.design)
     write_csv(out / "runs.csv", runs)
     about = {"seconds": round(seconds, 1), "options": flat(options)}
@@ -80,7 +82,8 @@ def execute(options: Options, console: Console) -> str:
     title = "Controllers on plants that they were not made for"
     write_report(out, title, sections, provenance_line("sweep", made))
     show(sections, console)
-    return f"{len(results)} tasks in {seconds:.0f} s. The report, data and maps are in {out}/"
+    count = len(limits) + len(results)
+    return f"{count} tasks in {seconds:.0f} s. The report, data and maps are in {out}/"
 
 
 def agent_key(

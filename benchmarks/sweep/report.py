@@ -37,16 +37,19 @@ ADAPTING = (
 
 
 def table(
-    plants: Sequence[Arguments], agents: Sequence[str], results: dict[str, Any]
+    plants: Sequence[Arguments],
+    agents: Sequence[str],
+    limits: dict[str, Any],
+    results: dict[str, Any],
 ) -> pd.DataFrame:
     """Return one row for each run: the plant, the measures, and how they compare.
 
-    A plant is what it differs in from the nominal one. The results are those of all tasks by
-    name: "limit I", "nothing I" and "AGENT I" for plant I.
+    A plant is what it differs in from the nominal one. Results are those of tasks by name:
+    "limit I"; "nothing I" and "AGENT I" for plant I.
     """
     rows = []
     for i, plant in enumerate(plants):
-        limit = results[f"limit {i}"]["mae"]
+        limit = limits[f"limit {i}"]["mae"]
         nothing = pd.DataFrame(results[f"nothing {i}"])
         for agent in agents:
             measures = pd.DataFrame(results[f"{agent} {i}"])
