@@ -66,7 +66,8 @@ class Ranges:
 
     def draw_one(self, stream: EpisodeStream) -> PlantNumbers[float]:
         """Begin an episode of a stream, and draw its numbers."""
-        return numbers_of_plant(self.draw([stream]), 0) if self._draws else self.given
+        drawn = self.draw([stream]).chosen(self.names) if self._draws else {}
+        return replace(self.given, **{name: each.item() for name, each in drawn.items()})
 
 
 def numbers_of_plant(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:

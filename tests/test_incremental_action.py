@@ -57,14 +57,6 @@ def test_a_move_is_a_share_of_half_the_range_within_the_limits(max_move, moves, 
         assert [info[name] for info in infos] == pytest.approx(flows, abs=1e-5)
 
 
-def test_the_first_flow_is_none_whatever_the_limits():
-    arguments = {"u_min": -7.3, "u_max": 12.9}
-    for undo in (False, True):
-        (info,) = infos_of(make(arguments, undo_dead_zone=undo), [0.0])
-        assert info["command"] == pytest.approx(0.0, abs=1e-6)
-        assert info["applied"] == 0.0
-
-
 def test_reset_begins_again_with_no_flow():
     env = make(undo_dead_zone=True)
     first, second = (infos_of(env, [0.3, 0.7]) for _ in range(2))
@@ -83,17 +75,20 @@ def test_every_flow_passes_the_dead_zone_that_is_undone(dead_zone):
         assert info["applied"] == pytest.approx(expected, abs=5e-5)
 
 
-def test_a_number_is_undone_whatever_the_dead_zone_is():
-    for dead_zone in (0.0, [1.0, 4.0], 5.0):
-        env = make({"dead_zone": dead_zone}, max_move=2.0, undo_dead_zone=6)
-        (info,) = infos_of(env, [0.25])  # wants half of the way
-        assert info["applied"] == pytest.approx(6.0 + 4.0 * 0.5, abs=5e-5)
-
-
-def test_a_limit_within_the_dead_zone_is_reached():
-    env = make({"u_min": -3.0, "u_max": 9.0}, max_move=2.0, undo_dead_zone=True)
-    (info,) = infos_of(env, [-0.1])
-    assert info["applied"] == -3.0
+@pytest.mark.parametrize(
+    ("arguments", "undo", "move", "expected"),
+    [
+        # The first flow is none, whatever the limits.
+        *(({"u_min": -7.3, "u_max": 12.9}, undo, 0.0, 0.0) for undo in (False, True)),
+        # A number is undone, whatever the dead zone is: a quarter wants half of the way.
+        *(({"dead_zone": z}, 6, 0.25, 6.0 + 4.0 * 0.5) for z in (0.0, [1.0, 4.0], 5.0)),
+        # A limit within the dead zone is reached.
+        ({"u_min": -3.0, "u_max": 9.0}, True, -0.1, -3.0),
+    ],
+)
+def test_the_first_flow_by_hand(arguments, undo, move, expected):
+    (info,) = infos_of(make(arguments, max_move=2.0, undo_dead_zone=undo), [move])
+    assert info["applied"] == pytest.approx(expected, abs=5e-5)
 
 
 def test_drawn_numbers_are_those_of_the_episode():

@@ -61,32 +61,18 @@ def test_noise_is_coloured_by_c():
     assert np.corrcoef(noise[1:], noise[:-1])[0, 1] == pytest.approx(expected, abs=0.03)
 
 
-@pytest.mark.parametrize(
-    ("command", "expected"),
-    [
-        (0.0, 0.0),
-        (4.999, 0.0),
-        (-4.999, 0.0),
-        (5.0, 5.0),  # the edge passes
-        (-5.0, -5.0),
-        (7.5, 7.5),
-        (-7.5, -7.5),
-        (10.0, 10.0),
-        (-10.0, -10.0),
-        (10.001, 10.0),
-        (-10.001, -10.0),
-        (1e300, 10.0),
-    ],
-)
-def test_actuator(command, expected):
-    assert applied(command) == expected
+@pytest.mark.parametrize(("size", "expected"), [
+    (0.0, 0.0), (4.999, 0.0), (5.0, 5.0), (7.5, 7.5), (10.0, 10.0), (10.001, 10.0),
+    (1e300, 10.0),
+])  # fmt: skip
+def test_actuator_whose_edge_passes(size, expected):
+    assert (applied(size), applied(-size)) == (expected, -expected)
 
 
 @pytest.mark.parametrize(
     ("command", "arguments", "expected"),
     [
         (0.1, {"dead_zone": 0.0}, 0.1),
-        (0.0, {"dead_zone": 0.0}, 0.0),
         (6.9, {"dead_zone": 7.0}, 0.0),
         (-12.0, {"u_min": -4.0}, -4.0),  # saturation comes after the dead zone
         (4.0, {"u_min": -4.0}, 0.0),
@@ -144,17 +130,6 @@ def test_only_commands_on_the_edge_are_moved(rng):
         ):
             _, passed, _ = step(float(action), dead_zone=dead_zone, u_max=u_max)
             assert passed == pytest.approx(sign * dead_zone, abs=2e-6)
-
-
-def test_more_feedwater_never_makes_it_hotter(rng):
-    for _ in range(20):
-        low = rng.uniform(-1, 1, 200)
-        high = np.minimum(low + rng.uniform(0, 1, 200), 1.0)
-        env = mptc_gym.MiddlePointEnv(noise_variance=0.5)
-        cooler = run(env, high, seed=3)["output"]
-        hotter = run(env, low, seed=3)["output"]
-        assert np.all(cooler <= hotter + 1e-12)
-        assert cooler.sum() < hotter.sum()
 
 
 def test_episodes_of_a_seed_do_not_overlap_however_long_they_are():
