@@ -97,14 +97,11 @@ def test_bad_argument_is_named(library, name, value):
         library.make(**{name: value})
 
 
-def test_more_plants_than_a_memory_holds_are_refused(library):
-    with pytest.raises(ValueError, match=r"^num_envs must be at most 33,\d+ with this delay"):
-        library.make(1_000_000, delay=[0, 10_000])
-
-
-def test_unknown_argument_is_refused(library):
+def test_unknown_arguments_and_more_plants_than_a_memory_holds_are_refused(library):
     with pytest.raises(TypeError, match="deadzone"):
         library.make(deadzone=5.0)
+    with pytest.raises(ValueError, match=r"^num_envs must be at most 33,\d+ with this delay"):
+        library.make(1_000_000, delay=[0, 10_000])
 
 
 BAD_SEEDS = [

@@ -17,25 +17,37 @@ ALLOWED = {
 }
 
 
-def imported(code: str) -> set[str]:
-    names = set()
+SOURCES = {
+    path: path.read_text(encoding="utf-8")
+    for package in ("mptc_gym", "agents", "benchmarks")
+    for path in (ROOT / package).rglob("*.py")
+}
+
+
+def imported(code: str) -> list[tuple[str, list[str]]]:
+    """Return which modules are imported, also within functions, and what is taken from each."""
+    found: list[tuple[str, list[str]]] = []
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            found += [(alias.name, []) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            names.add(node.module or "")
-    return {name.partition(".")[0] for name in names}
+            found.append((node.module or "", [alias.name for alias in node.names]))
+    return found
+
+
+def packages(code: str) -> set[str]:
+    return {module.partition(".")[0] for module, _ in imported(code)}
 
 
 @pytest.mark.parametrize("package", ALLOWED)
 def test_layers_import_downwards_only(package):
-    files = list((ROOT / package).rglob("*.py"))
+    files = [path for path in SOURCES if path.is_relative_to(ROOT / package)]
     assert files
     for path in files:
         allowed = ALLOWED[package] | STDLIB
         allowed |= {"torch"} if "torch" in path.stem else set()
         allowed |= {"stable_baselines3"} if path.stem == "sb3" else set()
-        assert imported(path.read_text(encoding="utf-8")) <= allowed, path
+        assert packages(SOURCES[path]) <= allowed, path
 
 
 UNPICKLERS = {"pickle", "cloudpickle", "dill", "shelve", "marshal"}
@@ -44,7 +56,9 @@ SAFELY = {"np.load": ("allow_pickle", False), "torch.load": ("weights_only", Tru
 
 def unpickles(code: str) -> list[str]:
     """Return what in a module would run code that a file holds, if it was planted there."""
-    tree, found = ast.parse(code), []
+    tree = ast.parse(code)
+    names = {name for module, taken in imported(code) for name in (module, *taken)}
+    found = sorted(names & UNPICKLERS)
     learners = {
         alias.asname or alias.name
         for node in ast.walk(tree)
@@ -52,9 +66,6 @@ def unpickles(code: str) -> list[str]:
         for alias in node.names
     }
     for node in ast.walk(tree):
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            names = {getattr(node, "module", "") or "", *(alias.name for alias in node.names)}
-            found += sorted(names & UNPICKLERS)
         if not isinstance(node, ast.Call):
             continue
         called = ast.unparse(node.func)
@@ -70,9 +81,8 @@ def unpickles(code: str) -> list[str]:
 
 
 def test_no_file_is_unpickled():
-    for package in ("mptc_gym", "agents", "benchmarks"):
-        for path in (ROOT / package).rglob("*.py"):
-            assert not unpickles(path.read_text(encoding="utf-8")), path
+    for path, code in SOURCES.items():
+        assert not unpickles(code), path
 
 
 @pytest.mark.parametrize(
@@ -91,9 +101,8 @@ def test_unpickling_is_noticed(code):
 
 def test_what_is_printed_can_be_redirected_on_windows():
     # Its encoding of files and pipes has no arrows, and printing one there is an error.
-    for package in ("mptc_gym", "agents", "benchmarks"):
-        for path in (ROOT / package).rglob("*.py"):
-            path.read_text(encoding="utf-8").encode("cp1252")
+    for code in SOURCES.values():
+        code.encode("cp1252")
 
 
 def test_top_level_holds_what_the_layout_says():
@@ -106,28 +115,17 @@ def test_top_level_holds_what_the_layout_says():
     }  # fmt: skip
 
 
-def modules() -> dict[str, Path]:
-    """Return all modules by name."""
-    packages = ("mptc_gym", "agents", "benchmarks")
-    files = [path for package in packages for path in (ROOT / package).rglob("*.py")]
-    names = {path.relative_to(ROOT).with_suffix(""): path for path in files}
-    return {
-        ".".join(name.parts).removesuffix(".__init__"): path for name, path in names.items()
-    }
-
-
 def imports_between_modules() -> dict[str, set[str]]:
-    """Return which modules each of them imports, also within functions."""
-    known = modules()
+    """Return which modules each of them imports."""
+    known = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): code
+        for path, code in SOURCES.items()
+    }
     found = {}
-    for name, path in known.items():
+    for name, code in known.items():
         targets = set()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                targets |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                within = {f"{node.module}.{alias.name}" for alias in node.names}
-                targets |= within & set(known) or {node.module}
+        for module, taken in imported(code):
+            targets |= {f"{module}.{each}" for each in taken} & set(known) or {module}
         found[name] = (targets & set(known)) - {name}
     return found
 
@@ -170,7 +168,7 @@ COMPARE = {  # the extra
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=range(len(EXAMPLES)))
 def test_examples_of_the_readme_run(example, monkeypatch, tmp_path):
-    names = imported(example)
+    names = packages(example)
     # `.ci/versions` tests without the extras; then only what needs none of them can run.
     for name in (names - {"agents", "benchmarks"}) | (
         COMPARE if "benchmarks" in names else set()
@@ -195,8 +193,3 @@ def test_what_a_page_links_to_is_there(page):
         file, _, _ = target.partition("#")
         unknown = target == "ADDRESS"  # the project's own, in the text for Gymnasium's list
         assert unknown or target.startswith("https://") or (page.parent / file).exists(), target
-
-
-def test_there_are_examples_and_pictures():
-    assert len(EXAMPLES) >= 4
-    assert "![" in PAGES[0].read_text("utf-8")

@@ -25,40 +25,28 @@ ARGUMENTS = {
 }  # fmt: skip
 
 
-def make_both():
-    return make_both_of([(N, ARGUMENTS)])
+ONE = [("MiddlePoint-v0", N, ARGUMENTS)]
+TWO = [
+    ("MiddlePoint-v0", 3, ARGUMENTS),
+    ("MiddlePoint-v0", 1, {**ARGUMENTS, "noise_variance": 0.0}),
+]
+TERMINATE = [("CartPole-v1", N, {"max_episode_steps": 15})]
 
 
-def make_both_of_two_batches():
-    return make_both_of([(3, ARGUMENTS), (1, {**ARGUMENTS, "noise_variance": 0.0})])
+def make_both(parts):
+    made = [(partial(gymnasium.make, id_, **given), count) for id_, count, given in parts]
+    batches = [SyncVectorEnv([one] * count, autoreset_mode="SameStep") for one, count in made]
+    if parts is not TERMINATE:
+        batches = [
+            gymnasium.make_vec(id_, count, autoreset_mode="SameStep", **given)
+            for id_, count, given in parts
+        ]
+    return GymnasiumVecEnv(*batches), DummyVecEnv([one for one, n in made for _ in range(n)])
 
 
-def make_both_of_episodes_that_terminate():
-    def make():
-        return gymnasium.make("CartPole-v1", max_episode_steps=15)
-
-    envs = SyncVectorEnv([make] * N, autoreset_mode="SameStep")
-    return GymnasiumVecEnv(envs), DummyVecEnv([make] * N)
-
-
-def make_both_of(parts):
-    batches = [
-        gymnasium.make_vec("MiddlePoint-v0", count, autoreset_mode="SameStep", **arguments)
-        for count, arguments in parts
-    ]
-    single = [
-        lambda arguments=arguments: gymnasium.make("MiddlePoint-v0", **arguments)
-        for count, arguments in parts
-        for _ in range(count)
-    ]
-    return GymnasiumVecEnv(*batches), DummyVecEnv(single)
-
-
-@pytest.mark.parametrize(
-    "make", [make_both, make_both_of_two_batches, make_both_of_episodes_that_terminate]
-)
-def test_trajectories_equal_those_of_dummy_vec_env(make, rng):
-    ours, theirs = make()
+@pytest.mark.parametrize("parts", [ONE, TWO, TERMINATE], ids=["one", "two", "terminate"])
+def test_trajectories_equal_those_of_dummy_vec_env(parts, rng):
+    ours, theirs = make_both(parts)
     assert ours.num_envs == theirs.num_envs
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
@@ -83,8 +71,7 @@ def test_trajectories_equal_those_of_dummy_vec_env(make, rng):
                     last = info["terminal_observation"]
                     np.testing.assert_array_equal(last, other["terminal_observation"])
                     truncated.append(info["TimeLimit.truncated"])
-    terminate = make is make_both_of_episodes_that_terminate
-    assert set(truncated) == ({True, False} if terminate else {True})
+    assert set(truncated) == ({True, False} if parts is TERMINATE else {True})
 
 
 def test_pictures_are_those_of_the_batch():
@@ -97,12 +84,9 @@ def test_pictures_are_those_of_the_batch():
     assert ours.render().shape == (2 * 540, 960, 3)
 
 
-def test_another_autoreset_mode_is_refused():
+def test_batches_of_another_mode_or_of_other_spaces_are_refused():
     with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
         GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", N))
-
-
-def test_batches_of_other_spaces_are_refused():
     batches = [
         gymnasium.make_vec("MiddlePoint-v0", 2, autoreset_mode="SameStep", action_window=window)
         for window in (0, 1)
@@ -111,8 +95,8 @@ def test_batches_of_other_spaces_are_refused():
         GymnasiumVecEnv(*batches)
 
 
-def test_infos_and_attributes_of_two_batches():
-    ours, _ = make_both_of_two_batches()
+def test_infos_and_attributes_are_those_of_the_batches():
+    ours, _ = make_both(TWO)
     ours.reset()
     ours.step(np.ones((N, 1), np.float32))
     assert list(ours.infos["command"]) == [10.0] * N
@@ -120,11 +104,8 @@ def test_infos_and_attributes_of_two_batches():
     assert ours.infos["noise"][3] == 0.0
     assert [p.noise_variance for p in ours.get_attr("parameters")] == [0.5, 0.5, 0.5, 0.0]
 
-
-def test_attributes_are_those_of_the_batch():
-    ours, _ = make_both()
+    assert [p.noise_variance for p in ours.get_attr("parameters", [0, 3])] == [0.5, 0.0]
     assert ours.get_attr("render_mode") == [None] * N
-    assert [p.noise_variance for p in ours.get_attr("parameters", [0, 1])] == [0.5, 0.5]
     assert ours.env_is_wrapped(Monitor) == [False] * N
     with pytest.raises(NotImplementedError, match="parameters"):
         ours.set_attr("parameters", None)
@@ -186,15 +167,13 @@ class TestMakeVecEnv:
 
     def test_returns_are_those_of_a_monitor(self):
         ours = make_vec_env("MiddlePoint-v0", 2, max_episode_steps=7, noise_variance=0.5)
-        theirs = DummyVecEnv(
-            [
-                lambda: Monitor(
-                    gymnasium.make("MiddlePoint-v0", max_episode_steps=7, noise_variance=0.5)
-                )
-            ]
-            * 2
-        )
-        found = []
+
+        def make():
+            return Monitor(
+                gymnasium.make("MiddlePoint-v0", max_episode_steps=7, noise_variance=0.5)
+            )
+
+        theirs, found = DummyVecEnv([make] * 2), []
         for plants in (ours, theirs):
             plants.seed(1)
             plants.reset()
@@ -261,17 +240,13 @@ class TestHowItWasTrained:
     def test_without_it_nothing_is_guessed(self, tmp_path):
         model = model_of(gymnasium.make("MiddlePoint-v0"))
         model.save(tmp_path / "bare.zip")
-        with pytest.raises(
-            ValueError, match="policy must be one that knows how it was trained"
-        ):
-            spec_of(tmp_path / "bare.zip")
-        with pytest.raises(
-            ValueError, match="policy must be one that knows how it was trained"
-        ):
-            spec_of(PPO.load(tmp_path / "bare.zip", device="cpu"))
+        bare = PPO.load(tmp_path / "bare.zip", device="cpu")
+        for each in (bare, tmp_path / "bare.zip"):
+            with pytest.raises(ValueError, match="must be one that knows how it was trained"):
+                spec_of(each)
         evaluate(model, episodes=2)  # it still has its environments
         with pytest.warns(UserWarning, match="does not say how it was trained"):
-            evaluate(PPO.load(tmp_path / "bare.zip", device="cpu"), episodes=2)
+            evaluate(bare, episodes=2)
         (tmp_path / "text.zip").write_text("no zip")
         with pytest.raises(ValueError, match=r"text\.zip must be a model"):
             spec_of(tmp_path / "text.zip")
