@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters
 from mptc_gym.batch import FACTORS, INFO
+from tests.conftest import assert_the_seed_is_all_that_differs
 
 MODES = [mode.value for mode in AutoresetMode]
 NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
@@ -28,6 +29,7 @@ def library(request):
             array=np.array,
             own={"render_mode"},
             shared={},
+            types=[{}],
             make=partial(_made, MiddlePointVectorEnv),
         )
     torch = pytest.importorskip("torch", reason="it is what is tested")
@@ -39,6 +41,7 @@ def library(request):
         own={"device", "dtype", "differentiable"},
         # Several steps may return the same, as documented.
         shared={*FACTORS, *(f"_{name}" for name in (*INFO, *FACTORS, "disturbance"))},
+        types=[{"dtype": torch.float32}, {"dtype": torch.float64}],
         make=partial(_made, MiddlePointTorchEnv, dtype=torch.float64),
     )
 
@@ -280,3 +283,185 @@ def test_gymnasium_s_time_limit_is_that_of_the_registration_unless_another_is_gi
 
     assert np.flatnonzero(truncations()) == 1199
     assert not any(truncations(max_episode_steps=None))
+
+
+def collected(env, steps, name):
+    """Return an info of all samples from k = 1 on, shape (steps, n), with no flow."""
+    actions = np.zeros((env.num_envs, 1))
+    return np.stack([plain(env.step(actions)[-1][name]) for _ in range(steps)])
+
+
+class TestDraws:
+    """Within five standard errors, which chance exceeds once in two million times."""
+
+    def test_noise_has_its_variance_and_is_normal_and_of_each_plant_alone(self, library):
+        env = library.make(400, noise_variance=0.5, c=[1.0])
+        env.reset(seed=3)
+        xi = collected(env, 250, "noise") / 0.5**0.5
+        # The variance of xi^p is E xi^2p - (E xi^p)^2: 1, 3 - 1, 15, 105 - 9.
+        for power, (moment, spread) in enumerate([(0, 1), (1, 2), (0, 15), (3, 96)], start=1):
+            assert abs((xi**power).mean() - moment) < 5 * (spread / xi.size) ** 0.5
+        for shifted in (1, 2, 7, 19, 20):
+            product = xi[:, shifted:] * xi[:, :-shifted]
+            assert abs(product.mean()) < 5 / product.size**0.5
+        inside = (np.abs(xi) < 0.6745).mean()  # the quartiles of a normal distribution
+        assert abs(inside - 0.5) < 5 * (0.25 / xi.size) ** 0.5
+
+    @pytest.mark.parametrize("c", [[1.0], [1.0, -0.35740, -0.03392]])
+    def test_noise_has_the_colour_of_c(self, library, c):
+        n, steps, variance = 400, 250, 0.5
+        env = library.make(n, noise_variance=variance, c=c)
+        env.reset(seed=4)
+        noise = collected(env, steps, "noise")[2:] / variance**0.5
+        for lag in (0, 1, 2, 3, 7, 19, 20):
+            product = noise[lag:] * noise[: len(noise) - lag]
+            expected = np.dot(c[lag:], c[: max(len(c) - lag, 0)])
+            # Neighbours in time are hardly independent: the spread is that of the plants'
+            # means.
+            means = product.mean(0)
+            assert abs(means.mean() - expected) < 5 * means.std() / n**0.5
+
+    def test_the_first_noise_of_each_episode_knows_none_before(self, library):
+        n = 4000
+        env = library.make(n, noise_variance=1.0, c=[1.0, 3.0], max_episode_steps=10)
+        env.reset(seed=0)
+        noise = collected(env, 30, "noise")
+        for first in (0, 11, 22):  # a reset lies between two episodes
+            spread = (2.0 / n) ** 0.5
+            assert abs(noise[first].var() - 1.0) < 5 * spread
+            assert abs(noise[first + 1].var() - 10.0) < 5 * 10.0 * spread
+
+    def test_readings_are_off_by_white_noise(self, library):
+        n, steps = 200, 100
+        env = library.make(
+            n, measurement_noise_variance=0.3, output_window=1, setpoint=0.0,
+            setpoint_window=0, error_window=1,
+        )  # fmt: skip
+        env.reset(seed=0)
+        readings = []
+        for _ in range(steps):
+            observation, _, _, _, infos = env.step(np.zeros((n, 1)))
+            error, reading = plain(observation).T
+            np.testing.assert_array_equal(error, -reading)
+            assert not infos["output"].any()
+            readings.append(reading)
+        v = np.stack(readings)
+        assert abs(v.var() - 0.3) < 5 * 0.3 * (2 / v.size) ** 0.5
+        assert abs((v[1:] * v[:-1]).mean()) < 5 * 0.3 / v.size**0.5
+
+    @pytest.mark.parametrize("period", [600, 7, 1])
+    def test_set_points_have_their_levels_and_lengths(self, library, period):
+        n, steps, amplitude = 300, 40 * max(period // 6, 3), 4.0
+        env = library.make(
+            n, setpoint="random", setpoint_period=period, setpoint_amplitude=amplitude,
+            max_episode_steps=None, delay=25,
+        )  # fmt: skip
+        _, infos = env.reset(seed=1)
+        levels = np.vstack([plain(infos["setpoint"]), collected(env, steps, "setpoint")])
+        assert np.abs(levels).max() <= amplitude
+        shortest, longest = max(1, -(-period // 6)), max(1, -(-period // 6), period // 2)
+        first = []
+        for column in levels.T:
+            changes = np.flatnonzero(np.diff(column)) + 1
+            lengths = np.diff(np.concatenate(([0], changes)))
+            assert set(lengths) <= set(range(shortest, longest + 1))
+            first.append(lengths[:5])
+        lengths = np.concatenate(first)  # as many of each plant, so that none is preferred
+        middle, count = (shortest + longest) / 2, longest - shortest + 1
+        spread = ((count**2 - 1) / 12 / lengths.size) ** 0.5
+        assert abs(lengths.mean() - middle) <= 5 * spread
+        if count < 100:
+            assert {lengths.min(), lengths.max()} == {shortest, longest}
+        starts = levels[0]
+        assert abs(starts.mean()) < 5 * amplitude / (3 * n) ** 0.5
+        # The variance of x^2, x uniform in [-1, 1], is 1/5 - 1/9.
+        squares = (starts / amplitude) ** 2
+        assert abs(squares.mean() - 1 / 3) < 5 * ((1 / 5 - 1 / 9) / n) ** 0.5
+
+    @pytest.mark.parametrize("interval", [50.0, 2.0])
+    def test_load_steps_have_their_times_and_levels(self, library, interval):
+        n, steps, amplitude = 300, 1000, 2.0
+        env = library.make(n, disturbance_amplitude=amplitude, disturbance_interval=interval)
+        env.reset(seed=2)
+        load = np.vstack([np.zeros(n), collected(env, steps, "disturbance")])
+        changed = np.diff(load, axis=0) != 0.0  # from k to k + 1
+        assert not changed[np.arange(1, steps + 1) % 10 != 0].any()
+        chances = changed[9::10]
+        probability = min(10 / interval, 1.0)  # below ten samples, every change is a step
+        spread = (probability * (1 - probability) / chances.size) ** 0.5
+        assert abs(chances.mean() - probability) <= 5 * spread
+        levels = load[1:][changed] / amplitude
+        assert np.abs(levels).max() <= 1.0
+        assert abs(levels.mean()) < 5 / (3 * levels.size) ** 0.5
+        assert abs((levels**2).mean() - 1 / 3) < 5 * ((1 / 5 - 1 / 9) / levels.size) ** 0.5
+
+    def test_the_walk_gains_its_variance(self, library):
+        n, steps, variance = 2000, 400, 0.01
+        env = library.make(n, disturbance_walk_variance=variance)
+        env.reset(seed=5)
+        load = collected(env, steps, "disturbance")
+        ends = load[steps - 1]
+        assert abs(ends.var() / (variance * steps) - 1.0) < 5 * (2 / n) ** 0.5
+        moves = np.diff(load[9::10], axis=0)
+        assert abs((moves[1:] * moves[:-1]).mean()) < 5 * variance * 10 / moves.size**0.5
+
+    def test_ranges_have_both_ends(self, library):
+        n = 20_000
+        for type_ in library.types:
+            env = library.make(n, delay=[12, 24], gain_factor=[0.75, 1.5], **type_)
+            infos = plain(env.reset(seed=0)[1])
+            delays, gains = infos["delay"], infos["gain_factor"]
+            counts = np.array([(delays == d).sum() for d in range(12, 25)])
+            assert counts.sum() == n
+            assert (np.abs(counts - n / 13) < 5 * (n / 13 * 12 / 13) ** 0.5).all()
+            # The ends are met to within 1 / n or so of the range: the chance of more than
+            # 20 / n at one end is e^-20.
+            assert 0.75 <= gains.min() < 0.75 + 0.75 * 20 / n
+            assert 1.5 - 0.75 * 20 / n < gains.max() <= 1.5
+            assert abs(gains.mean() - 1.125) < 5 * 0.75 / (12 * n) ** 0.5
+            assert abs(np.corrcoef(delays, gains)[0, 1]) < 5 / n**0.5
+
+    def test_partial_resets_leave_the_distributions_as_they_are(self, library):
+        n, steps, variance, walk = 1500, 250, 2.0, 0.01
+        env = library.make(
+            n, noise_variance=variance, c=[1.0, 3.0], disturbance_walk_variance=walk,
+            setpoint="random", setpoint_period=60, max_episode_steps=None,
+        )  # fmt: skip
+        _, infos = env.reset(seed=6)
+        rng = np.random.default_rng(0)
+        age, begun = np.zeros(n, int), np.zeros(n, int)  # of the episode; when it last changed
+        level = plain(infos["setpoint"])
+        noise, load, ages, lengths = [], [], [], []
+        for _ in range(steps):
+            infos = plain(env.step(np.zeros((n, 1)))[-1])
+            age += 1
+            changed = infos["setpoint"] != level
+            lengths.append((age - begun)[changed])
+            begun[changed], level = age[changed], infos["setpoint"]
+            noise.append(infos["noise"])
+            load.append(infos["disturbance"])
+            ages.append(age.copy())
+            mask = rng.random(n) < 0.02
+            if mask.any():
+                _, infos = env.reset(options={"reset_mask": mask})
+                level = np.where(mask, plain(infos["setpoint"]), level)
+                age[mask] = begun[mask] = 0
+        noise, load, ages = np.array(noise), np.array(load), np.array(ages)
+        for found, expected in (
+            (noise[ages == 1], variance),
+            (noise[ages == 2], 10.0 * variance),  # 1 + 3^2
+            (load[ages == 10], 10.0 * walk),
+            (load[ages == 45], 40.0 * walk),
+        ):
+            assert abs(found.var() / expected - 1.0) < 5 * (2 / found.size) ** 0.5
+        assert not load[ages < 10].any()
+        lengths = np.concatenate(lengths)
+        assert (lengths.min(), lengths.max()) == (10, 30)
+
+    def test_the_seed_is_all_that_differs(self, library):
+        def trajectory(seed):
+            env = library.make(5, **PRESETS["hard"], max_episode_steps=50)
+            env.reset(seed=seed)
+            return collected(env, 120, "output")
+
+        assert_the_seed_is_all_that_differs(trajectory)

@@ -155,19 +155,6 @@ def test_set_points_by_hand(arguments, expected):
     assert list(run(MiddlePointEnv(**arguments), actions)["setpoint"]) == expected
 
 
-def test_random_set_point_has_levels_and_lengths_as_documented():
-    env = MiddlePointEnv(setpoint="random", setpoint_amplitude=3.0, setpoint_period=60)
-    setpoint = run(env, np.zeros(20_000))["setpoint"]
-    changes = np.flatnonzero(np.diff(setpoint)) + 1
-    lengths, levels = np.diff(np.r_[0, changes]), setpoint[np.r_[0, changes]]
-    assert len(levels) > 900
-    assert lengths.min() == 10
-    assert lengths.max() == 30
-    assert lengths.mean() == pytest.approx(20, abs=0.7)
-    assert np.abs(levels).max() <= 3.0
-    assert np.quantile(levels, [0.25, 0.5, 0.75]) == pytest.approx([-1.5, 0, 1.5], abs=0.25)
-
-
 def test_same_seed_same_trajectory_to_the_bit(rng):
     actions = rng.uniform(-1, 1, 700)
     arguments = {"noise_variance": 0.5, "setpoint": "random"}

@@ -48,19 +48,6 @@ def test_dynamics_equal_a_transfer_function_with_noise(a, b, c, delay, rng):
     assert np.ptp(by_noise) > 1.0
 
 
-def test_noise_is_coloured_by_c():
-    env = mptc_gym.MiddlePointEnv(noise_variance=0.5)
-    noise = run(env, np.zeros(20_000))["noise"]
-    assert noise[0] == 0.0
-    xi = lfilter([1], C, noise)[1:]  # invert n = C xi
-    assert xi.var() == pytest.approx(0.5, rel=0.04)
-    for lag in (1, 2, 3):
-        assert abs(np.corrcoef(xi[lag:], xi[:-lag])[0, 1]) < 0.03
-    # With the colour the neighbours correlate, c_0 c_1 + c_1 c_2 over the sum of squares.
-    expected = (C[0] * C[1] + C[1] * C[2]) / (C[0] ** 2 + C[1] ** 2 + C[2] ** 2)
-    assert np.corrcoef(noise[1:], noise[:-1])[0, 1] == pytest.approx(expected, abs=0.03)
-
-
 @pytest.mark.parametrize(("size", "expected"), [
     (0.0, 0.0), (4.999, 0.0), (5.0, 5.0), (7.5, 7.5), (10.0, 10.0), (10.001, 10.0),
     (1e300, 10.0),
