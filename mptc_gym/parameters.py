@@ -24,27 +24,14 @@ Value = TypeVar("Value")  # of a plant number: float, an array for many plants, 
 
 @dataclass(frozen=True)
 class Argument:
-    """What is declared of an argument of the environment, beside its name and its type.
-
-    Attributes
-    ----------
-    default
-        Its default.
-    check
-        Returns a valid value in plain Python types, and raises a ValueError otherwise.
-    unit
-        Its unit, "" if there is none.
-    meaning
-        What the tables of arguments say about it.
-    linear
-        Whether the plant is (28) and (29) whatever its value: linear between the limits. An
-        analysis that supposes this refuses any other argument that is not at its default.
-    """
+    """What is declared of an argument of the environment, beside its name and its type."""
 
     default: Any
-    check: checks.Check
-    unit: str
-    meaning: str
+    check: checks.Check  # returns a valid value in plain Python types, or raises a ValueError
+    unit: str  # "" if there is none
+    meaning: str  # what the tables of arguments say about it
+    # Whether the plant is (28) and (29) whatever its value: linear between the limits. An
+    # analysis that supposes this refuses any other argument that is not at its default.
     linear: bool
 
     def checked(self, name: str, value: Any) -> Any:
@@ -144,10 +131,6 @@ def slowest_pole(a: Sequence[float]) -> complex | None:
     """Return the pole of 1 / A with the largest magnitude, None if there is no pole."""
     poles = np.roots(a)
     return complex(poles[np.argmax(np.abs(poles))]) if len(poles) else None
-
-
-def _least_magnitude(low: float, high: float) -> float:
-    return max(low, -high, 0.0)
 
 
 def _shown(number: Number) -> str:
@@ -282,7 +265,7 @@ class Parameters(PlantNumbers[Number]):
         if low >= high:
             reject("u_min", self.u_min, f"below u_max = {_shown(self.u_max)}")
         # The draw that leaves least of both limits.
-        reach = max(_least_magnitude(lowest, low), _least_magnitude(high, highest))
+        reach = max(lowest, -low, high, -highest, 0.0)
         if self.range_of("dead_zone")[1] > reach:
             reject(
                 "dead_zone",

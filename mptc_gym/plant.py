@@ -146,12 +146,8 @@ class Plant:
 
         Returns
         -------
-        command
-            u(k), t/h.
-        applied
-            u_a(k), t/h.
-        output
-            y(k+1), degC.
+        command, applied, output
+            u(k) and u_a(k), t/h, and y(k+1), degC.
         """
         if self._drifts:
             self._age += 1
@@ -259,22 +255,9 @@ class PlantBatch:
     def step(
         self, action: Values, noise: Values, load: Values | None = None
     ) -> tuple[Values, Values, Values]:
-        """Move all plants from sample k to k+1.
+        """Move all plants from sample k to k+1, as `Plant.step`, in arrays of shape (n,).
 
-        Parameters
-        ----------
-        action
-            a(k), shape (n,).
-        noise
-            n(k+1), degC, shape (n,).
-        load
-            w(k+1), degC, shape (n,), if there is any.
-
-        Returns
-        -------
-        command, applied, output
-            u(k) and u_a(k), t/h, and y(k+1), degC; each of shape (n,). The last is kept here
-            and must not be changed.
+        The output is kept here and must not be changed.
         """
         if self._drifts:
             self._clock += 1

@@ -18,16 +18,9 @@ class Ranges:
     """Draws what is given as a range, uniformly; a delay is an integer, both ends included.
 
     Every plant number has a draw of its own, whether it is a range or not. So one more range
-    changes nothing in what the others give.
-
-    Attributes
-    ----------
-    names : tuple of str
-        The arguments that are ranges.
-    given : PlantNumbers of float
-        All plant numbers, with the lower end of a range.
-    given_arrays : PlantNumbers of ndarray
-        The same as arrays of shape ().
+    changes nothing in what the others give. `names` are the arguments that are ranges. `given`
+    are all plant numbers, with the lower end of a range, and `given_arrays` the same as arrays
+    of shape ().
     """
 
     def __init__(self, parameters: Parameters) -> None:

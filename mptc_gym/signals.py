@@ -214,28 +214,17 @@ def _coloured(colour: Sequence[float] | Values, draws: Values) -> Values:
 
 
 class Levels:
-    """How the set point goes on: through levels, each held for a number of samples.
-
-    Attributes
-    ----------
-    random : bool
-        Whether they are drawn.
-    amplitude : float
-        Random ones are uniform within plus and minus that, degC.
-    shortest, longest : int
-        How many samples random ones are held for, both ends included.
-    values : list of float
-        Otherwise the levels, degC, to be repeated.
-    lengths : list of int
-        How many samples each is held for.
-    """
+    """How the set point goes on: through levels, each held for a number of samples."""
 
     def __init__(self, parameters: Parameters) -> None:
         kind, period = parameters.setpoint, parameters.setpoint_period
         self.random = kind == "random"
+        # Random levels are uniform within plus and minus that, degC, and held for so many
+        # samples, both ends included.
         self.amplitude = amplitude = parameters.setpoint_amplitude
         self.shortest = max(1, math.ceil(period / 6))
         self.longest = max(self.shortest, period // 2)
+        # Others are these, degC, again and again, and held for so many samples each.
         if isinstance(kind, str):  # "square"
             self.values = [amplitude, -amplitude]
             self.lengths = [(period + 1) // 2, period // 2]

@@ -45,22 +45,7 @@ def as_tensor(values: Any, like: Tensor) -> Tensor | None:
 class Episodes:
     """What signals and plants know of the present episodes, and where random numbers are from.
 
-    Attributes
-    ----------
-    zeros : Tensor
-        Zeros of the device and type to use, shape (n,).
-    generator : torch.Generator
-        Where all draws come from.
-    numbers : dict
-        The plant numbers of all plants, by name.
-    clock : int
-        Samples since the plants were made, at the first sample of the next block.
-    taken : int
-        How many samples of the last block have passed.
-    starts : Tensor
-        The clock when each plant's episode began, shape (n,).
-    phases : set of int
-        Their remainders when divided by `DRIFT_INTERVAL`, if anything changes as slowly.
+    `zeros` are of the device and type to use, shape (n,).
     """
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
@@ -71,12 +56,17 @@ class Episodes:
         # two tensors.
         limits = {"u_min", "u_max"}
         tensors = {*self._ranges} | (limits if limits & {*self._ranges} else set())
-        self.numbers: dict[str, Number] = {}
+        self.numbers: dict[str, Number] = {}  # of all plants
         for name in PLANT_NUMBERS:
             low = float(parameters.range_of(name)[0])
             self.numbers[name] = zeros + low if name in tensors else low
+        # Samples since the plants were made, at the first sample of the next block, and how
+        # many samples of the last block have passed.
         self.clock = self.taken = 0
+        # The clock when each plant's episode began, and the remainders of that when divided by
+        # `DRIFT_INTERVAL`, if anything changes as slowly.
         self.starts = torch.zeros_like(zeros, dtype=torch.int64)
+        self.phases: set[int] = set()
         self._rows = torch.arange(LONGEST, device=zeros.device)[:, None]
 
     def reset(
