@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from numbers import Integral, Real
 from typing import Any, Final, NoReturn
 
@@ -60,8 +61,10 @@ def one_action(action: Any) -> float:
         reject_action(action)
 
 
-def many_actions(actions: Any, num_envs: int) -> NDArray[np.float64]:
-    """Return the actions of many plants, finite or not, in a new array, shape (num_envs,)."""
+def many_actions(
+    actions: Any, num_envs: int, ignored: NDArray[np.bool_] | None
+) -> NDArray[np.float64]:
+    """Return the actions of many plants in a new array, shape (num_envs,); 0 if ignored."""
     given: NDArray[Any]
     try:
         given = np.asarray(actions)
@@ -73,7 +76,18 @@ def many_actions(actions: Any, num_envs: int) -> NDArray[np.float64]:
         given = np.empty(0)
     if given.shape != (num_envs, 1):
         reject("actions", actions, f"numbers, shape ({num_envs}, 1)")
-    return given.ravel()
+    checked = given.ravel()
+    if ignored is not None:
+        checked[ignored] = 0.0
+    if not math.isfinite(checked.dot(_faint(num_envs))):  # in one call, whatever their number
+        reject("actions", actions, "finite")
+    return checked
+
+
+@lru_cache(4)
+def _faint(size: int) -> NDArray[np.float64]:
+    """Return factors so small that no sum of finite actions overflows with them."""
+    return np.full(size, 1e-150)
 
 
 def plain(value: Any) -> Any:

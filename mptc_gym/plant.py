@@ -129,8 +129,8 @@ class Plant:
         # newest sample first: y(k), y(k-1), ... and u_a(k), u_a(k-1), ...
         delay = int(numbers.delay)
         self._beta = tuple(enumerate(parameters.b, start=delay))
-        self._outputs = _at_rest(len(self._alpha))
-        self._inputs = _at_rest(delay + len(self._beta))
+        self._outputs = deque([0.0] * len(self._alpha), len(self._alpha))
+        self._inputs = deque([0.0] * (delay + len(self._beta)), delay + len(self._beta))
 
     def step(self, action: float, noise: float, load: float) -> tuple[float, float, float]:
         """Move from sample k to k+1.
@@ -332,7 +332,3 @@ class PlantBatch:
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*self.factors)
         self._alpha = tuple(map(np.asarray, alpha))
         self._next_update = self._clock + int((slow + DRIFT_INTERVAL - ages).min())
-
-
-def _at_rest(samples: int) -> deque[float]:
-    return deque([0.0] * samples, maxlen=samples)

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mptc_gym.checks import many_actions, reject
+from mptc_gym.checks import many_actions
 from mptc_gym.parameters import Parameters
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import NUMBERS, Actuator, check_arguments
@@ -81,10 +81,7 @@ class IncrementalAction(VectorActionWrapper):
         """Move the wanted flows by actions, shape (num_envs, 1), and step the environments."""
         if self._flows is None:
             raise ResetNeeded("call reset before step")
-        moves = many_actions(actions, self.num_envs)
-        moves[self._ended] = 0.0  # ignored
-        if not np.isfinite(moves).all():
-            reject("actions", actions, "finite")
+        moves = many_actions(actions, self.num_envs, self._ended)
         flows = self._actuator.moved(self._flows, moves)
         returned = self.env.step(self._actuator.action(flows).astype(np.float32)[:, np.newaxis])
         _, _, terminations, truncations, infos = returned
