@@ -265,13 +265,11 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
                 self._seeds[i] = own
                 self._streams[i] = Streams.of_seed(own)
 
-    def _checked_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+    def _checked_seeds(self, seed: Any) -> list[int | None]:
         n = self.num_envs
         if seed is None:
             return [None] * n
-        seeds: Any = plain(seed)
-        if is_count(seeds):
-            seeds = [*range(int(seeds), int(seeds) + n)]
+        seeds = [*range(int(seed), int(seed) + n)] if is_count(seed) else plain(seed)
         if (
             not isinstance(seeds, list | tuple)
             or len(seeds) != n
