@@ -269,20 +269,10 @@ def test_without_a_mode_there_is_a_warning():
             assert env.render() is None
 
 
-@pytest.mark.parametrize(
-    ("made", "allowed"),
-    [
-        (MiddlePointEnv, ["human", "rgb_array", "ansi"]),
-        (MiddlePointVectorEnv, ["rgb_array"]),
-    ],
-)
-def test_unknown_modes_are_named(made, allowed):
-    assert made.metadata["render_modes"] == allowed
-    for mode in {"human", "ansi", "depth_array", "", 3} - set(allowed):
-        with pytest.raises(
-            ValueError, match=rf"render_mode must be .*'rgb_array'.*, got {mode!r}"
-        ):
-            made(render_mode=mode)
+@pytest.mark.parametrize("mode", ["depth_array", "", 3])
+def test_unknown_modes_are_named(mode):
+    with pytest.raises(ValueError, match=rf"render_mode must be .*'ansi', got {mode!r}"):
+        MiddlePointEnv(render_mode=mode)
 
 
 @pytest.mark.parametrize("made", [MiddlePointEnv, MiddlePointVectorEnv])

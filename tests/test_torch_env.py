@@ -234,17 +234,17 @@ def make(num_envs=2, **arguments):
     return MiddlePointTorchEnv(num_envs, **{"dtype": torch.float64, **arguments})
 
 
-def collected(env, steps, name):
-    """Return an info of all samples from k = 1 on, shape (steps, n), with no flow."""
+def outputs_of(env, steps):
+    """Return y of all samples from k = 1 on, shape (steps, n), with no flow."""
     actions = torch.zeros(env.num_envs, 1)
-    return torch.stack([env.step(actions)[-1][name].clone() for _ in range(steps)]).numpy()
+    return torch.stack([env.step(actions)[-1]["output"].clone() for _ in range(steps)])
 
 
 def test_nothing_is_drawn_from_the_global_generator():
     torch.manual_seed(0)
     state = torch.get_rng_state()
     env = make(5, **PRESETS["hard"], max_episode_steps=20)
-    env.reset(seed=0), collected(env, 60, "output")
+    env.reset(seed=0), outputs_of(env, 60)
     assert torch.equal(torch.get_rng_state(), state)
 
 
@@ -448,7 +448,7 @@ def test_quick_matrix_products_are_not_used(ask):
     def outputs():
         env = MiddlePointTorchEnv(3, noise_variance=0.5)
         env.reset(seed=0)
-        return collected(env, 60, "output")
+        return outputs_of(env, 60).numpy()
 
     expected = outputs()
     if ask == "autocast":
