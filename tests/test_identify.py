@@ -26,18 +26,7 @@ from benchmarks.identify.model import CannotTellError, HeldOut, Interval
 from benchmarks.identify.options import Columns, Knowledge
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import fault, headline, report
-from benchmarks.identify.study.command import (
-    KINDS,
-    PARTS,
-    RIVALS,
-    beside_rivals,
-    synthetic_log,
-    synthetic_plants,
-    task,
-)
-from benchmarks.identify.study.command import (
-    table as table_of,
-)
+from benchmarks.identify.study import command as study
 from benchmarks.identify.tuning import recommended, reduced
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, rollout
@@ -261,7 +250,7 @@ class TestRealLogs:
         # The noise is as slow as the walk. Without a walk, the gain's interval ends at -0.92.
         plant = {"delay": 18, "dead_zone": 6.7971, "noise_variance": 0.253856,
                  "gain_factor": 1.3164, "time_constant_factor": 1.5111}  # fmt: skip
-        model = identify(synthetic_log(plant, 1200, 101_000_002, "drift"))
+        model = identify(study.synthetic_log(plant, 1200, 101_000_002, "drift"))
         assert model.noise["disturbance_walk_variance"] == 0.0
         gain = model.estimates["gain"]
         assert gain.low < 1.3164 * -0.6825 < gain.high < -0.3
@@ -315,7 +304,7 @@ class TestRealLogs:
         try:
             model = identify(Log(flow, temperature, 1.0), Knowledge(longest_delay=10))
             Parameters(**plant_ranges(model))
-            recommended(model, Parameters(**plant_arguments(model)))
+            recommended(model)
         except ValueError:
             pass  # refused, for one of the reasons that are tested above
 
@@ -346,16 +335,16 @@ class TestTuning:
         flow = steps(generator, 1000)
         model = found_in(flow, signal.lfilter([0.0] * 4 + b, a, flow), generator)
         true = Parameters(a=a, b=b, delay=3, dead_zone=0.0)
-        tuned = recommended(model, Parameters(**plant_arguments(model)))
+        tuned = recommended(model)
         for each in tuned.values():
             assert each.worst <= 2.0
             assert Loop(each.controller, true).margins.sensitivity <= 2.0
 
     def test_what_the_log_leaves_open_slows_the_loop(self):
         model = identify(recorded(300, noise=0.3))
-        tuned = recommended(model, Parameters(**plant_arguments(model)))
+        tuned = recommended(model)
         sure = identify(recorded(1200, noise=0.01))
-        known = recommended(sure, Parameters(**plant_arguments(sure)))
+        known = recommended(sure)
         assert known["PI, SIMC"].slowed == 1.0
         for name, each in tuned.items():
             assert each is None or each.worst > known[name].worst + 0.05
@@ -507,14 +496,10 @@ class TestLog:
         np.testing.assert_allclose(first.temperature, second.temperature, rtol=1e-9)
         assert first.sampling_interval == second.sampling_interval
 
-    def test_plain(self, written):
-        log = read_log(written())
-        self.same(log, recorded(400))
-        assert log.notes == []
-
     @pytest.mark.parametrize(
         "options",
         [
+            {"sep": ","},
             {"sep": ";"},
             {"sep": "\t"},
             {"sep": ";", "decimal": ","},
@@ -526,7 +511,9 @@ class TestLog:
         shown = table()
         if options.get("quoting"):
             shown = shown.map(lambda value: f"{value!r}".replace(".", ","))
-        self.same(read_log(written(shown.to_csv(index=False, **options))), recorded(400))
+        log = read_log(written(shown.to_csv(index=False, **options)))
+        self.same(log, recorded(400))
+        assert log.notes == []
 
     @pytest.mark.parametrize("form", ["%Y-%m-%dT%H:%M:%S", "%d.%m.%Y %H:%M:%S"])
     def test_dates(self, written, form):
@@ -620,6 +607,11 @@ class TestLog:
         with pytest.raises(ValueError, match=complaint):
             read_log(written("\n".join(lines)))
 
+    def test_bad_line_among_decimal_commas_is_named(self, written):
+        rows = "".join(f"{k};1,5;{'1,0' if k != 3 else 'broken'}\n" for k in range(20))
+        with pytest.raises(ValueError, match=r"line 5: temperature .* got 'broken'"):
+            read_log(written(f"time;flow;temperature\n{rows}"))
+
     @pytest.mark.parametrize(
         ("heading", "columns", "complaint"),
         [
@@ -678,8 +670,9 @@ class TestCommand:
 
 class TestStudy:
     def test_log_of_a_known_plant(self):
-        found = task({"delay": 12, "dead_zone": 3.0, "noise_variance": 0.02}, 1200, seed=705)
-        truth, value, low, high = (found[f"delay_{part}"] for part in PARTS)
+        plant = {"delay": 12, "dead_zone": 3.0, "noise_variance": 0.02}
+        found = study.task(plant, 1200, seed=705)
+        truth, value, low, high = (found[f"delay_{part}"] for part in study.PARTS)
         assert truth == 12
         assert abs(value - 12) <= 1
         assert low <= value <= high
@@ -688,36 +681,37 @@ class TestStudy:
         assert found["seconds"] < 10.0
 
     def test_plants_do_not_drift_and_have_noise(self):
-        plants = synthetic_plants(20, 706, 1200)
+        plants = study.synthetic_plants(20, 706, 1200)
         assert not any("gain_drift" in plant for plant in plants)
         noise = [plant["noise_variance"] for plant in plants]
         assert 0.02 <= min(noise) < 0.1
         assert 0.4 < max(noise) <= 0.5
 
     def test_tables_count_by_hand(self):
-        names = ["delay", "dead_zone", "gain", "time_constant"]
-        columns = [f"{name}_{part}" for name in names for part in PARTS]
-        columns += [
-            f"{what}, {rival}" for what in ("delay", "gain", "explained") for rival in RIVALS
-        ]
+        columns = [
+            *(f"{name}_{part}" for name in ("delay", "dead_zone", "gain", "time_constant")
+              for part in study.PARTS),
+            *(f"{what}, {rival}" for what in ("delay", "gain", "explained")
+              for rival in study.RIVALS),
+        ]  # fmt: skip
         right = [10, 11, 10, 12, 3, 3.5, 2, 4, -1, -1.05, -1.2, -0.9, 100, 110, 90, 130]
         right += [11, 13, np.nan, -1.05, -1.2, -0.95, 0.9, 0.5, 0.7]
         wrong = [10, 12, 11, 13, 1, 8, 7, 9, -1, -1.2, -1.3, -1.1, 100, 130, 110, 150]
         wrong += [12, 10, np.nan, -1.2, -1.2, -1.2, 0.9, 0.5, 0.7]
         found = pd.DataFrame([right, wrong, [np.nan] * len(columns)], columns=columns)
         found = found.assign(kind="steps", refused=["", "", "no"])
-        shares = [each.split(" [")[0] for each in table_of(found)["steps"]]
+        shares = [each.split(" [")[0] for each in study.table(found)["steps"]]
         # Of the dead zones, one is too small to count. One log is refused.
         assert shares == [*["33 %"] * 3, *["50 %"] * 4, "100 %", "1"]
-        beside = beside_rivals(found)
+        beside = study.beside_rivals(found)
         assert list(beside["gain within 10 %"]) == ["50 %", "0 %", "50 %"]
         assert list(beside["delay within one sample"]) == ["50 %", "50 %", ""]
         assert list(beside["explained, median"]) == ["90.0 %", "50.0 %", "70.0 %"]
 
-    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize("kind", study.KINDS)
     def test_logs_of_each_kind_are_made_as_they_say(self, kind):
-        plant = synthetic_plants(3, 708, 600, kind)[2]
-        log = synthetic_log(plant, 600, 709, kind)
+        plant = study.synthetic_plants(3, 708, 600, kind)[2]
+        log = study.synthetic_log(plant, 600, 709, kind)
         still = np.mean(np.diff(log.flow) == 0.0)
         assert still > 0.9 if kind in ("steps", "drift", "second order") else still < 0.5
         assert ("a" in plant) == (kind == "second order")

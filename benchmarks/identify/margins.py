@@ -5,28 +5,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 from scipy import signal
 
+from agents import PIController
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 SLOWEST = 1e-5  # lowest frequency, of the Nyquist frequency
 POINTS = 20_000  # of the frequency response
-
-
-class Linear(Protocol):
-    """A controller that is linear between the limits of the flow."""
-
-    def transfer(self) -> tuple[Array, Array]:
-        """Return numerator and denominator, in powers of z^-1, from e to u."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +58,7 @@ class Loop:
     Parameters
     ----------
     controller
-        `agents.PIController` or `agents.SmithPredictor`, or anything else with their method
-        `transfer`.
+        Linear between the limits of the flow: its method `transfer` says how.
     parameters
         The plant's. A range stands for its middle, and a plant that drifts is taken at k = 0.
 
@@ -79,7 +70,7 @@ class Loop:
         Up to Nyquist's, rad/s, dense enough to see every crossing.
     """
 
-    def __init__(self, controller: Linear, parameters: Parameters) -> None:
+    def __init__(self, controller: PIController, parameters: Parameters) -> None:
         # u follows e, and y follows u: L = G_u G.
         (up, down), (b, a) = controller.transfer(), nominal(parameters).transfer()
         self.numerator, self.denominator = np.convolve(up, b), np.convolve(down, a)
@@ -90,13 +81,13 @@ class Loop:
             np.linspace(nyquist / POINTS, nyquist, POINTS),
         )
 
-    def response_at(self, frequency: Array) -> Complex:
+    def response_at(self, frequency: Array) -> NDArray[np.complex128]:
         """Return L at frequencies, rad/s."""
         at = frequency * self._interval
         return np.asarray(signal.freqz(self.numerator, self.denominator, at)[1])
 
     @cached_property
-    def response(self) -> Complex:
+    def response(self) -> NDArray[np.complex128]:
         """L at `frequency`."""
         return self.response_at(self.frequency)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -105,8 +106,7 @@ def plant_arguments(model: Model) -> dict[str, Any]:
     settled = settling(plant)
     if 2 * settled > defaults.setpoint_period:
         arguments["setpoint_period"] = 2 * settled
-    rounded: dict[str, Any] = _rounded(arguments)
-    return rounded
+    return _rounded(arguments)
 
 
 def plant_ranges(model: Model) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def plant_ranges(model: Model) -> dict[str, Any]:
         low = min(max(low, rate * 1.000001), 1.0)
         if low < high:
             arguments["time_constant_factor"] = [low, max(high, 1.0)]
-    ranges: dict[str, Any] = _rounded(arguments)
+    ranges = _rounded(arguments)
     try:
         Parameters(**ranges)
     except ValueError as error:
@@ -149,13 +149,12 @@ def plant_ranges(model: Model) -> dict[str, Any]:
     return ranges
 
 
-def _rounded(value: Any) -> Any:
-    """Return numbers with eight digits, which is more than any log tells."""
-    if isinstance(value, dict):
-        return {name: _rounded(each) for name, each in value.items()}
-    if isinstance(value, list):
-        return [_rounded(each) for each in value]
-    return float(f"{value:.8g}") if isinstance(value, float) else value
+def _rounded(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments with eight digits, which is more than any log tells."""
+    rounded: dict[str, Any] = json.loads(
+        json.dumps(arguments), parse_float=lambda text: float(f"{float(text):.8g}")
+    )
+    return rounded
 
 
 def _factors(interval: Interval) -> list[float]:

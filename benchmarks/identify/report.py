@@ -42,13 +42,11 @@ def report(model: Model, out: Path) -> list[Section]:
     out
         Where to write the pictures.
     """
-    arguments = plant_arguments(model)
-    parameters = Parameters(**arguments)
     step = reduced(model.plant)
     plots.plot_log(model, out / "log.png")
     plots.plot_residuals(model, out / "residuals.png")
     plots.plot_step(model, step, out / "step.png")
-    tuned = {} if fault(model) else recommended(model, parameters)
+    tuned = {} if fault(model) else recommended(model)
     found = {name: each for name, each in tuned.items() if each}
     sections = [
         _found(model, found),
@@ -73,7 +71,7 @@ def report(model: Model, out: Path) -> list[Section]:
     if tuned:
         sections.append(_controllers(tuned, out))
     if found:
-        sections.append(_on_the_plant(found, arguments))
+        sections.append(_on_the_plant(found, plant_arguments(model)))
     return sections
 
 

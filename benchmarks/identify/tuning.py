@@ -13,9 +13,9 @@ from scipy import integrate, signal
 from agents import PIController, SmithPredictor
 from benchmarks.controllers.step_test import StepTest
 from benchmarks.identify.armax import Array
-from benchmarks.identify.margins import Linear, Loop
+from benchmarks.identify.margins import Loop
 from benchmarks.identify.model import Model
-from benchmarks.identify.plant import settling
+from benchmarks.identify.plant import plant_arguments, settling
 from benchmarks.loop.linear import LinearModel
 from mptc_gym import Parameters
 
@@ -41,7 +41,7 @@ class Recommended:
         By which factor the closed loop is slower than by the rule.
     """
 
-    controller: PIController | SmithPredictor
+    controller: PIController
     loop: Loop
     worst: float
     slowed: float
@@ -74,13 +74,13 @@ def reduced(plant: LinearModel) -> StepTest:
     )
 
 
-def recommended(model: Model, parameters: Parameters) -> dict[str, Recommended | None]:
+def recommended(model: Model) -> dict[str, Recommended | None]:
     """Return a PI controller by SIMC's rule and a Smith predictor, by name.
 
     Each is slowed until Ms is at most 2 with the identified plant and with 95 % of those that
     the log leaves possible. It is None if that is not to be had.
     """
-    step = reduced(model.plant)
+    step, parameters = reduced(model.plant), Parameters(**plant_arguments(model))
     limits: dict[str, Any] = {"u_min": model.u_min, "u_max": model.u_max}
 
     def pi(slowed: float) -> PIController:
@@ -102,9 +102,7 @@ def recommended(model: Model, parameters: Parameters) -> dict[str, Recommended |
     known = len(stable) > len(model.possible) / 2
     plants = Plants([model.plant, *stable])
 
-    def slowed(
-        make: Callable[[float], PIController | SmithPredictor],
-    ) -> Recommended | None:
+    def slowed(make: Callable[[float], PIController]) -> Recommended | None:
         for times in range(SLOWEST if known else 0):
             controller = make(SLOWER**times)
             own, *peaks = plants.sensitivity(controller)
@@ -133,7 +131,7 @@ class Plants:
             for plant in plants
         ])  # fmt: skip
 
-    def sensitivity(self, controller: Linear) -> Array:
+    def sensitivity(self, controller: PIController) -> Array:
         """Return Ms of each plant with a controller, infinite where the loop is not stable.
 
         1 + L begins at -90 degrees, for the integrator, and ends real. By Nyquist's criterion

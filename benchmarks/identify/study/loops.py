@@ -11,7 +11,6 @@ from scipy import signal
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
 from benchmarks.identify.margins import Loop
-from benchmarks.identify.plant import plant_arguments
 from benchmarks.identify.tuning import MOST_SENSITIVE, recommended
 from mptc_gym import Parameters
 
@@ -62,7 +61,7 @@ def task(number: int, seed: int) -> dict[str, float | str]:
         model = identify(Log(u, driven + noise, 1.0))
     except ValueError as error:
         return {"refused": str(error)}
-    tuned = recommended(model, Parameters(**plant_arguments(model)))
+    tuned = recommended(model)
     found: dict[str, float | str] = {"refused": ""}
     for name, each in tuned.items():
         if each:

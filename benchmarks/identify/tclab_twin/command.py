@@ -103,10 +103,9 @@ def model_of(log: Log) -> Model:
 
 def controllers(model: Model) -> dict[str, Controller]:
     """Return those that are tuned from the model, and the course's."""
-    parameters = Parameters(**plant_arguments(model))
-    tuned = recommended(model, parameters)
-    found = {name: each.controller for name, each in tuned.items() if each}
-    return {**found, "nn-smith": nn_smith(parameters), "PI, course": COURSE}
+    found = {name: each.controller for name, each in recommended(model).items() if each}
+    told = nn_smith(Parameters(**plant_arguments(model)))
+    return {**found, "nn-smith": told, "PI, course": COURSE}
 
 
 def run(controller: Controller, seed: int = 1) -> NDArray[np.float64]:
