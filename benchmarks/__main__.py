@@ -6,7 +6,7 @@ import re
 import sys
 from pathlib import Path
 
-from benchmarks.lib.command_line import sentence
+from benchmarks.lib.commands import sentence
 
 MAP = Path(__file__).with_name("README.md")
 

@@ -1,6 +1,6 @@
 """Test the paper's claims: `python -m benchmarks.claims --help`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("claims", interrupted="the claims that are done are kept.")
 

@@ -1,6 +1,6 @@
 """Compare controllers, all of them on the same noise: `python -m benchmarks.compare --help`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("compare", width=190)
 

@@ -1,6 +1,6 @@
 """Write offline data sets: `python -m benchmarks.datasets --help`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("datasets")
 

@@ -1,6 +1,6 @@
 """Draw counterparts of the paper's figures: `python -m benchmarks.figures --help`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("figures", interrupted="the figures that are done are kept.")
 

@@ -1,6 +1,6 @@
 """Find a plant and its controllers from a log: `python -m benchmarks.identify --help`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("identify", interrupted="nothing is written.")
 

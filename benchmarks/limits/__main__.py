@@ -1,6 +1,6 @@
 """Print what no controller can do better: `python -m benchmarks.limits --help`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("limits", width=180, interrupted="bounds that are known are kept.")
 

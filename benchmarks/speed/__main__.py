@@ -1,6 +1,6 @@
 """Measure the speed of the environments: `python -m benchmarks.speed --help`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("speed", width=130, interrupted="nothing is kept.")
 

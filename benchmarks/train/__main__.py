@@ -1,6 +1,6 @@
 """Train the networks that control: `python -m benchmarks.train --help`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("train", interrupted="the same command trains what is missing.")
 

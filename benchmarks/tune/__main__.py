@@ -1,6 +1,6 @@
 """Search a controller's gains: `python -m benchmarks.tune --help`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("tune", interrupted="the same command goes on from here.")
 

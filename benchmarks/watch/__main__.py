@@ -1,6 +1,6 @@
 """Watch a controller at work, or take its place: `python -m benchmarks.watch --help`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("watch", interrupted="nothing is kept.")
 

@@ -1,6 +1,6 @@
 """Identify known plants from synthetic logs: `python -m benchmarks.identify.study`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command(
     "identify.study", interrupted="what has finished is kept, and the next call goes on."

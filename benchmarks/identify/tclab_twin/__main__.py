@@ -1,6 +1,6 @@
 """Identify TCLab's twin and control it: `python -m benchmarks.identify.tclab_twin`."""
 
-from benchmarks.lib.command_line import command
+from benchmarks.lib.commands import command
 
 main = command("identify.tclab_twin", interrupted="nothing is kept.")
 
