@@ -145,13 +145,22 @@ class TestSweep:
         wide = pd.read_csv(tmp_path / "one" / "runs.csv")["delay"].unique()
         assert wide.tolist() == [plant["delay"] for plant in random_design(2, 0, 700, WIDE)]
 
+    def test_told_each_plant_a_controller_does_better(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(command, "report", lambda *_: [])
+        errors = {}
+        for told in ("nominal", "each"):
+            given = ["--design", "random", "--plants", 4, "--agents", "smith", "--told", told]
+            assert run_sweep(tmp_path, *given) == 0
+            errors[told] = pd.read_csv(tmp_path / "runs.csv")["mae"]
+        assert errors["each"].mean() < errors["nominal"].mean() - 0.05
+
     def test_everything_that_shapes_a_task_is_in_the_key(self):
         common = {
-            "plants": [{"delay": 18}], "nominal": {}, "factories": [Factory(simc_pi)],
+            "plants": [{"delay": 18}], "told": [{}], "factories": [Factory(simc_pi)],
             "options": Options(runs=2, samples=700), "name": "pi",
         }  # fmt: skip
         changes = [
-            {}, {"plants": [{"delay": 19}]}, {"nominal": {"dead_zone": 7.0}},
+            {}, {"plants": [{"delay": 19}]}, {"told": [{"dead_zone": 7.0}]},
             {"factories": [Factory(simc_pi, provenance={"file": "b"})]}, {"name": "nn"},
             {"options": Options(runs=3, samples=700)},
             {"options": Options(runs=2, samples=650)},

@@ -42,6 +42,7 @@ def execute(options: Options, console: Console) -> str:
     for plant in plants:
         with blame(f"--design {options.design}"):
             Parameters(**plant)
+    told = plants if options.told == "each" else [nominal] * len(plants)
     made = origin()
     out = out_folder(options.out or Path(f"results/sweep-{options.design}"))
     training = options.controllers.training()
@@ -64,22 +65,23 @@ def execute(options: Options, console: Console) -> str:
             {
                 # Every plant has a member, in turn: how much they differ shows in the maps.
                 f"{name} {i}": partial(
-                    agent_task, factories[i % len(factories)], nominal, plant, **common
+                    agent_task, factories[i % len(factories)], told[i], plant, **common
                 )
                 for i, plant in enumerate(plants)
             },
             # A folder for each, so that one more controller leaves the others' tasks valid.
-            out / "tasks" / agent_key(name, factories, plants, nominal, options),
+            out / "tasks" / agent_key(name, factories, plants, told, options),
             title=name,
         )
     seconds = time.perf_counter() - began
 
     runs = table(differing, list(controllers), limits, results)
-    sections = report(runs, out, options.design)
+    sections = report(runs, out, options.design, options.told)
     write_csv(out / "runs.csv", runs)
     about = {"seconds": round(seconds, 1), "options": flat(options)}
     write_json(out / "provenance.json", {**made, **about, "policies": provenances(members)})
-    title = "Controllers on plants that they were not made for"
+    knowing = "are told" if options.told == "each" else "were not made for"
+    title = f"Controllers on plants that they {knowing}"
     write_report(out, title, sections, provenance_line("sweep", made))
     show(sections, console)
     count = len(limits) + len(results)
@@ -90,7 +92,7 @@ def agent_key(
     name: str,
     factories: Sequence[Factory],
     plants: list[Arguments],
-    nominal: Arguments,
+    told: list[Arguments],
     options: Options,
 ) -> str:
     """Return a name made of everything that shapes the results of a controller."""
@@ -99,7 +101,7 @@ def agent_key(
         factories[0].module,
         options=[options.runs, options.samples],
         plants=plants,
-        nominal=nominal,
+        told=told,
         controller=name,
         policies=provenances({name: factories}),
     )

@@ -30,6 +30,9 @@ class Options:
     """Plants of a random or wide design."""
     design_seed: Seed = 0
     """Seed that the plants of a random or wide design are drawn with."""
+    told: Literal["nominal", "each"] = "nominal"
+    """nominal: every controller is made for the one plant above; each: for the very plant that
+    it runs on, as it is at the start if it drifts."""
     runs: Runs = 20
     """Runs of a controller on a plant."""
     samples: Runs = 1200

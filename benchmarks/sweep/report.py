@@ -97,15 +97,18 @@ DIFFERENCES_TEXT = (
 )
 
 
-def report(runs: pd.DataFrame, out: Path, design: str) -> list[Section]:
-    """Draw the maps of a "grid", "random" or "wide" design, and return the report."""
+def report(runs: pd.DataFrame, out: Path, design: str, told: str) -> list[Section]:
+    """Draw the maps of a "grid", "random" or "wide" design, and return the report.
+
+    What adaptation is good for is asked where controllers are `told` a "nominal" plant.
+    """
     title = "How many plants each controller works on"
     if design == "grid":
         maps.plot_grid(runs, out / "map.png")
         return [Section(title, [OVERVIEW_TEXT], overview(runs), ["map.png"])]
     maps.plot_plants(runs, out / "plants.png")
     sections = [Section(title, [OVERVIEW_TEXT], overview(runs), ["plants.png"])]
-    for title, text, pairs, picture in QUESTIONS:
+    for title, text, pairs, picture in QUESTIONS if told == "nominal" else ():
         asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
         if not asked:
             continue
