@@ -6,7 +6,7 @@ from functools import partial
 import gymnasium
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import agents
@@ -20,12 +20,8 @@ from agents import (
     SmithPredictor,
     Weights,
 )
-from agents.controller import action_from_command
 from agents.policy_network import PRETRAINED
 from benchmarks.loop.rollout import make_plants, rollout
-from mptc_gym import Parameters
-from mptc_gym.parameters import PlantNumbers
-from mptc_gym.plant import Plant
 from tests.conftest import run_closed
 
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
@@ -33,48 +29,6 @@ FIELDS = ("W", "theta_1", "W_1", "theta_2")
 
 def same(first, second):
     return all(np.array_equal(getattr(first, f), getattr(second, f)) for f in FIELDS)
-
-
-class TestActions:
-    @settings(max_examples=300, deadline=None)
-    @given(
-        u_min=st.floats(-20, 5),
-        reach=st.floats(0.01, 30),
-        dead_zone=st.floats(0.01, 15),
-        beyond=st.sampled_from([0.0, 1e-12, 1e-9, 1e-7, 1e-4]),
-    )
-    @example(u_min=-10.0, reach=20.0, dead_zone=7.0, beyond=0.0)
-    @example(u_min=-10.0, reach=20.0, dead_zone=4.1, beyond=0.0)
-    @example(u_min=-6.0, reach=16.0, dead_zone=7.0, beyond=0.0)  # -7 t/h lies below u_min
-    @example(u_min=-5.0, reach=24.2, dead_zone=7.1, beyond=0.0)  # an action of about 0
-    def test_a_command_on_the_edge_has_an_effect(self, u_min, reach, dead_zone, beyond):
-        u_max = u_min + reach
-        edge = dead_zone * (1.0 + beyond)
-        numbers = PlantNumbers(delay=0.0, dead_zone=dead_zone, u_min=u_min, u_max=u_max)
-        for command in (np.float64(-edge), np.float64(edge)):
-            (action,) = action_from_command(command, u_min, u_max, dead_zone)
-            plant = Plant(Parameters(), numbers)
-            arrived, applied, _ = plant.step(float(action), 0.0, 0.0)
-            assert applied == np.clip(arrived, u_min, u_max)  # and not 0
-            assert arrived == pytest.approx(command, abs=1e-5)
-
-    def test_commands_elsewhere_are_only_rounded(self, rng):
-        commands = rng.uniform(-12, 12, 1000)
-        commands = np.r_[commands[np.abs(np.abs(commands) - 7.0) > 1e-3], 0.0]
-        known = action_from_command(commands, -10.0, 10.0, 7.0)
-        np.testing.assert_array_equal(known, action_from_command(commands, -10.0, 10.0))
-        assert known.dtype == np.float32
-
-    def test_a_controller_that_knows_the_dead_zone(self):
-        class Edge(Controller):
-            def _control(self, observation):
-                return -self.dead_zone * np.ones_like(observation[..., 0])
-
-        knows = Edge(n_obs=1, u_min=-10.0, u_max=10.0, dead_zone=7.0)
-        runs = rollout(make_plants(3, 5, dead_zone=7.0), knows, 5, seed=0)
-        assert runs.applied == pytest.approx(np.full((5, 3), -7.0), abs=1e-5)
-        with pytest.raises(ValueError, match="dead_zone"):
-            Edge(n_obs=1, u_min=-10.0, u_max=10.0, dead_zone=-1.0)
 
 
 class TestPI:

@@ -307,9 +307,8 @@ class TestDraws:
         inside = (np.abs(xi) < 0.6745).mean()  # the quartiles of a normal distribution
         assert abs(inside - 0.5) < 5 * (0.25 / xi.size) ** 0.5
 
-    @pytest.mark.parametrize("c", [[1.0], [1.0, -0.35740, -0.03392]])
-    def test_noise_has_the_colour_of_c(self, library, c):
-        n, steps, variance = 400, 250, 0.5
+    def test_noise_has_the_colour_of_c(self, library):
+        n, steps, variance, c = 400, 250, 0.5, [1.0, -0.35740, -0.03392]
         env = library.make(n, noise_variance=variance, c=c)
         env.reset(seed=4)
         noise = collected(env, steps, "noise")[2:] / variance**0.5
@@ -320,16 +319,6 @@ class TestDraws:
             # means.
             means = product.mean(0)
             assert abs(means.mean() - expected) < 5 * means.std() / n**0.5
-
-    def test_the_first_noise_of_each_episode_knows_none_before(self, library):
-        n = 4000
-        env = library.make(n, noise_variance=1.0, c=[1.0, 3.0], max_episode_steps=10)
-        env.reset(seed=0)
-        noise = collected(env, 30, "noise")
-        for first in (0, 11, 22):  # a reset lies between two episodes
-            spread = (2.0 / n) ** 0.5
-            assert abs(noise[first].var() - 1.0) < 5 * spread
-            assert abs(noise[first + 1].var() - 10.0) < 5 * 10.0 * spread
 
     def test_readings_are_off_by_white_noise(self, library):
         n, steps = 200, 100
@@ -395,16 +384,6 @@ class TestDraws:
         assert abs(levels.mean()) < 5 / (3 * levels.size) ** 0.5
         assert abs((levels**2).mean() - 1 / 3) < 5 * ((1 / 5 - 1 / 9) / levels.size) ** 0.5
 
-    def test_the_walk_gains_its_variance(self, library):
-        n, steps, variance = 2000, 400, 0.01
-        env = library.make(n, disturbance_walk_variance=variance)
-        env.reset(seed=5)
-        load = collected(env, steps, "disturbance")
-        ends = load[steps - 1]
-        assert abs(ends.var() / (variance * steps) - 1.0) < 5 * (2 / n) ** 0.5
-        moves = np.diff(load[9::10], axis=0)
-        assert abs((moves[1:] * moves[:-1]).mean()) < 5 * variance * 10 / moves.size**0.5
-
     def test_ranges_have_both_ends(self, library):
         n = 20_000
         for type_ in library.types:
@@ -421,21 +400,22 @@ class TestDraws:
             assert abs(gains.mean() - 1.125) < 5 * 0.75 / (12 * n) ** 0.5
             assert abs(np.corrcoef(delays, gains)[0, 1]) < 5 / n**0.5
 
-    def test_partial_resets_leave_the_distributions_as_they_are(self, library):
+    def test_resets_leave_the_distributions_as_they_are(self, library):
         n, steps, variance, walk = 1500, 250, 2.0, 0.01
         env = library.make(
             n, noise_variance=variance, c=[1.0, 3.0], disturbance_walk_variance=walk,
-            setpoint="random", setpoint_period=60, max_episode_steps=None,
+            setpoint="random", setpoint_period=60, max_episode_steps=100,
         )  # fmt: skip
         _, infos = env.reset(seed=6)
-        rng = np.random.default_rng(0)
+        rng, ended = np.random.default_rng(0), np.zeros(n, bool)
         age, begun = np.zeros(n, int), np.zeros(n, int)  # of the episode; when it last changed
         level = plain(infos["setpoint"])
         noise, load, ages, lengths = [], [], [], []
         for _ in range(steps):
-            infos = plain(env.step(np.zeros((n, 1)))[-1])
-            age += 1
-            changed = infos["setpoint"] != level
+            _, _, _, truncated, infos = plain(env.step(np.zeros((n, 1))))
+            age = np.where(ended, 0, age + 1)
+            begun[ended] = 0
+            changed = (infos["setpoint"] != level) & ~ended
             lengths.append((age - begun)[changed])
             begun[changed], level = age[changed], infos["setpoint"]
             noise.append(infos["noise"])
@@ -446,6 +426,7 @@ class TestDraws:
                 _, infos = env.reset(options={"reset_mask": mask})
                 level = np.where(mask, plain(infos["setpoint"]), level)
                 age[mask] = begun[mask] = 0
+            ended = truncated & ~mask
         noise, load, ages = np.array(noise), np.array(load), np.array(ages)
         for found, expected in (
             (noise[ages == 1], variance),

@@ -8,7 +8,6 @@ from functools import partial
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import data_equivalence
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,7 +20,7 @@ INFO = {"output", "setpoint", "error", "command", "applied", "noise"}
 
 
 @pytest.mark.parametrize("library", ["gymnasium.utils", "stable_baselines3.common"])
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(arguments=valid_arguments)
 def test_the_checker_of_a_library_is_content_with_any_valid_arguments(library, arguments):
     checker = pytest.importorskip(f"{library}.env_checker", reason="it is what checks")
@@ -143,30 +142,9 @@ def test_measurement_saturates_and_truth_does_not():
     assert list(record["observation"][-1]) == [5, 5, 5, 3, 3, 3, 2]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ({"setpoint_amplitude": 2.0, "setpoint_period": 6}, [2, 2, 2, -2, -2, -2, 2, 2, 2]),
-        ({"setpoint": [1.0, 2.0]}, [1, 2, 2, 2, 2]),
-    ],
-)
-def test_set_points_by_hand(arguments, expected):
-    actions = np.zeros(len(expected) - 1)
-    assert list(run(MiddlePointEnv(**arguments), actions)["setpoint"]) == expected
-
-
-def test_same_seed_same_trajectory_to_the_bit(rng):
-    actions = rng.uniform(-1, 1, 700)
-    arguments = {"noise_variance": 0.5, "setpoint": "random"}
-    first = run(MiddlePointEnv(**arguments), actions, seed=5)
-    env = MiddlePointEnv(**arguments)
-    run(env, actions[:10], seed=9)  # whatever happened before
-    second = run(env, actions, seed=5)
-    other = run(env, actions, seed=6)
-    for key in first:
-        np.testing.assert_array_equal(first[key], second[key])
-    assert not np.array_equal(first["noise"], other["noise"])
-    assert not np.array_equal(first["setpoint"], other["setpoint"])
+def test_square_wave_by_hand():
+    env = MiddlePointEnv(setpoint_amplitude=2.0, setpoint_period=6)
+    assert list(run(env, np.zeros(8))["setpoint"]) == [2, 2, 2, -2, -2, -2, 2, 2, 2]
 
 
 @pytest.mark.parametrize(
@@ -325,22 +303,6 @@ def test_a_tensor_of_two_numbers_is_refused_as_an_array_of_two_is():
     with pytest.raises(ValueError, match="action must be one finite number"):
         env.step(torch.zeros(2))
     env.step(torch.zeros(1))
-
-
-def test_step_before_reset():
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        gymnasium.make("MiddlePoint-v0").step(np.zeros(1, np.float32))
-
-
-def test_spec_round_trips_through_json():
-    env = gymnasium.make(
-        "MiddlePoint-v0", a=[1.0, -0.5], setpoint=[1.0, 2.0], delay=3, noise_variance=0.5,
-        action_window=5, reward="absolute",
-    )  # fmt: skip
-    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert again.unwrapped.parameters == env.unwrapped.parameters
-    actions = np.linspace(-1, 1, 50)
-    assert data_equivalence(run(env, actions), run(again, actions), exact=True)
 
 
 def test_help_shows_every_argument():

@@ -17,7 +17,6 @@ from scipy import signal
 from agents import PIController
 from benchmarks.identify import log as log_module
 from benchmarks.identify.__main__ import main
-from benchmarks.identify.armax import Orders, Rows
 from benchmarks.identify.cleaning import without_noise_of_held_flow, without_standstill
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log, read_log
@@ -88,6 +87,7 @@ class TestFit:
         np.testing.assert_allclose(model.plant.a, PAPER.a, atol=2e-3)
         np.testing.assert_allclose(model.plant.b, PAPER.b, atol=2e-4)
         assert model.estimates["delay"].value == 18
+        assert model.estimates["dead_zone"].value == 0.0
 
     def test_log_without_noise_needs_no_higher_orders(self):
         log = recorded(noise=0.0)
@@ -119,13 +119,6 @@ class TestFit:
         found = identify(Log(flow, answer(flow, generator), 8.0)).estimates["dead_zone"]
         assert found.value == pytest.approx(5.0)
         assert (found.low, found.high) == (pytest.approx(3.1), pytest.approx(6.9))
-
-    def test_flow_behind_the_actuator_needs_no_dead_zone(self, good):
-        log, _ = good
-        applied = np.where(np.abs(log.flow) < 5.0, 0.0, log.flow)
-        model = identify(Log(applied, log.temperature, 8.0), Knowledge(applied=True))
-        assert model.estimates["dead_zone"].value == 0.0
-        assert model.estimates["delay"].value == 18
 
     def test_gaps_are_left_out(self, good):
         log, whole = good
@@ -357,22 +350,6 @@ class TestTuning:
         assert "80.0 %" in headline(poor)
         gain = {**model.estimates, "gain": Interval(-0.7, -1.0, 0.1)}
         assert "the direction" in fault(replace(model, estimates=gain))
-
-
-class TestRows:
-    def test_least_squares_over_a_gap_finds_what_made_the_errors(self):
-        generator = np.random.default_rng(707)
-        xi = generator.normal(size=(2, 4000))
-        noise = signal.lfilter([1.0, -0.6], [1.0], xi, axis=1)  # two stretches, each from rest
-        regressor = generator.normal(size=8000)
-        known = np.ones(8001, dtype=bool)
-        known[4000] = False
-        target = 3.0 * regressor + noise.ravel()
-        table = np.column_stack([target, regressor])
-        linear, c, errors = Rows(known, known).solve(table, Orders(0, 1, 1))
-        assert linear[0] == pytest.approx(3.0, abs=0.05)
-        assert c[0] == pytest.approx(-0.6, abs=0.05)
-        np.testing.assert_allclose(errors, xi.ravel(), atol=0.3)
 
 
 class TestRefusal:

@@ -195,18 +195,6 @@ class TestProgramme:
         least = best_plan(setpoint, **plant).value
         assert least * (1 - 1e-6) <= found < 1.005 * least
 
-    def test_a_grid_of_states_comes_to_the_same(self):
-        # Dynamic programming backwards over y, without delay: y(k+1) = 0.9 y(k) + 0.2 u(k).
-        plant, setpoint = ODD[1], np.repeat([0.0, 2.0, -0.5, 1.0], 10)
-        grid = np.linspace(-3.0, 6.0, 1801)
-        flows = np.linspace(-1.0, 3.0, 81)
-        to_go = np.zeros(len(grid))
-        for level in setpoint[:0:-1]:
-            cost = np.abs(level - grid) + to_go
-            to_go = np.min([np.interp(0.9 * grid + 0.2 * u, grid, cost) for u in flows], axis=0)
-        found = abs(setpoint[0]) + np.interp(0.0, grid, to_go)
-        assert best_plan(setpoint, **plant).value == pytest.approx(found, rel=0.01)
-
     @pytest.mark.parametrize("period", [40, 76, 152, 200, 320])
     def test_a_controller_that_knows_the_future_attains_the_bound(self, period):
         # Without a dead zone, so that every flow can be applied.

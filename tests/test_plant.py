@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 import mptc_gym
-from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
+from agents.controller import action_from_command as agents_action
+from mptc_gym.parameters import PlantNumbers
 from mptc_gym.plant import Plant, action_from_command, float32_action
 from mptc_gym.ranges import Ranges
 from mptc_gym.signals import EpisodeStream
@@ -76,46 +79,52 @@ def test_scaling_by_hand():
         assert action_from_command(command, -4.0, 8.0) == action
 
 
-EDGES = [
-    *((edge, -10.0, 10.0) for edge in (0.1, 4.1, 5.0, 6.3, 6.5, 7.0, 9.0, 9.9, 10.0)),
-    (2.0, -6.0, 8.0), (5.0, -5.0, 15.0), (0.3, -0.4, 0.7), (9.3, -10.1, 9.3),
-    (1e-3, -1.0, 1e6), (7.0, -1e9, 7.0),
-]  # fmt: skip
+BOTH = pytest.mark.parametrize("scaled", [float32_action, agents_action])
 
 
-@pytest.mark.parametrize(("dead_zone", "u_min", "u_max"), EDGES)
-def test_a_command_on_the_edge_of_the_dead_zone_passes_in_float32(dead_zone, u_min, u_max):
-    arguments = {"dead_zone": dead_zone, "u_min": u_min, "u_max": u_max}
-    reached = [edge for edge in (-dead_zone, dead_zone) if u_min <= edge <= u_max]
-    for command in reached:
-        action = float32_action(command, u_min, u_max, dead_zone)
+@BOTH
+@settings(max_examples=300, deadline=None)
+@given(
+    u_min=st.floats(-20, 5),
+    reach=st.floats(0.01, 30),
+    dead_zone=st.floats(0.01, 15),
+    beyond=st.sampled_from([0.0, 1e-12, 1e-9, 1e-7, 1e-4]),
+)
+@example(u_min=-10.0, reach=20.0, dead_zone=7.0, beyond=0.0)
+@example(u_min=-10.0, reach=20.0, dead_zone=4.1, beyond=0.0)
+@example(u_min=-6.0, reach=16.0, dead_zone=7.0, beyond=0.0)  # -7 t/h lies below u_min
+@example(u_min=-5.0, reach=24.2, dead_zone=7.1, beyond=0.0)  # an action of about 0
+@example(u_min=-1e9, reach=1e9 + 7.0, dead_zone=7.0, beyond=0.0)
+def test_a_command_on_the_edge_of_the_dead_zone_passes_in_float32(
+    scaled, u_min, reach, dead_zone, beyond
+):
+    u_max = u_min + reach
+    edge = dead_zone * (1.0 + beyond)
+    numbers = PlantNumbers(delay=0.0, dead_zone=dead_zone, u_min=u_min, u_max=u_max)
+    for command in (np.float64(-edge), np.float64(edge)):
+        action = scaled(command, u_min, u_max, dead_zone)
         assert action.dtype == np.float32
-        env, envs = MiddlePointEnv(**arguments), MiddlePointVectorEnv(1, **arguments)
-        env.reset(seed=0), envs.reset(seed=0)
-        passed = env.step(action.reshape(1))[-1]["applied"]
+        plant = Plant(mptc_gym.Parameters(), numbers)
+        arrived, passed, _ = plant.step(action.item(), 0.0, 0.0)
+        assert passed == np.clip(arrived, u_min, u_max)  # and not 0
         # Rounding to float32 makes 1.2e-7 of the range, at the most.
-        assert passed == pytest.approx(command, abs=1.3e-7 * (u_max - u_min))
-        assert abs(passed) >= dead_zone
-        assert envs.step(action.reshape(1, 1))[-1]["applied"][0] == passed
+        assert arrived == pytest.approx(command, abs=1.3e-7 * (reach + abs(u_min) + edge))
 
 
-def test_only_commands_on_the_edge_are_moved(rng):
+@BOTH
+def test_only_commands_on_the_edge_are_moved(scaled, rng):
     commands = rng.uniform(-12, 12, 1000)
     plain = action_from_command(commands, -10.0, 10.0).astype(np.float32)
-    np.testing.assert_array_equal(float32_action(commands, -10.0, 10.0, 7.0), plain)
+    np.testing.assert_array_equal(scaled(commands, -10.0, 10.0, 7.0).ravel(), plain)
     inside = np.nextafter(7.0, 0.0)  # stays inside
     assert applied(7.0, dead_zone=7.0) == 7.0
-    assert step(float(float32_action(inside, -10, 10, 7.0)), dead_zone=7.0)[1] == 0.0
+    assert step(scaled(inside, -10, 10, 7.0).item(), dead_zone=7.0)[1] == 0.0
     # Many at a time, each with limits of its own.
-    dead_zones = np.array([4.1, 6.3, 7.0])
+    dead_zones, limits = np.array([4.1, 6.3, 7.0]), np.array([10.0, 11.0, 12.0])
     for sign in (-1, 1):
-        actions = float32_action(
-            sign * dead_zones, -10.0, np.array([10.0, 11.0, 12.0]), dead_zones
-        )
-        for action, dead_zone, u_max in zip(
-            actions, dead_zones, (10.0, 11.0, 12.0), strict=True
-        ):
-            _, passed, _ = step(float(action), dead_zone=dead_zone, u_max=u_max)
+        actions = scaled(sign * dead_zones, -10.0, limits, dead_zones).ravel().tolist()
+        for action, dead_zone, u_max in zip(actions, dead_zones, limits, strict=True):
+            _, passed, _ = step(action, dead_zone=dead_zone, u_max=u_max)
             assert passed == pytest.approx(sign * dead_zone, abs=2e-6)
 
 
