@@ -197,18 +197,6 @@ class TestEstimates:
             "The runs tell all of them apart, at 95 %."
         )
 
-    def test_no_controller_does(self, tmp_path):
-        # All runs of all controllers but PPO, which is trained elsewhere.
-        names = "square-dead-zone-7", "square-noise", "constant", "load"
-        options = ("--agents", *FIXED, "--runs", 20, "--scenarios", *names)
-        run_compare(tmp_path / "out", *options)
-        estimates = pd.read_csv(tmp_path / "out/estimates.csv")
-        assert len(estimates) == len(FIXED) * len(names)
-        best = estimates[(estimates["agent"] == "mpc") & (estimates["scenario"] != "load")]
-        assert best["ratio"].between(0.97, 1.05).all()
-        report = (tmp_path / "out/report.md").read_text()
-        assert "No controller comes below" in report
-
 
 class TestReport:
     def test_pages(self, tmp_path):
@@ -420,6 +408,7 @@ class TestCompare:
             .sort_index()
             for name in ("runs.csv", "estimates.csv")
         )
+        assert (estimates["ratio"] > 1.0).all()
         for agent, preset in runs.index.unique():
             factory = ROSTER[agent].members()[0]
             controller = factory(PRESETS[preset], 2, SEED)

@@ -17,6 +17,7 @@ from scipy import signal
 from agents import PIController
 from benchmarks.identify import log as log_module
 from benchmarks.identify.__main__ import main
+from benchmarks.identify.armax import Orders, Rows
 from benchmarks.identify.cleaning import without_noise_of_held_flow, without_standstill
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log, read_log
@@ -350,6 +351,22 @@ class TestTuning:
         assert "80.0 %" in headline(poor)
         gain = {**model.estimates, "gain": Interval(-0.7, -1.0, 0.1)}
         assert "the direction" in fault(replace(model, estimates=gain))
+
+
+class TestRows:
+    def test_least_squares_over_a_gap_finds_what_made_the_errors(self):
+        generator = np.random.default_rng(707)
+        xi = generator.normal(size=(2, 4000))
+        noise = signal.lfilter([1.0, -0.6], [1.0], xi, axis=1)  # two stretches, each from rest
+        regressor = generator.normal(size=8000)
+        known = np.ones(8001, dtype=bool)
+        known[4000] = False
+        target = 3.0 * regressor + noise.ravel()
+        table = np.column_stack([target, regressor])
+        linear, c, errors = Rows(known, known).solve(table, Orders(0, 1, 1))
+        assert linear[0] == pytest.approx(3.0, abs=0.05)
+        assert c[0] == pytest.approx(-0.6, abs=0.05)
+        np.testing.assert_allclose(errors, xi.ravel(), atol=0.3)
 
 
 class TestRefusal:
