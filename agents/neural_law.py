@@ -22,21 +22,27 @@ Array = NDArray[np.float64]
 PRETRAINED: Final = Path(__file__).parent / "pretrained"
 # Exponential means, by the share that the newest sample has: of the load that explains the
 # residual, and of the residual itself. A share of 1 is the newest sample alone.
-LOAD_RATES: Final = (1.0, 0.5, 0.2, 0.07, 0.025, 0.01)
+LOAD_RATES: Final = (1.0, 0.5, 0.2, 0.07, 0.025, 0.008, 0.002)
 RESIDUAL_RATES: Final = (1.0, 0.5, 0.2)
 REFERENCE: Final = 2  # of the loads, the one that news are told from
 NEWS: Final = 7  # samples of news that the network sees
 LEAST_NOISE: Final = 0.002  # of the reach
 DOUBT: Final = 0.0002  # of the reach, added to noise before its logarithm is taken
-TRUST: Final = 2.0  # how far means that have missed less are preferred at first
-NOISE_RATE: Final = 0.05  # a sample, of the estimate of the noise
+# Misses of the means are remembered for 20 samples and for 100, by which a load is told from
+# noise. Logarithms of their ratios are evidence, weighed so, and more of it counts for less.
+MISS_RATES: Final = (0.05, 0.01)  # a sample
+TRUST: Final = (5.0, 30.0)
+SATURATION: Final = 0.07
 CLEARANCE: Final = 0.005  # of half the range, that commands pass the dead zone by
 MOST_ADDED: Final = 0.45  # of half the range
-# Weights of the means before the network has a say: logarithms, but for a constant.
-PREFERENCE: Final = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+MOST_WEIGHT: Final = 40.0  # the logarithm, up or down
+# Weights of the means before the network has a say: logarithms, but for a constant. Unless
+# there is evidence of it, no load is expected to jump. The network tilts those of the loads.
+PREFERENCE: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.5, 2.5, 0.0, 1.0, 0.0)
+TILT: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
 _LOADS, _MEANS = len(LOAD_RATES), len(LOAD_RATES) + len(RESIDUAL_RATES)
-INPUTS: Final = _MEANS - 2 + NEWS + 1 + 6 + 6 + _LOADS
-OUTPUTS: Final = _MEANS + 1
+INPUTS: Final = _MEANS - 2 + NEWS + 1 + 6 + 6 + 2 * _LOADS
+OUTPUTS: Final = 1 + len(RESIDUAL_RATES) + 1
 
 
 class Network(Protocol):
@@ -98,15 +104,24 @@ class Law:
         NumPy or PyTorch.
     still
         Returns a number without its gradient.
+    haste
+        How much quicker than the network asks for: it tilts the means of the load to the newer
+        samples, and is added to the logit of the rate.
     """
 
     def __init__(
-        self, prior: Prior, xp: Any = np, still: Callable[[Any], Any] = lambda value: value
+        self,
+        prior: Prior,
+        xp: Any = np,
+        still: Callable[[Any], Any] = lambda value: value,
+        haste: float = 0.0,
     ) -> None:
         self._xp, self._still = xp, still
         zero = self._zero = prior.unit * 0.0
         self._rates = self._array(LOAD_RATES + RESIDUAL_RATES)
+        self._tilt, self._haste = self._array(TILT), haste
         self._preference = self._array(PREFERENCE)
+        self._preference[:_LOADS] -= haste * self._tilt
         self._sharpness = self._array([1.0, *(rate**-0.5 for rate in LOAD_RATES[1:-1])])
         groups = np.zeros((_MEANS, _MEANS))
         groups[:_LOADS, :_LOADS] = groups[_LOADS:, _LOADS:] = 1.0
@@ -114,7 +129,7 @@ class Law:
         self._nothing = zero[:, None] + self._array([0.0] * (_MEANS - 1 + NEWS))
         self._means = zero[:, None] + 0.0 * self._rates
         self._news = zero[:, None] + self._array([0.0] * NEWS)
-        self._misses = zero[:, None] + LEAST_NOISE + 0.0 * self._rates[:_LOADS]
+        self._misses = [zero[:, None] + LEAST_NOISE + 0.0 * self._rates[:_LOADS]] * 2
         self._plain = zero[:, None] + self._array([0.0] * (_MEANS - _LOADS))
         self._tell(prior)
 
@@ -135,7 +150,7 @@ class Law:
         residuals = self._means[:, _LOADS:] * ratio[:, None] + residual[:, None]
         self._means = self._xp.concatenate([loads, residuals], axis=1)
         self._news = self._news * units[:, None]
-        self._misses = self._misses * units[:, None]
+        self._misses = [misses * units[:, None] for misses in self._misses]
         self._tell(prior)
 
     def _tell(self, prior: Prior) -> None:
@@ -177,10 +192,18 @@ class Law:
         now, before, last = state
         missed = load[:, None] - self._means[:, :_LOADS]
         news, size = missed[:, REFERENCE], abs(still(missed))
-        most = 4.0 * self._misses + LEAST_NOISE  # outliers count for no more
-        self._misses = self._misses + NOISE_RATE * (xp.clip(size, None, most) - self._misses)
-        noise = self._misses[:, REFERENCE]
-        doubts = xp.log((self._misses + DOUBT) / (noise + DOUBT)[:, None])
+        size = xp.clip(size, None, 4.0 * self._misses[0] + LEAST_NOISE)  # no outliers
+        self._misses = [
+            misses + rate * (size - misses)
+            for rate, misses in zip(MISS_RATES, self._misses, strict=True)
+        ]
+        noise = self._misses[0][:, REFERENCE]
+        doubts, slow = (
+            xp.log((misses + DOUBT) / (misses[:, REFERENCE] + DOUBT)[:, None])
+            for misses in self._misses
+        )
+        against = TRUST[0] * doubts + TRUST[1] * slow
+        against = against / (1.0 + SATURATION * abs(against))
         newest = xp.concatenate(
             [
                 load[:, None] + 0.0 * self._rates[:_LOADS],
@@ -210,7 +233,7 @@ class Law:
         )
         compared = compared / (1.0 + abs(compared))
         level = 0.3 * xp.log(noise + DOUBT) + 1.5
-        about = xp.concatenate([level[:, None], doubts, self._told], axis=1)
+        about = xp.concatenate([level[:, None], doubts, 0.1 * against, self._told], axis=1)
         seen, held, zero = (
             [10.0 * (now - before), 1.4 * setpoint],
             setpoint - residual,
@@ -222,11 +245,13 @@ class Law:
             xp.concatenate([compared, xp.stack(seen, axis=1), about], axis=1),
             xp.concatenate([self._nothing, xp.stack(resting, axis=1), about], axis=1),
         )
-        preferred = xp.concatenate([-TRUST * doubts, self._plain], axis=1) + self._preference
-        weights = xp.exp(5.0 * outputs[:, :-1] + preferred)
+        preferred = xp.concatenate([-against, self._plain], axis=1) + self._preference
+        chosen = [2.0 * outputs[:, :1] * self._tilt, 3.0 * outputs[:, 1:-1]]
+        weights = xp.concatenate(chosen, axis=1) + preferred
+        weights = xp.exp(xp.clip(weights, -MOST_WEIGHT, MOST_WEIGHT))
         weights = weights / (weights @ self._groups)
         target = setpoint - (weights * means * self._shares).sum(1)
-        rate = 1.0 / (1.0 + xp.exp(0.5 - outputs[:, -1]))
+        rate = 1.0 / (1.0 + xp.exp(0.5 - self._haste - outputs[:, -1]))
         return target + rate / self.prior.unit * (target - now) + added
 
     def applied(self, flow: Any) -> tuple[Any, Any]:

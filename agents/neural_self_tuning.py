@@ -14,6 +14,9 @@ from agents.self_tuning import Learning, SelfTuningController
 Array = NDArray[np.float64]
 
 MOST_UNCERTAIN = 0.3  # the network was trained up to this
+# The network was trained with models that stay as they are. What one that changes explains
+# changes, too, and is sooner out of date.
+HASTE = 0.75
 
 
 class NeuralSelfTuningController(SelfTuningController):
@@ -46,6 +49,7 @@ class NeuralSelfTuningController(SelfTuningController):
         gain_spread=0.25,
         delay_spread=6.0,
         time_constant_spread=0.3,
+        prefilter_zero=0.965,
     )
     _reach: Array  # of the bank's model, degC, (loops,)
     _residual: Array  # the last one, degC, (loops,)
@@ -108,7 +112,7 @@ class NeuralSelfTuningController(SelfTuningController):
             uncertainty=np.minimum(self._spread(delay), MOST_UNCERTAIN),
         )
         if self._rule is None:
-            self._rule = Law(prior)
+            self._rule = Law(prior, haste=HASTE)
         else:
             self._rule.retell(prior, self._reach / reach, (before - self._residual) / reach)
         self._reach = reach

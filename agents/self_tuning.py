@@ -27,9 +27,8 @@ ZONES = (-0.5, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
 ZONE_SPREAD = 0.2
 NOISE_SAMPLES = 30.0  # that the expected noise is worth
 GAINS = (0.3, 3.0)  # estimates stay between these multiples of the step test's gain
-# The prefilter (1 - 0.92 z^-1) / (1 - 0.6 z^-1) of what is compared: its zero makes the noise
-# white, its pole takes out what is too quick for models of first order.
-PREFILTER_ZERO, PREFILTER_POLE = 0.92, 0.6
+# Of the prefilter of what is compared: takes out what is too quick for models of first order.
+PREFILTER_POLE = 0.6
 LEAST_NOISE = 0.02  # degC; smaller errors tell no model from another
 EXCITED = 0.05  # of half the range: the flow has to have moved by it to be learnt from
 MEMORY = 20  # samples before the longest delay, in which it has to have moved
@@ -58,6 +57,9 @@ class Learning:
     gain_spread, delay_spread, time_constant_spread
         Standard deviations of the step test: of the gain, as a share of it; of the delay,
         samples; of the time constant's logarithm.
+    prefilter_zero
+        Of the prefilter of what is compared: 0.92 makes the noise white; nearer to 1, a load
+        that changes is taken less for another gain.
     """
 
     interval: int = 10
@@ -67,6 +69,7 @@ class Learning:
     gain_spread: float = 0.5
     delay_spread: float = 8.0
     time_constant_spread: float = 0.5
+    prefilter_zero: float = 0.92
 
 
 class SelfTuningController(Controller):
@@ -251,7 +254,7 @@ class SelfTuningController(Controller):
         filtered = (
             PREFILTER_POLE * self._filtered_outputs[:, -1]
             + output
-            - PREFILTER_ZERO * self._outputs[:, 0]
+            - self._learning.prefilter_zero * self._outputs[:, 0]
         )
         self._outputs = np.column_stack([output, self._outputs[:, :-1]])
         self._filtered_outputs[:, :-1] = self._filtered_outputs[:, 1:].copy()
@@ -379,7 +382,7 @@ class SelfTuningController(Controller):
         filtered = (
             PREFILTER_POLE * self._filtered[:, now]
             + units
-            - PREFILTER_ZERO * self._units[:, now]
+            - self._learning.prefilter_zero * self._units[:, now]
         )
         self._flows[:, now] = flow
         if now + 1 == self._units.shape[1]:

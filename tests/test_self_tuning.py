@@ -5,7 +5,7 @@ import pytest
 
 from agents import NeuralSelfTuningController, SelfTuningController, SmithPredictor
 from benchmarks.loop.rollout import make_plants, rollout
-from mptc_gym import evaluate
+from mptc_gym import PRESETS, evaluate
 
 STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
 # Steady-state gain of (28), degC per t/h, and 1 / (1 - p) samples of 8 s, p its slowest pole.
@@ -100,6 +100,15 @@ def test_the_network_does_not_hunt_beside_a_dead_zone(told, dead_zone, setpoint)
         controller, episodes=2, max_episode_steps=600, dead_zone=dead_zone, setpoint=setpoint
     )
     assert found.travel < 80.0
+
+
+def test_behind_the_bank_the_network_takes_no_load_for_a_gain():
+    plant = PRESETS["disturbed"] | {"setpoint_amplitude": 4.5, "delay": 14, "runs": 40}
+    ours, theirs = (
+        mean_error(control(make(**{**STEP_TEST, "delay": 120.0}), **plant))
+        for make in (NeuralSelfTuningController, SelfTuningController)
+    )
+    assert ours < theirs - 0.015
 
 
 def test_ten_thousand_quiet_samples_teach_nothing():

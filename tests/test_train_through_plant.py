@@ -30,7 +30,7 @@ from benchmarks.train.through_plant import (  # noqa: E402
 from mptc_gym import Parameters  # noqa: E402
 from tests.conftest import assert_the_seed_is_all_that_differs  # noqa: E402
 
-SMALL = Training(steps=4, plants=4, samples=60, choosing=4, adding=3)
+SMALL = Training(steps=4, plants=4, samples=60, stretches=2, choosing=4, adding=3)
 
 
 @pytest.fixture(autouse=True)
@@ -189,7 +189,7 @@ class TestKept:
         advance = through_plant._advance
 
         def stop(*arguments):
-            if arguments[-1] == 3:
+            if arguments[-1] == 2:
                 raise KeyboardInterrupt
             advance(*arguments)
 

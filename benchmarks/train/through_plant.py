@@ -46,18 +46,20 @@ class Training:
     seed: int = 10_000
     """Of the initial weights, and of all that the plants meet."""
     steps: int = 600
-    """Of the optimiser, each on new plants."""
-    plants: int = 128
+    """Of the optimiser."""
+    plants: int = 256
     """Of a step."""
     samples: int = 300
-    """Length of their runs."""
+    """That a step looks back on."""
+    stretches: int = 4
+    """Steps that go on with the same plants, before there are new ones."""
     choosing: int = 64
     """Nodes of each hidden layer of the network that chooses."""
     adding: int = 24
     """The same of the one that adds to the flow."""
     learning_rate: float = 2e-3
     """Of Adam at the start; it falls linearly, to a hundredth."""
-    move_price: float = 0.02
+    move_price: float = 0.007
     """Of what the flow travels a sample, half the range, in multiples of the reach."""
     tolerance: float = 0.003
     """Below this error, a share of the reach, the loss is quadratic (Huber)."""
@@ -154,10 +156,10 @@ class Draw:
             "measurement_noise_variance": noisy
             * self.some(0.5, self.uniform(0.0, 0.2))
             * small**2,
-            "disturbance_amplitude": self.some(0.6, self.uniform(0.0, 2.5)) * small,
+            "disturbance_amplitude": self.some(0.45, self.uniform(0.0, 2.5)) * small,
             "disturbance_interval": self.uniform(100.0, 300.0),
             "disturbance_walk_variance": noisy
-            * self.some(0.5, self.uniform(0.0, 0.001))
+            * self.some(0.4, self.uniform(0.0, 0.001))
             * small**2,
             "small": small,
         }
@@ -174,7 +176,7 @@ class Draw:
         most = (room * numbers["gain_factor"] * numbers["small"]).clamp(max=6.5)
         size = (0.3 + 0.65 * self.uniform(0.0, 1.0, self._samples // 60 + 2, n)) * most
         sign = torch.sign(self.uniform(-1.0, 1.0, *size.shape))
-        begun, length = self.uniform(0.0, 150.0).floor(), self.uniform(60.0, 160.0).floor()
+        begun, length = self.uniform(0.0, 150.0).floor(), self.uniform(60.0, 300.0).floor()
         held = (size * sign).gather(
             0, ((age + begun) // length).long().clamp(max=len(size) - 1)
         )
@@ -188,7 +190,7 @@ class Draw:
         told["first"] = self.uniform(0.0, 1.0) < 0.6
         k = self.some(0.0 if exact else 0.5, self.uniform(0.0, self._spread))
         # Some were right once, and nobody knows that they are not any more.
-        aged = self.some(0.0 if exact else 0.2, self.uniform(0.0, 0.3))
+        aged = self.some(0.0 if exact else 0.1, self.uniform(0.0, 0.3))
         wrong = torch.randn(3, self._n, generator=self._generator) * k
         wrong[:2] += self.uniform(-1.5, 1.5, 2, self._n) * aged
         told["uncertainty"] = k
@@ -240,6 +242,14 @@ class Loops:
         self._new: list[Tensor] = []
         self._model = self._last_model = self._flow = self._last_flow = zero
         self._residual = self._last_residual = self._off = zero
+
+    def detach(self) -> None:
+        """Forget where everything came from."""
+        for owner in (self, self.law):
+            for name, value in vars(owner).items():
+                if isinstance(value, Tensor):
+                    setattr(owner, name, value.detach())
+        self._new = [each.detach() for each in self._new]
 
     def act(self, net: Net, observations: Tensor) -> Tensor:
         """Return actions, shape (n, 1)."""
@@ -307,15 +317,34 @@ def run(
     seed: int,
 ) -> tuple[Tensor, Tensor]:
     """Return e(k + 1) in multiples of the reach, u_a(k) of half the range: (samples, n)."""
-    signals = {name: values for name, values in numbers.items() if name != "small"}
-    observations, _ = plants.reset(seed=seed, options={"signals": signals})
-    loops = Loops(told)
-    errors, applied = [], []
-    for _ in range(samples):
-        observations, _, _, _, infos = plants.step(loops.act(net, observations))
-        errors.append(infos["error"])
-        applied.append(infos["applied"])
-    return torch.stack(errors) / loops.reach, torch.stack(applied) / loops._half
+    return Rollout(plants, numbers, told, seed).go_on(net, samples)
+
+
+class Rollout:
+    """A batch of plants under the network, from rest on."""
+
+    def __init__(
+        self, plants: MiddlePointTorchEnv, numbers: Numbers, told: Numbers, seed: int
+    ) -> None:
+        signals = {name: values for name, values in numbers.items() if name != "small"}
+        self._plants, self._loops = plants, Loops(told)
+        self._observations, _ = plants.reset(seed=seed, options={"signals": signals})
+
+    def go_on(self, net: Net, samples: int) -> tuple[Tensor, Tensor]:
+        """Run on, and return what `run` does; gradients end where the call began."""
+        self._plants.detach()
+        self._loops.detach()
+        observations = self._observations.detach()
+        errors, applied = [], []
+        for _ in range(samples):
+            observations, _, _, _, infos = self._plants.step(self._loops.act(net, observations))
+            errors.append(infos["error"])
+            applied.append(infos["applied"])
+        self._observations = observations
+        return (
+            torch.stack(errors) / self._loops.reach,
+            torch.stack(applied) / self._loops._half,
+        )
 
 
 def loss_of(errors: Tensor, applied: Tensor, small: Tensor, training: Training) -> Tensor:
@@ -399,15 +428,16 @@ def train(training: Training, state: Path | None = None, source: str = "") -> La
         for name, part in parts.items():
             part.load_state_dict(kept[name])
         done, seconds = kept["done"], kept["seconds"]
-    plants = environment(training.plants, training.samples)
-    for step in range(done, training.steps):
+    plants = environment(training.plants, training.stretches * training.samples)
+    for step in range(done, training.steps, training.stretches):
         began = time.process_time()
         _advance(net, mean, optimiser, plants, training, step)
         seconds += time.process_time() - began
-        if state is not None and step % SAVED_EVERY == SAVED_EVERY - 1:
+        done = step + training.stretches
+        if state is not None and done % SAVED_EVERY < training.stretches:
             kept = {name: part.state_dict() for name, part in parts.items()}
             with replacing(state) as file:
-                torch.save({**kept, "done": step + 1, "seconds": seconds}, file)
+                torch.save({**kept, "done": done, "seconds": seconds}, file)
     return mean.export(
         training=asdict(training),
         validation={"seed": VALIDATION_SEED, **validate(mean, training)},
@@ -426,23 +456,25 @@ def _advance(
     training: Training,
     step: int,
 ) -> None:
-    """Take a step of the optimiser, on new plants."""
-    left = max(1.0 - step / training.steps, 0.01)
-    optimiser.param_groups[0]["lr"] = training.learning_rate * left
-    draw = Draw(training, training.plants, training.samples, training.seed, step)
+    """Take some steps of the optimiser, on new plants."""
+    length = training.stretches * training.samples
+    draw = Draw(training, training.plants, length, training.seed, step)
     numbers = draw.plants()
-    told = draw.told(numbers)
-    errors, applied = run(plants, net, numbers, told, training.samples, step)
-    loss = loss_of(errors, applied, numbers["small"], training)
-    optimiser.zero_grad()
-    loss.backward()
-    if math.isfinite(nn.utils.clip_grad_norm_(net.parameters(), 1.0)):
-        optimiser.step()
-    # At first the mean forgets faster, so that the initial weights have no part in it.
-    share = 1.0 - min(training.averaging, (step + 1) / (step + 11))
-    with torch.no_grad():
-        for slow, new in zip(mean.parameters(), net.parameters(), strict=True):
-            slow.lerp_(new, share)
+    rollout = Rollout(plants, numbers, draw.told(numbers), step)
+    for now in range(step, min(step + training.stretches, training.steps)):
+        left = max(1.0 - now / training.steps, 0.01)
+        optimiser.param_groups[0]["lr"] = training.learning_rate * left
+        errors, applied = rollout.go_on(net, training.samples)
+        loss = loss_of(errors, applied, numbers["small"], training)
+        optimiser.zero_grad()
+        loss.backward()
+        if math.isfinite(nn.utils.clip_grad_norm_(net.parameters(), 1.0)):
+            optimiser.step()
+        # At first the mean forgets faster, so that the initial weights have no part in it.
+        share = 1.0 - min(training.averaging, (now + 1) / (now + 11))
+        with torch.no_grad():
+            for slow, new in zip(mean.parameters(), net.parameters(), strict=True):
+                slow.lerp_(new, share)
 
 
 def training_key(training: Training) -> str:
