@@ -111,29 +111,6 @@ class TestEveryController:
 
 
 class TestDirectNN:
-    def test_one_update_by_hand(self):
-        # N = 2, N_1 = 1, inputs (0.5, 1) after scaling by 0.5, error e(k) = 2.
-        nn = DirectNNController(
-            n_inputs=2, n_hidden=1, eta=0.5, eta_1=2.0, eta_theta=0.25, eta_1_theta=4.0,
-            input_scale=0.5, error_index=1, u_min=-10.0, u_max=10.0,
-        )  # fmt: skip
-        nn.weights = Weights(
-            W=np.array([[2.0, -1.0]]), theta_1=np.zeros(1), W_1=np.array([2.0]), theta_2=-1.0
-        )
-        action = nn.act([1.0, 2.0])
-        # O_1 = 2 * 0.5 - 1 * 1 = 0, X_1 = 1/2; O_2 = 2 * 1/2 = 1, X_2 = 1 / (1 + e^0) = 1/2
-        assert action[0] == 0.0
-        assert nn.command == 0.0
-        # delta_1 = 2 * -1 * 1/4 = -1/2; delta = -1/2 * 2 * 1/4 = -1/4
-        weights = nn.weights
-        assert pytest.approx([2.0 + 2.0 * -0.5 * 0.5]) == weights.W_1
-        assert (
-            pytest.approx(np.array([[2.0 + 0.5 * -0.25 * 0.5, -1.0 + 0.5 * -0.25 * 1.0]]))
-            == weights.W
-        )
-        assert weights.theta_2 == pytest.approx(-1.0 + 4.0 * -0.5)
-        assert weights.theta_1 == pytest.approx([0.25 * -0.25])
-
     @settings(max_examples=40, deadline=None)
     @given(
         n_inputs=st.integers(1, 12),
@@ -280,15 +257,6 @@ class TestAntiWindup:
             controller.act([e])
             commands.append(controller.command)
         assert commands == [-3.0, -1.5, 4.0, 2.5]
-
-    def test_it_shortens_the_overshoot(self):
-        gains = {"kp": 1.34, "ki": 0.0456}
-        plants = make_plants(1, 300, setpoint=6.5)
-        with_it, without = (
-            rollout(plants, PIController(**gains, anti_windup=flag), 300, seed=0).output
-            for flag in (True, False)
-        )
-        assert with_it.max() < without.max()
 
 
 class TestSimc:

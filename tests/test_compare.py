@@ -92,13 +92,6 @@ class TestMeasures:
         assert values["dead_zone_share"] == pytest.approx(100 * 2 / 6)
         assert values["saturation_share"] == pytest.approx(100 * 2 / 6)
 
-    def test_runs_are_measured_apart(self):
-        one, other = trajectory([1, 1], [0, 1]), trajectory([3, 3], [0, 0])
-        both = Trajectory(
-            *(np.hstack([getattr(t, f) for t in (one, other)]) for f in vars(one))
-        )
-        assert list(measure(both, Parameters())["mae"]) == [0.5, 3.0]
-
     def test_what_cannot_be_measured_of_drawn_actuators_is_not(self):
         runs = Trajectory(*np.zeros((6, 3, 1)))
         values = measure(runs, Parameters(dead_zone=[4, 6]))

@@ -8,15 +8,13 @@ import sys
 import time
 from collections import Counter
 from functools import partial
-from pathlib import Path
 
 import pytest
 
 from benchmarks.lib import cluster, fan_out, storage
 from benchmarks.lib.fan_out import FanOut, TasksFailedError
 from tests import tasks
-
-ROOT = Path(__file__).parent.parent
+from tests.conftest import ROOT
 
 
 def work(n, calls=None, seconds=0.0):

@@ -5,11 +5,11 @@ import graphlib
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.conftest import ROOT
+
 STDLIB = set(sys.stdlib_module_names)
 ALLOWED = {
     "mptc_gym": {"mptc_gym", "gymnasium", "numpy", "pygame"},  # the last when it is used

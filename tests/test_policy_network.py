@@ -36,17 +36,6 @@ def constant(value, **arguments):
 
 
 class TestForward:
-    def test_by_hand(self):
-        # z = 1 * elu(2 * (0.5 * 3) - 4) + 0.25 = elu(-1) + 0.25 = e^-1 - 1 + 0.25
-        network = PolicyNetwork(
-            [([[2.0]], [-4.0]), ([[1.0]], [0.25])],
-            observation={"error_window": 1},
-            input_scale=[0.5],
-        )
-        expected = np.exp(-1.0) - 0.75
-        assert network.act([3.0]) == pytest.approx([expected], abs=1e-7)
-        assert network.command == pytest.approx(10.0 * expected, abs=1e-12)
-
     @pytest.mark.parametrize("activation", ["elu", "relu", "tanh"])
     def test_equals_torch(self, activation):
         torch = pytest.importorskip("torch")

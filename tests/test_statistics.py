@@ -101,17 +101,6 @@ class TestBootstrap:
         assert np.random.get_state()[1].tolist() == state  # noqa: NPY002
         assert bootstrap(values, seed=2).low != first.low
 
-    def test_members_are_drawn(self, rng):
-        # Four trainings that differ much, with runs that differ little: what counts is four.
-        level = np.array([[0.0], [1.0], [2.0], [3.0]])
-        values = level + rng.normal(0, 0.01, (4, 100))
-        crossed = bootstrap(values, seed=0)
-        flat = bootstrap(values.reshape(-1), seed=0)
-        assert crossed.value == flat.value == pytest.approx(1.5, abs=0.01)
-        # The mean of four draws out of 0, 1, 2, 3 has the deviation sqrt(1.25 / 4) = 0.56.
-        assert crossed.high - crossed.low == pytest.approx(2 * 1.96 * 0.56, rel=0.1)
-        assert flat.high - flat.low < 0.3
-
     def test_tasks_are_not_drawn(self, rng):
         # How much they differ does not widen the interval.
         tables = [rng.normal(mean, 0.1, (2, 40)) for mean in (0.2, 0.8)]
