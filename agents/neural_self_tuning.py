@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.controller import check_number
 from agents.neural_law import Law, LawNetwork, Prior
 from agents.neural_smith import NOMINAL
 from agents.self_tuning import Learning, SelfTuningController
@@ -14,9 +15,6 @@ from agents.self_tuning import Learning, SelfTuningController
 Array = NDArray[np.float64]
 
 MOST_UNCERTAIN = 0.3  # the network was trained up to this
-# The network was trained with models that stay as they are. What one that changes explains
-# changes, too, and is sooner out of date.
-HASTE = 0.75
 
 
 class NeuralSelfTuningController(SelfTuningController):
@@ -32,6 +30,10 @@ class NeuralSelfTuningController(SelfTuningController):
         The weights; None for those that come with the project.
     forgetting
         What a sample leaves of the weight of those before it; up to 1, which forgets nothing.
+    haste
+        How much quicker the law is than the network asks for, see `agents.neural_law.Law`. The
+        network was trained with models that stay as they are; what a model that changes does
+        not explain is sooner out of date. 0 halves the valve travel in noise.
     **told
         Those of `SelfTuningController`, except `closed_loop_time_constant`.
 
@@ -55,9 +57,15 @@ class NeuralSelfTuningController(SelfTuningController):
     _residual: Array  # the last one, degC, (loops,)
 
     def __init__(
-        self, *, network: LawNetwork | None = None, forgetting: float = 0.999, **told: Any
+        self,
+        *,
+        network: LawNetwork | None = None,
+        forgetting: float = 0.999,
+        haste: float = 0.75,
+        **told: Any,
     ) -> None:
         super().__init__(forgetting=forgetting, **told)
+        self._haste = check_number("haste", haste, 0)
         self._network = LawNetwork.load() if network is None else network
         self._half = (self.u_max - self.u_min) / 2.0
         self._flow = self._half * np.sign(self.gain)  # t/h, of a flow of 1
@@ -112,7 +120,7 @@ class NeuralSelfTuningController(SelfTuningController):
             uncertainty=np.minimum(self._spread(delay), MOST_UNCERTAIN),
         )
         if self._rule is None:
-            self._rule = Law(prior, haste=HASTE)
+            self._rule = Law(prior, haste=self._haste)
         else:
             self._rule.retell(prior, self._reach / reach, (before - self._residual) / reach)
         self._reach = reach

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from agents import NeuralSelfTuningController, SelfTuningController, SmithPredictor
+from benchmarks.loop.metrics import travel
 from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import PRESETS, evaluate
 
@@ -109,6 +110,20 @@ def test_behind_the_bank_the_network_takes_no_load_for_a_gain():
         for make in (NeuralSelfTuningController, SelfTuningController)
     )
     assert ours < theirs - 0.015
+
+
+def test_haste_is_paid_for_in_valve_travel():
+    hasty, calm = (
+        travel(
+            control(
+                NeuralSelfTuningController(**STEP_TEST, **haste), 500, 6, noise_variance=0.5
+            )
+        )
+        for haste in ({}, {"haste": 0.0})
+    )
+    assert calm.mean() < 0.75 * hasty.mean()
+    with pytest.raises(ValueError, match="haste must be a finite number of at least 0, got -1"):
+        NeuralSelfTuningController(**STEP_TEST, haste=-1)
 
 
 def test_ten_thousand_quiet_samples_teach_nothing():
