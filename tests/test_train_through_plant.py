@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch")
 
 from agents import LawNetwork, NeuralSmithPredictor  # noqa: E402
 from agents.neural_law import PRETRAINED  # noqa: E402
+from benchmarks.controllers.roster import ROSTER  # noqa: E402
 from benchmarks.examples import through_plant as example  # noqa: E402
 from benchmarks.lib.fan_out import FanOut  # noqa: E402
 from benchmarks.loop.rollout import make_plants, rollout  # noqa: E402
@@ -227,10 +228,18 @@ class TestKept:
         assert f"chooses seed {seed}" in capsys.readouterr().out
 
     def test_the_one_of_the_project_is_that_of_the_defaults(self):
-        kept = LawNetwork.load(PRETRAINED / "nn-smith.npz").provenance
+        network = LawNetwork.load(PRETRAINED / "nn-smith.npz")
+        kept = network.provenance
         assert kept["training"] == json.loads(json.dumps(through_plant.asdict(Training())))
         assert kept["validation"]["seed"] >= 3_000_000
         assert kept["cpu_seconds"] > 60.0
+        count = sum(W.size + len(b) for W, b in (*network.choosing, *network.adding))
+        of = Training()
+        samples = of.steps * of.plants * of.samples / 1e6
+        for name in ("nn-smith", "nn-self-tuning"):
+            cost = ROSTER[name].cost
+            assert f"{count:,} weights" in cost.parameters
+            assert f"{samples:.0f} M" in cost.samples
 
 
 def test_policies_of_ppo_are_listed_by_their_seeds(tmp_path, capsys):

@@ -10,7 +10,7 @@ from benchmarks.controllers import engineered, pretrained
 from benchmarks.controllers.records import Cost, Factory, RosterEntry, Tuning
 
 _STEP_TEST = "gain, time constant, delay"
-_NETWORK = "8,427 weights for all plants"
+_NETWORK = "8,894 weights for all plants"
 _SEARCH = "566 M (search)"
 
 ROSTER: dict[str, RosterEntry] = {
@@ -143,7 +143,7 @@ ROSTER: dict[str, RosterEntry] = {
             "nn-smith",
             "NN, told",
             pretrained.told_network(engineered.nn_smith),
-            Cost(f"{_STEP_TEST}, dead zone, limits", _NETWORK, "one step test; 23 M, once"),
+            Cost(f"{_STEP_TEST}, dead zone, limits", _NETWORK, "one step test; 46 M, once"),
             swept=True,
             drawn=True,
         ),
@@ -153,8 +153,8 @@ ROSTER: dict[str, RosterEntry] = {
             pretrained.told_network(engineered.nn_self_tuning),
             Cost(
                 f"{_STEP_TEST}, dead zone, limits; delay range",
-                f"a bank of models, 30 settings; {_NETWORK}",
-                "one step test; 23 M, once",
+                f"a bank of models, 31 settings; {_NETWORK}",
+                "one step test; 46 M, once",
             ),
             swept=True,
             drawn=True,
