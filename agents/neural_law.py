@@ -92,9 +92,10 @@ class Law:
 
     The residual r is what the model, with the delay, does not explain of the output. A steady
     load of A(z^-1) r / A(1) would explain it. Means of that load and of the residual are
-    *foreseen*: at the end of the delay, the residual will have gone some way to the load. The
-    network chooses a mean of the means, by two softmaxes, the rate at which the model is
-    brought to what is then left of the set point, and a small addition.
+    *foreseen*: at the end of the delay, the residual will have gone some way to the load. What
+    each mean of the load has missed of the newest samples speaks against it; the network tilts
+    that to newer samples or to older ones. It also chooses a mean of the residual, the rate at
+    which the model is brought to what is then left of the set point, and a small addition.
 
     Parameters
     ----------
