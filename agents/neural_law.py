@@ -130,7 +130,8 @@ class Law:
         self._nothing = zero[:, None] + self._array([0.0] * (_MEANS - 1 + NEWS))
         self._means = zero[:, None] + 0.0 * self._rates
         self._news = zero[:, None] + self._array([0.0] * NEWS)
-        self._misses = [zero[:, None] + LEAST_NOISE + 0.0 * self._rates[:_LOADS]] * 2
+        missed = zero[:, None] + LEAST_NOISE + 0.0 * self._rates[:_LOADS]
+        self._misses = [missed] * len(MISS_RATES)
         self._plain = zero[:, None] + self._array([0.0] * (_MEANS - _LOADS))
         self._tell(prior)
 
