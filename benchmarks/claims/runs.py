@@ -13,7 +13,7 @@ from agents import DirectNNController, PIController
 from agents.direct_nn import Weights
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 BAND = 0.05  # of the distance that the weights have travelled
 STILL = 100  # the last samples of a run, in which weights that have converged do not move
@@ -21,15 +21,33 @@ STILL = 100  # the last samples of a run, in which weights that have converged d
 
 @dataclass(frozen=True)
 class Batch:
-    """Runs side by side, each with initial weights and noise of its own."""
+    """Runs side by side; run i has initial weights and noise of the seed `seed + i`."""
 
     runs: int
     seed: int = 0
-    """Run i has the seed `seed + i`."""
 
-    def network(self, **gains: Any) -> DirectNNController:
-        """Return a network for each run, with gains that are not the defaults."""
-        return DirectNNController(num_envs=self.runs, seed=self.seed, **gains)
+    def networks(
+        self, *, nodes: int = 3, length: int = 3, slower: bool = False, direction: int = -1
+    ) -> DirectNNController:
+        """Return a network for each run, the paper's unless told otherwise.
+
+        It has so many hidden nodes, and sees `length` set points and errors. The more terms a
+        sum has, the faster it moves when the weights of all of them learn with the same gain:
+        gains that are `slower` make up for it.
+        """
+        of_nodes, of_inputs = (3 / nodes, 3 / length) if slower else (1.0, 1.0)
+        paper = DirectNNController()
+        return DirectNNController(
+            n_inputs=2 * length,
+            n_hidden=nodes,
+            eta=of_nodes * of_inputs * paper.eta,
+            eta_1=of_nodes * paper.eta_1,
+            eta_theta=of_nodes * paper.eta_theta,
+            direction=direction,
+            error_index=length,
+            seed=self.seed,
+            num_envs=self.runs,
+        )
 
     def run(
         self,
@@ -43,8 +61,8 @@ class Batch:
         return rollout(plants, agent, samples, self.seed, before)
 
     def run_nn(self, samples: int, **arguments: Any) -> Trajectory:
-        """Run networks with the default gains."""
-        return self.run(self.network(), samples, **arguments)
+        """Run the paper's networks."""
+        return self.run(self.networks(), samples, **arguments)
 
     def run_pi(self, kp: float, ki: float, samples: int, **arguments: Any) -> Trajectory:
         """Run a PI controller: one run stands for all where there is no noise."""
@@ -53,53 +71,14 @@ class Batch:
         return batch.run(PIController(kp, ki), samples, **arguments)
 
 
-@dataclass(frozen=True)
-class Network:
-    """A network that is not the paper's."""
-
-    name: str
-    """What sets it apart."""
-    controller: dict[str, Any]
-    """Arguments of the controller."""
-    windows: dict[str, Any]
-    """Arguments of the environment that feeds it."""
-    slower: dict[str, float]
-    """Gains that are in proportion: each with a factor to the default. The more terms a sum
-    has, the faster it moves when the weights of all of them learn with the same gain."""
-
-
-def hidden_nodes(count: int) -> Network:
-    """Return the paper's network with another number of hidden nodes."""
-    slower = dict.fromkeys(("eta", "eta_1", "eta_theta"), 3 / count)
-    return Network(f"{count} hidden nodes", {"n_hidden": count}, {}, slower)
-
-
-def longer_windows(length: int) -> Network:
-    """Return a network that sees `length` set points and errors."""
-    return Network(
-        f"{length} set points and errors",
-        {"n_inputs": 2 * length, "error_index": length},
-        {"setpoint_window": length, "error_window": length},
-        {"eta": 3 / length},
-    )
-
-
-def with_gains(batch: Batch, network: Network, *, slower: bool) -> DirectNNController:
-    """Return a batch of these networks, with the default gains or with slower ones."""
-    default = DirectNNController()
-    factors = network.slower if slower else {}
-    gains = {name: factor * getattr(default, name) for name, factor in factors.items()}
-    return batch.network(**network.controller, **gains)
-
-
-def flat(weights: Weights) -> NDArray[np.float32]:
+def flat(weights: Weights) -> Array:
     """Return the weights of each network in one row, shape (runs, n)."""
-    arrays = (weights.W, weights.theta_1, weights.W_1, weights.theta_2)
     runs = len(weights.theta_2)
-    return np.hstack([array.reshape(runs, -1) for array in arrays]).astype(np.float32)
+    arrays = [array.reshape(runs, -1) for array in vars(weights).values()]
+    return np.hstack(arrays, dtype=np.float32)
 
 
-def converged_at(weights: NDArray[np.floating]) -> Array:
+def converged_at(weights: Array) -> Array:
     """Return when weights have converged, in samples, shape (runs,).
 
     That is the first sample from which on their distance to where they end, by the Euclidean
@@ -116,10 +95,10 @@ def converged_at(weights: NDArray[np.floating]) -> Array:
     return np.where(first <= samples - STILL, first, np.inf)
 
 
-def fail_node(controller: DirectNNController, stuck_at: int, node: int = 0) -> None:
+def fail_node(controller: DirectNNController, stuck_at: int) -> None:
     """Break a hidden node of every network: its output stays at 0 or 1, whatever it is fed."""
     weights = controller.weights
-    weights.W[..., node, :] = 0.0
+    weights.W[..., 0, :] = 0.0
     # So far out on the sigmoid that its slope vanishes, and with it all learning of the node.
-    weights.theta_1[..., node] = 1e6 if stuck_at else -1e6
+    weights.theta_1[..., 0] = 1e6 if stuck_at else -1e6
     controller.weights = weights
