@@ -1,6 +1,7 @@
 """Runs tasks on the Ray cluster of RAY_ADDRESS; one kills its worker, another fails."""
 
 import json
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -22,5 +23,6 @@ faulty = {"the fault": partial(tasks.fail, 1), "plant 3": work["plant 3"]}
 try:
     fan_out.run(faulty, scratch / "results")
 except TasksFailedError as error:
-    out = {"results": results, "errors": error.errors, "jobs": fan_out.jobs}
+    there = fan_out.run({"there": os.listdir})["there"]
+    out = {"results": results, "errors": error.errors, "there": there}
     (scratch / "out.json").write_text(json.dumps(out))

@@ -50,8 +50,3 @@ def fail(seed: int) -> Rows:
         pass
 
     raise LocalError(f"no such plant as {seed}")
-
-
-def unfit(seed: int) -> object:
-    """Return what JSON cannot hold."""
-    return {seed}

@@ -171,11 +171,12 @@ def test_what_does_not_fit_is_refused_before_anything_is_run_or_written(
         ("datasets", "minari", "data"),
         ("watch", "pygame", "render"), ("train", "torch", "torch"), ("tune", "optuna", "bench"),
         ("identify.tclab_twin", "tclab", "test"), ("speed", "torch", "torch"),
+        ("claims", "ray", "ray"),
     ],
 )  # fmt: skip
 def test_a_missing_package_is_named_with_its_extra(name, package, extra):
-    positional = {"train": ["nn-smith"], "tune": ["pi"]}
-    done = run_without(package, name, positional.get(name, []))
+    given = {"train": ["nn-smith"], "tune": ["pi"], "claims": ["--backend", "ray"]}
+    done = run_without(package, name, given.get(name, []))
     assert done.returncode == 2
     assert f'{package} is not installed: pip install -e ".[{extra}]"' in done.stderr
     assert "Traceback" not in done.stderr

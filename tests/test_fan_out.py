@@ -167,10 +167,6 @@ class TestFailures:
         assert run(mended, tmp_path / "out", jobs)["the fault"] == tasks.draw(3)
         assert counted(calls) == Counter(range(4))
 
-    def test_a_result_that_cannot_be_saved_names_its_task(self):
-        with pytest.raises(TasksFailedError, match=r"unfit: TypeError.*set"):
-            run({"unfit": partial(tasks.unfit, 3)})
-
     def test_a_stop_by_the_user_is_not_a_failure(self, tmp_path):
         def stop():
             raise KeyboardInterrupt
@@ -180,41 +176,14 @@ class TestFailures:
         assert len(list(tmp_path.iterdir())) == 2
 
 
-class TestBackends:
-    def test_without_ray_it_says_how_to_install_it(self, monkeypatch):
-        monkeypatch.setitem(sys.modules, "ray", None)
-        with pytest.raises(ValueError, match=r"pip install .*ray"):
-            FanOut(1, "ray")
-
-    def test_an_unknown_backend_is_refused(self):
-        with pytest.raises(ValueError, match="loky, ray, got 'dask'"):
-            FanOut(1, "dask")
-
-
-class TestNodes:
-    def test_one_with_other_versions_computes_nothing(self):
-        here = storage.versions()
-        assert cluster._answer(partial(tasks.draw, 1), here) == (tasks.draw(1), "", False)
-        other = {**here, "numpy": "0.1", "more": "1.0"}
-        result, error, lost = cluster._answer(partial(tasks.draw, 1), other)
-        assert result is None
-        assert lost
-        assert f"numpy {here['numpy']} instead of 0.1, more missing instead of 1.0" in error
-
-    def test_what_travels_is_code_alone(self, tmp_path, monkeypatch):
-        (tmp_path / "checkout" / "results").mkdir(parents=True)
-        (tmp_path / "checkout" / "mine.py").write_text("")
-        monkeypatch.setattr(cluster, "ROOT", tmp_path / "checkout")
-        there = tmp_path / "there"
-        there.mkdir()
-        cluster._pack(there)
-        top = {path.name for path in there.iterdir()}
-        assert top == {"agents", "benchmarks", "mptc_gym", "mine.py"}
-        files = [path for path in there.rglob("*") if path.is_file()]
-        assert {path.suffix for path in files} <= {
-            ".py", ".npz", ".csv", ".ipynb", ".json", ".txt", ".typed", ".yml"
-        }  # fmt: skip
-        assert sum(path.stat().st_size for path in files) < 2e6
+def test_a_node_with_other_versions_computes_nothing():
+    here = storage.versions()
+    assert cluster._answer(partial(tasks.draw, 1), here) == (tasks.draw(1), "", False)
+    other = {**here, "numpy": "0.1", "more": "1.0"}
+    result, error, lost = cluster._answer(partial(tasks.draw, 1), other)
+    assert result is None
+    assert lost
+    assert f"numpy {here['numpy']} instead of 0.1, more missing instead of 1.0" in error
 
 
 def until(condition, seconds=30.0):

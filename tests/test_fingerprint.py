@@ -16,17 +16,20 @@ USER = "from own.helper import double\n\n\ndef four():\n    return double(2)\n"
 def own(tmp_path, monkeypatch):
     """Return a function that writes a package `own` and says its fingerprint."""
     monkeypatch.setattr(module, "ROOT", tmp_path)
-    monkeypatch.setattr(module, "PACKAGES", ("own",))
     (tmp_path / "own").mkdir()
 
     def write(helper=HELPER, user=USER, **shaped_by):
         for name, text in (("helper", helper), ("user", user), ("__init__", "")):
             (tmp_path / "own" / f"{name}.py").write_text(text)
-        code.cache_clear()
+        clear()
         return fingerprint("own.user", **shaped_by)
 
+    def clear():
+        imported.cache_clear()
+        code.cache_clear()
+
     yield write
-    code.cache_clear()
+    clear()
 
 
 def test_comments_docstrings_and_layout_do_not_count(own):

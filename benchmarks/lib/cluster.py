@@ -6,10 +6,8 @@ is on them: Ray unpacks the code where its workers run.
 
 from __future__ import annotations
 
-import importlib
 import logging
 import os
-import shutil
 import socket
 import tempfile
 import traceback
@@ -21,11 +19,14 @@ from typing import Any
 
 from benchmarks.lib.storage import ROOT, versions
 
-TRAVELS = ("agents", "benchmarks", "mptc_gym")  # and the modules beside them
-STAYS = ("__pycache__", "published", "*.md")
+# What does not travel of the checkout, as in a .gitignore: all but its code, and the modules
+# beside it, such as those of controllers of one's own.
+STAYS = [
+    *("/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py"),
+    *("__pycache__", "published", "*.md"),
+]
 QUEUED = 4  # tasks a core that are handed out; also for nodes that come later
 
-INSTALL_RAY = 'Ray is not installed: pip install -e ".[bench,ray]"'
 START_RAY = (
     "No Ray cluster can be reached: start one with `ray start --head`, or set RAY_ADDRESS"
 )
@@ -34,35 +35,30 @@ START_RAY = (
 Answer = tuple[str, Any, str, bool]
 
 
-def connect() -> int:
-    """Connect to the cluster of RAY_ADDRESS, or of this machine; return how many cores it has.
+def connect() -> None:
+    """Connect to the cluster of RAY_ADDRESS, or of this machine.
 
     Raises
     ------
     ValueError
-        If Ray is not installed, or no cluster is found.
+        If no cluster is found.
     """
+    import ray  # here: an extra, which takes a second to load
+
+    if ray.is_initialized():
+        return
+    # Code that `ray job submit` has brought there is the same.
+    os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
     try:
-        import ray  # here: an extra, which takes a second to load
-    except ImportError as error:
-        raise ValueError(INSTALL_RAY) from error
-    if not ray.is_initialized():
-        # Code that `ray job submit` has brought there is the same.
-        os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
-        address = os.environ.get("RAY_ADDRESS", "")
-        try:
-            _knock(address or _latest())
-            with tempfile.TemporaryDirectory() as folder:
-                _pack(Path(folder))
-                ray.init(
-                    address=address or "auto",
-                    runtime_env={"working_dir": folder},
-                    log_to_driver=False,
-                    logging_level=logging.ERROR,
-                )
-        except OSError as error:
-            raise ValueError(f"{START_RAY} ({error})") from error
-    return int(ray.cluster_resources().get("CPU", 1))
+        _knock()
+        ray.init(
+            address="auto",
+            runtime_env={"working_dir": str(ROOT), "excludes": STAYS},
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+        )
+    except OSError as error:
+        raise ValueError(f"{START_RAY} ({error})") from error
 
 
 def answers(
@@ -129,26 +125,11 @@ def attempt(task: Callable[[], Any]) -> tuple[Any, str]:
         return None, traceback.format_exc()
 
 
-def _pack(folder: Path) -> None:
-    """Copy the code that tasks import."""
-    stays = shutil.ignore_patterns(*STAYS)
-    for name in TRAVELS:
-        package = importlib.import_module(name)  # mptc_gym may be installed
-        assert package.__file__ is not None
-        shutil.copytree(Path(package.__file__).parent, folder / name, ignore=stays)
-    for module in ROOT.glob("*.py"):  # such as those of controllers of one's own
-        shutil.copy(module, folder)
-
-
-def _latest() -> str:
-    """Return the address of the latest `ray start` here, which may be gone; "" if none."""
-    folder = os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
-    file = Path(folder, "ray", "ray_current_cluster")
-    return file.read_text().strip() if file.exists() else ""
-
-
-def _knock(address: str) -> None:
-    """Raise OSError if nobody listens there: Ray itself would wait for many minutes."""
+def _knock() -> None:
+    """Raise OSError if nobody listens where Ray would: it would wait for many minutes."""
+    latest = Path(os.environ.get("RAY_TMPDIR", tempfile.gettempdir()), "ray/ray_current_cluster")
+    found = latest.read_text().strip() if latest.exists() else ""  # it may be gone
+    address = os.environ.get("RAY_ADDRESS") or found
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host, int(port)), timeout=10).close()

@@ -7,7 +7,6 @@ when, does not matter to its result as long as all its randomness comes from its
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 import time
@@ -15,15 +14,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from contextlib import suppress
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import quote
 
 from benchmarks.lib import cluster
 from benchmarks.lib.storage import seal, unseal, write_text
 
-BACKENDS = ("loky", "ray")
 LOSSES = 3  # a task that saw so many workers vanish runs alone, to see whether it is to blame
 GIVE_UP = 10  # when so many tasks were to blame, there is another fault
 NAMED = 10  # failed tasks in a message
@@ -64,18 +62,15 @@ class FanOut:
     Raises
     ------
     ValueError
-        If the backend is unknown, Ray is not installed, or no cluster is found.
+        If no cluster is found.
     """
 
-    def __init__(self, jobs: int | None = None, backend: str = "loky") -> None:
-        if backend not in BACKENDS:
-            raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
-        import joblib  # here: it takes a while to load
-
-        self.backend = backend
-        self._asked = jobs
-        cores = cluster.connect() if backend == "ray" else joblib.cpu_count()
-        self.jobs = jobs or cores
+    def __init__(
+        self, jobs: int | None = None, backend: Literal["loky", "ray"] = "loky"
+    ) -> None:
+        self._jobs, self._backend = jobs, backend
+        if backend == "ray":
+            cluster.connect()
 
     def run(self, tasks: Tasks, folder: Path | None = None, title: str = "") -> dict[str, Any]:
         """Run the tasks that have no result yet, and return the results of all.
@@ -107,11 +102,12 @@ class FanOut:
         for key, file in files.items():
             with suppress(FileNotFoundError, ValueError):  # not there, or damaged
                 results[key] = unseal(file.read_text(encoding="utf-8"))
-        missing = {key: partial(_as_json, tasks[key]) for key in tasks if key not in results}
-        for key, text in self.stream(missing, title, len(results)):
-            results[key] = json.loads(text)
+        missing = {key: tasks[key] for key in tasks if key not in results}
+        for key, result in self.stream(missing, title, len(results)):
+            text = seal(result)
+            results[key] = unseal(text)
             if folder:
-                write_text(files[key], seal(results[key]))
+                write_text(files[key], text)
         return {key: results[key] for key in tasks}
 
     def stream(self, tasks: Tasks, title: str = "", done: int = 0) -> Iterator[tuple[str, Any]]:
@@ -126,10 +122,10 @@ class FanOut:
         bar = tqdm(total=done + len(tasks), initial=done, desc=title, disable=not title)
         errors = dict.fromkeys(tasks, "Not run: too many lost their worker.")
         blamed = 0
-        if self.backend == "ray":
-            answers = cluster.answers(tasks, self._asked, LOSSES)
+        if self._backend == "ray":
+            answers = cluster.answers(tasks, self._jobs, LOSSES)
         else:
-            answers = self._local(tasks)
+            answers = _local(tasks, self._jobs)
         with bar:
             for key, result, error, lost in answers:
                 if not error:
@@ -144,49 +140,50 @@ class FanOut:
         if errors:
             raise TasksFailedError(errors, done + len(tasks))
 
-    def _local(self, tasks: Tasks) -> Iterator[cluster.Answer]:
-        """Run tasks on this machine, those again whose worker is lost."""
-        away = {key: task for key, task in tasks.items() if self.jobs > 1 and _travels(task)}
-        here = [key for key in tasks if key not in away]
-        losses: Counter[str] = Counter()
-        while away:
-            suspects = [key for key in away if losses[key] >= LOSSES][:1]
-            started: list[str] = []
-            try:
-                tried = {key: away[key] for key in suspects or away}
-                for key, result, error in self._in_processes(tried, started):
-                    del away[key]
-                    yield key, result, error, False
-            except BrokenExecutor as lost:
-                # Any of those under way may have been the end of the worker.
-                under_way = [key for key in started if key in away]
-                if not under_way:
-                    raise
-                losses.update(under_way)
-                for key in suspects:
-                    del away[key]
-                    yield key, None, f"{lost}\nIts worker was lost each time.", True
-        for key in here:
-            yield key, *cluster.attempt(tasks[key]), False
 
-    def _in_processes(self, tasks: Tasks, started: list[str]) -> Iterator[tuple[str, Any, str]]:
-        """Run tasks, yield their answers as they come, and note which were handed out."""
-        import joblib
+def _local(tasks: Tasks, jobs: int | None) -> Iterator[cluster.Answer]:
+    """Run tasks on this machine, those again whose worker is lost."""
+    import joblib  # here: it takes a while to load
 
-        def handed_out() -> Iterator[Any]:
-            for key, task in tasks.items():
-                started.append(key)
-                yield joblib.delayed(_answer)(key, task, os.getpid())
+    jobs = jobs or joblib.cpu_count()
+    away = {key: task for key, task in tasks.items() if jobs > 1 and _travels(task)}
+    here = [key for key in tasks if key not in away]
+    losses: Counter[str] = Counter()
+    while away:
+        suspects = [key for key in away if losses[key] >= LOSSES][:1]
+        started: list[str] = []
+        try:
+            tried = {key: away[key] for key in suspects or away}
+            for key, result, error in _in_processes(tried, jobs, started):
+                del away[key]
+                yield key, result, error, False
+        except BrokenExecutor as lost:
+            # Any of those under way may have been the end of the worker.
+            losses.update(key for key in started if key in away)
+            for key in suspects:
+                del away[key]
+                yield key, None, f"{lost}\nIts worker was lost each time.", True
+    for key in here:
+        yield key, *cluster.attempt(tasks[key]), False
 
-        # With one process joblib would use this one, which no task is to bring down.
-        processes = max(2, min(self.jobs, len(tasks)))
-        with joblib.parallel_config("loky", inner_max_num_threads=1):
-            parallel = joblib.Parallel(
-                processes,
-                return_as="generator_unordered",
-                batch_size=1,  # a lost worker takes along no more than it must
-            )
-        yield from parallel(handed_out())
+
+def _in_processes(
+    tasks: Tasks, jobs: int, started: list[str]
+) -> Iterator[tuple[str, Any, str]]:
+    """Run tasks, yield their answers as they come, and note which were handed out."""
+    import joblib
+
+    def handed_out() -> Iterator[Any]:
+        for key, task in tasks.items():
+            started.append(key)
+            yield joblib.delayed(_answer)(key, task, os.getpid())
+
+    # With one process joblib would use this one, which no task is to bring down.
+    processes = max(2, min(jobs, len(tasks)))
+    with joblib.parallel_config("loky", inner_max_num_threads=1):
+        # One by one: a lost worker takes along no more than it must.
+        parallel = joblib.Parallel(processes, return_as="generator_unordered", batch_size=1)
+    yield from parallel(handed_out())
 
 
 def _travels(task: Callable[[], Any]) -> bool:
@@ -198,10 +195,6 @@ def _travels(task: Callable[[], Any]) -> bool:
     except Exception:
         return False
     return True
-
-
-def _as_json(task: Callable[[], Any]) -> str:
-    return json.dumps(task())
 
 
 def _answer(key: str, task: Callable[[], Any], parent: int) -> tuple[str, Any, str]:

@@ -1,7 +1,7 @@
 """Name a kept result after all that shapes it, and nothing else.
 
 Three things shape a trained policy or a swept task: its arguments, the code that runs, and the
-environment. Code is every module of this project that the code imports, directly or not,
+environment. Code is every module of the checkout that the code imports, directly or not,
 without comments and docstrings. Of the environment it is what it does: trajectories. So an
 edited comment keeps a result, and a moved function cannot leave a stale one in use.
 """
@@ -11,8 +11,9 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
+from contextlib import suppress
 from functools import cache
-from pathlib import Path
+from modulefinder import ModuleFinder
 from typing import Any
 
 import gymnasium
@@ -21,7 +22,6 @@ import numpy as np
 import mptc_gym
 from benchmarks.lib.storage import ROOT, versions
 
-PACKAGES = ("agents", "benchmarks")  # whose code counts
 SAMPLES = 60  # of each trajectory
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -29,8 +29,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 def fingerprint(*modules: str, **shaped_by: Any) -> str:
     """Return sixteen hexadecimal digits that name what modules compute.
 
-    What they import of `agents` and `benchmarks` counts, too, and all else that shapes the
-    result, in a form for JSON.
+    What they import counts, too, and all else that shapes the result, in a form for JSON.
     """
     everything = {
         **shaped_by,
@@ -59,48 +58,22 @@ def behaviour() -> str:
     return digest.hexdigest()
 
 
+@cache
 def imported(module: str) -> set[str]:
-    """Return a module's name and those that it imports of `PACKAGES`, directly or not."""
-    found: set[str] = set()
-    waiting = [module]
-    while waiting:
-        name = waiting.pop()
-        if name not in found and _file(name) is not None:
-            found.add(name)
-            waiting += _imports(name)
-    return found
+    """Return a module's name and those that it imports of the checkout, directly or not."""
+    finder = ModuleFinder([str(ROOT)], excludes=["mptc_gym"])
+    with suppress(ImportError):  # a controller of one's own may lie elsewhere
+        finder.import_hook(module)
+    return {name for name, found in finder.modules.items() if found.__file__}
 
 
 @cache
 def code(module: str) -> str:
     """Return a hash of a module's code without comments, docstrings and layout."""
-    tree = _tree(module)
+    path = ROOT.joinpath(*module.split("."))
+    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    tree = ast.parse(file.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         if isinstance(node, DOCUMENTED) and ast.get_docstring(node) is not None:
             del node.body[0]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
-
-
-@cache
-def _imports(module: str) -> tuple[str, ...]:
-    found: list[str] = []
-    for node in ast.walk(_tree(module)):
-        if isinstance(node, ast.Import):
-            found += (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            # What is imported may be a module itself.
-            found += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    return tuple(found)
-
-
-def _tree(module: str) -> ast.Module:
-    path = _file(module)
-    assert path is not None
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-def _file(module: str) -> Path | None:
-    path = ROOT.joinpath(*module.split("."))
-    files = (path.with_suffix(".py"), path / "__init__.py")
-    ours = module.partition(".")[0] in PACKAGES
-    return next((file for file in files if ours and file.is_file()), None)
