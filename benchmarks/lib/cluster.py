@@ -127,8 +127,9 @@ def attempt(task: Callable[[], Any]) -> tuple[Any, str]:
 
 def _knock() -> None:
     """Raise OSError if nobody listens where Ray would: it would wait for many minutes."""
-    latest = Path(os.environ.get("RAY_TMPDIR", tempfile.gettempdir()), "ray/ray_current_cluster")
-    found = latest.read_text().strip() if latest.exists() else ""  # it may be gone
+    folder = os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
+    latest = Path(folder, "ray", "ray_current_cluster")  # of `ray start`; it may be gone
+    found = latest.read_text().strip() if latest.exists() else ""
     address = os.environ.get("RAY_ADDRESS") or found
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():

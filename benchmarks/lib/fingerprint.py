@@ -61,7 +61,7 @@ def behaviour() -> str:
 @cache
 def imported(module: str) -> set[str]:
     """Return a module's name and those that it imports of the checkout, directly or not."""
-    finder = ModuleFinder([str(ROOT)], excludes=["mptc_gym"])
+    finder: Any = ModuleFinder([str(ROOT)], excludes=["mptc_gym"])
     with suppress(ImportError):  # a controller of one's own may lie elsewhere
         finder.import_hook(module)
     return {name for name, found in finder.modules.items() if found.__file__}
