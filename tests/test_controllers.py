@@ -46,7 +46,7 @@ def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, mo
     ways = {
         "compare": errors(factory, 2, 900, **plant),
         "sweep": agent_task(factory, plant, plant, 900, 2, 0)["mae"],
-        "watch": mean_error(rivals.replay(entry.name, {}, scenario, 0)),
+        "watch": mean_error(rivals.replay(factory, scenario, 0)),
     }
     for way, found in ways.items():
         if entry.name == "nothing":

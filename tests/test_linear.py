@@ -15,7 +15,6 @@ from benchmarks.limits import __main__ as limits
 from benchmarks.limits import frontier, least_possible
 from benchmarks.loop import linear
 from benchmarks.loop.linear import Coefficients, LinearModel, course, nominal
-from benchmarks.watch.rivals import touched_plants
 from mptc_gym import MiddlePointEnv, Parameters
 from mptc_gym.parameters import ARGUMENTS
 from mptc_gym.ranges import Ranges
@@ -87,7 +86,6 @@ ANALYSES = {
     "self-tuning": lambda **p: engineered.self_tuning(Parameters(**p), 1, 0),
     "MPC": lambda **p: PredictiveController(Parameters(**p), 1),
     "margins": lambda **p: Loop(PIController(), Parameters(**p)),
-    "by hand": lambda **p: touched_plants(30, p)[0],
 }
 
 

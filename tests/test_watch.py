@@ -3,10 +3,10 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import gymnasium
 import numpy as np
 import pygame
 import pytest
+from gymnasium.utils.env_checker import data_equivalence
 from moviepy import VideoFileClip
 from PIL import Image
 from scipy import signal
@@ -15,9 +15,7 @@ from agents import PIController
 from benchmarks.watch import command as watch
 from benchmarks.watch import rivals
 from benchmarks.watch.__main__ import main
-from mptc_gym import PRESETS, MiddlePointEnv, Parameters, drawing
-from mptc_gym.plant import Plant
-from mptc_gym.ranges import Ranges
+from mptc_gym import PRESETS, MiddlePointEnv, drawing
 from tests.conftest import run, run_closed
 
 SAMPLES = 40
@@ -115,7 +113,7 @@ def test_interrupted(tmp_path, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     (tmp_path / "film.gif").write_bytes(b"earlier")
-    monkeypatch.setattr(watch, "rollout", stop)
+    monkeypatch.setattr(rivals, "rollout", stop)
     assert main(["--video", "film.gif"]) == 130
     assert "Interrupted" in capsys.readouterr().out
     assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"earlier"]
@@ -275,39 +273,14 @@ def test_speed_pause_and_escape(hands_on, monkeypatch):
 
 
 @pytest.mark.parametrize("preset", ["disturbed", "hard"])
-def test_a_plant_that_is_not_touched_is_the_environment_s(preset):
-    arguments = {**PRESETS[preset], "output_window": 2, "action_window": 3}
-    rng = np.random.default_rng(1)
-    plants, _ = rivals.touched_plants(50, arguments)
-    plain = gymnasium.make("MiddlePoint-v0", **arguments)
-    assert np.array_equal(plants.reset(seed=3)[0][0], plain.reset(seed=3)[0])
-    for action in rng.uniform(-1, 1, (40, 1)).astype(np.float32):
-        ours, theirs = plants.step(action[None]), plain.step(action)
-        assert np.array_equal(ours[0][0], theirs[0])
-        assert ours[4]["output"][0] == theirs[4]["output"]
-
-
-def test_the_observation_is_that_of_the_touched_plant():
-    # All windows, against an environment whose own set point changes.
+def test_a_plant_is_the_environment_until_it_is_touched(preset, rng):
+    # From sample 5 on it has 2 degC more, against an environment whose own set point changes.
     windows = {"setpoint_window": 2, "error_window": 4, "output_window": 3, "action_window": 1}
-    touched, _ = rivals.touched_plants(50, {"setpoint": 1.0, **windows})
-    other = gymnasium.make("MiddlePoint-v0", setpoint=[1.0] * 6 + [3.0], **windows)
-    touched.reset(seed=0), other.reset(seed=0)
-    for k in range(40):
+    arguments = {**PRESETS[preset], **windows}
+    touched = rivals.Touched(**{**arguments, "setpoint": 1.0})
+    other = MiddlePointEnv(**{**arguments, "setpoint": [1.0] * 6 + [3.0]})
+    touched.reset(seed=3), other.reset(seed=3)
+    for k, action in enumerate(rng.uniform(-1, 1, (40, 1))):
         if k == 5:
-            touched.envs[0].setpoint = 2.0
-        ours, theirs = touched.step(np.array([[0.9]])), other.step(np.array([0.9]))
-        assert ours[0][0] == pytest.approx(theirs[0], abs=1e-5)
-
-
-def test_a_load_by_hand_is_a_load_of_the_plant_while_it_drifts():
-    drift = {"gain_drift": 0.5, "time_constant_drift": 2.0, "drift_samples": 60}
-    touched, _ = rivals.touched_plants(50, drift)
-    parameters = Parameters(**drift)
-    plant = Plant(parameters, Ranges(parameters).given)
-    touched.reset(seed=0)
-    touched.envs[0].load = 2.0
-    for _ in range(45):
-        *_, infos = touched.step(np.array([[0.9]]))
-        _, _, output = plant.step(0.9, noise=0.0, load=2.0)
-        assert infos["output"][0] == pytest.approx(output, abs=1e-12)
+            touched.setpoint = 2.0
+        assert data_equivalence(touched.step(action), other.step(action), exact=True)

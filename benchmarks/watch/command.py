@@ -7,13 +7,13 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import cast
 
 import pygame
 from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
 from PIL import Image
 from rich.console import Console
 
+from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.own import own_entry
 from benchmarks.controllers.records import Factory, RosterEntry
 from benchmarks.controllers.roster import ROSTER
@@ -21,13 +21,14 @@ from benchmarks.lib.command_line import UsageError
 from benchmarks.lib.storage import replacing
 from benchmarks.lib.tables import on_screen
 from benchmarks.loop.metrics import mean_error
-from benchmarks.loop.rollout import Trajectory, make_plants, rollout
+from benchmarks.loop.rollout import Trajectory
 from benchmarks.loop.scenarios import SCENARIOS, Scenario, scenarios_of
 from benchmarks.watch import rivals
 from benchmarks.watch.hands import HELP, Closed, Hands
 from benchmarks.watch.options import YOU, Options
 from mptc_gym import Parameters, drawing
 from mptc_gym.drawing import SIZE
+from mptc_gym.record import Record
 from mptc_gym.rendering import Frame
 
 COLOURS = 48  # of a GIF: the lines', the areas' and what lies between them
@@ -37,41 +38,40 @@ Put = Callable[[Frame], object]  # takes the pictures of a film, one after the o
 
 def execute(options: Options, console: Console) -> str:
     """Run a controller on a scenario and show it."""
-    film: Path | None = options.video
+    film = options.video
     if film and film.suffix not in FILMS:
         raise UsageError(f"--video: must end in {' or '.join(FILMS)}, got {film}")
     controller = None if options.agent == YOU else _controller(options.agent)
+    label = controller.label if controller else YOU
     plant = options.plant.chosen()
     scenarios = scenarios_of(plant.name, plant.arguments) if plant.arguments else SCENARIOS
-    if options.scenario not in scenarios:
-        known = ", ".join(scenarios)
+    scenario = scenarios.get(options.scenario)
+    if scenario is None:
         raise UsageError(
-            f"--scenario: no {options.scenario!r} on this plant; there are {known}"
+            f"--scenario: no {options.scenario!r} on this plant; there are "
+            f"{', '.join(scenarios)}"
         )
-    scenario = scenarios[options.scenario]
-    has_screen = film is None and _has_screen()
-    if controller is None and not has_screen:
+    needs_film = film is not None or not _has_screen()
+    if controller is None and needs_film:
         raise UsageError(f"--agent {YOU}: needs a screen to open a window on, and no --video")
     factory = controller.first() if controller else None
-    if film is None and not has_screen:
+    if film is None and needs_film:
         film = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.mp4"
         console.print(f"There is no screen to open a window on: writing a film, {film}")
-    closing = f"{controller.label if controller else YOU} on {scenario.title}: mean absolute"
-    if film is not None:
-        assert factory is not None
+    if factory and film:
         trajectory = in_film(factory, scenario, options.seed, options.speed, film)
-        return f"{closing} error {mean_error(trajectory)[0]:.3f} °C\nThe film is {film}"
-    console.print(HELP)
-    try:
-        trajectory, moves = in_window(factory, scenario, options.seed, options.speed)
-    except Closed:
-        return "The window was closed."
-    if controller is None or moves:
-        console.print("The same for the controllers ...")
-        label = controller.label if controller else YOU
-        table = rivals.table(label, trajectory, moves, scenario, options.seed)
-        console.print(on_screen(table))
-    return f"{closing} error {mean_error(trajectory)[0]:.3f} °C"
+    else:
+        console.print(HELP)
+        try:
+            trajectory, moves = in_window(factory, scenario, options.seed, options.speed)
+        except Closed:
+            return "The window was closed."
+        if controller is None or moves:
+            console.print("The same for the controllers ...")
+            table = rivals.table(label, trajectory, moves, scenario, options.seed)
+            console.print(on_screen(table))
+    found = f"{mean_error(trajectory)[0]:.3f} °C" + (f"\nThe film is {film}" if film else "")
+    return f"{label} on {scenario.title}: mean absolute error {found}"
 
 
 def in_window(
@@ -79,62 +79,47 @@ def in_window(
 ) -> tuple[Trajectory, rivals.Moves]:
     """Run a controller, or the one who watches if there is none, and show it in a window.
 
-    The speed, samples a second, is that at the start, if so many can be drawn. What is returned
-    are the one run, and what was done to set point and load.
-
-    Raises
-    ------
-    Closed
-        If the window is closed before the end.
+    What is returned are the one run, and what was done to set point and load. `Closed` is
+    raised if the window is closed before the end.
     """
     arguments = factory.arguments(scenario.arguments) if factory else scenario.arguments
-    parameters = Parameters(**arguments)
-    hands = Hands(parameters.range_of("u_min")[0], parameters.range_of("u_max")[1], speed)
-    plants, touched = rivals.touched_plants(
-        scenario.samples, arguments, lambda record: drawing.show(record, hands.speed)
-    )
+    hands = Hands(**limits(Parameters(**arguments)), speed=speed)
+    plant = rivals.Touched(hands.show, **arguments)
     moves: rivals.Moves = {}
 
     def attend(k: int) -> None:
-        hands.take(pygame.event.get(), touched.record)
+        hands.take(pygame.event.get())
         while hands.paused:
             pygame.time.wait(20)
-            hands.take(pygame.event.get(), touched.record)
-        if (hands.setpoint, hands.load) != (touched.setpoint, touched.load):
-            moves[k] = touched.setpoint, touched.load = hands.setpoint, hands.load
+            hands.take(pygame.event.get())
+        if (hands.setpoint, hands.load) != (plant.setpoint, plant.load):
+            moves[k] = plant.setpoint, plant.load = hands.setpoint, hands.load
 
     controller = factory(arguments, 1, seed) if factory else hands
     pygame.display.init()
     pygame.key.set_repeat(300, 60)  # ms
     try:
-        return rollout(plants, controller, scenario.samples, seed, attend), moves
+        return rivals.run(plant, controller, scenario.samples, seed, attend), moves
     finally:
-        plants.close()
         drawing.close_window()
 
 
 def in_film(
     factory: Factory, scenario: Scenario, seed: int, speed: int, path: Path
 ) -> Trajectory:
-    """Run a controller and write what a window would show, as `in_window`, to a file.
+    """Run a controller and write what a window would show to a file.
 
-    Its pictures are those of every n-th sample, such that there are no more of them a second
-    than its kind of film allows.
+    It shows every n-th sample, as its kind of film has only so many pictures a second.
     """
-    arguments = factory.arguments(scenario.arguments)
-    plants = make_plants(1, scenario.samples, render_mode="rgb_array", **arguments)
     film, fps = FILMS[path.suffix]
     every = math.ceil(speed / fps)
-    controller = factory(arguments, 1, seed)
     with replacing(path) as partial, film(partial, speed / every) as put:
 
-        def draw(k: int) -> None:
-            if k % every == 0:
-                put(cast("tuple[Frame, ...]", plants.render())[0])
+        def show(record: Record) -> None:
+            if record.k % every == 0 and record.k < scenario.samples:
+                put(drawing.frame(record))
 
-        trajectory = rollout(plants, controller, scenario.samples, seed, draw)
-    plants.close()
-    return trajectory
+        return rivals.replay(factory, scenario, seed, show=show)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Turn keys and mouse into the flow that the player asks for."""
+"""A window with the plant in it, in which keys and mouse do what the player asks for."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pygame
 
 from benchmarks.controllers.engineered import Nothing
-from mptc_gym.drawing import flow_at
+from mptc_gym import drawing
 from mptc_gym.record import Record
 
 HELP = (
@@ -31,7 +31,7 @@ class Closed(Exception):  # noqa: N818 (no error)
 
 
 class Hands(Nothing):
-    """A controller whose flow comes from keys and mouse."""
+    """A controller whose flow comes from keys and mouse, and the window that it looks at."""
 
     def __init__(self, u_min: float, u_max: float, speed: float) -> None:
         super().__init__(u_min, u_max)
@@ -39,14 +39,13 @@ class Hands(Nothing):
         self.setpoint = self.load = 0.0  # what has been added to both by hand, degC
         self.paused = False  # whether the plant is to stand still
 
-    def take(self, events: Iterable[Any], record: Record) -> None:
-        """Do what events of pygame ask for, in a window that shows the record.
+    def show(self, record: Record) -> None:
+        """Show a record in the window."""
+        self._record = record
+        drawing.show(record, self.speed)
 
-        Raises
-        ------
-        Closed
-            If the window has been closed, or Esc pressed.
-        """
+    def take(self, events: Iterable[Any]) -> None:
+        """Do what events of pygame ask for; `Closed` if that is the end."""
         for event in events:
             if event.type == pygame.QUIT:
                 raise Closed
@@ -55,7 +54,7 @@ class Hands(Nothing):
             held = event.type == pygame.MOUSEBUTTONDOWN and event.button == 1
             dragged = event.type == pygame.MOUSEMOTION and event.buttons[0]
             if held or dragged:
-                flow = flow_at(record, event.pos)
+                flow = drawing.flow_at(self._record, event.pos)
                 if flow is not None:
                     self._move(flow)
 

@@ -2,55 +2,74 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
-import gymnasium
 import pandas as pd
+from gymnasium.vector import SyncVectorEnv
 
+from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.limits import least_possible
 from benchmarks.loop.metrics import mean_error, travel
-from benchmarks.loop.rollout import Trajectory, rollout
+from benchmarks.loop.rollout import Agent, Trajectory, rollout
 from benchmarks.loop.scenarios import Scenario
-from benchmarks.watch.touched import Touched
+from mptc_gym import MiddlePointEnv
 from mptc_gym.record import Record
 
 Moves = dict[int, tuple[float, float]]  # k: what is added to set point and load from k + 1 on
 EPISODES = 20  # of the bound, where a plant is drawn
 
 
-def touched_plants(
-    samples: int, arguments: Mapping[str, Any], show: Callable[[Record], None] | None = None
-) -> tuple[gymnasium.vector.SyncVectorEnv, Touched]:
-    """Return a batch of one plant that can be touched, and that plant."""
-    plants = gymnasium.make_vec(
-        "MiddlePoint-v0",
-        1,
-        vectorization_mode="sync",
-        wrappers=(lambda env: Touched(env, show),),
-        max_episode_steps=samples,
-        **arguments,
-    )
-    assert isinstance(plants, gymnasium.vector.SyncVectorEnv)
-    return plants, cast("Touched", plants.envs[0])
+class Touched(MiddlePointEnv):
+    """The environment, with a set point and a load that a hand changes while it runs.
+
+    `show`, if given, is called with a record of the last samples at each reset and step.
+    """
+
+    def __init__(
+        self, show: Callable[[Record], object] | None = None, **arguments: Any
+    ) -> None:
+        super().__init__(render_mode="rgb_array" if show else None, **arguments)
+        self._shown = show
+        self.setpoint = self.load = 0.0  # what is added from the next sample on, degC
+
+    def step(self, action: Any) -> Any:
+        """Step the plant, with what the hand adds."""
+        if not self._ahead:
+            self._look_ahead()
+        setpoint, noise, load, transmitter_noise = self._ahead[-1]
+        self._ahead[-1] = setpoint + self.setpoint, noise, load + self.load, transmitter_noise
+        return super().step(action)
+
+    def _show(self) -> None:
+        if self._shown and self._record:
+            self._shown(self._record)
 
 
-def replay(name: str, moves: Moves, scenario: Scenario, seed: int) -> Trajectory:
-    """Run a controller of the roster, with the noise and the moves of another's run."""
-    (factory,) = ROSTER[name].members()
+def run(
+    plant: Touched, agent: Agent, samples: int, seed: int, before: Callable[[int], object]
+) -> Trajectory:
+    """Run a controller on one plant, as `rollout` does on a batch."""
+    return rollout(SyncVectorEnv([lambda: plant]), agent, samples, seed, before)
+
+
+def replay(
+    factory: Factory,
+    scenario: Scenario,
+    seed: int,
+    moves: Moves | None = None,
+    show: Callable[[Record], object] | None = None,
+) -> Trajectory:
+    """Run a controller, with the noise and the moves of another's run."""
     arguments = factory.arguments(scenario.arguments)
-    plants, touched = touched_plants(scenario.samples, arguments)
+    plant, moves = Touched(show, **arguments), moves or {}
 
     def move(k: int) -> None:
-        if k in moves:
-            touched.setpoint, touched.load = moves[k]
+        plant.setpoint, plant.load = moves.get(k, (plant.setpoint, plant.load))
 
-    try:
-        return rollout(plants, factory(arguments, 1, seed), scenario.samples, seed, move)
-    finally:
-        plants.close()
+    return run(plant, factory(arguments, 1, seed), scenario.samples, seed, move)
 
 
 def table(
@@ -61,8 +80,8 @@ def table(
     There is no bound where the load was moved by hand.
     """
     runs = {label: trajectory} | {
-        controller.label: replay(name, moves, scenario, seed)
-        for name, controller in ROSTER.items()
+        controller.label: replay(controller.first(), scenario, seed, moves)
+        for controller in ROSTER.values()
         if controller.compared and not controller.trained and controller.label != label
     }
     found = {name: float(mean_error(run)[0]) for name, run in runs.items()}
@@ -75,9 +94,8 @@ def table(
         if moves:
             # Whoever moves the set point knows it beforehand.
             kind, longer = "preview", replace(scenario, samples=scenario.samples + 1)
-            arguments["setpoint"] = (
-                replay("nothing", moves, longer, seed).setpoint[:, 0].tolist()
-            )
+            idle = replay(ROSTER["nothing"].first(), longer, seed, moves)
+            arguments["setpoint"] = idle.setpoint[:, 0].tolist()
         bound = least_possible(
             samples=scenario.samples, kind=kind, episodes=EPISODES, **arguments
         )
