@@ -621,6 +621,15 @@ class TestLog:
         with pytest.raises(ValueError, match=complaint):
             read_log(written(renamed.to_csv(index=False)), Columns(**columns))
 
+    def test_fields_beyond_the_heading(self, written):
+        heading, *lines = table().to_csv(index=False).split()
+        empty, long = (
+            "\n".join([heading, *(line + end for line in lines)]) for end in (",", ",0")
+        )
+        self.same(read_log(written(empty)), recorded(400))
+        with pytest.raises(ValueError, match="lines longer than the heading"):
+            read_log(written(long))
+
     def test_other_faults_are_named(self, written, tmp_path):
         with pytest.raises(ValueError, match="is empty"):
             read_log(written(""))

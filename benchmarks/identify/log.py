@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections import deque
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -86,31 +86,47 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) 
     columns = columns or Columns()
     if columns.sampling_interval is not None and not columns.sampling_interval > 0:
         raise ValueError(f"sampling_interval must be above 0, got {columns.sampling_interval}")
-    file = _File(path, columns)
-    clock = _Clock(columns.sampling_interval)
-    kept: deque[pd.DataFrame] = deque()
-    read = 0
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            return _read(_File(path, columns), columns.sampling_interval, rows)
+    except (pd.errors.EmptyDataError, pd.errors.ParserError, pd.errors.ParserWarning) as error:
+        long = isinstance(error, pd.errors.ParserWarning)
+        reason = "lines longer than the heading" if long else str(error).strip()
+        raise ValueError(
+            f"{path} is not a table: {reason}. With decimal commas, the separator must be a "
+            "semicolon or a tab, or the numbers in quotes"
+        ) from error
+
+
+def _read(file: _File, interval: float | None, rows: int) -> Log:
+    clock, kept, read = _Clock(interval), pd.DataFrame(), 0
     with tqdm(unit="row", unit_scale=True, desc="reading", delay=PROGRESS_AFTER) as progress:
         for table in file.pieces():
             times = table.pop(file.time) if file.time else None
-            kept.append(table if times is None else clock.spread(times, table))
-            while len(kept) > 1 and sum(map(len, kept)) - len(kept[0]) >= rows:
-                kept.popleft()
+            spread = table if times is None else clock.spread(times, table)
+            kept = pd.concat([kept, spread])[-rows:] if read else spread[-rows:]
             read += len(table)
             progress.update(len(table))
     if clock.interval is None or not read:
         raise ValueError(
-            f"{path} is too short: {read} rows, and hundreds are needed, while the flow moves"
+            f"{file.path} is too short: {read} rows, and hundreds are needed, while the flow "
+            "moves"
         )
     notes = ["The flow is in %: read % wherever t/h is said."] if file.in_percent else []
     notes += clock.notes
     if read > rows:
         notes.append(f"Of the {read:,} rows, the last {rows:,} are used (--rows).")
-    found = {str(name): each.to_numpy() for name, each in pd.concat(kept)[-rows:].items()}
-    flow, temperature = (found.pop(name) for name in list(found)[:2])
-    flow, disturbances = _held(flow), {name: _held(each) for name, each in found.items()}
-    notes += _missing({"flow": flow, "temperature": temperature, **disturbances})
-    return Log(flow, temperature, clock.interval, notes, disturbances)
+    flow, temperature, *others = kept.columns
+    log = Log(
+        _held(kept[flow]),
+        kept[temperature].to_numpy(),
+        clock.interval,
+        notes,
+        {name: _held(kept[name]) for name in others},
+    )
+    notes += _missing({"flow": log.flow, "temperature": log.temperature, **log.disturbances})
+    return log
 
 
 class _File:
@@ -134,12 +150,13 @@ class _File:
             "encoding_errors": "replace",
             "skipinitialspace": True,
             "skip_blank_lines": False,
+            "index_col": False,  # fields beyond the heading are warned of
         }
         wanted = [("flow", columns.flow), ("temperature", columns.temperature)]
         wanted += [("disturbance", each) for each in columns.disturbance]
         if columns.sampling_interval is None:
             wanted.append(("time", columns.time))
-        names = [str(name) for name in self._read(nrows=0).columns]
+        names = [str(name) for name in pd.read_csv(path, nrows=0, **self._format).columns]
         found = [self._find(name, names, option) for option, name in wanted]
         if len(set(found)) < len(found):
             raise ValueError(f"each column can be one thing only, got {', '.join(found)}")
@@ -149,19 +166,6 @@ class _File:
         }
         self.in_percent = _unit(found[0], "flow", columns) == "%"
         self.time = found[-1] if wanted[-1][0] == "time" else None
-
-    def _read(self, **options: Any) -> Any:
-        try:
-            # Fields beyond the heading become an index, by which they are found.
-            return pd.read_csv(self.path, **{**self._format, **options})
-        except pd.errors.ParserError as error:
-            raise self._not_a_table(error) from error
-
-    def _not_a_table(self, reason: object) -> ValueError:
-        return ValueError(
-            f"{self.path} is not a table: {str(reason).strip()}. With decimal commas, "
-            "the separator must be a semicolon or a tab, or the numbers in quotes"
-        )
 
     def _find(self, name: str, names: Sequence[str], option: str) -> str:
         """Return the column of a name: exactly, or but for case and a unit in brackets."""
@@ -179,16 +183,9 @@ class _File:
 
     def pieces(self) -> Iterator[pd.DataFrame]:
         """Return the file piece by piece: flow, temperature, disturbances and time, if any."""
-        try:
-            with self._read(chunksize=CHUNK) as chunks:
-                for chunk in chunks:
-                    if not isinstance(chunk.index, pd.RangeIndex):
-                        raise self._not_a_table("lines longer than the heading")
-                    yield pd.DataFrame(
-                        {name: self._numbers(chunk[name]) for name in self._scales}
-                    )
-        except pd.errors.ParserError as error:
-            raise self._not_a_table(error) from error
+        with pd.read_csv(self.path, chunksize=CHUNK, **self._format) as chunks:
+            for chunk in chunks:
+                yield pd.DataFrame({name: self._numbers(chunk[name]) for name in self._scales})
 
     def _numbers(self, column: Any) -> Any:
         """Return a column in the units of the plant."""
@@ -278,32 +275,28 @@ def _unit(name: str, quantity: str, columns: Columns) -> str:
 
 
 def _missing(columns: dict[str, Array]) -> list[str]:
+    """Return a note of what is not known; ValueError if that is too much."""
     counts = {name: int(np.isnan(each).sum()) for name, each in columns.items()}
     rows = len(columns["flow"])
     for name, count in counts.items():
-        known = rows - count
-        least = LEAST_TEMPERATURES if name == "temperature" else (1.0 - LEAST_KNOWN) * rows
-        if count and known < min(least, rows):
+        least = LEAST_TEMPERATURES if name == "temperature" else LEAST_KNOWN * rows
+        if count and rows - count < min(least, rows):
             raise ValueError(
                 f"{count} of {rows} rows have no {name}: too many are missing. Name another "
                 "column, or take the rows in which it is known"
             )
-    if not any(counts.values()):
-        return []
     said = " and ".join(f"{count} {name}s" for name, count in counts.items() if count)
-    return [f"{said} are missing (NaN); rows that need them are left out of the fit."]
+    note = f"{said} are missing (NaN); rows that need them are left out of the fit."
+    return [note] if said else []
 
 
-def _held(flow: Array) -> Array:
+def _held(series: pd.Series[float]) -> Array:
     """Return a flow with its gaps closed where it is the same on both sides.
 
     So is that of a recorder that writes it less often than the temperature.
     """
-    series = pd.Series(flow)
     before, after = series.ffill(), series.bfill()
-    known = np.flatnonzero(series.notna())
-    steps = np.diff(known)
-    if len(steps) and np.min(steps) > 1 and np.mean(steps == steps[0]) > 0.95:
-        return np.asarray(before, np.float64)
-    filled = series.where(series.notna() | (before != after), before)
-    return np.asarray(filled, np.float64)
+    steps = np.diff(np.flatnonzero(series.notna()))
+    if not (len(steps) and np.min(steps) > 1 and np.mean(steps == steps[0]) > 0.95):
+        before = series.fillna(before.where(before == after))
+    return np.asarray(before, np.float64)
