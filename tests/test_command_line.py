@@ -226,12 +226,12 @@ class TestReading:
         assert self.read("--agents", "nn,pi").agents == ("nn,pi",)
         assert self.read("--agents").agents == ()
 
-    def test_names_add_up_and_of_equal_numbers_the_last_counts(self):
+    def test_the_last_of_equal_options_counts_unless_it_may_be_repeated(self):
         options = self.read(
             "--agents", "nn", "pi", "--agents", "mpc", "--runs", "3", "--runs", "4",
             "--set", "delay=3", "--set", "a=[1,-0.5]",
         )  # fmt: skip
-        assert (options.agents, options.runs) == (("nn", "pi", "mpc"), 4)
+        assert (options.agents, options.runs) == (("mpc",), 4)
         assert options.plant.set == ("delay=3", "a=[1,-0.5]")
 
     @pytest.mark.parametrize(

@@ -42,6 +42,12 @@ def flat(group: Any) -> dict[str, Any]:
     return found
 
 
+def _latest(_type: object, tokens: Sequence[Token]) -> tuple[str, ...]:
+    """Return the names of the last of equal options, as of any other option."""
+    begins = [i for i, token in enumerate(tokens) if token.keyword and token.index == 0]
+    return tuple(token.value for token in tokens[max(begins, default=0) :] if token.value)
+
+
 def _integers(_type: object, tokens: Sequence[Token]) -> Any:
     """Read integers, and refuse 2.5, which cyclopts would round."""
     try:
@@ -76,7 +82,7 @@ Seed = Annotated[int, integer(0, 2**63)]
 Orders = Annotated[tuple[int, int, int], integer(0, 1000, many=3)]
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 Positive = Annotated[float, Parameter(validator=Number(gt=0.0, lt=math.inf))]
-Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
+Names = Annotated[tuple[str, ...], Parameter(converter=_latest, consume_multiple=True)]
 Repeated = tuple[str, ...]
 Folder = Annotated[Path, Parameter(help="Folder to write to.")]
 
