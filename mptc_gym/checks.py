@@ -17,6 +17,7 @@ LARGEST: Final[Any] = 10**9
 # Far more than any plant needs. Beyond them, a mistyped number would fill the memory.
 LONGEST: Final = 10_000  # samples of a delay or of a window
 MOST_COEFFICIENTS: Final = 1_000
+COEFFICIENTS: Final = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
 MOST_PLANTS: Final = 10_000_000  # of one environment
 MOST_NUMBERS: Final = 1_000_000_000  # that the plants of one environment keep together
 SETPOINTS: Final = ("square", "random")
@@ -135,24 +136,19 @@ samples = partial(count, minimum=0, maximum=LONGEST)  # that are kept
 duration = partial(count, minimum=1, maximum=LARGEST)  # in samples
 
 
-def numbers(
-    name: str, value: Any, allowed: str = "a list of one or more numbers within +-1e9"
-) -> tuple[float, ...]:
+def numbers(name: str, value: Any, allowed: str) -> tuple[float, ...]:
     """Return a list of one number or more."""
     if not isinstance(value, list | tuple) or not value:
         reject(name, value, allowed)
     for i, element in enumerate(value):
         if not is_number(element):
-            raise ValueError(
-                f"{name} must be {allowed}, got {shortened(value)}, "
-                f"where element {i} is {shortened(element)}"
-            )
+            where = f"{shortened(value)}, where element {i} is {shortened(element)}"
+            raise ValueError(f"{name} must be {allowed}, got {where}")
     return tuple(float(element) for element in value)
 
 
-def coefficients(name: str, value: Any, condition: str = "") -> tuple[float, ...]:
-    """Return coefficients, up to `MOST_COEFFICIENTS`; an error also tells the `condition`."""
-    allowed = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9{condition}"
+def coefficients(name: str, value: Any, allowed: str = COEFFICIENTS) -> tuple[float, ...]:
+    """Return coefficients, up to `MOST_COEFFICIENTS`."""
     checked = numbers(name, value, allowed)
     if len(checked) > MOST_COEFFICIENTS:
         reject(name, value, allowed)
@@ -161,10 +157,10 @@ def coefficients(name: str, value: Any, condition: str = "") -> tuple[float, ...
 
 def polynomial(name: str, value: Any) -> tuple[float, ...]:
     """Return coefficients of which the first is 1."""
-    condition = ", the first of them 1"
-    checked = coefficients(name, value, condition)
+    allowed = f"{COEFFICIENTS}, the first of them 1"
+    checked = coefficients(name, value, allowed)
     if checked[0] != 1.0:
-        reject(name, value, f"a list of numbers within +-1e9{condition}")
+        reject(name, value, allowed)
     return checked
 
 
@@ -194,11 +190,9 @@ def or_range(check: Check) -> Callable[[str, Any], Number]:
         if not isinstance(value, list | tuple):
             single: float = check(name, value)
             return single
-        if len(value) != 2:
-            reject(name, value, "one number, or a range [low, high]")
-        low, high = check(name, value[0]), check(name, value[1])
-        if low > high:
+        ends = [check(name, each) for each in value]
+        if len(ends) != 2 or ends[0] > ends[1]:
             reject(name, value, "one number, or a range [low, high] with low <= high")
-        return low, high
+        return ends[0], ends[1]
 
     return checked

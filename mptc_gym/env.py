@@ -16,9 +16,9 @@ from mptc_gym import rendering
 from mptc_gym.checks import one_action, reject_action
 from mptc_gym.parameters import Parameters, argument_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
-from mptc_gym.ranges import Ranges
+from mptc_gym.ranges import Ranges, numbers_of_plant
 from mptc_gym.record import Record
-from mptc_gym.signals import BLOCK, Disturbance, Noise, SetPoint, Streams
+from mptc_gym.signals import ONE, Signals, Streams
 
 _FLOAT32 = np.dtype(np.float32)  # quicker to pass on than the type
 
@@ -209,17 +209,12 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             parameters.observation_size,
         )
         self._ranges = Ranges(parameters)
-        self._setpoint = SetPoint(parameters)
-        self._others = (
-            Noise("noise", parameters),
-            Disturbance(parameters),
-            Noise("measurement_noise", parameters),
-        )
+        self._signals = Signals.of(parameters)
         self._has_more_info = parameters.is_disturbed or parameters.drifts
         self._streams: Streams | None = None
         self._root: np.random.Generator | None = None  # what the streams come from
         # y_d, n, w and the transmitter's noise of the samples ahead, the next one last.
-        self._ahead: list[tuple[float, float, float, float]] = []
+        self._ahead: list[tuple[float, ...]] = []
 
     # One list of arguments, that of `Parameters`; help() and editors see it spelt out here.
     __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
@@ -250,10 +245,9 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
             self._streams = Streams.spawn(seeds)
         parameters = self.parameters
-        numbers = self._ranges.draw_one(self._streams.plant)
-        setpoint = self._setpoint.reset(self._streams, numbers)
-        for signal in self._others:  # each is 0 at k = 0
-            signal.reset(self._streams, numbers)
+        drawn = self._ranges.draw([self._streams.plant])
+        setpoint = self._signals.reset(ONE, [self._streams], drawn).item()
+        numbers = numbers_of_plant(drawn, 0)
         self._plant = Plant(parameters, numbers)
 
         # At rest u is 0, whatever action that is.
@@ -385,8 +379,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     def _look_ahead(self) -> None:
         if self._streams is None:
             raise ResetNeeded("call reset before step")
-        signals = self._setpoint, *self._others
-        self._ahead = list(zip(*(signal.next(BLOCK) for signal in signals), strict=True))[::-1]
+        self._ahead = self._signals.ahead()[::-1]
 
     def _add_more_info(self, info: dict[str, float], load: float) -> None:
         """Add to the info what belongs to arguments that are off by default."""

@@ -28,8 +28,7 @@ class Argument:
 
     default: Any
     check: checks.Check  # returns a valid value in plain Python types, or raises a ValueError
-    unit: str  # "" if there is none
-    meaning: str  # what the tables of arguments say about it
+    meaning: str  # and unit: what the tables of arguments say about it
     # Whether the plant is (28) and (29) whatever its value: linear between the limits. An
     # analysis that supposes this refuses any other argument that is not at its default.
     linear: bool
@@ -48,15 +47,12 @@ class Argument:
         """Return its row in a Markdown table of arguments."""
         default = repr(self.default).replace("'", '"')
         star = "*" if name in PLANT_NUMBERS else ""
-        unit = f", {self.unit}" if self.unit else ""
-        return f"| `{name}` | {default}{star} | {self.meaning}{unit} |"
+        return f"| `{name}` | {default}{star} | {self.meaning} |"
 
 
-def _argument(
-    default: Any, check: checks.Check, unit: str, meaning: str, *, linear: bool = False
-) -> Any:
+def _argument(default: Any, check: checks.Check, meaning: str, *, linear: bool = False) -> Any:
     """Declare an argument: a field of a dataclass that carries an `Argument`."""
-    argument = Argument(default, check, unit, meaning, linear)
+    argument = Argument(default, check, meaning, linear)
     return field(default=default, metadata={"argument": argument})
 
 
@@ -72,54 +68,51 @@ class PlantNumbers(Generic[Value]):
     reset, which is part of what a seed means: the order never changes, and new ones come last.
     """
 
-    delay: Value = _linear(18, checks.samples, "samples", "transport delay d of the plant (28)")
+    delay: Value = _linear(18, checks.samples, "transport delay d of the plant (28), samples")
     dead_zone: Value = _linear(
-        5.0, checks.not_negative, "t/h", "half width of the actuator's dead zone (29)"
+        5.0, checks.not_negative, "half width of the actuator's dead zone (29), t/h"
     )
     u_min: Value = _linear(
-        -10.0, checks.number, "t/h", "lower limit of the actuator, U_min in (29)"
+        -10.0, checks.number, "lower limit of the actuator, U_min in (29), t/h"
     )
     u_max: Value = _linear(
-        10.0, checks.number, "t/h", "upper limit of the actuator, U_max in (29)"
+        10.0, checks.number, "upper limit of the actuator, U_max in (29), t/h"
     )
     noise_variance: Value = _linear(
-        0.0, checks.not_negative, "degC^2", "R, the variance of xi in (28)"
+        0.0, checks.not_negative, "R, the variance of xi in (28), degC^2"
     )
     measurement_noise_variance: Value = _linear(
         0.0,
         checks.not_negative,
-        "degC^2",
-        "variance of the transmitter's white noise, which observations show and rewards do not",
+        "variance of the transmitter's white noise, which observations show and rewards do "
+        "not, degC^2",
     )
     disturbance_amplitude: Value = _linear(
         0.0,
         checks.not_negative,
-        "degC",
-        "largest level of the load disturbance's steps, up or down",
+        "largest level of the load disturbance's steps, up or down, degC",
     )
     disturbance_interval: Value = _linear(
         150.0,
         checks.at_least_1,
-        "samples",
-        "mean interval between these steps; below 10 it is 10",
+        "mean interval between these steps; below 10 it is 10, samples",
     )
     disturbance_walk_variance: Value = _linear(
         0.0,
         checks.not_negative,
-        "degC^2",
-        "variance that the load disturbance's random walk adds a sample",
+        "variance that the load disturbance's random walk adds a sample, degC^2",
     )
     gain_factor: Value = _linear(
-        1.0, checks.positive, "", "steady-state gain, as a multiple of that of `a` and `b`"
+        1.0, checks.positive, "steady-state gain, as a multiple of that of `a` and `b`"
     )
     time_constant_factor: Value = _linear(
-        1.0, checks.positive, "", "dominant time constant, as a multiple of that of `a`"
+        1.0, checks.positive, "dominant time constant, as a multiple of that of `a`"
     )
     gain_drift: Value = _linear(
-        1.0, checks.positive, "", "factor by which the gain changes in `drift_samples`"
+        1.0, checks.positive, "factor by which the gain changes in `drift_samples`"
     )
     time_constant_drift: Value = _linear(
-        1.0, checks.positive, "", "factor by which the time constant changes in `drift_samples`"
+        1.0, checks.positive, "factor by which the time constant changes in `drift_samples`"
     )
 
     def chosen(self, names: Sequence[str]) -> dict[str, Value]:
@@ -131,10 +124,6 @@ def slowest_pole(a: Sequence[float]) -> complex | None:
     """Return the pole of 1 / A with the largest magnitude, None if there is no pole."""
     poles = np.roots(a)
     return complex(poles[np.argmax(np.abs(poles))]) if len(poles) else None
-
-
-def _shown(number: Number) -> str:
-    return f"{number:g}" if isinstance(number, float | int) else f"{list(number)}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,73 +144,65 @@ class Parameters(PlantNumbers[Number]):
     a: Sequence[float] = _linear(
         (1.0, -0.45181, -0.47546),
         checks.polynomial,
-        "",
-        "coefficients of A in (28), from z^0 on; the first is 1. If A is unstable, y may grow "
-        "beyond all floats",
+        "coefficients of A in (28), from z^0 on; the first is 1. If A is unstable, y may "
+        "grow beyond all floats",
     )
     b: Sequence[float] = _linear(
         (-0.04560, -0.00404),
         checks.coefficients,
-        "degC per t/h",
-        "coefficients of B in (28), from z^-1 on",
+        "coefficients of B in (28), from z^-1 on, degC per t/h",
     )
     c: Sequence[float] = _linear(
         (1.0, -0.35740, -0.03392),
         checks.polynomial,
-        "",
         "coefficients of C in (28), from z^0 on; the first is 1",
     )
     drift_samples: int = _linear(
-        1200, checks.duration, "samples", "how long gain and time constant drift"
+        1200, checks.duration, "how long gain and time constant drift, samples"
     )
     sampling_interval: float = _linear(  # Section 5
-        8.0, checks.positive, "s", "scale of the time axis, without effect on the dynamics"
+        8.0, checks.positive, "scale of the time axis, without effect on the dynamics, s"
     )
     # The paper plots the set point and does not state it.
     setpoint: str | float | Sequence[float] = _linear(
         "square",
         checks.setpoint,
-        "degC",
-        '"square", "random", a number (constant), or a list with a number for each sample, the '
-        "last one held: [-5, 5] is two samples, not a range",
+        '"square", "random", a number (constant), or a list with a number for each sample, '
+        "the last one held: [-5, 5] is two samples, not a range, degC",
     )
     setpoint_amplitude: float = _linear(
         5.0,
         checks.not_negative,
-        "degC",
         'A. "square": A for the first half period, then -A. "random": levels uniform in '
-        "[-A, A]",
+        "[-A, A], degC",
     )
     setpoint_period: int = _linear(
         600,
         checks.duration,
-        "samples",
         'period of "square". "random": each level is held for a length uniform in '
-        "[period/6, period/2]",
+        "[period/6, period/2], samples",
     )
     # The observation. By default it is the six inputs of the paper's network: y_d(k), y_d(k-1),
     # y_d(k-2), e(k), e(k-1), e(k-2).
     setpoint_window: int = _linear(
-        3, checks.samples, "samples", "how many of the latest set points the observation holds"
+        3, checks.samples, "how many of the latest set points the observation holds, samples"
     )
-    error_window: int = _linear(3, checks.samples, "samples", "the same for errors")
-    output_window: int = _linear(0, checks.samples, "samples", "the same for measured outputs")
-    action_window: int = _linear(0, checks.samples, "samples", "the same for past actions")
+    error_window: int = _linear(3, checks.samples, "the same for errors, samples")
+    output_window: int = _linear(0, checks.samples, "the same for measured outputs, samples")
+    action_window: int = _linear(0, checks.samples, "the same for past actions, samples")
     temperature_span: float = _linear(
         50.0,
         checks.positive,
-        "degC",
-        "range of the transmitter: the measurement saturates at +-`temperature_span`",
+        "range of the transmitter: the measurement saturates at +-`temperature_span`, degC",
     )
-    reward: str = _linear("quadratic", checks.reward, "", '"quadratic" or "absolute"')
+    reward: str = _linear("quadratic", checks.reward, '"quadratic" or "absolute"')
     error_scale: float = _linear(
         5.0,
         checks.positive,
-        "degC",
-        'the error that costs 1/2 ("quadratic") or 1 ("absolute") in each sample',
+        'the error that costs 1/2 ("quadratic") or 1 ("absolute") in each sample, degC',
     )
     move_weight: float = _linear(
-        0.0, checks.not_negative, "", "cost of a change of the normalised action by 1"
+        0.0, checks.not_negative, "cost of a change of the normalised action by 1"
     )
 
     def __post_init__(self) -> None:
@@ -263,7 +244,7 @@ class Parameters(PlantNumbers[Number]):
         """Refuse limits and a dead zone that do not fit together, whatever is drawn."""
         (lowest, low), (high, highest) = self.range_of("u_min"), self.range_of("u_max")
         if low >= high:
-            reject("u_min", self.u_min, f"below u_max = {_shown(self.u_max)}")
+            reject("u_min", self.u_min, f"below u_max = {self.u_max}")
         # The draw that leaves least of both limits.
         reach = max(lowest, -low, high, -highest, 0.0)
         if self.range_of("dead_zone")[1] > reach:
@@ -277,10 +258,9 @@ class Parameters(PlantNumbers[Number]):
     def _check_dynamics(self) -> None:
         """Refuse a change of dynamics that A has no meaning for."""
         if self.changes_time_constant:
+            names = "time_constant_factor, time_constant_drift"
             refuse = partial(
-                reject,
-                "time_constant_factor, time_constant_drift",
-                (self.time_constant_factor, self.time_constant_drift),
+                reject, names, (self.time_constant_factor, self.time_constant_drift)
             )
             pole = slowest_pole(self.a)
             if pole is None:

@@ -27,17 +27,12 @@ class Ranges:
         self.names = parameters.ranges
         # The disturbance's draws follow those of the plant numbers.
         self._draws = bool(self.names) or parameters.is_disturbed
+        self._ranges = {name: parameters.range_of(name) for name in self.names}
         lows = {name: parameters.range_of(name)[0] for name in PLANT_NUMBERS}
         self.given: PlantNumbers[float] = PlantNumbers(**lows)
         self.given_arrays: PlantNumbers[Values] = PlantNumbers(
             **{name: np.array(low) for name, low in lows.items()}
         )
-        self._places = [PLANT_NUMBERS[name] for name in self.names]
-        self._lows, highs = (
-            np.array([parameters.range_of(n) for n in self.names]).reshape(-1, 2).T
-        )
-        self._whole = np.array([ARGUMENTS[name].is_integer for name in self.names], np.bool_)
-        self._widths = highs - self._lows + self._whole
 
     def draw(self, streams: Sequence[EpisodeStream]) -> PlantNumbers[Values]:
         """Begin an episode of each stream, and draw its numbers.
@@ -49,18 +44,14 @@ class Ranges:
         draws = np.empty((len(streams), DRAWS))
         for stream, row in zip(streams, draws, strict=True):
             stream.next_episode().random(out=row)
-        offsets = draws[:, self._places] * self._widths
-        offsets[:, self._whole] = np.floor(offsets[:, self._whole])
-        drawn = zip(self.names, self._whole, (self._lows + offsets).T, strict=True)
-        return replace(
-            self.given_arrays,
-            **{name: values.astype(int if whole else float) for name, whole, values in drawn},
-        )
-
-    def draw_one(self, stream: EpisodeStream) -> PlantNumbers[float]:
-        """Begin an episode of a stream, and draw its numbers."""
-        drawn = self.draw([stream]).chosen(self.names) if self._draws else {}
-        return replace(self.given, **{name: each.item() for name, each in drawn.items()})
+        drawn = {}
+        for name, (low, high) in self._ranges.items():
+            share = draws[:, PLANT_NUMBERS[name]]
+            if ARGUMENTS[name].is_integer:
+                drawn[name] = low + np.floor(share * (high + 1 - low)).astype(int)
+            else:
+                drawn[name] = low + share * (high - low)
+        return replace(self.given_arrays, **drawn)
 
 
 def numbers_of_plant(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:

@@ -1,21 +1,17 @@
 """Make what comes from outside during an episode: set point, noise and load disturbance.
 
-Every signal has two verbs, here and in `mptc_gym.torch_signals`. `reset` begins an episode and
-returns the signal at k = 0, and `next` returns it at the samples that follow:
+Every signal has the same verbs. `reset` begins an episode of some plants at k = 0. `next`
+returns the sample that follows of all plants, and `ahead` the next `BLOCK` of one plant alone.
 
-- of one plant: `reset(streams, numbers)`, and `next(samples)`, a list;
-- of many plants: `reset(which, streams, numbers)`, and `next()`, an array of one sample.
-
-Both share how a signal goes on, and agree to the bit. Noise and disturbance are made a block of
-samples at a time: drawing many numbers in one call costs a small part of drawing them one by
-one, and gives the same numbers.
+Noise and disturbance are made a block of samples at a time: drawing many numbers in one call
+costs a small part of drawing them one by one, and gives the same numbers.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +26,7 @@ FOREVER = 1 << 62  # samples
 PLANTS_AT_A_TIME = 32  # whose draws are made together: they stay in the processor's cache
 LOAD_INTERVAL = 10  # samples between two changes of the load disturbance
 LEVELS_AT_A_TIME = 60  # of the load disturbance, made together
+ONE = np.zeros(1, np.intp)  # the indices of one plant
 
 
 class EpisodeStream:
@@ -48,7 +45,6 @@ class EpisodeStream:
 
     def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
         self._seeds = entropy, spawn_key, pool_size
-        self._origin = 0, 0  # state and increment of the bit generator at the start
         self._episode = 0
 
     def next_episode(self) -> np.random.Generator:
@@ -61,15 +57,10 @@ class EpisodeStream:
             self._origin = origin["state"], origin["inc"]
         else:
             # Found through the generator, as a copy of it may have a bit generator of its own.
-            bit_generator = cast("np.random.PCG64", self.generator.bit_generator)
-            state, increment = self._origin
-            bit_generator.state = {
-                "bit_generator": "PCG64",
-                "state": {"state": state, "inc": increment},
-                "has_uint32": 0,
-                "uinteger": 0,
-            }
-            bit_generator.advance(self._episode << 64)
+            bits = cast("np.random.PCG64", self.generator.bit_generator)
+            at: Any = dict(zip(("state", "inc"), self._origin, strict=True))
+            bits.state = {"bit_generator": "PCG64", "state": at, "has_uint32": 0, "uinteger": 0}
+            bits.advance(self._episode << 64)
         self._episode += 1
         return self.generator
 
@@ -86,17 +77,12 @@ class Streams(NamedTuple):
     def spawn(cls, seeds: np.random.SeedSequence) -> Streams:
         """Make the streams of a seed sequence, each of a child of it."""
         children = seeds.spawn(len(cls._fields))
-        return cls(
-            *(EpisodeStream(each.entropy, each.spawn_key, each.pool_size) for each in children)
-        )
+        return cls(*(EpisodeStream(c.entropy, c.spawn_key, c.pool_size) for c in children))
 
     @classmethod
     def of_seed(cls, seed: int) -> Streams:
-        """Make the streams that `spawn` makes of `SeedSequence(seed)`."""
-        return cls(*(EpisodeStream(seed, key) for key in _SPAWN_KEYS))
-
-
-_SPAWN_KEYS: Final = tuple((place,) for place in range(len(Streams._fields)))
+        """Make the streams that `spawn` makes of `SeedSequence(seed)`, in less time."""
+        return cls(*(EpisodeStream(seed, (place,)) for place in range(len(cls._fields))))
 
 
 def colour_of(name: str, parameters: Parameters) -> Sequence[float]:
@@ -112,39 +98,8 @@ def is_silent(name: str, parameters: Parameters) -> bool:
 class Noise:
     """Coloured noise, C(z^-1) xi(k) of (28), or the transmitter's, by name; 0 at k = 0."""
 
-    def __init__(self, name: str, parameters: Parameters) -> None:
-        self._name = name
-        self._c = colour_of(name, parameters)
-        self._silent = is_silent(name, parameters)
-
-    def reset(self, streams: Streams, numbers: PlantNumbers[float]) -> float:
-        """Begin an episode, with one draw a sample; without noise the stream is untouched."""
-        stream: EpisodeStream = getattr(streams, self._name)
-        self._generator = None if self._silent else stream.next_episode()
-        deviation = math.sqrt(getattr(numbers, f"{self._name}_variance"))
-        self._colour = [deviation * coefficient for coefficient in self._c]
-        self._past = np.zeros(len(self._c) - 1)  # draws, oldest first
-        return 0.0
-
-    def next(self, samples: int) -> list[float]:
-        """Return the next values, degC."""
-        if self._generator is None:
-            return [0.0] * samples
-        draws = np.concatenate((self._past, self._generator.standard_normal(samples)))
-        self._past = draws[samples:]
-        noise: list[float] = _coloured(self._colour, draws).tolist()
-        return noise
-
-
-class NoiseBatch:
-    """`Noise` for many plants, each to the bit what it is alone; `block` samples at a time.
-
-    `silent` says whether it is always 0.
-    """
-
     def __init__(self, name: str, parameters: Parameters, num_envs: int, block: int) -> None:
         self._name, self._variance = name, f"{name}_variance"
-        self.silent = is_silent(name, parameters)
         c = np.array(colour_of(name, parameters))
         self._c = c[:, np.newaxis, np.newaxis]
         # C times the deviation of xi: [lag, plant, 0], all plants in one if they are alike.
@@ -154,37 +109,38 @@ class NoiseBatch:
         self._past = np.zeros((num_envs, len(c) - 1))
         self._generators: dict[int, np.random.Generator] = {}
         # A row a sample: what all plants need at a time lies together.
-        self._block = np.zeros((0 if self.silent else block, num_envs))
-        self._silence = np.zeros(num_envs)
+        self._block = np.zeros((block, num_envs))
         self._row = 0  # the next one
 
     def reset(
         self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
-    ) -> Values:
+    ) -> None:
         """Begin an episode of some plants, with the streams of each."""
-        if not self.silent:
-            if not self._alike:
-                deviations = np.sqrt(getattr(numbers, self._variance))
-                self._colour[:, which] = deviations[:, np.newaxis] * self._c
-            self._past[which] = 0.0
-            for i, own in zip(which.tolist(), streams, strict=True):
-                self._generators[i] = getattr(own, self._name).next_episode()
-            if len(which) == len(self._past):
-                self._row = len(self._block)
-            else:
-                self._fill(which, self._row)
-        return np.zeros(len(which))
+        if not self._alike:
+            deviations = np.sqrt(getattr(numbers, self._variance))
+            self._colour[:, which] = deviations[:, np.newaxis] * self._c
+        self._past[which] = 0.0
+        for i, own in zip(which.tolist(), streams, strict=True):
+            self._generators[i] = getattr(own, self._name).next_episode()
+        if len(which) == len(self._past):
+            self._row = len(self._block)
+        else:
+            self._fill(which, self._row)
 
     def next(self) -> Values:
         """Return the next values of all plants, degC, shape (num_envs,); only to be read."""
-        if self.silent:
-            return self._silence
         if self._row == len(self._block):
             self._fill(np.arange(len(self._past)), 0)
             self._row = 0
         row: Values = self._block[self._row]
         self._row += 1
         return row
+
+    def ahead(self) -> list[float]:
+        """Return the next block of one plant, degC."""
+        self._fill(ONE, 0)
+        noise: list[float] = self._block[:, 0].tolist()
+        return noise
 
     def _fill(self, which: Indices, first_row: int) -> None:
         """Make the noise of some plants, from a row on to the end of the block."""
@@ -241,33 +197,7 @@ class Levels:
         return level, int(generator.integers(self.shortest, self.longest, endpoint=True))
 
 
-class SetPoint:
-    """The set point y_d(k)."""
-
-    def __init__(self, parameters: Parameters) -> None:
-        self._levels = Levels(parameters)
-
-    def reset(self, streams: Streams, numbers: PlantNumbers[float]) -> float:
-        """Begin an episode; the stream is untouched unless levels are random."""
-        self._generator = streams.setpoint.next_episode() if self._levels.random else None
-        self._place = 0  # of the next level
-        self._level, self._left = 0.0, 0  # the level now, and for how many samples more
-        return self.next(1)[0]
-
-    def next(self, samples: int) -> list[float]:
-        """Return the next values of y_d, degC."""
-        values: list[float] = []
-        while len(values) < samples:
-            if self._left == 0:
-                self._level, self._left = self._levels.next(self._place, self._generator)
-                self._place += 1
-            length = min(self._left, samples - len(values))
-            values += [self._level] * length
-            self._left -= length
-        return values
-
-
-class _LevelsBatch:
+class _Held:
     """Values of many plants, each of which is held until it changes."""
 
     def __init__(self, num_envs: int) -> None:
@@ -295,8 +225,8 @@ class _LevelsBatch:
         raise NotImplementedError
 
 
-class SetPointBatch(_LevelsBatch):
-    """`SetPoint` for many plants, each to the bit what it is alone."""
+class SetPoint(_Held):
+    """The set point y_d(k)."""
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         super().__init__(num_envs)
@@ -306,10 +236,8 @@ class SetPointBatch(_LevelsBatch):
         self._generators: dict[int, np.random.Generator] = {}
         self._places = np.zeros(num_envs, np.intp)  # of the next level
 
-    def reset(
-        self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
-    ) -> Values:
-        """Begin an episode of some plants, with the streams of each."""
+    def reset(self, which: Indices, streams: Sequence[Streams]) -> Values:
+        """Begin an episode of some plants, with the streams of each; return y_d(0)."""
         if self._levels.random:
             for i, own in zip(which.tolist(), streams, strict=True):
                 self._generators[i] = own.setpoint.next_episode()
@@ -317,6 +245,20 @@ class SetPointBatch(_LevelsBatch):
         self._changes[which] = self._next_change = self._clock
         self._catch_up()
         return self._now[which]
+
+    def ahead(self) -> list[float]:
+        """Return the next block of one plant, degC."""
+        level, place = self._now.item(), self._places.item()
+        values: list[float] = []
+        end = self._next_change - self._clock - 1  # of the level, counted from here
+        while end < BLOCK:
+            values += [level] * (end - len(values))
+            level, length = self._levels.next(place, self._generators.get(0))
+            place, end = place + 1, end + length
+        self._now[0], self._places[0] = level, place
+        self._clock += BLOCK
+        self._next_change = self._clock + 1 + end - BLOCK
+        return values + [level] * (BLOCK - len(values))
 
     def _change(self, due: NDArray[np.bool_]) -> None:
         which = np.flatnonzero(due)
@@ -331,7 +273,7 @@ class SetPointBatch(_LevelsBatch):
             self._places[which] = (places + 1) % len(self._values)
 
 
-class Disturbance:
+class Disturbance(_Held):
     """The load disturbance w(k): steps and a random walk, both from 0.
 
     It changes every `LOAD_INTERVAL` samples. The walk takes a uniform step, as wide as the
@@ -339,33 +281,6 @@ class Disturbance:
     `LOAD_INTERVAL / disturbance_interval` the other part jumps to a new level, uniform within
     +-`disturbance_amplitude`.
     """
-
-    def __init__(self, parameters: Parameters) -> None:
-        self._silent = not parameters.is_disturbed
-
-    def reset(self, streams: Streams, numbers: PlantNumbers[float]) -> float:
-        """Begin an episode; the draws follow those of the plant numbers."""
-        if not self._silent:
-            self._generator = streams.plant.generator
-        self._shape = np.array([_shape(numbers)])
-        self._last = np.zeros((1, 2))
-        self._ahead = [0.0] * (LOAD_INTERVAL - 1)
-        return 0.0
-
-    def next(self, samples: int) -> list[float]:
-        """Return the next values of w, degC."""
-        if self._silent:
-            return [0.0] * samples
-        while len(self._ahead) < samples:
-            draws = self._generator.random((1, LEVELS_AT_A_TIME, 3))
-            levels, self._last = _disturbance(draws, self._shape, self._last)
-            self._ahead += np.repeat(levels[0], LOAD_INTERVAL).tolist()
-        values, self._ahead = self._ahead[:samples], self._ahead[samples:]
-        return values
-
-
-class DisturbanceBatch(_LevelsBatch):
-    """`Disturbance` for many plants, each to the bit what it is alone."""
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs)
@@ -379,7 +294,7 @@ class DisturbanceBatch(_LevelsBatch):
 
     def reset(
         self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
-    ) -> Values:
+    ) -> None:
         """Begin an episode of some plants, with the streams of each."""
         for i, own in zip(which.tolist(), streams, strict=True):
             self._generators[i] = own.plant.generator
@@ -389,7 +304,15 @@ class DisturbanceBatch(_LevelsBatch):
         self._places[which] = self._ends[which]
         self._changes[which] = self._clock + LOAD_INTERVAL
         self._next_change = int(self._changes.min())
-        return np.zeros(len(which))
+        self._ahead = [0.0] * (LOAD_INTERVAL - 1)  # of one plant
+
+    def ahead(self) -> list[float]:
+        """Return the next block of one plant, degC."""
+        while len(self._ahead) < BLOCK:
+            self._refill(ONE)
+            self._ahead += np.repeat(self._levels[0], LOAD_INTERVAL).tolist()
+        values, self._ahead = self._ahead[:BLOCK], self._ahead[BLOCK:]
+        return values
 
     def _change(self, due: NDArray[np.bool_]) -> None:
         self._refill(np.flatnonzero(due & (self._places == self._ends)))
@@ -433,3 +356,36 @@ def _disturbance(draws: Values, shapes: Values, last: Values) -> tuple[Values, V
     latest = np.maximum.accumulate(np.where(jumps, np.arange(1, jumps.shape[1] + 1), 0), axis=1)
     steps = np.take_along_axis(levels, latest, axis=1)
     return steps + walk, np.stack((steps[:, -1], walk[:, -1]), axis=1)
+
+
+class Signals(NamedTuple):
+    """What comes from outside to some plants; None is always 0."""
+
+    setpoint: SetPoint
+    noise: Noise | None
+    disturbance: Disturbance | None
+    measurement_noise: Noise | None
+
+    @classmethod
+    def of(cls, parameters: Parameters, num_envs: int = 1, block: int = BLOCK) -> Signals:
+        """Make the signals of an environment; noise is made `block` samples at a time."""
+        noise, measurement_noise = (
+            None if is_silent(name, parameters) else Noise(name, parameters, num_envs, block)
+            for name in ("noise", "measurement_noise")
+        )
+        disturbance = Disturbance(num_envs) if parameters.is_disturbed else None
+        return cls(SetPoint(parameters, num_envs), noise, disturbance, measurement_noise)
+
+    def reset(
+        self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
+    ) -> Values:
+        """Begin an episode of some plants, and return their y_d(0); all else is 0 then."""
+        for signal in (self.noise, self.disturbance, self.measurement_noise):
+            if signal is not None:
+                signal.reset(which, streams, numbers)
+        return self.setpoint.reset(which, streams)
+
+    def ahead(self) -> list[tuple[float, ...]]:
+        """Return y_d, n, w and the transmitter's noise of one plant, a tuple a sample."""
+        silence = [0.0] * BLOCK
+        return list(zip(*(each.ahead() if each else silence for each in self), strict=True))

@@ -20,15 +20,7 @@ from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
 from mptc_gym.record import Record
-from mptc_gym.signals import (
-    BLOCK,
-    DisturbanceBatch,
-    Indices,
-    NoiseBatch,
-    SetPointBatch,
-    Streams,
-    Values,
-)
+from mptc_gym.signals import BLOCK, Indices, Signals, Streams, Values
 
 Observations = NDArray[np.float32]  # shape (num_envs, observation_size)
 
@@ -108,13 +100,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
         # longer to make, where the memory of many plants would be large.
         longest = max(1, min(BLOCK, NOISE_BYTES // (8 * num_envs)))
         block = math.ceil(self._limit / math.ceil(self._limit / longest))
-        self._noise, transmitter = (
-            NoiseBatch(name, parameters, num_envs, block)
-            for name in ("noise", "measurement_noise")
-        )
-        self._transmitter = None if transmitter.silent else transmitter
-        self._setpoint = SetPointBatch(parameters, num_envs)
-        self._disturbance = DisturbanceBatch(num_envs) if parameters.is_disturbed else None
+        self._signals = Signals.of(parameters, num_envs, block)
         self._plants = PlantBatch(parameters, num_envs)
         self._shown = _Window(parameters.windows, num_envs)
         self._actions = np.zeros(num_envs)  # the last ones
@@ -162,9 +148,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
 
     def _advance(self, a: Values) -> tuple[Observations, Values, Mask, Mask, Infos]:
         # This is the hot path: for few plants, the number of calls determines its speed.
-        setpoint = self._setpoint.next()
-        noise = self._noise.next()
-        load = self._disturbance.next() if self._disturbance is not None else None
+        of_setpoint, of_noise, of_load, of_transmitter = self._signals
+        setpoint = of_setpoint.next()
+        noise = self._zeros if of_noise is None else of_noise.next()
+        load = None if of_load is None else of_load.next()
         command, applied, output = self._plants.step(a, noise, load)
         error = setpoint - output
 
@@ -180,8 +167,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
         self._actions = a
 
         measured, measured_error = output, error
-        if self._transmitter is not None:
-            measured = output + self._transmitter.next()
+        if of_transmitter is not None:
+            measured = output + of_transmitter.next()
             measured_error = setpoint - measured
         lowest, highest, squared = self._span
         # Otherwise no single one can be beyond the span.
@@ -222,10 +209,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
         streams = [self._streams[i] for i in which.tolist()]
         numbers = self._ranges.draw([each.plant for each in streams])
         self._plants.reset(which, numbers)
-        setpoint = self._setpoint.reset(which, streams, numbers)
-        for signal in (self._noise, self._transmitter, self._disturbance):
-            if signal is not None:
-                signal.reset(which, streams, numbers)  # to 0 at k = 0
+        setpoint = self._signals.reset(which, streams, numbers)
         rest_action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         self._actions[which] = rest_action
         self._shown.reset(which, setpoint, rest_action)
