@@ -12,7 +12,7 @@ import mptc_gym
 from agents import DirectNNController, PIController, PolicyNetwork
 from agents.policy_network import PRETRAINED
 from benchmarks.limits import least_possible
-from benchmarks.limits.packaged import CASES
+from benchmarks.limits.command import PACKAGED as CASES
 from mptc_gym import IDS, PRESETS, MiddlePointEnv, evaluate
 from mptc_gym.evaluation import SEED, least_errors
 from mptc_gym.wrappers import IncrementalAction

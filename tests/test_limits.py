@@ -13,8 +13,7 @@ from benchmarks.lib.fan_out import FanOut
 from benchmarks.limits import bounds, command, frontier, least_possible, programme, verify
 from benchmarks.limits.__main__ import main
 from benchmarks.limits.news import News
-from benchmarks.limits.programme import plan
-from benchmarks.limits.reference import TAIL, reference
+from benchmarks.limits.programme import TAIL, plan, reference
 from benchmarks.limits.unknown import noise_variance, unknown
 from benchmarks.limits.verify import beats, controllers, errors
 from benchmarks.loop.linear import course

@@ -1,32 +1,20 @@
 """The least possible mean error of any case of the environment, and the score that it gives.
 
-Two bounds are theorems; the third number is a reference under a condition.
-
-"preview"
-    No controller does better on average, even one that knows the whole set point and the
-    drawn plant beforehand. Valid for every set point, however short it is held.
-"news"
-    No controller does better to which a change of the set point is news. For random set points
-    only, whose law it takes (`benchmarks.limits.news`). A controller between the two bounds
-    uses the future.
-"reference"
-    What is possible without preview if each change finds the plant settled and no other is
-    reckoned with (`benchmarks.limits.reference`). For the square wave and for lists. It is no
-    bound: a controller that counts samples can come below it.
-
-Where the set point never changes, all three are the same. The mean error is that of the
-rewards, of |e(k)| over k = 1 to N. Each number is the mean over the episodes that the
-environment draws: for each, the programme of `benchmarks.limits.programme` with what
-`benchmarks.limits.unknown` leaves. All rest on this: the plant is (28) and (29), a controller
-knows at k what the transmitter has shown up to k, and any set points, plant numbers and loads
-up to k besides, but not the true output, `info["output"]`; the dead zone may be undone.
+"preview" and "news" are theorems, "reference" holds under a condition; README.md says for whom.
+The mean error is that of the rewards, of |e(k)| over k = 1 to N. Each number is the mean over
+the episodes that the environment draws: for each, the programme of
+`benchmarks.limits.programme` with what `benchmarks.limits.unknown` leaves. All rest on this:
+the plant is (28) and (29), a controller knows at k what the transmitter has shown up to k, and
+any set points, plant numbers and loads up to k besides, but not the true output,
+`info["output"]`; the dead zone may be undone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,20 +26,24 @@ from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.lib.storage import ROOT, seal, unseal, write_text
 from benchmarks.limits.news import News
-from benchmarks.limits.programme import Plan, plan
-from benchmarks.limits.reference import SMOOTH, TAIL, reference
+from benchmarks.limits.programme import SMOOTH, TAIL, Plan, plan, reference
 from benchmarks.limits.unknown import Unknown, unknown
 from benchmarks.loop.linear import Course, course
 from benchmarks.loop.rollout import drawn_numbers, make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
-from mptc_gym.parameters import PlantNumbers
 from mptc_gym.plant import action_from_command
 from mptc_gym.ranges import numbers_of_plant
 
 Array = NDArray[np.float64]
 
-KINDS = ("preview", "news", "reference")
+KINDS = {  # for which controllers nothing better is possible
+    "preview": "every controller that reads the transmitter and not the true output, even one "
+    "that knows the set point beforehand",
+    "news": "controllers that read the transmitter and not the true output, and to which a "
+    "change of the set point is news",
+    "reference": "none: a reference, if each change finds the plant settled",
+}
 DIGITS = 6  # of a bound, degC
 SAME = 1e-4  # degC; where two bounds differ by less, that of every controller is shown
 CACHE = ROOT / "results" / "limits"
@@ -81,13 +73,7 @@ class LeastPossible(Estimate):
     @property
     def holds_for(self) -> str:
         """For which controllers nothing better is possible."""
-        return {
-            "preview": "every controller that reads the transmitter and not the true output, "
-            "even one that knows the set point beforehand",
-            "news": "controllers that read the transmitter and not the true output, and to "
-            "which a change of the set point is news",
-            "reference": "none: a reference, if each change finds the plant settled",
-        }[self.kind]
+        return KINDS[self.kind]
 
     def score(self, errors: ArrayLike) -> Array:
         """Return 0 for the mean error of a valve that is left alone, 1 for `value`.
@@ -172,7 +158,7 @@ def least_possible(
             return LeastPossible(**{**kept, "episodes": tuple(kept["episodes"])})
     cases, idle = _draw(parameters, samples, episodes, seed)
     # The same on every machine, as solvers differ in later digits.
-    values = [round(case.solve(kind).cost / samples, DIGITS) for case in cases]
+    values = [round(best(kind).cost / samples, DIGITS) for best in cases]
     least, left_alone = student(values), student(idle)
     found = LeastPossible(
         **vars(least),
@@ -229,39 +215,18 @@ def frontier(
     cases, idle = _draw(parameters, samples, episodes, seed)
     points = []
     for price in sorted(prices):
-        plans = [case.solve(kind, price) for case in cases]
-        travel = float(np.mean([p.travel.sum() for p in plans])) / samples
-        value = float(np.mean([p.cost for p in plans])) / samples
+        plans = [best(kind, price) for best in cases]
+        travel = float(np.mean([each.travel for each in plans])) / samples
+        value = float(np.mean([each.cost for each in plans])) / samples
         points.append((travel, value - price * travel))
     return [*points, (0.0, float(np.mean(idle)))]
-
-
-@dataclass(frozen=True)
-class _Case:
-    """An episode: its plant, what is unknown in it, and its set point from k = 0 to N."""
-
-    parameters: Parameters
-    course: Course
-    unknown: Unknown
-    setpoint: Array
-
-    def solve(self, kind: str, price: float = 0.0) -> Plan:
-        if kind == "reference":
-            return reference(self.course, self.unknown, self.setpoint, price=max(price, SMOOTH))
-        samples = len(self.setpoint)
-        now, unknown = self.course.first(samples), self.unknown.of(0, samples)
-        penalty = None
-        if kind == "news" and self.parameters.setpoint_amplitude > 0.0:
-            penalty = News(self.parameters, now, unknown).penalty(self.setpoint)
-        return plan(now, unknown, self.setpoint, price=price, penalty=penalty)
 
 
 class _Idle:
     """Leaves the valve at 0 t/h."""
 
-    def __init__(self, numbers: PlantNumbers[Array]) -> None:
-        action = action_from_command(0.0, numbers.u_min, numbers.u_max)
-        self._actions = np.asarray(action)[:, np.newaxis]
+    def __init__(self, u_min: Array, u_max: Array) -> None:
+        self._actions = np.asarray(action_from_command(0.0, u_min, u_max))[:, np.newaxis]
 
     def reset(self) -> None:
         """Do nothing."""
@@ -283,18 +248,37 @@ def is_random(parameters: Parameters) -> bool:
 
 def _draw(
     parameters: Parameters, samples: int, episodes: int, seed: int
-) -> tuple[list[_Case], Array]:
-    """Return episodes as the environment draws them, and mean |e| with the valve left alone."""
+) -> tuple[list[Callable[..., Plan]], Array]:
+    """Return `_best` of episodes as they are drawn, and mean |e| with the valve left alone."""
     count = episodes if _is_drawn(parameters) else 1
     runs = episodes if is_random(parameters) else 1
     numbers = drawn_numbers(parameters, runs, seed)
     plants = make_plants(runs, samples + 1, **asdict(parameters))
-    trajectory = rollout(plants, _Idle(numbers), samples + 1, seed)
+    trajectory = rollout(plants, _Idle(numbers.u_min, numbers.u_max), samples + 1, seed)
     plants.close()
-    cases = []
+    cases: list[Callable[..., Plan]] = []
     for i in range(count):
         of_plant, setpoint = numbers_of_plant(numbers, i), trajectory.setpoint[:, i].copy()
         longer = samples + 1 + int(of_plant.delay) + len(parameters.b) + TAIL
         along = course(parameters, of_plant, longer)
-        cases.append(_Case(parameters, along, unknown(along), setpoint))
+        cases.append(partial(_best, parameters, along, unknown(along), setpoint))
     return cases, np.abs(trajectory.setpoint - trajectory.output)[1:].mean(axis=0)
+
+
+def _best(
+    parameters: Parameters,
+    course: Course,
+    unknown: Unknown,
+    setpoint: Array,
+    kind: str,
+    price: float = 0.0,
+) -> Plan:
+    """Return the best plan for a set point from k = 0 to N; the course is longer by a tail."""
+    if kind == "reference":
+        return reference(course, unknown, setpoint, price=max(price, SMOOTH))
+    samples = len(setpoint)
+    course, unknown = course.first(samples), unknown.of(0, samples)
+    penalty = None
+    if kind == "news" and parameters.setpoint_amplitude > 0.0:
+        penalty = News(parameters, course, unknown).penalty(setpoint)
+    return plan(course, unknown, setpoint, price=price, penalty=penalty)

@@ -1,4 +1,4 @@
-"""Print bounds as the options say, or test them."""
+"""Print bounds as the options say, test them, or write those of the package."""
 
 from __future__ import annotations
 
@@ -13,18 +13,26 @@ from rich.console import Console
 
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import UsageError, blame, out_folder
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import Estimate, bootstrap
+from benchmarks.lib.storage import ROOT, commit, versions, write_json
 from benchmarks.lib.tables import on_screen
-from benchmarks.limits import packaged
 from benchmarks.limits.bounds import CACHE, least_possible
 from benchmarks.limits.options import Options
 from benchmarks.limits.verify import errors, verify
 from benchmarks.loop.linear import check_linear
-from benchmarks.loop.scenarios import SCENARIOS, scenarios_of
+from benchmarks.loop.scenarios import SCENARIOS, Scenario, scenarios_of
 from mptc_gym import PRESETS, Parameters
+from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
 
-SAMPLES = 1200  # of an episode of a preset
-KINDS = {"preview": "with preview", "news": "without preview", "reference": "reference"}
+HEADINGS = {"preview": "with preview", "news": "without preview", "reference": "reference"}
+PACKAGE = ROOT / "mptc_gym" / "bounds.json"
+MORE = 20  # episodes beyond those of a score, to choose policies by
+PACKAGED = PRESETS | {
+    f"{name}, random set points": {**PRESETS[name], "setpoint": "random"}
+    for name in ("paper", "disturbed", "fouling")  # of the data sets
+}
 
 NOTE = (
     "With preview: no controller does better on average, even one that knows the set point "
@@ -44,17 +52,18 @@ def execute(options: Options, console: Console) -> str:
     if options.verify and (plant.arguments or options.mpc):
         raise UsageError("--verify: goes without --mpc, --plant, --preset and --set")
     cache = out_folder(options.cache or CACHE, "--cache")
+    fan_out = options.fan_out.open()
     if options.package:
-        packaged.write(cache, options.fan_out.open())
-        return f"Written to {packaged.PLACE}"
+        write_package(cache, fan_out)
+        return f"Written to {PACKAGE}"
     if options.verify:
-        table, beaten = verify(options.runs, cache, options.fan_out.open())
+        table, beaten = verify(options.runs, cache, fan_out)
         console.print(on_screen(table))
         if beaten:
             console.print(f"Beaten beyond the interval: {'; '.join(beaten)}.")
             raise SystemExit(1)
         return "No controller beats the bound that applies to it, beyond its interval."
-    cases = PRESETS
+    cases: Mapping[str, Mapping[str, Any]] = PRESETS
     if plant.arguments:
         with blame(plant.name):
             check_linear(Parameters(**plant.arguments))
@@ -63,51 +72,68 @@ def execute(options: Options, console: Console) -> str:
     # Those whose plants are drawn take the longest, and begin first.
     first = sorted(cases, key=lambda name: not Parameters(**cases[name]).ranges)
     tasks: dict[str, Callable[[], Any]] = {
-        name: partial(
-            bounds, name, cases[name], folder=cache, episodes=options.episodes, mpc=options.mpc
-        )
+        name: partial(row, name, cases[name], cache, options.episodes, options.mpc)
         for name in first
     }
-    compared = {} if plant.arguments else {f"scenario {name}": name for name in SCENARIOS}
-    tasks |= {key: partial(bounds_of_scenario, name, cache) for key, name in compared.items()}
-    rows = options.fan_out.open().run(tasks, title="bounds")
+    compared = [] if plant.arguments else list(SCENARIOS.values())
+    tasks |= {
+        f"scenario {each.name}": partial(row_of_scenario, each, cache) for each in compared
+    }
+    rows = fan_out.run(tasks, title="bounds")
     if compared:
         console.print("The scenarios of `python -m benchmarks.compare`, °C:")
-        console.print(on_screen(pd.DataFrame([rows[key] for key in compared])))
+        table = pd.DataFrame([rows[f"scenario {each.name}"] for each in compared])
+        console.print(on_screen(table))
     console.print(f"{plant.name if plant.arguments else 'The presets'}, mean |e| in °C:")
     console.print(on_screen(pd.DataFrame([rows[name] for name in cases])))
     return NOTE
 
 
-def bounds_of_scenario(name: str, cache: Path) -> dict[str, str]:
+def row_of_scenario(scenario: Scenario, cache: Path) -> dict[str, str]:
     """Return a row of the table of scenarios."""
-    scenario = SCENARIOS[name]
-    row = {"scenario": name}
-    for kind in ("preview", "reference"):
-        least = least_possible(
-            kind=kind, samples=scenario.samples, folder=cache, **scenario.arguments
-        )
-        row[KINDS[kind]] = f"{least.value:.4f}"
-    return row
+    case = {"samples": scenario.samples, "folder": cache, **scenario.arguments}
+    return {"scenario": scenario.name} | {
+        HEADINGS[kind]: f"{least_possible(kind=kind, **case).value:.4f}"
+        for kind in ("preview", "reference")
+    }
 
 
-def bounds(
-    name: str, arguments: Mapping[str, Any], *, folder: Path, episodes: int, mpc: int | None
+def row(
+    name: str, arguments: Mapping[str, Any], cache: Path, episodes: int, mpc: int | None
 ) -> dict[str, str]:
     """Return a row of the table of plants, with the error of so many runs of MPC, if any."""
-    found = {}
-    for kind in KINDS:
+    case = {"samples": SAMPLES, "episodes": episodes, "folder": cache, **arguments}
+    of = least_possible(kind="preview", **case)
+    idle = Estimate(of.idle, of.idle_low, of.idle_high, of.runs)
+    cells = {"plant": name, "valve left alone": f"{idle:.3f}"}
+    for kind, heading in HEADINGS.items():
+        cells[heading] = ""
         # "news" is for random set points, "reference" for those that are held long enough.
         with suppress(ValueError):
-            found[kind] = least_possible(
-                kind=kind, samples=SAMPLES, episodes=episodes, folder=folder, **arguments
-            )
-    of = found["preview"]
-    idle = Estimate(of.idle, of.idle_low, of.idle_high, of.runs)
-    row = {"plant": name, "valve left alone": f"{idle:.3f}"}
-    for kind, title in KINDS.items():
-        row[title] = f"{found[kind]:.3f}" if kind in found else ""
+            cells[heading] = f"{least_possible(kind=kind, **case):.3f}"
     if mpc:
         (predictive,) = ROSTER["mpc"].members()
-        row["MPC"] = f"{bootstrap(errors(predictive, mpc, SAMPLES, **arguments), seed=0):.3f}"
-    return row
+        cells["MPC"] = f"{bootstrap(errors(predictive, mpc, SAMPLES, **arguments), seed=0):.3f}"
+    return cells
+
+
+def write_package(cache: Path, fan_out: FanOut) -> None:
+    """Write the least possible error of each case, episode by episode where they differ."""
+    case: dict[str, Any] = {"samples": SAMPLES, "seed": SEED, "episodes": EPISODES + MORE}
+    tasks = {
+        name: partial(least_possible, folder=cache, **{**case, **arguments})
+        for name, arguments in PACKAGED.items()
+    }
+    found = dict(fan_out.stream(tasks, title="bounds"))
+    cases = {
+        name: {"arguments": arguments, "kind": found[name].kind, "least": found[name].episodes}
+        for name, arguments in PACKAGED.items()
+    }
+    about = {
+        "command": "python -m benchmarks.limits --package",
+        "commit": commit(),
+        "code": fingerprint("benchmarks.limits.bounds"),
+        "versions": versions(),
+        "unit": "degC, mean of |e(k)| over k = 1 to samples",
+    }
+    write_json(PACKAGE, {**about, **case, "cases": cases})

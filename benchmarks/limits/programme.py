@@ -1,10 +1,10 @@
-"""The linear programme behind every bound: the best mean flow for a course and a set point."""
+"""The linear programme behind every bound, and the plans that make a reference."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from scipy import linalg, optimize, sparse
 
 from benchmarks.limits.unknown import Unknown
 from benchmarks.loop.linear import Course
+from benchmarks.loop.metrics import held
 
 Array = NDArray[np.float64]
 
@@ -19,17 +20,15 @@ NOTHING = 1e-9  # of the largest response: what is smaller is left out
 SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)  # with presolve or not
 TIME_LIMIT = 30.0  # s, of each attempt
 
+# Of a reference.
+SETTLED = 0.05  # of the flow's range: how much a flow that has settled may move within the lag
+TAIL = 60  # samples more than the lag that a plan looks beyond the end of a hold
+LEVEL = 0.001  # least slope of an error that counts in plans, so that they end at the set point
+SMOOTH = 1e-4  # price of a t/h of travel, so that of equal plans the quiet one is taken
+
 
 class NotSolvedError(RuntimeError):
     """The optimum of a linear programme was not found; the message says why."""
-
-
-class Programme(NamedTuple):
-    """Equations in blocks, a row of matrices each; and cost, low and high of the unknowns."""
-
-    rows: list[list[Any]]
-    right: list[Array]
-    unknowns: list[Array]
 
 
 @dataclass(frozen=True)
@@ -51,10 +50,9 @@ class Plan:
         return self.value - float(self.error[0])
 
     @property
-    def travel(self) -> Array:
-        """|u_a(k) - u_a(k-1)| of the mean flow, t/h; 0 before k = 0."""
-        moves: Array = np.abs(np.diff(self.flow, prepend=0.0))
-        return moves
+    def travel(self) -> float:
+        """The sum of |u_a(k) - u_a(k-1)| of the mean flow, t/h; it is 0 before k = 0."""
+        return float(np.abs(np.diff(self.flow, prepend=0.0)).sum())
 
 
 def plan(
@@ -112,24 +110,22 @@ def plan(
         If all attempts fail or take too long.
     """
     samples = len(setpoint)
+    penalty = np.zeros(samples) if penalty is None else penalty
     output, flow = np.zeros(samples), np.zeros(samples)
     if before is not None:
         output[: start + 1], flow[:start] = before.output[: start + 1], before.flow[:start]
     n = samples - 1 - start  # outputs after `start`, and flows from it on
     of_now = unknown.of(start, samples)
     if n:
-        solved = _solve(
+        output[start + 1 :], flow[start:-1] = _solve(
             course, of_now, setpoint, output, flow, start, price, penalty, least_slope
         )
-        output[start + 1 :], flow[start:-1] = solved[:n], solved[n : 2 * n]
     # The last flow shows in no output; without a move it costs nothing either.
     flow[-1] = flow[-2] if samples > 1 else 0.0
     error = np.zeros(samples)
     error[start:] = of_now.mean_error(setpoint[start:] - output[start:])
     moves = np.abs(np.diff(flow, prepend=0.0))[start:]
-    value = error[start:].sum() + price * moves.sum()
-    if penalty is not None:
-        value += float(penalty[start:] @ flow[start:])
+    value = error[start:].sum() + price * moves.sum() + penalty[start:] @ flow[start:]
     return Plan(error, output, flow, float(value))
 
 
@@ -141,14 +137,12 @@ def _solve(
     flow: Array,
     start: int,
     price: float,
-    penalty: Array | None,
+    penalty: Array,
     least_slope: float,
-) -> Array:
-    """Return outputs after `start`, then flows from it on."""
+) -> tuple[Array, Array]:
+    """Return outputs after `start`, and flows from it on."""
     samples = len(setpoint)
     n = samples - 1 - start
-    eye, nothing = sparse.eye_array(n), sparse.csr_array((n, n))
-
     # (28) without noise: A y = B u, rows from start + 1 on; what is past goes to the right.
     A = sparse.eye_array(samples) - _lagged(course.alpha, samples, 1)
     B = _lagged(course.beta, samples, course.delay + 1)
@@ -156,88 +150,64 @@ def _solve(
     past = B[:, :start] @ flow[:start] - A[:, : start + 1] @ output[: start + 1]
     A, B = A[:, start + 1 :], B[:, start:-1]
 
-    # E|m - n| as a sum of pieces of |m|, each with its slope; between lines there are corners.
-    slopes, intercepts = unknown.slopes, unknown.intercepts[1:]
-    corners = (intercepts[:, :-1] - intercepts[:, 1:]) / np.diff(slopes)
-    corners = np.maximum.accumulate(corners, axis=1)
-    ends = np.column_stack([corners, np.full(n, np.inf)])
-    lengths = np.diff(ends, axis=1, prepend=0.0) if len(slopes) > 1 else ends
-    pieces = [(s, sign, length) for s, length in zip(slopes, lengths.T, strict=True)
-              for sign in (1.0, -1.0)]  # fmt: skip
-
-    def unknowns(cost: Any, low: Any, high: Any) -> Array:
-        return np.column_stack([np.broadcast_to(each, n) for each in (cost, low, high)])
-
-    # y, u, the pieces; then the moves up and down, if they have a price.
+    # y, u, the pieces of E|m - n| for m above and below 0; then the moves up and down, if they
+    # have a price.
+    eye, slopes = sparse.eye_array(n), unknown.slopes
+    pieces = sparse.hstack([eye, -eye] * len(slopes))
+    lengths = np.repeat(unknown.lengths[1:], 2, axis=1).T.ravel()
     columns = [
-        unknowns(0.0, -np.inf, np.inf),
-        unknowns(0.0 if penalty is None else penalty[start:-1], course.low, course.high),
-        *(unknowns(max(slope, least_slope), 0.0, length) for slope, _, length in pieces),
+        _unknowns(n, 0.0, -np.inf, np.inf),
+        _unknowns(n, penalty[start:-1], course.low, course.high),
+        _unknowns(
+            len(lengths), np.repeat(np.maximum(slopes, least_slope), 2 * n), 0.0, lengths
+        ),
     ]
-    rows = [
-        [A, -B, *[nothing] * len(pieces)],
-        [eye, nothing, *(sign * eye for _, sign, _ in pieces)],
-    ]
+    rows: list[list[Any]] = [[A, -B, None], [eye, None, pieces]]
     right = [past, setpoint[start + 1 :]]
     if price:
         moves = eye - sparse.eye_array(n, k=-1)
-        rows = [[*row, nothing, nothing] for row in rows]
-        rows.append([nothing, moves, *[nothing] * len(pieces), -eye, eye])
-        first = np.zeros(n)
-        first[0] = flow[start - 1] if start else 0.0
-        right.append(first)
-        columns += [unknowns(price, 0.0, np.inf)] * 2
-    programme = Programme(rows, right, columns)
-    ways = [_as_recursion, _as_response]
+        rows = [[*row, None] for row in rows]
+        rows.append([None, moves, None, sparse.hstack([-eye, eye])])
+        right.append(np.zeros(n))
+        right[-1][0] = flow[start - 1] if start else 0.0
+        columns.append(_unknowns(2 * n, price, 0.0, np.inf))
+
+    # With the outputs among the unknowns it is sparse, and fast where A is slow. But where a
+    # zero of B lies outside the unit circle, the flow that belongs to an output grows without
+    # end: solvers that try outputs at will fail, or end at what is not the optimum.
+    for_flows_alone = [False, True]
     if np.any(np.abs(np.roots(course.beta[start])) > 1.0):
-        ways.reverse()
-    attempts = list(itertools.product(ways, SOLVERS))
-    found: Array | None
-    why = ""
-    for way, (method, presolve) in attempts:
-        options = {"time_limit": TIME_LIMIT, "presolve": presolve}
-        found, why = way(programme, method=method, options=options)
-        if found is not None:
-            return found
+        for_flows_alone.reverse()
+    attempts = list(itertools.product(for_flows_alone, SOLVERS))
+    for flows_alone, (method, presolve) in attempts:
+        blocks, targets, unknowns = rows, right, columns
+        if flows_alone:  # each output is the sum of what the flows do to it
+            idle = linalg.solve_triangular(A.toarray(), past, lower=True)
+            G = linalg.solve_triangular(A.toarray(), B.toarray(), lower=True)
+            G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
+            blocks = [[sparse.csr_array(G), *rows[1][2:]], *(row[1:] for row in rows[2:])]
+            targets, unknowns = [right[1] - idle, *right[2:]], columns[1:]
+        costs_and_ends = np.concatenate(unknowns)
+        solved = optimize.linprog(
+            costs_and_ends[:, 0],
+            A_eq=sparse.block_array(blocks).tocsc(),
+            b_eq=np.concatenate(targets),
+            bounds=costs_and_ends[:, 1:],
+            method=method,
+            options={"time_limit": TIME_LIMIT, "presolve": presolve},
+        )
+        if solved.success and flows_alone:
+            return idle + G @ solved.x[:n], solved.x[:n]
+        if solved.success:
+            return solved.x[:n], solved.x[n : 2 * n]
     raise NotSolvedError(
         f"the linear programme of {n} samples was not solved in any of {len(attempts)} ways: "
-        f"{why}"
+        f"{solved.message}"
     )
 
 
-def _as_recursion(programme: Programme, **solver: Any) -> tuple[Array | None, str]:
-    """Solve with the outputs among the unknowns: sparse, and fast where A is slow.
-
-    What is returned are the unknowns, or None, and what the solver says.
-
-    Where a zero of B lies outside the unit circle, the flow that belongs to an output grows
-    without end: solvers that try outputs at will fail, or end at what is not the optimum.
-    """
-    unknowns = np.concatenate(programme.unknowns)
-    solved = optimize.linprog(
-        unknowns[:, 0],
-        A_eq=sparse.vstack([sparse.hstack(row) for row in programme.rows]).tocsc(),
-        b_eq=np.concatenate(programme.right),
-        bounds=unknowns[:, 1:],
-        **solver,
-    )
-    return (solved.x if solved.success else None), solved.message
-
-
-def _as_response(programme: Programme, **solver: Any) -> tuple[Array | None, str]:
-    """Solve for the flows alone, with each output the sum of what the flows do to it."""
-    rows, right, unknowns = programme
-    A, B = rows[0][0].toarray(), -rows[0][1].toarray()
-    alone = linalg.solve_triangular(A, right[0], lower=True)
-    G = linalg.solve_triangular(A, B, lower=True)
-    G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
-    second = [sparse.csr_array(G), *rows[1][2:]]
-    reduced = [second, *(row[1:] for row in rows[2:])]
-    of_flows = Programme(reduced, [right[1] - alone, *right[2:]], unknowns[1:])
-    solved, why = _as_recursion(of_flows, **solver)
-    if solved is None:
-        return None, why
-    return np.concatenate([alone + G @ solved[: len(alone)], solved]), why
+def _unknowns(count: int, cost: Any, low: Any, high: Any) -> Array:
+    return np.column_stack([np.broadcast_to(each, count) for each in (cost, low, high)])
 
 
 def _lagged(coefficients: Array, samples: int, lag: int) -> sparse.sparray:
@@ -248,3 +218,49 @@ def _lagged(coefficients: Array, samples: int, lag: int) -> sparse.sparray:
     diagonals = [coefficients[lag + i : samples, i] for i in inside]
     offsets = [-(lag + i) for i in inside]
     return sparse.diags_array(diagonals, offsets=offsets, shape=(samples, samples))
+
+
+def reference(
+    course: Course, unknown: Unknown, setpoint: Array, *, price: float = SMOOTH
+) -> Plan:
+    """Return the best mean flow of a controller that never expects another change.
+
+    Where set points have no law (a square wave, a list), there is no bound but that with
+    preview: for one given course any controller may have the times of the changes built in.
+    This is a reference under a condition. At each change the controller takes, from where it
+    is, the flow that is best if the new set point stays. If the plant has settled by the next
+    change, each change costs the least that it can without preview; see `plan`.
+
+    Parameters
+    ----------
+    course, unknown
+        The plant and what is unknown, for `course.lag + TAIL` samples more than set points.
+    setpoint
+        y_d(k), degC, shape (samples,).
+    price
+        Of valve travel, degC times samples for each t/h.
+
+    Raises
+    ------
+    ValueError
+        If the plant has not settled when a change comes.
+    """
+    settled = SETTLED * (course.high - course.low)
+    error = np.zeros(len(setpoint))
+    found: Plan | None = None
+    for start, stop in held(setpoint):
+        last = stop == len(setpoint)
+        beyond = np.full(0 if last else course.lag + TAIL, setpoint[start])
+        ahead = np.concatenate([setpoint[:stop], beyond])
+        found = plan(
+            course, unknown, ahead, before=found, start=start, price=price, least_slope=LEVEL
+        )
+        error[start:stop] = found.error[start:stop]
+        moving = found.flow[max(stop - course.lag - 1, start - 1, 0) : stop]
+        if not last and (stop - start < course.lag or np.ptp(moving) > settled):
+            raise ValueError(
+                "setpoint must be held until the plant has settled, or there is no reference; "
+                f"got a hold of {stop - start} samples"
+            )
+    assert found is not None
+    return replace(found, error=error, value=float(error.sum() + price * found.travel))

@@ -58,6 +58,17 @@ class Unknown:
         highest: Array = lines.max(axis=1)
         return highest
 
+    @property
+    def lengths(self) -> Array:
+        """Of the pieces of |m|, each with its slope, that add up to the bound, like intercepts.
+
+        They end at the corners between the lines.
+        """
+        ends = np.full(self.intercepts.shape, np.inf)
+        corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)
+        ends[:, :-1] = np.maximum.accumulate(corners, axis=1)
+        return np.diff(ends, axis=1, prepend=0.0)
+
     def of(self, start: int, stop: int) -> Unknown:
         """Return the same for some samples."""
         return Unknown(self.slopes, self.intercepts[start:stop])

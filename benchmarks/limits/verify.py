@@ -47,35 +47,30 @@ CASES: dict[str, dict[str, Any]] = {
 
 
 class Counting:
-    """Counts samples: it knows when the square wave changes, and changes the flow before.
+    """Counts samples, and so knows when the square wave changes.
 
-    The flow is that which holds the set point of d + 10 samples later. So it is a controller
-    with preview, though nobody shows it the future.
+    The flow is that which holds the set point of d + 10 samples later.
     """
 
-    def __init__(self, plant: Parameters, runs: int, seed: int = 0) -> None:
-        self._p = plant
-        self._lead = plant.range_of("delay")[0] + 10
-        self.reset()
+    def __init__(self, plant: Parameters, runs: int, seed: int) -> None:
+        self._plant = plant
+        self._gain = nominal(plant).gain
+        self._limits = [np.mean(plant.range_of(name)) for name in ("u_min", "u_max")]
 
     def reset(self) -> None:
         """Begin to count."""
-        self._k = 0
+        self._k = self._plant.range_of("delay")[0] + 10
 
     def act(self, observation: Array) -> Array:
         """Return actions for observations, both of a row for each run."""
-        p = self._p
         level = np.asarray(observation, dtype=np.float64)[:, 0]
-        if p.setpoint == "square":
-            first_half = (self._k + self._lead) % p.setpoint_period < (
-                p.setpoint_period + 1
-            ) // 2
-            level = np.full_like(level, p.setpoint_amplitude * (1.0 if first_half else -1.0))
+        if self._plant.setpoint == "square":
+            period, amplitude = self._plant.setpoint_period, self._plant.setpoint_amplitude
+            first_half = self._k % period < (period + 1) // 2
+            level = np.full_like(level, amplitude if first_half else -amplitude)
         self._k += 1
-        u_min, u_max = (float(np.mean(p.range_of(name))) for name in ("u_min", "u_max"))
-        command = level / nominal(p).gain
-        action: Array = action_from_command(command, u_min, u_max)[:, np.newaxis]
-        return action
+        action: Array = action_from_command(level / self._gain, *self._limits)
+        return action[:, np.newaxis]
 
 
 def controllers() -> dict[str, Factory]:
@@ -120,9 +115,9 @@ def verify(
     factories = controllers()
     tasks: dict[str, Callable[[], Any]] = {}
     for case in cases:
-        tasks[f"bound, {case}"] = partial(_bound, case, runs)
+        tasks[f"bound, {case}"] = partial(_bound, runs, CASES[case])
         for name, factory in factories.items():
-            tasks[f"{name}, {case}"] = partial(_errors, factory, case, runs)
+            tasks[f"{name}, {case}"] = partial(_errors, factory, runs, CASES[case])
     sources = [factory.module for factory in factories.values()]
     kept = folder / f"verify-{fingerprint('benchmarks.limits.verify', *sources, runs=runs)}"
     results = fan_out.run(tasks, kept, title="verify")
@@ -140,13 +135,12 @@ def verify(
     return pd.DataFrame(rows), beaten
 
 
-def _bound(case: str, runs: int) -> dict[str, Any]:
-    arguments = CASES[case]
-    kind = theorem(Parameters(**arguments))
-    found = least_possible(samples=SAMPLES, kind=kind, episodes=runs, folder=None, **arguments)
-    return asdict(found)
+def _bound(runs: int, case: dict[str, Any]) -> dict[str, Any]:
+    kind = theorem(Parameters(**case))
+    return asdict(
+        least_possible(samples=SAMPLES, kind=kind, episodes=runs, folder=None, **case)
+    )
 
 
-def _errors(factory: Factory, case: str, runs: int) -> list[float]:
-    found: list[float] = errors(factory, runs, SAMPLES, **CASES[case]).tolist()
-    return found
+def _errors(factory: Factory, runs: int, case: dict[str, Any]) -> list[float]:
+    return list(errors(factory, runs, SAMPLES, **case))
