@@ -1,12 +1,14 @@
-"""Define what every controller is, something that resets and acts, and check arguments."""
+"""Define what every controller is, something that resets and acts, and check its arguments."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache, partial
 from numbers import Integral, Real
-from typing import Any, Final
+from typing import Annotated, Any, Final, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,18 +68,25 @@ def check_count(name: str, value: Any, least: int, most: int | None = None) -> i
     return int(value)
 
 
-def check_number(name: str, value: Any, least: float = -math.inf) -> float:
-    """Return `value` if it is a finite number of at least `least`; ValueError otherwise."""
-    if not _is_finite(value) or value < least:
-        bound = "" if least == -math.inf else f" of at least {least:g}"
-        raise ValueError(f"{name} must be a finite number{bound}, got {value!r}")
-    return float(value)
+def check_number(
+    name: str, value: Any, least: float = -math.inf, above: float = -math.inf
+) -> float:
+    """Return `value` if it is a finite number within bounds; ValueError otherwise."""
+    try:
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        if number and math.isfinite(value) and value >= least and value > above:
+            return float(value)
+    except OverflowError:  # an integer beyond all floats
+        pass
+    bound = "" if least == -math.inf else f" of at least {least:g}"
+    bound += "" if above == -math.inf else f" above {above:g}"
+    raise ValueError(f"{name} must be a finite number{bound}, got {value!r}")
 
 
-def check_positive(name: str, value: Any) -> float:
-    """Return `value` if it is a finite number above 0; ValueError otherwise."""
-    if not _is_finite(value) or float(value) <= 0.0:
-        raise ValueError(f"{name} must be a finite number above 0, got {value!r}")
+def check_gain(name: str, value: Any) -> float:
+    """Return `value` if it is a finite number other than 0; ValueError otherwise."""
+    if check_number(name, value) == 0.0:
+        raise ValueError(f"{name} must not be 0, got {value!r}")
     return float(value)
 
 
@@ -86,15 +95,6 @@ def check_flag(name: str, value: Any) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {value!r}")
     return bool(value)
-
-
-def _is_finite(value: Any) -> bool:
-    if not isinstance(value, Real) or isinstance(value, bool):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer beyond all floats
-        return False
 
 
 def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
@@ -108,31 +108,43 @@ def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
     raise ValueError(f"{name} must be numbers, got {value!r}")
 
 
-def check_limits(u_min: Any, u_max: Any) -> tuple[float, float]:
-    """Return the limits if they are finite and in order; ValueError otherwise."""
+def check_limits(u_min: Any, u_max: Any) -> None:
+    """Raise a ValueError unless the limits are finite and in order."""
     low, high = check_number("u_min", u_min), check_number("u_max", u_max)
     if low >= high:
         raise ValueError(f"u_min must be below u_max = {u_max!r}, got {u_min!r}")
     if not math.isfinite(high - low):
         raise ValueError(f"u_min and u_max are too far apart, got {u_min!r}, {u_max!r}")
-    return low, high
 
 
+# Arguments of controllers, with what checks them.
+Number = Annotated[float, check_number]
+NotNegative = Annotated[float, partial(check_number, least=0.0)]
+Positive = Annotated[float, partial(check_number, above=0.0)]
+Gain = Annotated[float, check_gain]
+Flag = Annotated[bool, check_flag]
+Index = Annotated[int, partial(check_count, least=0)]
+Count = Annotated[int, partial(check_count, least=1)]
+Size = Annotated[int, partial(check_count, least=1, most=MOST)]
+
+
+@cache
+def _checks(controller: type[Controller]) -> dict[str, Callable[[str, Any], Any]]:
+    hints = get_type_hints(controller, include_extras=True).items()
+    return {name: hint.__metadata__[0] for name, hint in hints if hasattr(hint, "__metadata__")}
+
+
+@dataclass(eq=False, kw_only=True)
 class Controller(ABC):
     """A controller of one loop, or of a batch of loops side by side.
 
-    Parameters
-    ----------
-    n_obs
-        The least number of elements of an observation.
-    u_min, u_max
-        The actuator's limits, t/h.
-    dead_zone
-        The actuator's, t/h: a command on its edge becomes an action that has an effect. 0 if it
-        is not known.
+    Controllers are dataclasses: their fields are the arguments of the constructor. Types such
+    as `Positive` say what is allowed.
 
     Attributes
     ----------
+    n_obs : int
+        The least number of elements of an observation.
     command : float64 or ndarray of float64
         The last command u before the actuator, t/h: a number after `act` on one observation,
         shape (batch,) after `act` on a batch.
@@ -140,19 +152,25 @@ class Controller(ABC):
     Raises
     ------
     ValueError
-        If the limits are not finite or not in order, or the dead zone is negative.
+        If an argument is out of range; the message names it.
     """
+
+    u_min: Number = -10.0
+    """The actuator's lower limit, t/h."""
+    u_max: Number = 10.0
+    """Its upper limit, t/h. The limits scale the action; they do not limit the command."""
+    n_obs: int = field(init=False, repr=False)
+    command: Values = field(init=False, repr=False)
 
     _advice = ""  # in the error that observations of a wrong shape bring
     _remembers = True  # what has been; otherwise each batch may be of another size
+    _edge = 0.0  # t/h, of a dead zone: a command on it becomes an action that has an effect
 
-    def __init__(
-        self, *, n_obs: int, u_min: float, u_max: float, dead_zone: float = 0.0
-    ) -> None:
-        self.n_obs = n_obs
-        self.u_min, self.u_max = check_limits(u_min, u_max)
-        self.dead_zone = check_number("dead_zone", dead_zone, 0)
-        self.command: Values = np.float64(0.0)
+    def __post_init__(self) -> None:
+        for name, check in _checks(type(self)).items():
+            setattr(self, name, check(name, getattr(self, name)))
+        check_limits(self.u_min, self.u_max)
+        self.command = np.float64(0.0)
         self._loops_before: tuple[int, ...] | None = None  # () or (batch,), since `reset`
 
     def reset(self) -> None:
@@ -198,8 +216,34 @@ class Controller(ABC):
         self.command = self._control(values)
         if self._remembers:
             self._loops_before = now
-        return action_from_command(self.command, self.u_min, self.u_max, self.dead_zone)
+        return action_from_command(self.command, self.u_min, self.u_max, self._edge)
 
     @abstractmethod
     def _control(self, observation: NDArray[np.float64]) -> Values:
         """Return u in t/h for an observation that has been checked."""
+
+
+@dataclass(eq=False, kw_only=True)
+class ToldController(Controller):
+    """A controller that is told what a step test shows of the plant, and its actuator."""
+
+    gain: Gain
+    """Steady-state gain of the plant, degC per t/h, of either sign."""
+    time_constant: Positive
+    """Its time constant, s."""
+    delay: NotNegative
+    """Its delay, s; the sample that any input takes to show is part of it."""
+    dead_zone: NotNegative = 0.0
+    """The actuator's, t/h: commands within it are 0 to the plant, those on its edge have an
+    effect. 0 if it is not known."""
+    sampling_interval: Positive = 8.0
+    """s."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._delay_samples = self.delay / self.sampling_interval
+        if self._delay_samples > MOST:
+            raise ValueError(
+                f"delay must be at most {MOST:,} times sampling_interval = "
+                f"{self.sampling_interval!r}, got {self.delay!r}"
+            )

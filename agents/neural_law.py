@@ -11,15 +11,15 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
-from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.archive import PRETRAINED, reading
+
 Array = NDArray[np.float64]
 
-PRETRAINED: Final = Path(__file__).parent / "pretrained"
 # Exponential means, by the share that the newest sample has: of the load that explains the
 # residual, and of the residual itself. A share of 1 is the newest sample alone.
 LOAD_RATES: Final = (1.0, 0.5, 0.2, 0.07, 0.025, 0.008, 0.002)
@@ -43,48 +43,34 @@ TILT: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
 _LOADS, _MEANS = len(LOAD_RATES), len(LOAD_RATES) + len(RESIDUAL_RATES)
 INPUTS: Final = _MEANS - 2 + NEWS + 1 + 6 + 6 + 2 * _LOADS
 OUTPUTS: Final = 1 + len(RESIDUAL_RATES) + 1
+PARTS: Final = "choosing", "adding"  # of the networks
 
 
-class Network(Protocol):
-    """What the law asks at each sample."""
-
-    def __call__(self, seen: Any, at_rest: Any) -> tuple[Any, Any]:
-        """Return outputs, shape (n, OUTPUTS), and an addition to the flow, shape (n,).
-
-        The addition is 0 where what is seen is what there is at rest.
-        """
+# What the law asks at each sample, with what is seen and with what there is at rest: returns
+# outputs, shape (n, OUTPUTS), and an addition to the flow, shape (n,), which is 0 where the two
+# are the same.
+Network = Callable[[Any, Any], tuple[Any, Any]]
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What the law is told of n plants; every field has shape (n,).
-
-    Attributes
-    ----------
-    unit
-        A(1) of the model: the steady input of 1 moves its output by this in a sample, at rest.
-    fading
-        What is left of a deviation once the delay and a sample are over.
-    time_constant
-        In multiples of the paper's, which has 20.6 samples.
-    delay
-        d, samples.
-    dead_zone
-        In multiples of half the range.
-    centre
-        Of the flows that the limits let pass: they are within 1 of it.
-    uncertainty
-        By how much, in natural logarithms, the gain may be wrong (a standard deviation); it
-        stands for the other numbers, too.
-    """
+    """What the law is told of n plants; every field has shape (n,)."""
 
     unit: Any
+    """A(1) of the model: by so much a steady input of 1 moves it from rest in a sample."""
     fading: Any
+    """What is left of a deviation once the delay and a sample are over."""
     time_constant: Any
+    """In multiples of the paper's, which has 20.6 samples."""
     delay: Any
+    """d, samples."""
     dead_zone: Any
+    """In multiples of half the range."""
     centre: Any
+    """Of the flows that the limits let pass: they are within 1 of it."""
     uncertainty: Any
+    """By how much, in natural logarithms, the gain may be wrong (a standard deviation); it
+    stands for the other numbers, too."""
 
 
 class Law:
@@ -127,12 +113,11 @@ class Law:
         groups = np.zeros((_MEANS, _MEANS))
         groups[:_LOADS, :_LOADS] = groups[_LOADS:, _LOADS:] = 1.0
         self._groups = self._array(groups)
-        self._nothing = zero[:, None] + self._array([0.0] * (_MEANS - 1 + NEWS))
-        self._means = zero[:, None] + 0.0 * self._rates
-        self._news = zero[:, None] + self._array([0.0] * NEWS)
-        missed = zero[:, None] + LEAST_NOISE + 0.0 * self._rates[:_LOADS]
-        self._misses = [missed] * len(MISS_RATES)
-        self._plain = zero[:, None] + self._array([0.0] * (_MEANS - _LOADS))
+        self._nothing, self._means, self._news, self._plain = (
+            zero[:, None] + self._array([0.0] * size)
+            for size in (_MEANS - 1 + NEWS, _MEANS, NEWS, _MEANS - _LOADS)
+        )
+        self._misses = [self._means[:, :_LOADS] + LEAST_NOISE] * len(MISS_RATES)
         self._tell(prior)
 
     def retell(self, prior: Prior, ratio: Any, residual: Any) -> None:
@@ -157,14 +142,7 @@ class Law:
 
     def _tell(self, prior: Prior) -> None:
         xp, self.prior = self._xp, prior
-        fading = prior.fading[:, None]
-        self._shares = xp.concatenate(
-            [
-                (1.0 - fading) / prior.unit[:, None] + 0.0 * self._rates[:_LOADS],
-                fading + 0.0 * self._rates[_LOADS:],
-            ],
-            axis=1,
-        )
+        self._shares = self._of_each_mean((1.0 - prior.fading) / prior.unit, prior.fading)
         numbers = [
             xp.log(prior.time_constant),
             prior.delay / 20.0 - 1.0,
@@ -206,13 +184,7 @@ class Law:
         )
         against = TRUST[0] * doubts + TRUST[1] * slow
         against = against / (1.0 + SATURATION * abs(against))
-        newest = xp.concatenate(
-            [
-                load[:, None] + 0.0 * self._rates[:_LOADS],
-                residual[:, None] + 0.0 * self._rates[_LOADS:],
-            ],
-            axis=1,
-        )
+        newest = self._of_each_mean(load, residual)
         means = self._means = self._means + self._rates * (newest - self._means)
         self._news = xp.concatenate([news[:, None], self._news[:, :-1]], axis=1)
 
@@ -236,12 +208,9 @@ class Law:
         compared = compared / (1.0 + abs(compared))
         level = 0.3 * xp.log(noise + DOUBT) + 1.5
         about = xp.concatenate([level[:, None], doubts, 0.1 * against, self._told], axis=1)
-        seen, held, zero = (
-            [10.0 * (now - before), 1.4 * setpoint],
-            setpoint - residual,
-            self._zero,
-        )
-        seen += [1.4 * now, last, 3.0 * residual, 3.0 * error]
+        held, zero = setpoint - residual, self._zero
+        seen = [10.0 * (now - before), 1.4 * setpoint, 1.4 * now, last]
+        seen += [3.0 * residual, 3.0 * error]
         resting = [zero, 1.4 * setpoint, 1.4 * held, held, 3.0 * residual, zero]
         outputs, added = network(
             xp.concatenate([compared, xp.stack(seen, axis=1), about], axis=1),
@@ -264,6 +233,12 @@ class Law:
         moved = xp.where(size < edge, edge * xp.sign(hard) * (size >= edge / 2.0), hard)
         flow = flow + (moved - hard)  # straight through, for the gradient
         return flow, xp.clip(flow, self.prior.centre - 1.0, self.prior.centre + 1.0)
+
+    def _of_each_mean(self, load: Any, residual: Any) -> Any:
+        """Return a column for each mean: those of the load, then those of the residual."""
+        loads = load[:, None] + 0.0 * self._rates[:_LOADS]
+        residuals = residual[:, None] + 0.0 * self._rates[_LOADS:]
+        return self._xp.concatenate([loads, residuals], axis=1)
 
     def _array(self, values: Any) -> Any:
         if self._xp is np:
@@ -304,31 +279,25 @@ class LawNetwork:
         ValueError
             If the file is damaged or holds something else.
         """
-        with Path(path).open("rb") as raw:
-            try:
-                with np.load(raw, allow_pickle=False) as file:
-                    kept = {name: file[name] for name in file.files}
-                parts = [
-                    [(kept[f"{part}_W{i}"], kept[f"{part}_b{i}"]) for i in range(3)]
-                    for part in ("choosing", "adding")
-                ]
-                _check(parts)
-                return cls(parts[0], parts[1], json.loads(str(kept["provenance"])))
-            except Exception as error:  # damage shows in zip, zlib, NumPy, JSON or the checks
-                raise ValueError(
-                    f"{path} holds no told network, or is damaged: {error}"
-                ) from error
+        with reading(path, "told network") as file:
+            choosing, adding = (
+                [(file[f"{part}_W{i}"], file[f"{part}_b{i}"]) for i in range(3)]
+                for part in PARTS
+            )
+            _check(choosing, OUTPUTS)
+            _check(adding, 1)
+            return cls(choosing, adding, json.loads(str(file["provenance"])))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the networks to a `.npz` file."""
-        kept: dict[str, Any] = {"provenance": np.array(json.dumps(dict(self.provenance)))}
-        for part in ("choosing", "adding"):
-            for i, (W, b) in enumerate(getattr(self, part)):
-                kept |= {
-                    f"{part}_W{i}": W.astype(np.float32),
-                    f"{part}_b{i}": b.astype(np.float32),
-                }
-        np.savez_compressed(path, **kept)
+        layers = {
+            f"{part}_{name}{i}": array.astype(np.float32)
+            for part in PARTS
+            for i, layer in enumerate(getattr(self, part))
+            for name, array in zip("Wb", layer, strict=True)
+        }
+        about = json.dumps(dict(self.provenance))
+        np.savez_compressed(path, provenance=about, **layers)
 
 
 def _forward(layers: Sequence[tuple[Array, Array]], x: Array) -> Array:
@@ -339,14 +308,11 @@ def _forward(layers: Sequence[tuple[Array, Array]], x: Array) -> Array:
     return x @ last_W.T + last_b
 
 
-def _check(parts: Sequence[Sequence[tuple[Array, Array]]]) -> None:
-    for layers, outputs in zip(parts, (OUTPUTS, 1), strict=True):
-        inputs = INPUTS
-        for W, b in layers:
-            if W.shape != (len(b), inputs) or not (
-                np.isfinite(W).all() and np.isfinite(b).all()
-            ):
-                raise ValueError(f"layers must be finite and fit together, got shape {W.shape}")
-            inputs = len(b)
-        if inputs != outputs:
-            raise ValueError(f"the last layer must have {outputs} nodes, got {inputs}")
+def _check(layers: Sequence[tuple[Array, Array]], outputs: int) -> None:
+    inputs = INPUTS
+    for W, b in layers:
+        if W.shape != (len(b), inputs) or not np.isfinite(np.append(W, b)).all():
+            raise ValueError(f"layers must be finite and fit together, got shape {W.shape}")
+        inputs = len(b)
+    if inputs != outputs:
+        raise ValueError(f"the last layer must have {outputs} nodes, got {inputs}")

@@ -2,79 +2,88 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import check_number
+from agents.controller import NotNegative, Positive
 from agents.neural_law import Law, LawNetwork, Prior
 from agents.neural_smith import NOMINAL
-from agents.self_tuning import Learning, SelfTuningController
+from agents.self_tuning import SelfTuningController
 
 Array = NDArray[np.float64]
 
 MOST_UNCERTAIN = 0.3  # the network was trained up to this
 
 
+@dataclass(eq=False, kw_only=True)
 class NeuralSelfTuningController(SelfTuningController):
     """Identifies the plant as a self-tuning controller does, and controls it by a network.
 
     The bank of models takes the place of the model that a `NeuralSmithPredictor` is told, and
     the bank's spread that of the uncertainty. What is found out is taken over at once: the
     network was trained on models that are wrong, and is told how wrong they may be.
-
-    Parameters
-    ----------
-    network
-        The weights; None for those that come with the project.
-    forgetting
-        What a sample leaves of the weight of those before it; up to 1, which forgets nothing.
-    haste
-        How much quicker the law is than the network asks for, see `agents.neural_law.Law`. The
-        network was trained with models that stay as they are; what a model that changes does
-        not explain is sooner out of date. 0 halves the valve travel in noise.
-    **told
-        Those of `SelfTuningController`, except `closed_loop_time_constant`.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range; the message names it.
     """
 
-    _learning = Learning(
-        interval=2,
-        share=1.0,
-        caution=1.0,
-        noise=0.25,
-        gain_spread=0.25,
-        delay_spread=6.0,
-        time_constant_spread=0.3,
-        prefilter_zero=0.965,
-    )
-    _reach: Array  # of the bank's model, degC, (loops,)
-    _residual: Array  # the last one, degC, (loops,)
+    forgetting: Positive = 0.999
+    network: LawNetwork = field(default_factory=LawNetwork.load, repr=False)
+    """The weights; by default those that come with the project."""
+    haste: NotNegative = 0.75
+    """How much quicker the law is than the network asks for, see `agents.neural_law.Law`. The
+    network was trained with models that stay as they are; what a model that changes does not
+    explain is sooner out of date. 0 halves the valve travel in noise."""
+    closed_loop_time_constant: float = field(init=False, default=0.15)
 
-    def __init__(
-        self,
-        *,
-        network: LawNetwork | None = None,
-        forgetting: float = 0.999,
-        haste: float = 0.75,
-        **told: Any,
-    ) -> None:
-        super().__init__(forgetting=forgetting, **told)
-        self._haste = check_number("haste", haste, 0)
-        self._network = LawNetwork.load() if network is None else network
+    _every, _share, _caution, _noise = 2, 1.0, 1.0, 0.25
+    _gain_spread, _delay_spread, _time_constant_spread = 0.25, 6.0, 0.3
+    _prefilter_zero = 0.965
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self._half = (self.u_max - self.u_min) / 2.0
         self._flow = self._half * np.sign(self.gain)  # t/h, of a flow of 1
+        self._reach: Array  # of the bank's model, degC
         self._rule: Law | None = None
 
     def reset(self) -> None:
         """Forget the episode and what was learnt: the next plant may be another."""
         super().reset()
         self._rule = None
+
+    def _informed(self, before: Array) -> Law:
+        """Return the law, which knows what the bank has found out."""
+        if self._rule is not None and self._samples % self._every:
+            return self._rule
+        gain = self._sums.sum(1)
+        reach = np.abs(gain) * self._half
+        unit = (self._sums * (1.0 - self._poles)).sum(1) / gain
+        delay = self.estimates["delay"] / self.sampling_interval - 1.0
+        prior = Prior(
+            unit=unit,
+            fading=self._trust * (1.0 - unit) ** 1.5,
+            time_constant=np.clip(1.0 / unit / NOMINAL, 0.3, 3.3),
+            delay=np.minimum(delay, 44.0),
+            dead_zone=self._zone / self._half,
+            centre=np.full(self._loops, (self.u_max + self.u_min) / 2.0 / self._flow),
+            uncertainty=np.minimum(self._spread(delay), MOST_UNCERTAIN),
+        )
+        if self._rule is None:
+            self._rule = Law(prior, haste=self.haste)
+        else:
+            self._rule.retell(prior, self._reach / reach, (before - self._residual) / reach)
+        self._reach = reach
+        return self._rule
+
+    def _spread(self, delay: Array) -> Array:
+        """Return how uncertain the bank is, in natural logarithms of the gain."""
+        by_mode, by_delay = (self._by_model(self._weights).sum(axis) for axis in (1, 2))
+        constants = np.log(self._constants)
+        constant = (by_mode * constants).sum(1, keepdims=True)
+        of_constant = (by_mode * (constants - constant) ** 2).sum(1) / 1.5**2
+        of_delay = (by_delay * (self._delays - delay[:, np.newaxis]) ** 2).sum(1) / 20.0**2
+        spread: Array = np.sqrt((of_constant + of_delay + self._gain_variance) / 3.0)
+        return spread
 
     def _law(self, setpoint: Array) -> Array:
         off = [
@@ -93,7 +102,7 @@ class NeuralSelfTuningController(SelfTuningController):
         passed = self._flows[:, self._now - 1]
         passed = passed * (np.abs(passed) >= self._zone) / self._flow
         wanted = rule.flow(
-            self._network,
+            self.network,
             setpoint / self._reach,
             residual / self._reach,
             load / self._reach,
@@ -101,37 +110,3 @@ class NeuralSelfTuningController(SelfTuningController):
         )
         command: Array = self._flow * wanted
         return command
-
-    def _informed(self, before: Array) -> Law:
-        """Return the law, which knows what the bank has found out."""
-        if self._rule is not None and self._samples % self._learning.interval:
-            return self._rule
-        gain = self._sums.sum(1)
-        reach = np.abs(gain) * self._half
-        unit = (self._sums * (1.0 - self._poles)).sum(1) / gain
-        delay = self.estimates["delay"] / self._interval - 1.0
-        prior = Prior(
-            unit=unit,
-            fading=self._trust * (1.0 - unit) ** 1.5,
-            time_constant=np.clip(1.0 / unit / NOMINAL, 0.3, 3.3),
-            delay=np.minimum(delay, 44.0),
-            dead_zone=self._zone / self._half,
-            centre=np.full(self._loops, (self.u_max + self.u_min) / 2.0 / self._flow),
-            uncertainty=np.minimum(self._spread(delay), MOST_UNCERTAIN),
-        )
-        if self._rule is None:
-            self._rule = Law(prior, haste=self._haste)
-        else:
-            self._rule.retell(prior, self._reach / reach, (before - self._residual) / reach)
-        self._reach = reach
-        return self._rule
-
-    def _spread(self, delay: Array) -> Array:
-        """Return how uncertain the bank is, in natural logarithms of the gain."""
-        by_mode, by_delay = (self._by_model(self._weights).sum(axis) for axis in (1, 2))
-        constants = np.log(self._constants)
-        constant = (by_mode * constants).sum(1, keepdims=True)
-        of_constant = (by_mode * (constants - constant) ** 2).sum(1) / 1.5**2
-        of_delay = (by_delay * (self._delays - delay[:, np.newaxis]) ** 2).sum(1) / 20.0**2
-        spread: Array = np.sqrt((of_constant + of_delay + self._gain_variance) / 3.0)
-        return spread

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import (
-    MOST,
-    PAPER_WINDOWS,
-    Controller,
-    Values,
-    check_count,
-    check_number,
-    check_positive,
-)
+from agents.controller import PAPER_WINDOWS, Index, NotNegative, ToldController, Values
 from agents.neural_law import Law, LawNetwork, Prior
 
 Array = NDArray[np.float64]
@@ -25,7 +18,8 @@ NOMINAL = 20.62  # samples, the time constant of the paper's plant
 SLOWEST = 45.0  # samples, of the plants that the network was trained on
 
 
-class NeuralSmithPredictor(Controller):
+@dataclass(eq=False, kw_only=True)
+class NeuralSmithPredictor(ToldController):
     """A trained network that is told the plant.
 
     As in a Smith predictor, a model of the plant runs beside it, and what the model makes of
@@ -36,90 +30,43 @@ class NeuralSmithPredictor(Controller):
     one set of weights serves plants of either sign, of any limits and any sampling interval.
     For plants with a time constant of more than 90 samples it acts every second sample or less
     often.
-
-    Parameters
-    ----------
-    gain
-        Steady-state gain of the plant, degC per t/h, of either sign.
-    time_constant
-        Its time constant, s.
-    delay
-        Its delay, s; the sample that any input takes to show is part of it.
-    dead_zone
-        The actuator's, t/h: commands within it are 0, those on its edge have an effect. 0 if it
-        is not known.
-    coefficients
-        A and B of the plant, if more than its first order is known: `a[0]` is 1, and `b` begins
-        with z^-1. Their gain is taken for `gain`.
-    uncertainty
-        By how much the gain may be wrong, a standard deviation as a share of it. It stands for
-        the time constant, which may be wrong by half as much again, and for the delay: 0.1
-        means two samples. 0 where the numbers are exact.
-    sampling_interval
-        s.
-    setpoint_index, error_index
-        Where the observation holds y_d(k) and e(k), degC.
-    u_min, u_max
-        The actuator's limits, t/h.
-    network
-        The weights; None for those that come with the project.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range; the message names it.
     """
+
+    coefficients: tuple[Sequence[float], Sequence[float]] | None = None
+    """A and B of the plant, if more than its first order is known: `a[0]` is 1, and `b` begins
+    with z^-1. Their gain is taken for `gain`."""
+    uncertainty: NotNegative = 0.0
+    """By how much the gain may be wrong, a standard deviation as a share of it. It stands for
+    the time constant, which may be wrong by half as much again, and for the delay: 0.1 means
+    two samples. 0 where the numbers are exact."""
+    setpoint_index: Index = 0
+    """Where the observation holds y_d(k), degC."""
+    error_index: Index = 3
+    """Where it holds e(k), degC."""
+    network: LawNetwork = field(default_factory=LawNetwork.load, repr=False)
+    """The weights; by default those that come with the project."""
 
     observation = PAPER_WINDOWS  # that the default indices are for
 
-    def __init__(
-        self,
-        *,
-        gain: float,
-        time_constant: float,
-        delay: float,
-        dead_zone: float = 0.0,
-        coefficients: tuple[Sequence[float], Sequence[float]] | None = None,
-        uncertainty: float = 0.0,
-        sampling_interval: float = 8.0,
-        setpoint_index: int = 0,
-        error_index: int = 3,
-        u_min: float = -10.0,
-        u_max: float = 10.0,
-        network: LawNetwork | None = None,
-    ) -> None:
-        self.setpoint_index = check_count("setpoint_index", setpoint_index, 0)
-        self.error_index = check_count("error_index", error_index, 0)
-        super().__init__(
-            n_obs=max(setpoint_index, error_index) + 1,
-            u_min=u_min,
-            u_max=u_max,
-            dead_zone=dead_zone,
-        )
-        if check_number("gain", gain) == 0.0:
-            raise ValueError(f"gain must not be 0, got {gain!r}")
-        interval = check_positive("sampling_interval", sampling_interval)
-        constant = check_positive("time_constant", time_constant) / interval
-        samples = check_number("delay", delay, 0) / interval
-        if samples > MOST:
-            raise ValueError(
-                f"delay must be at most {MOST:,} times sampling_interval = "
-                f"{sampling_interval!r}, got {delay!r}"
-            )
-        self._every = 1 if coefficients else max(1, int(constant / SLOWEST))
-        constant, samples = constant / self._every, samples / self._every
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.n_obs = max(self.setpoint_index, self.error_index) + 1
+        self._edge = self.dead_zone
+        constant = self.time_constant / self.sampling_interval
+        self._is_first_order = self.coefficients is None
+        self._every = max(1, int(constant / SLOWEST)) if self._is_first_order else 1
+        constant /= self._every
         pole = math.exp(-1.0 / constant)
-        self._is_first_order = coefficients is None
-        if coefficients is None:
-            self._a, self._b = np.array([1.0, -pole]), np.array([gain * (1.0 - pole)])
+        if self.coefficients is None:
+            self._a, self._b = np.array([1.0, -pole]), np.array([self.gain * (1.0 - pole)])
         else:
-            self._a, self._b = _checked(coefficients)
+            self._a, self._b = _checked(self.coefficients)
         gain = self._b.sum() / self._a.sum()
         half = (self.u_max - self.u_min) / 2.0
         self._flow = math.copysign(half, gain)  # t/h, of a flow of 1
         self._reach = abs(gain) * half
         self._b = self._b / gain
-        self._delay = max(round(samples) - 1, 0)
+        self._delay = max(round(self._delay_samples / self._every) - 1, 0)
         self._about = {
             "unit": self._a.sum(),
             "fading": pole ** (self._delay + (1.5 if self._is_first_order else 1.0)),
@@ -127,9 +74,8 @@ class NeuralSmithPredictor(Controller):
             "delay": min(self._delay, 44),
             "dead_zone": self.dead_zone / half,
             "centre": (self.u_max + self.u_min) / 2.0 / self._flow,
-            "uncertainty": check_number("uncertainty", uncertainty, 0),
+            "uncertainty": self.uncertainty,
         }
-        self._network = LawNetwork.load() if network is None else network
         self._law: Law | None = None
 
     def reset(self) -> None:
@@ -164,7 +110,7 @@ class NeuralSmithPredictor(Controller):
         residual[0] = (off + self._off) / 2.0 if self._is_first_order else off
         self._off = off
         state = model[0], model[1], flows[0]
-        wanted = law.flow(self._network, setpoint, residual[0], self._a @ residual, state)
+        wanted = law.flow(self.network, setpoint, residual[0], self._a @ residual, state)
         wanted, passed = law.applied(wanted)
         flows[1:] = flows[:-1].copy()
         flows[0] = passed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -10,61 +11,43 @@ from numpy.typing import NDArray
 from agents.controller import (
     PAPER_WINDOWS,
     Controller,
+    Flag,
+    Index,
+    Number,
     Values,
-    check_count,
-    check_flag,
+    check_gain,
     check_number,
-    check_positive,
 )
 
 # From `python -m benchmarks.tune pi`.
 SEARCHED_GAINS = {"kp": 1.34, "ki": 0.0456}
 
 
+@dataclass(eq=False)
 class PIController(Controller):
     """u(k) = -Kp e(k) - Ki sum_{i<=k} e(i), as printed in Section 5.
 
     The signs are those of a plant whose output falls when its input rises, D(G) = -1. For a
     plant of the other direction both gains are below zero.
-
-    Parameters
-    ----------
-    kp
-        Kp, t/h per degC.
-    ki
-        Ki, t/h per degC and sample.
-    anti_windup
-        Whether the sum stands still while the command lies beyond a limit and the error would
-        drive it further (conditional integration; Astrom and Hagglund, "PID Controllers",
-        2nd edition, 1995, section 3.5). The paper's goes on.
-    error_index
-        Where the observation holds e(k), degC.
-    u_min, u_max
-        The actuator's limits, t/h. They scale the action; they do not limit the command.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range; the message names it.
     """
+
+    kp: Number = 2.2
+    """Kp, t/h per degC."""
+    ki: Number = 0.3
+    """Ki, t/h per degC and sample."""
+    _: KW_ONLY
+    anti_windup: Flag = False
+    """Whether the sum stands still while the command lies beyond a limit and the error would
+    drive it further (conditional integration; Astrom and Hagglund, "PID Controllers", 2nd
+    edition, 1995, section 3.5). The paper's goes on."""
+    error_index: Index = 3
+    """Where the observation holds e(k), degC."""
 
     observation = PAPER_WINDOWS  # that the default indices are for
 
-    def __init__(
-        self,
-        kp: float = 2.2,
-        ki: float = 0.3,
-        *,
-        anti_windup: bool = False,
-        error_index: int = 3,
-        u_min: float = -10.0,
-        u_max: float = 10.0,
-    ) -> None:
-        self.error_index = check_count("error_index", error_index, 0)
-        super().__init__(n_obs=self.error_index + 1, u_min=u_min, u_max=u_max)
-        self.kp = check_number("kp", kp)
-        self.ki = check_number("ki", ki)
-        self.anti_windup = check_flag("anti_windup", anti_windup)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.n_obs = self.error_index + 1
         self._sum: Values | None = None  # of all errors so far
 
     @classmethod
@@ -85,12 +68,8 @@ class PIController(Controller):
 
         Parameters
         ----------
-        gain
-            Steady-state gain k of the plant, degC per t/h, of either sign.
-        time_constant
-            Its time constant tau_1, s.
-        delay
-            Its delay theta, s.
+        gain, time_constant, delay
+            k, tau_1 and theta of the plant: degC per t/h, of either sign, s and s.
         closed_loop_time_constant
             tau_c, s; by default the delay, "tight control with good robustness".
         sampling_interval
@@ -103,14 +82,17 @@ class PIController(Controller):
         ValueError
             If an argument is out of range; the message names it.
         """
-        kp, ki = simc_gains(
-            gain=gain,
-            time_constant=time_constant,
-            delay=delay,
-            closed_loop_time_constant=closed_loop_time_constant,
-            sampling_interval=sampling_interval,
-        )
-        return cls(kp, ki, **{"anti_windup": True, **arguments})
+        k = check_gain("gain", gain)
+        tau_1 = check_number("time_constant", time_constant, above=0)
+        theta = check_number("delay", delay, 0)
+        if closed_loop_time_constant is None and theta == 0.0:
+            raise ValueError("closed_loop_time_constant must be given where delay is 0")
+        tau_c = theta if closed_loop_time_constant is None else closed_loop_time_constant
+        tau_c = check_number("closed_loop_time_constant", tau_c, above=0)
+        interval = check_number("sampling_interval", sampling_interval, above=0)
+        kp = -tau_1 / (k * (tau_c + theta))  # (23), with the sign of u = -Kp e
+        tau_i = min(tau_1, 4 * (tau_c + theta))  # (24)
+        return cls(kp, kp * interval / tau_i, **{"anti_windup": True, **arguments})
 
     def reset(self) -> None:
         """Set the integral to zero."""
@@ -142,27 +124,3 @@ class PIController(Controller):
             command = -self.kp * error - self.ki * total
         self._sum = total
         return command
-
-
-def simc_gains(
-    *,
-    gain: float,
-    time_constant: float,
-    delay: float,
-    closed_loop_time_constant: float | None = None,
-    sampling_interval: float = 8.0,
-) -> tuple[float, float]:
-    """Return Kp, t/h per degC, and Ki, t/h per degC and sample: see `PIController.simc`."""
-    k = check_number("gain", gain)
-    if k == 0:
-        raise ValueError(f"gain must not be 0, got {gain!r}")
-    tau_1 = check_positive("time_constant", time_constant)
-    theta = check_number("delay", delay, 0)
-    if closed_loop_time_constant is None and theta == 0.0:
-        raise ValueError("closed_loop_time_constant must be given where delay is 0")
-    tau_c = theta if closed_loop_time_constant is None else closed_loop_time_constant
-    tau_c = check_positive("closed_loop_time_constant", tau_c)
-    interval = check_positive("sampling_interval", sampling_interval)
-    kp = -tau_1 / (k * (tau_c + theta))  # (23), with the sign of u = -Kp e
-    tau_i = min(tau_1, 4 * (tau_c + theta))  # (24)
-    return kp, kp * interval / tau_i

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from agents.archive import reading
 from agents.controller import (
     Controller,
     Values,
@@ -25,7 +25,6 @@ from agents.controller import (
 Array = NDArray[np.float64]
 
 WINDOWS: Final = ("setpoint_window", "error_window", "output_window", "action_window")
-PRETRAINED: Final = Path(__file__).parent / "pretrained"
 _FORMAT = 1  # of the file
 
 
@@ -53,88 +52,56 @@ class Increments:
         check_number("dead_zone", self.dead_zone, 0)
 
 
+@dataclass(eq=False)
 class PolicyNetwork(Controller):
     """A feed-forward network from the latest observation to an action.
 
     The observation is multiplied by `input_scale` and goes through the layers. The activation
     follows each of them but the last, which gives one number, limited to [-1, 1]. It is the
     action, or with `increments` the velocity of the valve. All is computed in float64.
-
-    Parameters
-    ----------
-    layers
-        Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
-    observation
-        The windows of the observation that the network wants, by the names of the
-        environment's arguments: `setpoint_window`, `error_window`, `output_window`,
-        `action_window`. A window that is not named is 0.
-    input_scale
-        Factor of each element of the observation; shape (n_obs,).
-    activation
-        "elu", "relu" or "tanh".
-    increments
-        The velocity form, if the network was trained in it.
-    provenance
-        Where the weights come from; whatever JSON can hold.
-    u_min, u_max
-        The actuator's limits, t/h.
-
-    Attributes
-    ----------
-    observation : dict of str to int
-        All four windows, as arguments for the environment.
-    provenance : dict
-        As given.
-
-    Raises
-    ------
-    ValueError
-        If arguments are out of range or do not fit together; the message names them.
     """
+
+    layers: Sequence[tuple[Array, Array]] = field(repr=False)
+    """Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer."""
+    _: KW_ONLY
+    observation: Mapping[str, int]
+    """The windows of the observation that the network wants, by the names of the environment's
+    arguments: `setpoint_window`, `error_window`, `output_window`, `action_window`. A window
+    that is not named is 0."""
+    input_scale: Array = field(repr=False)
+    """Factor of each element of the observation; shape (n_obs,)."""
+    activation: str = "elu"
+    """"elu", "relu" or "tanh"."""
+    increments: Increments | None = None
+    """The velocity form, if the network was trained in it."""
+    provenance: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """Where the weights come from; whatever JSON can hold."""
 
     _advice = "; the environment needs the network's `observation` as arguments"
 
-    def __init__(
-        self,
-        layers: Sequence[tuple[ArrayLike, ArrayLike]],
-        *,
-        observation: Mapping[str, int],
-        input_scale: ArrayLike,
-        activation: str = "elu",
-        increments: Increments | None = None,
-        provenance: Mapping[str, Any] | None = None,
-        u_min: float = -10.0,
-        u_max: float = 10.0,
-    ) -> None:
-        if not isinstance(observation, Mapping):
-            raise ValueError(f"observation must be a dict of windows, got {observation!r}")
-        for name in observation:
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in self.observation:
             if name not in WINDOWS:
                 raise ValueError(f"observation must name {', '.join(WINDOWS)}, got {name!r}")
         self.observation = {
-            name: check_count(f"observation[{name!r}]", observation.get(name, 0), 0)
+            name: check_count(f"observation[{name!r}]", self.observation.get(name, 0), 0)
             for name in WINDOWS
         }
-        if not isinstance(increments, Increments | None):
-            raise ValueError(f"increments must be None or an Increments, got {increments!r}")
-        if not isinstance(provenance, Mapping | None):
-            raise ValueError(f"provenance must be None or a dict, got {provenance!r}")
-        dead_zone = 0.0 if increments is None else increments.dead_zone
-        n_obs = sum(self.observation.values())
-        super().__init__(n_obs=n_obs, u_min=u_min, u_max=u_max, dead_zone=dead_zone)
-        if dead_zone > 0.0 and dead_zone >= min(-self.u_min, self.u_max):
+        self.n_obs = sum(self.observation.values())
+        self._edge = self.increments.dead_zone if self.increments else 0.0
+        if self._edge > 0.0 and self._edge >= min(-self.u_min, self.u_max):
             raise ValueError(
-                f"increments.dead_zone must be inside the limits {u_min!r} and {u_max!r}, "
-                f"got {dead_zone!r}"
+                f"increments.dead_zone must be inside the limits {self.u_min!r} and "
+                f"{self.u_max!r}, got {self._edge!r}"
             )
-        if not isinstance(activation, str) or activation not in ACTIVATIONS:
-            raise ValueError(f"activation must be one of {[*ACTIVATIONS]}, got {activation!r}")
-        self.activation = activation
-        self.increments = increments
-        self._remembers = increments is not None
-        self.provenance = dict(provenance or {})
-        self.input_scale = _finite("input_scale", input_scale, (self.n_obs,))
-        self.layers = _checked(layers, self.n_obs)
+        if self.activation not in [*ACTIVATIONS]:
+            raise ValueError(
+                f"activation must be one of {[*ACTIVATIONS]}, got {self.activation!r}"
+            )
+        self._remembers = self.increments is not None
+        self.input_scale = _finite("input_scale", self.input_scale, (self.n_obs,))
+        self.layers = _checked(self.layers, self.n_obs)
         self._position: Values | None = None  # of the valve, in velocity form
 
     @classmethod
@@ -152,30 +119,24 @@ class PolicyNetwork(Controller):
             or not in order.
         """
         check_limits(u_min, u_max)  # here, so that they are not taken for damage to the file
-        with Path(path).open("rb") as raw:
-            try:
-                with np.load(raw, allow_pickle=False) as file:
-                    about = json.loads(str(file["about"]))
-                    if about["format"] != _FORMAT:
-                        raise ValueError(f"its format is {about['format']!r}, not {_FORMAT}")
-                    increments = about["increments"]
-                    return cls(
-                        [(file[f"W{i}"], file[f"b{i}"]) for i in range(about["layers"])],
-                        observation=about["observation"],
-                        input_scale=file["input_scale"],
-                        activation=about["activation"],
-                        increments=None if increments is None else Increments(**increments),
-                        provenance=about["provenance"],
-                        u_min=u_min,
-                        u_max=u_max,
-                    )
-            except Exception as error:  # damage shows in zip, zlib, NumPy, JSON or the checks
-                raise ValueError(
-                    f"{path} holds no policy network, or is damaged: {error}"
-                ) from error
+        with reading(path, "policy network") as file:
+            about = json.loads(str(file["about"]))
+            if about["format"] != _FORMAT:
+                raise ValueError(f"its format is {about['format']!r}, not {_FORMAT}")
+            increments = about["increments"]
+            return cls(
+                [(file[f"W{i}"], file[f"b{i}"]) for i in range(about["layers"])],
+                observation=about["observation"],
+                input_scale=file["input_scale"],
+                activation=about["activation"],
+                increments=None if increments is None else Increments(**increments),
+                provenance=about["provenance"],
+                u_min=u_min,
+                u_max=u_max,
+            )
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the network to a `.npz` file, whole or not at all."""
+        """Write the network to a `.npz` file."""
         about = {
             "format": _FORMAT,
             "layers": len(self.layers),
@@ -184,20 +145,11 @@ class PolicyNetwork(Controller):
             "increments": None if self.increments is None else asdict(self.increments),
             "provenance": self.provenance,
         }
-        arrays: dict[str, Any] = {
-            "about": np.array(json.dumps(about)),
-            "input_scale": self.input_scale,
-        }
+        arrays: dict[str, Any] = {"about": json.dumps(about), "input_scale": self.input_scale}
         for i, (W, b) in enumerate(self.layers):
             arrays |= {f"W{i}": W, f"b{i}": b}
-        target = Path(path)
-        partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-        try:
-            with partial.open("wb") as file:
-                np.savez_compressed(file, **arrays)
-            partial.replace(target)
-        finally:
-            partial.unlink(missing_ok=True)
+        with Path(path).open("wb") as file:
+            np.savez_compressed(file, **arrays)
 
     def reset(self) -> None:
         """Forget the episode: in velocity form, the valve's position."""
@@ -215,12 +167,11 @@ class PolicyNetwork(Controller):
         for W, b in hidden:
             x = ACTIVATIONS[self.activation](x @ W.T + b)
         position: Values = np.clip(x @ last_W[0] + last_b[0], -1.0, 1.0)
-        edge = 0.0
         if self.increments is not None:
             before = 0.0 if self._position is None else self._position
             moved = before + self.increments.max_move * position
             self._position = position = np.clip(moved, -1.0, 1.0)
-            edge = self.increments.dead_zone
+        edge = self._edge
         if edge == 0.0:
             return self.u_min + (position + 1.0) * (self.u_max - self.u_min) / 2.0
         limit = np.where(position > 0.0, self.u_max, -self.u_min)
@@ -237,24 +188,14 @@ def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def _checked(
-    layers: Sequence[tuple[ArrayLike, ArrayLike]], inputs: int
-) -> list[tuple[Array, Array]]:
+def _checked(layers: Sequence[tuple[Array, Array]], inputs: int) -> list[tuple[Array, Array]]:
     """Return the layers in float64 if each fits the one before it and the last has one node."""
-    if not isinstance(layers, list | tuple) or not layers:
-        raise ValueError(f"layers must be a list of at least one layer, got {layers!r}")
+    if not layers:
+        raise ValueError("layers must hold at least one layer, got none")
     checked = []
-    for i, layer in enumerate(layers):
-        if not isinstance(layer, Sequence) or len(layer) != 2:
-            raise ValueError(f"layers[{i}] must be a pair of weights and biases, got {layer!r}")
-        W, b = layer
-        last = i == len(layers) - 1
-        nodes = 1 if last else len(np.atleast_1d(np.asarray(b)))
-        checked.append(
-            (
-                _finite(f"weights of layers[{i}]", W, (nodes, inputs)),
-                _finite(f"biases of layers[{i}]", b, (nodes,)),
-            )
-        )
+    for i, (W, b) in enumerate(layers):
+        nodes = np.size(b) if i < len(layers) - 1 else 1
+        weights = _finite(f"weights of layers[{i}]", W, (nodes, inputs))
+        checked.append((weights, _finite(f"biases of layers[{i}]", b, (nodes,))))
         inputs = nodes
     return checked

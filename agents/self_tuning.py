@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +9,12 @@ from numpy.typing import NDArray
 
 from agents.controller import (
     PAPER_WINDOWS,
-    Controller,
+    Index,
+    NotNegative,
+    Positive,
+    ToldController,
     Values,
     check_count,
-    check_number,
-    check_positive,
 )
 
 Array = NDArray[np.float64]
@@ -40,39 +40,8 @@ MOST_DELAY = 10_000  # samples: beyond it, the bank would be too large for any c
 _ROOM = 64  # samples until the histories are moved back
 
 
-@dataclass(frozen=True)
-class Learning:
-    """How fast evidence becomes control, and how sure the step test is.
-
-    Attributes
-    ----------
-    interval
-        Samples between two designs.
-    share
-        Of a design that is taken over.
-    caution
-        Factor of the log-likelihood, as the errors are not quite white.
-    noise
-        That is expected, degC.
-    gain_spread, delay_spread, time_constant_spread
-        Standard deviations of the step test: of the gain, as a share of it; of the delay,
-        samples; of the time constant's logarithm.
-    prefilter_zero
-        Of the prefilter of what is compared: 0.92 makes the noise white; nearer to 1, a load
-        that changes is taken less for another gain.
-    """
-
-    interval: int = 10
-    share: float = 0.5
-    caution: float = 0.5
-    noise: float = 0.5
-    gain_spread: float = 0.5
-    delay_spread: float = 8.0
-    time_constant_spread: float = 0.5
-    prefilter_zero: float = 0.92
-
-
-class SelfTuningController(Controller):
+@dataclass(eq=False, kw_only=True)
+class SelfTuningController(ToldController):
     """A predictive controller that identifies the plant while it controls it.
 
     *Identification.* There is a bank of models, one for each combination of a delay d, a time
@@ -105,122 +74,64 @@ class SelfTuningController(Controller):
       and 3 times that.
     - Certainty comes from evidence: with none, the controller is that of the step test. Errors
       below 0.02 degC are no evidence, and a new design is taken over gradually.
-
-    Parameters
-    ----------
-    gain
-        Steady-state gain by a step test, degC per t/h; below zero or above.
-    time_constant
-        By the step test, s.
-    delay
-        By the step test, s; the sample that any input takes to show is part of it.
-    dead_zone
-        The actuator's, as far as is known, t/h.
-    dead_zones
-        Those that it may have, t/h. One alone is taken for granted. None for `dead_zone` and up
-        to seven around it.
-    shortest_delay, longest_delay
-        Delays that the plant may have, d in samples: an input shows after d + 1.
-    closed_loop_time_constant
-        As a share of the plant's, whatever that is found to be.
-    forgetting
-        What a sample leaves of the weight of those before it; up to 1, which forgets nothing.
-    sampling_interval
-        s.
-    setpoint_index, error_index
-        Where the observation holds y_d(k) and e(k), degC.
-    u_min, u_max
-        The actuator's limits, t/h.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range; the message names it.
     """
 
+    dead_zone: NotNegative = 5.0
+    """The actuator's, as far as is known, t/h. The bank has this one and up to seven around
+    it."""
+    shortest_delay: Index = 6
+    """Of the delays that the plant may have, d in samples: an input shows after d + 1."""
+    longest_delay: Index = 36
+    """Of these delays."""
+    closed_loop_time_constant: Positive = 0.15
+    """As a share of the plant's, whatever that is found to be."""
+    forgetting: Positive = 0.996
+    """What a sample leaves of the weight of those before it; up to 1, which forgets nothing."""
+    setpoint_index: Index = 0
+    """Where the observation holds y_d(k), degC."""
+    error_index: Index = 3
+    """Where it holds e(k), degC."""
+
     observation = PAPER_WINDOWS  # that the default indices are for
-    _learning = Learning()
 
-    # What a batch remembers: responses without delay, of unit gain, and the same prefiltered,
-    # (loops, time, responses); the flow within the limits, t/h, (loops, time).
-    _units: Array
-    _filtered: Array
-    _flows: Array
-    # The last outputs, newest first, (loops, 3), their offset and the disturbance that is
-    # foreseen, (loops,), and the last prefiltered outputs, (loops, interval); all in degC.
-    _outputs: Array
-    _bias: Array
-    _disturbance: Array
-    _filtered_outputs: Array
-    # Sums over the past: of squared regressors and of regressors times outputs, (loops,
-    # models); of squared outputs and of the samples themselves, (loops, 1).
-    _information: Array
-    _products: Array
-    _energy: Array
-    _seen: Array
-    # The design: probabilities and, times these, gains of the models, (loops, models).
-    _weights: Array
-    _gains: Array
-    _gain_variance: Array  # of all gains, as a share of the square of their mean, (loops,)
+    # How fast evidence becomes control.
+    _every = 10  # samples between two designs
+    _share = 0.5  # of a design that is taken over
+    _caution = 0.5  # factor of the log-likelihood, as the errors are not quite white
+    # How sure the step test is: standard deviations of the gain, as a share of it, of the
+    # delay, samples, and of the time constant's logarithm.
+    _gain_spread, _delay_spread, _time_constant_spread = 0.5, 8.0, 0.5
+    _noise = 0.5  # degC, that is expected
+    # Of the prefilter of what is compared: 0.92 makes the noise white; nearer to 1, a load that
+    # changes is taken less for another gain.
+    _prefilter_zero = 0.92
 
-    def __init__(
-        self,
-        *,
-        gain: float,
-        time_constant: float,
-        delay: float,
-        dead_zone: float = 5.0,
-        dead_zones: Sequence[float] | None = None,
-        shortest_delay: int = 6,
-        longest_delay: int = 36,
-        closed_loop_time_constant: float = 0.15,
-        forgetting: float = 0.996,
-        sampling_interval: float = 8.0,
-        setpoint_index: int = 0,
-        error_index: int = 3,
-        u_min: float = -10.0,
-        u_max: float = 10.0,
-    ) -> None:
-        self.setpoint_index = check_count("setpoint_index", setpoint_index, 0)
-        self.error_index = check_count("error_index", error_index, 0)
-        super().__init__(n_obs=max(setpoint_index, error_index) + 1, u_min=u_min, u_max=u_max)
-        self.gain = check_number("gain", gain)
-        if gain == 0:
-            raise ValueError(f"gain must not be 0, got {gain!r}")
-        self._interval = check_positive("sampling_interval", sampling_interval)
-        samples = check_positive("time_constant", time_constant) / self._interval
-        self._closed_loop = check_positive(
-            "closed_loop_time_constant", closed_loop_time_constant
-        )
-        if not 0.0 < check_number("forgetting", forgetting) <= 1.0:
-            raise ValueError(f"forgetting must be above 0, up to 1, got {forgetting!r}")
-        self._forgetting = float(forgetting)
-        shortest = check_count("shortest_delay", shortest_delay, 0)
-        longest = check_count("longest_delay", longest_delay, shortest, MOST_DELAY)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.n_obs = max(self.setpoint_index, self.error_index) + 1
+        shortest = self.shortest_delay
+        longest = check_count("longest_delay", self.longest_delay, shortest, MOST_DELAY)
+        if self.forgetting > 1.0:
+            raise ValueError(f"forgetting must be above 0, up to 1, got {self.forgetting!r}")
         limit = max(abs(self.u_min), abs(self.u_max))
-        told_zone = check_number("dead_zone", dead_zone, 0)
-        if dead_zones is None:
-            zones = told_zone + limit * np.array(ZONES)
-            self._zones = zones[(zones == told_zone) | (zones >= 0.0) & (zones < limit)]
-        else:
-            self._zones = _checked_zones(dead_zones)
+        zones = self.dead_zone + limit * np.array(ZONES)
+        self._zones = zones[(zones == self.dead_zone) | (zones >= 0.0) & (zones < limit)]
 
         # Responses without delay differ by dead zone and pole, models by delay, too: the
         # longest one first, as in the history of the responses.
         self._delays = np.arange(longest, shortest - 1, -DELAY_STEP)
-        constants = np.tile(samples * np.array(TIME_CONSTANTS), len(self._zones))
-        self._constants = constants
-        self._poles = np.exp(-1.0 / constants)
+        told = self.time_constant / self.sampling_interval
+        self._constants = np.tile(told * np.array(TIME_CONSTANTS), len(self._zones))
+        self._poles = np.exp(-1.0 / self._constants)
         self._dead_zones = np.repeat(self._zones, len(TIME_CONSTANTS))
         self._fading = (self._poles ** self._delays[:, np.newaxis]).ravel()
-        told_delay = check_number("delay", delay, 0) / self._interval - 1.0
-        off_delay = (self._delays - told_delay) / self._learning.delay_spread
-        off_constant = np.log(constants / samples) / self._learning.time_constant_spread
-        off_zone = (self._dead_zones - told_zone) / (ZONE_SPREAD * limit)
+        off_delay = (self._delays - (self._delay_samples - 1.0)) / self._delay_spread
+        off_constant = np.log(self._constants / told) / self._time_constant_spread
+        off_zone = (self._dead_zones - self.dead_zone) / (ZONE_SPREAD * limit)
         off = np.square(off_delay)[:, np.newaxis] + np.square(off_constant) + off_zone**2
         self._prior = -0.5 * off.ravel()  # log-probability, but for a constant
         self._excited = EXCITED * (self.u_max - self.u_min) / 2.0
-        self._history = longest + max(MEMORY, self._learning.interval) + 2
+        self._history = longest + max(MEMORY, self._every) + 2
         self._loops = 0  # not known before the first observation
 
     @property
@@ -235,8 +146,8 @@ class SelfTuningController(Controller):
         by_mode, by_delay = (self._by_model(self._weights).sum(axis) for axis in (1, 2))
         return {
             "gain": self._gains.sum(1),
-            "time_constant": (by_mode * self._constants).sum(1) * self._interval,
-            "delay": ((by_delay * self._delays).sum(1) + 1.0) * self._interval,
+            "time_constant": (by_mode * self._constants).sum(1) * self.sampling_interval,
+            "delay": ((by_delay * self._delays).sum(1) + 1.0) * self.sampling_interval,
             "dead_zone": self._zone.copy(),
         }
 
@@ -245,24 +156,105 @@ class SelfTuningController(Controller):
         super().reset()
         self._loops = 0
 
+    def _start(self, loops: int) -> None:
+        """Bring everything to rest, and the models to what the step test has shown."""
+        models, size = (loops, len(self._prior)), self._history + 1
+        self._loops, self._samples, self._now = loops, 0, size - 1
+        # Responses without delay, of unit gain, and the same prefiltered, (loops, time,
+        # responses); the flow within the limits, t/h, (loops, time).
+        shape = loops, size + _ROOM, len(self._poles)
+        self._units, self._filtered = np.zeros(shape), np.zeros(shape)
+        self._flows = np.zeros(shape[:2])
+        # The last outputs, newest first, prefiltered ones, newest last, the outputs' offset and
+        # the disturbance that is foreseen, degC.
+        self._outputs, self._filtered_outputs = (
+            np.zeros((loops, 3)),
+            np.zeros((loops, self._every)),
+        )
+        self._bias, self._disturbance = np.zeros(loops), np.zeros(loops)
+        # Sums over the past: of squared regressors, of regressors times outputs, of squared
+        # outputs and of the samples themselves.
+        self._information, self._products = np.zeros(models), np.zeros(models)
+        self._energy, self._seen = np.zeros((loops, 1)), np.zeros((loops, 1))
+        # The design: the noise, and the probabilities of the models and, times these, gains.
+        self._variance = np.full((loops, 1), self._noise**2)
+        self._weights, self._gains = np.zeros(models), np.zeros(models)
+        self._design(1.0)
+
+    def _learn(self) -> None:
+        """Add the last samples to the sums, of those loops whose flow has moved."""
+        interval = self._every
+        flows = self._flows[:, self._now - self._history : self._now]
+        moved = flows.max(1) - flows.min(1) > self._excited
+        gate = moved.astype(float)[:, np.newaxis]
+        kept = 1.0 - gate * (1.0 - self.forgetting**interval)
+        outputs = self._filtered_outputs * gate
+        information = self._by_model(self._information)
+        products = self._by_model(self._products)
+        self._information *= kept
+        self._products *= kept
+        longest, shortest = int(self._delays[0]), int(self._delays[-1])
+        oldest = self._now - longest - interval + 1
+        filtered = self._filtered[:, oldest : self._now - shortest + 1]
+        squares = np.square(filtered) * gate[:, :, np.newaxis]
+        for i in range(interval):
+            delayed = slice(i, i + longest - shortest + 1, DELAY_STEP)
+            products += filtered[:, delayed] * outputs[:, i, np.newaxis, np.newaxis]
+            information += squares[:, delayed]
+        self._energy *= kept
+        self._energy += np.square(outputs).sum(1, keepdims=True)
+        self._seen *= kept
+        self._seen += interval * gate
+
+    def _design(self, share: float) -> None:
+        """Weigh the models by what was seen, and take over a share of what they ask for."""
+        prior = self._variance / (self._gain_spread * self.gain) ** 2
+        information = self._information + prior
+        products = self._products + prior * self.gain
+        gains = products / information
+        errors = self._energy + prior * self.gain**2 - products * gains  # sums of squares
+        weights = self._prior - (0.5 * self._caution) * errors / self._variance
+        weights -= weights.max(1, keepdims=True)
+        np.exp(weights, out=weights)
+        weights /= weights.sum(1, keepdims=True)
+        least = np.maximum(errors.min(1, keepdims=True), LEAST_NOISE**2 * self._seen)
+        self._variance = (least + NOISE_SAMPLES * self._noise**2) / (self._seen + NOISE_SAMPLES)
+
+        gains = np.clip(gains / self.gain, *GAINS) * self.gain  # the direction stays
+        spread = np.square(gains) + self._variance / information
+        mean = (weights * gains).sum(1)
+        # Of all gains, as a share of the square of their mean.
+        self._gain_variance = (weights * spread).sum(1) / np.square(mean) - 1.0
+        self._weights += share * (weights - self._weights)
+        self._gains += share * (weights * gains - self._gains)
+
+        # Averages over the models of what the control law needs.
+        self._faded = self._gains * self._fading
+        self._trust = np.einsum("ij,j->i", self._weights, self._fading)
+        self._sums = self._by_model(self._gains).sum(1)
+        rates = self._sums * (1.0 - self._poles)
+        rate = rates.sum(1)
+        self._shares = rates / rate[:, np.newaxis]
+        constant = self._sums.sum(1) / rate  # of the average plant, samples
+        self._feedback = -np.expm1(-1.0 / (self.closed_loop_time_constant * constant)) / rate
+        by_zone = self._by_model(self._weights).sum(1)
+        by_zone = by_zone.reshape(self._loops, len(self._zones), -1).sum(2)
+        self._zone = self._zones[by_zone.argmax(1)]
+
     def _control(self, observation: Array) -> Values:
         rows = np.atleast_2d(observation)
         if not self._loops:
             self._start(len(rows))
         setpoint = rows[:, self.setpoint_index]
         output = setpoint - rows[:, self.error_index]
-        filtered = (
-            PREFILTER_POLE * self._filtered_outputs[:, -1]
-            + output
-            - self._learning.prefilter_zero * self._outputs[:, 0]
-        )
+        filtered = self._filter(self._filtered_outputs[:, -1], output, self._outputs[:, 0])
         self._outputs = np.column_stack([output, self._outputs[:, :-1]])
         self._filtered_outputs[:, :-1] = self._filtered_outputs[:, 1:].copy()
         self._filtered_outputs[:, -1] = filtered
         self._samples += 1
-        if self._samples % self._learning.interval == 0:
+        if self._samples % self._every == 0:
             self._learn()
-            self._design(self._learning.share)
+            self._design(self._share)
 
         command = self._beyond_the_dead_zone(self._law(setpoint))
         self._apply(command)
@@ -285,86 +277,6 @@ class SelfTuningController(Controller):
         """Return what each model of gain 1 made of the output some samples ago."""
         return self._units[:, self._now - self._delays - ago].reshape(self._loops, -1)
 
-    def _start(self, loops: int) -> None:
-        """Bring everything to rest, and the models to what the step test has shown."""
-        if not loops:
-            raise ValueError("observation must have a row for each loop, got none")
-        models = len(self._prior)
-        history = self._history + 1
-        self._loops, self._samples, self._now = loops, 0, history - 1
-        shape = loops, history + _ROOM, len(self._poles)
-        self._units, self._filtered = np.zeros(shape), np.zeros(shape)
-        self._flows = np.zeros(shape[:2])
-        self._outputs, self._bias = np.zeros((loops, 3)), np.zeros(loops)
-        self._disturbance = np.zeros(loops)
-        self._filtered_outputs = np.zeros((loops, self._learning.interval))
-        self._information, self._products = np.zeros((loops, models)), np.zeros((loops, models))
-        self._energy, self._seen = np.zeros((loops, 1)), np.zeros((loops, 1))
-        self._variance = np.full((loops, 1), self._learning.noise**2)
-        self._weights, self._gains = np.zeros((loops, models)), np.zeros((loops, models))
-        self._design(1.0)
-
-    def _learn(self) -> None:
-        """Add the last samples to the sums, of those loops whose flow has moved."""
-        interval = self._learning.interval
-        flows = self._flows[:, self._now - self._history : self._now]
-        moved = flows.max(1) - flows.min(1) > self._excited
-        gate = moved.astype(float)[:, np.newaxis]
-        kept = 1.0 - gate * (1.0 - self._forgetting**interval)
-        outputs = self._filtered_outputs * gate
-        information = self._by_model(self._information)
-        products = self._by_model(self._products)
-        self._information *= kept
-        self._products *= kept
-        longest, shortest = int(self._delays[0]), int(self._delays[-1])
-        oldest = self._now - longest - interval + 1
-        filtered = self._filtered[:, oldest : self._now - shortest + 1]
-        squares = np.square(filtered) * gate[:, :, np.newaxis]
-        for i in range(interval):
-            delayed = slice(i, i + longest - shortest + 1, DELAY_STEP)
-            products += filtered[:, delayed] * outputs[:, i, np.newaxis, np.newaxis]
-            information += squares[:, delayed]
-        self._energy *= kept
-        self._energy += np.square(outputs).sum(1, keepdims=True)
-        self._seen *= kept
-        self._seen += interval * gate
-
-    def _design(self, share: float) -> None:
-        """Weigh the models by what was seen, and take over a share of what they ask for."""
-        prior = self._variance / (self._learning.gain_spread * self.gain) ** 2
-        information = self._information + prior
-        products = self._products + prior * self.gain
-        gains = products / information
-        errors = self._energy + prior * self.gain**2 - products * gains  # sums of squares
-        weights = self._prior - (0.5 * self._learning.caution) * errors / self._variance
-        weights -= weights.max(1, keepdims=True)
-        np.exp(weights, out=weights)
-        weights /= weights.sum(1, keepdims=True)
-        least = np.maximum(errors.min(1, keepdims=True), LEAST_NOISE**2 * self._seen)
-        self._variance = (least + NOISE_SAMPLES * self._learning.noise**2) / (
-            self._seen + NOISE_SAMPLES
-        )
-
-        gains = np.clip(gains / self.gain, *GAINS) * self.gain  # the direction stays
-        spread = np.square(gains) + self._variance / information
-        mean = (weights * gains).sum(1)
-        self._gain_variance = (weights * spread).sum(1) / np.square(mean) - 1.0
-        self._weights += share * (weights - self._weights)
-        self._gains += share * (weights * gains - self._gains)
-
-        # Averages over the models of what the control law needs.
-        self._faded = self._gains * self._fading
-        self._trust = np.einsum("ij,j->i", self._weights, self._fading)
-        self._sums = self._by_model(self._gains).sum(1)
-        rates = self._sums * (1.0 - self._poles)
-        rate = rates.sum(1)
-        self._shares = rates / rate[:, np.newaxis]
-        constant = self._sums.sum(1) / rate  # of the average plant, samples
-        self._feedback = -np.expm1(-1.0 / (self._closed_loop * constant)) / rate
-        by_zone = self._by_model(self._weights).sum(1)
-        by_zone = by_zone.reshape(self._loops, len(self._zones), -1).sum(2)
-        self._zone = self._zones[by_zone.argmax(1)]
-
     def _beyond_the_dead_zone(self, command: Array) -> Array:
         """Move what lies within the dead zone to its edge or to 0, whichever is nearer."""
         edge = np.where(self._zone > 0.0, self._zone + CLEARANCE, 0.0)
@@ -379,11 +291,7 @@ class SelfTuningController(Controller):
         applied = column * (np.abs(column) >= self._dead_zones)
         now = self._now
         units = self._poles * self._units[:, now] + (1.0 - self._poles) * applied
-        filtered = (
-            PREFILTER_POLE * self._filtered[:, now]
-            + units
-            - self._learning.prefilter_zero * self._units[:, now]
-        )
+        filtered = self._filter(self._filtered[:, now], units, self._units[:, now])
         self._flows[:, now] = flow
         if now + 1 == self._units.shape[1]:
             for history in (self._units, self._filtered, self._flows):
@@ -393,17 +301,13 @@ class SelfTuningController(Controller):
         self._units[:, now] = units
         self._filtered[:, now] = filtered
 
+    def _filter(self, filtered: Array, new: Array, before: Array) -> Array:
+        """Return the next sample of the prefilter."""
+        return PREFILTER_POLE * filtered + new - self._prefilter_zero * before
+
     def _by_model(self, values: Array) -> Array:
         """Return what there is of each model by loop, delay and response without delay."""
         return values.reshape(self._loops, len(self._delays), -1)
-
-
-def _checked_zones(zones: Sequence[float]) -> Array:
-    """Return dead zones as an array if they are a list of one number or more."""
-    sequence = isinstance(zones, Sequence | np.ndarray) and not isinstance(zones, str | bytes)
-    if not sequence or not np.size(zones) or not np.ndim(zones):
-        raise ValueError(f"dead_zones must be a list of one number or more, got {zones!r}")
-    return np.array([check_number("dead_zones", zone, 0) for zone in zones])
 
 
 def _dot(first: Array, second: Array) -> Array:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 
-from agents.controller import MOST, Values, check_number
-from agents.pi import PIController, simc_gains
+from agents.controller import Flag, Number, Positive, ToldController, Values
+from agents.pi import PIController
 
 Array = NDArray[np.float64]
 
 
-class SmithPredictor(PIController):
+@dataclass(eq=False, kw_only=True)
+class SmithPredictor(ToldController, PIController):
     """A PI controller on the error that a model of the plant, without its delay, foresees.
 
     The model is of first order with a delay. It runs beside the plant. Its output without the
@@ -22,60 +24,30 @@ class SmithPredictor(PIController):
     controller acts on the error less this effect. So far as the model is right, it acts as if
     there were no delay (O. J. M. Smith, "Closer control of loops with dead time", Chemical
     Engineering Progress 53, 1957, 217-219).
-    Its gains are SIMC's for the plant without delay; it has anti-windup.
-
-    Parameters
-    ----------
-    gain, time_constant, delay, sampling_interval
-        The model, as for `PIController.simc`: degC per t/h, s, s, s. The sample that any input
-        takes to show is part of the delay.
-    closed_loop_time_constant
-        Of the loop without the delay, s.
-    dead_zone
-        The actuator's, t/h: commands within it are 0 to the model, those on its edge have an
-        effect. 0 if it is not known.
-    error_index, u_min, u_max
-        As for `PIController`; to the model the command stays within the limits.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range; the message names it.
+    Its gains are SIMC's for the plant without delay; it has anti-windup. To the model the
+    command stays within the limits.
     """
 
-    def __init__(
-        self,
-        *,
-        gain: float,
-        time_constant: float,
-        delay: float,
-        closed_loop_time_constant: float,
-        dead_zone: float = 0.0,
-        sampling_interval: float = 8.0,
-        error_index: int = 3,
-        u_min: float = -10.0,
-        u_max: float = 10.0,
-    ) -> None:
-        kp, ki = simc_gains(
-            gain=gain,
-            time_constant=time_constant,
+    closed_loop_time_constant: Positive
+    """Of the loop without the delay, s."""
+    kp: Number = field(init=False)
+    ki: Number = field(init=False)
+    anti_windup: Flag = field(init=False, default=True)
+
+    def __post_init__(self) -> None:
+        rule = PIController.simc(
+            gain=self.gain,
+            time_constant=self.time_constant,
             delay=0.0,
-            closed_loop_time_constant=closed_loop_time_constant,
-            sampling_interval=sampling_interval,
+            closed_loop_time_constant=self.closed_loop_time_constant,
+            sampling_interval=self.sampling_interval,
         )
-        super().__init__(
-            kp, ki, anti_windup=True, error_index=error_index, u_min=u_min, u_max=u_max
-        )
-        self.dead_zone = check_number("dead_zone", dead_zone, 0)
-        self._pole = math.exp(-sampling_interval / time_constant)
-        self._input_gain = gain * (1.0 - self._pole)
-        samples = check_number("delay", delay, 0) / sampling_interval
-        if samples > MOST:
-            raise ValueError(
-                f"delay must be at most {MOST:,} times sampling_interval = "
-                f"{sampling_interval!r}, got {delay!r}"
-            )
-        self._delay = max(round(samples), 1)
+        self.kp, self.ki = rule.kp, rule.ki
+        super().__post_init__()
+        self._edge = self.dead_zone
+        self._pole = math.exp(-self.sampling_interval / self.time_constant)
+        self._input_gain = self.gain * (1.0 - self._pole)
+        self._delay = max(round(self._delay_samples), 1)
         self._model: list[Values] = []  # its last outputs without delay, newest last
 
     def reset(self) -> None:

@@ -1,6 +1,7 @@
 """The controllers: equations by hand and by automatic differentiation, batches, files."""
 
 import inspect
+import pickle
 from functools import partial
 
 import gymnasium
@@ -13,6 +14,8 @@ import agents
 from agents import (
     Controller,
     DirectNNController,
+    LawNetwork,
+    NeuralSelfTuningController,
     NeuralSmithPredictor,
     PIController,
     PolicyNetwork,
@@ -20,7 +23,7 @@ from agents import (
     SmithPredictor,
     Weights,
 )
-from agents.policy_network import PRETRAINED
+from agents.archive import PRETRAINED
 from benchmarks.loop.rollout import make_plants, rollout
 from tests.conftest import run_closed
 
@@ -46,6 +49,16 @@ class TestPI:
             action = controller.act([0, 0, 0, 5.0, 9, 9])
             assert controller.command == pytest.approx(-2.2 * 5 - 0.3 * 5 * k)
         assert action[0] < -10  # beyond the actuator's range, as printed
+
+    def test_anti_windup_by_hand(self):
+        # Kp 1, Ki 0.5, limits +-4. e = 3: -3 - 1.5 = -4.5 is beyond the limit: the sum stays 0.
+        # e = 1: -1 - 0.5; e = -3: 3 + 0.5 (2) = 4 is not beyond it; e = -1: 1 + 0.5 (3).
+        controller = PIController(1.0, 0.5, anti_windup=True, error_index=0, u_min=-4, u_max=4)
+        commands = []
+        for e in (3.0, 1.0, -3.0, -1.0):
+            controller.act([e])
+            commands.append(controller.command)
+        assert commands == [-3.0, -1.5, 4.0, 2.5]
 
 
 # Of first order, nearly. Each controller is told what it has to be told.
@@ -247,18 +260,6 @@ class TestDirectNN:
             DirectNNController().act(np.zeros((2, 6)))
 
 
-class TestAntiWindup:
-    def test_by_hand(self):
-        # Kp 1, Ki 0.5, limits +-4. e = 3: -3 - 1.5 = -4.5 is beyond the limit: the sum stays 0.
-        # e = 1: -1 - 0.5; e = -3: 3 + 0.5 (2) = 4 is not beyond it; e = -1: 1 + 0.5 (3).
-        controller = PIController(1.0, 0.5, anti_windup=True, error_index=0, u_min=-4, u_max=4)
-        commands = []
-        for e in (3.0, 1.0, -3.0, -1.0):
-            controller.act([e])
-            commands.append(controller.command)
-        assert commands == [-3.0, -1.5, 4.0, 2.5]
-
-
 class TestSimc:
     def test_by_hand(self):
         # Kc = tau / (|k| (tau_c + theta)) = 100 / (2 x 50) = 1; tau_I = min(100, 4 x 50) = 100.
@@ -312,19 +313,10 @@ class TestSmithPredictor:
 
 
 @pytest.mark.parametrize(
-    "observation",
-    [
-        "text",
-        [0.0, "x", 0.0, 0.0, 0.0, 0.0],
-        (np.zeros(6), {"output": 0.0}),
-        None,
-        ["1"] * 6,
-        np.zeros(6) * 1j,
-        [10**400] * 6,
-    ],
+    "observation", ["text", (np.zeros(6), {}), None, ["1"] * 6, np.zeros(6) * 1j, [10**400] * 6]
 )
 def test_what_is_no_observation_is_refused_by_name(observation):
-    # The third is what `reset` returns, handed on whole.
+    # The second is what `reset` returns, handed on whole.
     with pytest.raises(ValueError, match=r"^observation must"):
         PIController().act(observation)
 
@@ -334,26 +326,66 @@ def test_bad_limits_are_not_taken_for_a_damaged_file():
         PolicyNetwork.load(PRETRAINED / "ppo-10000.npz", u_min=3.0, u_max=1.0)
 
 
-def test_damaged_weights_are_refused_by_path(tmp_path):
-    path = tmp_path / "weights.npz"
-    np.savez(path, W=np.zeros(3))
-    with pytest.raises(ValueError, match="theta_1, W_1, theta_2 not found"):
-        Weights.load(path)
-    for content in (b"", b"text", b"PK\x03\x04 and no more"):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"weights\.npz holds no weights"):
-            Weights.load(path)
-    with pytest.raises(ValueError, match=r"^weights must be"):
-        DirectNNController().weights = 5
+class Harm:
+    def __reduce__(self):
+        return print, ("executed",)
+
+
+SAVED = {
+    "weights": DirectNNController().weights,
+    "told network": LawNetwork.load(),
+    "policy network": PolicyNetwork.load(PRETRAINED / "ppo-10000.npz"),
+}
+
+
+@pytest.mark.parametrize("kind", SAVED)
+class TestFiles:
+    def test_one_that_was_cut_off(self, tmp_path, kind):
+        path = tmp_path / "cut.npz"
+        SAVED[kind].save(path)
+        data = path.read_bytes()
+        for kept in (0, 1, 20, 200, len(data) // 2, int(0.99 * len(data)), -1):
+            path.write_bytes(data[:kept])
+            with pytest.raises(ValueError, match=rf"cut\.npz holds no {kind}"):
+                SAVED[kind].load(path)
+
+    def test_one_with_a_changed_byte_loads_or_says_so(self, tmp_path, kind):
+        path = tmp_path / "changed.npz"
+        SAVED[kind].save(path)
+        data, refused = path.read_bytes(), 0
+        places = np.linspace(0, len(data) - 1, 40, dtype=int)
+        for place in places:
+            damaged = bytearray(data)
+            damaged[place] ^= 0xFF
+            path.write_bytes(damaged)
+            try:
+                SAVED[kind].load(path)  # some bytes nobody reads
+            except ValueError:
+                refused += 1
+        assert refused > len(places) / 2
+
+    def test_nothing_in_one_of_something_else_is_executed(self, tmp_path, capsys, kind):
+        np.savez(tmp_path / "other.npz", A=np.zeros(3))
+        np.save(tmp_path / "array.npy", np.zeros(3))
+        (tmp_path / "pickle.npz").write_bytes(pickle.dumps(Harm()))
+        harm = np.array(Harm(), dtype=object)
+        np.savez(tmp_path / "object.npz", about=harm, W=harm, choosing_W0=harm)
+        for file in tmp_path.iterdir():
+            with pytest.raises(ValueError, match=f"holds no {kind}"):
+                SAVED[kind].load(file)
+        assert capsys.readouterr().out == ""
+
+    def test_a_missing_one(self, tmp_path, kind):
+        with pytest.raises(FileNotFoundError):
+            SAVED[kind].load(tmp_path / "missing.npz")
 
 
 BAD = {
     DirectNNController: [
-        ("n_inputs", 0), ("n_hidden", 1.5), ("eta", -0.1), ("eta_1", np.nan),
-        ("eta_theta", np.inf), ("eta_1_theta", -1), ("direction", 0), ("direction", 0.5),
-        ("input_scale", np.nan), ("weight_scale", -1.0), ("num_envs", 0),
-        ("weight_scale", 1e308), ("update_interval", 0), ("seed", -1), ("error_index", -1),
-        ("n_inputs", "6"), ("num_envs", True), ("eta", None),
+        ("n_inputs", 0), ("n_inputs", "6"), ("n_hidden", 1.5), ("eta", -0.1), ("eta", None),
+        ("eta_1", np.nan), ("eta_theta", np.inf), ("direction", 0), ("direction", 0.5),
+        ("weight_scale", 1e308), ("num_envs", 0), ("num_envs", True), ("update_interval", 0),
+        ("seed", -1), ("error_index", -1), ("learning", "no"),
     ],
     partial(PIController.simc, **PLANT): [
         ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
@@ -362,19 +394,14 @@ BAD = {
     ],
     partial(SmithPredictor, **TOLD): [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)],
     partial(NeuralSmithPredictor, **PLANT): [
-        ("gain", 0.0), ("time_constant", 0.0), ("delay", -8.0), ("delay", 1e12),
-        ("dead_zone", -1.0), ("uncertainty", np.nan), ("sampling_interval", 0.0),
+        ("gain", 0.0), ("time_constant", 0.0), ("delay", 1e12), ("uncertainty", np.nan),
         ("coefficients", ([1.0, -1.0], [0.1])), ("coefficients", ([1.0, 0.0], [0.1, -0.1])),
     ],
     partial(SelfTuningController, **PLANT): [
-        ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
-        ("dead_zone", -1.0), ("dead_zones", ()), ("dead_zones", [-1.0]), ("dead_zones", 5.0),
         ("shortest_delay", -1), ("longest_delay", 5), ("longest_delay", 10.0),
-        ("closed_loop_time_constant", 0.0), ("forgetting", 0.0), ("forgetting", 1.1),
-        ("sampling_interval", 0.0), ("setpoint_index", -1), ("error_index", 1.5),
-        ("u_min", 10.0), ("longest_delay", 10**9), ("dead_zones", b"15"),
-        ("dead_zones", np.array(5.0)), ("gain", 10**400),
+        ("longest_delay", 10**9), ("forgetting", 0.0), ("forgetting", 1.1), ("u_min", 10.0),
     ],
+    partial(NeuralSelfTuningController, **PLANT): [("haste", -1)],
 }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from gymnasium.spaces import Box
 
 import mptc_gym
 from agents import DirectNNController, PIController, PolicyNetwork
-from agents.policy_network import PRETRAINED
+from agents.archive import PRETRAINED
 from benchmarks.limits import least_possible
 from benchmarks.limits.command import PACKAGED as CASES
 from mptc_gym import IDS, PRESETS, MiddlePointEnv, evaluate

@@ -207,7 +207,7 @@ class TestMembers:
         observation = np.random.default_rng(0).normal(size=network.n_obs)
         for given, edge in ((7.0, 0.7), (5.0, 0.5), ([3.0, 7.0], 0.5)):
             controller = trained(network, Parameters(dead_zone=given), 1, 0)
-            assert controller.dead_zone == 10.0 * edge  # whose edge no rounding falls short of
+            assert controller.increments.dead_zone == 10.0 * edge
             # At its first move the policy is just beyond the edge of the dead zone.
             position = (abs(controller.act(observation)[0]) - edge) / (1.0 - edge)
             assert 0.0 < position < 0.2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -27,18 +26,10 @@ def trained(network: PolicyNetwork, plant: Parameters, runs: int, seed: int) -> 
     ValueError
         If the dead zone that it is to undo leaves no flow on one side.
     """
-    controller = copy.deepcopy(network)
-    controller.u_min, controller.u_max = limits(plant).values()
-    zone = plant.dead_zone
-    if controller.increments and not isinstance(zone, Sequence):
-        if zone >= min(-controller.u_min, controller.u_max):
-            raise ValueError(
-                f"dead_zone must be inside u_min = {plant.u_min} and u_max = {plant.u_max} "
-                f"for a policy that undoes it, got {zone}"
-            )
-        controller.increments = replace(controller.increments, dead_zone=zone)
-        controller.dead_zone = zone
-    return controller
+    increments = network.increments
+    if increments and not isinstance(plant.dead_zone, Sequence):
+        increments = replace(increments, dead_zone=plant.dead_zone)
+    return replace(network, increments=increments, **limits(plant))
 
 
 def told_network(make: Callable[..., Agent]) -> Members:

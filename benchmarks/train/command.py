@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
+from agents.archive import PRETRAINED
 from agents.neural_law import LawNetwork
-from agents.policy_network import PRETRAINED
 from benchmarks.lib import command_line
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import commit, replacing

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from agents import PolicyNetwork
-from agents.policy_network import PRETRAINED
+from agents.archive import PRETRAINED
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.train import kept

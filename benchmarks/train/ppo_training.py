@@ -155,7 +155,7 @@ def exported(
         input_scale=np.ones(parameters.observation_size),
         activation="tanh",
         increments=Increments(arguments.max_move, arguments.undo_dead_zone),
-        provenance=provenance,
+        provenance=provenance or {},
     )
 
 
