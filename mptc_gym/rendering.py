@@ -5,7 +5,7 @@ Pictures in pixels are made by `mptc_gym.drawing`, which is loaded with the firs
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import ModuleType
 from typing import cast
 
@@ -18,7 +18,7 @@ from mptc_gym.checks import reject
 from mptc_gym.record import Axis, Record
 
 Frame = NDArray[np.uint8]
-_TEXT_COLUMNS = 72
+_COLUMNS = 72  # of a picture in text
 
 
 def check_mode(mode: str | None, modes: Sequence[str]) -> None:
@@ -77,63 +77,42 @@ def _drawing() -> ModuleType:
 
 def text(record: Record) -> str:
     """Return a picture in text: set point -, temperature *; command +, applied #."""
-    places = [round(c * record.span / (_TEXT_COLUMNS - 1)) for c in range(_TEXT_COLUMNS)]
-    places = [place for place in places if record.first + place <= record.k]
-    in_transit = [record.first + place > record.k - record.in_transit for place in places]
-
-    temperatures = _Grid(record.temperatures, rows=11)
-    flows = _Grid(record.flows, rows=9)
-    flows.fill(-record.plant.dead_zone, record.plant.dead_zone, ":")
-    samples = list(record.samples)
-    for column, place in enumerate(places):
-        setpoint, output, command, applied = samples[place]
-        temperatures.put(column, setpoint, "-")
-        temperatures.put(column, output, "*")
-        flows.put(column, command, "+")
-        flows.put(column, applied, "#")
-
+    places = np.round(np.arange(_COLUMNS) * record.span / (_COLUMNS - 1)).astype(int)
+    places = places[record.first + places <= record.k]
+    setpoints, outputs, commands, applied = np.array(record.samples)[places].T
+    in_transit = record.first + places > record.k - record.in_transit
+    marks = "".join(np.where(in_transit, "^", " ")).rstrip()
     numbers = [f"{name} {value}" for name, value in record.readings.items()]
-    marks = "".join("^" if still else " " for still in in_transit).rstrip()
-    minutes = record.minutes
-    left, right = f"{minutes.low:.4g} min", f"{minutes.high:.4g} min"
+    left, right = f"{record.minutes.low:.4g} min", f"{record.minutes.high:.4g} min"
+    zone = record.plant.dead_zone
     return "\n".join(
         [
             "   ".join(numbers[:4]),
             "   ".join(numbers[4:]),
             "",
             "°C: set point -, temperature *",
-            *temperatures.lines(),
+            *_panel(record.temperatures, 11, {"-": setpoints, "*": outputs}),
             "t/h: command +, applied #, dead zone :, in transit ^",
-            *flows.lines(),
+            *_panel(record.flows, 9, {"+": commands, "#": applied}, zone),
             f"{'':9}{marks}",
-            f"{'':9}{left}{right:>{_TEXT_COLUMNS - len(left)}}",
+            f"{'':9}{left}{right:>{_COLUMNS - len(left)}}",
         ]
     )
 
 
-class _Grid:
-    """Characters in rows, the top one first."""
+def _panel(
+    axis: Axis, rows: int, lines: dict[str, NDArray[np.float64]], dead_zone: float = 0.0
+) -> Iterator[str]:
+    """Yield rows of characters, the top one first: lines, over the shade of a dead zone."""
 
-    def __init__(self, axis: Axis, rows: int) -> None:
-        self._axis = axis
-        self._rows = [[" "] * _TEXT_COLUMNS for _ in range(rows)]
+    def row_of(value: float) -> int:
+        return round((1.0 - axis.share(value)) * (rows - 1))
 
-    def put(self, column: int, value: float, character: str) -> None:
-        self._rows[self._row(value)][column] = character
-
-    def fill(self, low: float, high: float, character: str) -> None:
-        """Fill the rows whose middle lies between two values."""
-        for row, characters in enumerate(self._rows):
-            share = 1.0 - row / (len(self._rows) - 1)
-            if low < self._axis.low + share * (self._axis.high - self._axis.low) < high:
-                characters[:] = character * _TEXT_COLUMNS
-
-    def lines(self) -> list[str]:
-        labels = {self._row(tick): f"{tick:.6g}" for tick in self._axis.ticks()}
-        return [
-            f"{labels.get(row, ''):>7} |{''.join(characters)}".rstrip()
-            for row, characters in enumerate(self._rows)
-        ]
-
-    def _row(self, value: float) -> int:
-        return round((1.0 - self._axis.share(value)) * (len(self._rows) - 1))
+    middles = axis.low + (1.0 - np.arange(rows) / (rows - 1)) * (axis.high - axis.low)
+    grid = np.full((rows, _COLUMNS), " ")
+    grid[np.abs(middles) < dead_zone] = ":"
+    for character, values in lines.items():
+        grid[[row_of(value) for value in values], range(len(values))] = character
+    labels = {row_of(tick): f"{tick:.6g}" for tick in axis.ticks()}
+    for row, characters in enumerate(grid):
+        yield f"{labels.get(row, ''):>7} |{''.join(characters)}".rstrip()

@@ -13,12 +13,12 @@ It needs `pip install "mptc_gym[sb3]"`.
 from __future__ import annotations
 
 import copy
-import itertools
 import json
 import os
 import time
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,11 +29,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env.base_vec_env import (
-    VecEnv,
-    VecEnvIndices,
-    VecEnvStepReturn,
-)
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from mptc_gym.checks import MOST_PLANTS, count, plain, reject
 from mptc_gym.evaluation import (
@@ -41,16 +38,13 @@ from mptc_gym.evaluation import (
     SEED,
     WINDOWS,
     Evaluation,
-    action_wrappers,
     evaluate,
     make_one,
     native_batch,
-    trained_on,
 )
+from mptc_gym.policies import action_wrappers, trained_on
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
-
-Wrapper = Mapping[str, Any] | Callable[..., Any]
 
 
 def make_vec_env(
@@ -58,12 +52,13 @@ def make_vec_env(
     n_envs: int = 1,
     *,
     seed: int | None = None,
-    wrapper: Wrapper | None = None,
+    wrapper: Mapping[str, Any] | Callable[..., Any] | None = None,
     **arguments: Any,
 ) -> GymnasiumVecEnv:
     """Make plants that are stepped at once, for the algorithms of Stable-Baselines3.
 
     A model that is trained on them knows how, and `model.save` saves it: `spec_of` reads it.
+    The infos of an episode's end have its return, as `Monitor` has it.
 
     Parameters
     ----------
@@ -78,11 +73,6 @@ def make_vec_env(
         Asks for `IncrementalAction`: its arguments, or the class for its defaults.
     **arguments
         More arguments for the id, as of `gymnasium.make`.
-
-    Returns
-    -------
-    GymnasiumVecEnv
-        The plants; the infos of an episode's end have its return, as `Monitor` has it.
 
     Raises
     ------
@@ -104,9 +94,9 @@ def make_vec_env(
     batch = native_batch(single)
     if batch is None:
         raise ValueError(f"wrapper must be IncrementalAction, got {single}")
-    spec = single.spec
     single.close()
-    plants = GymnasiumVecEnv(batch(n_envs, autoreset_mode=AutoresetMode.SAME_STEP), spec=spec)
+    many = batch(n_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+    plants = GymnasiumVecEnv(many, spec=single.spec)
     plants.seed(seed)
     return plants
 
@@ -130,9 +120,8 @@ class GymnasiumVecEnv(VecEnv):
     ----------
     infos : dict
         The last infos as Gymnasium gives them, in arrays; those that all batches have. The list
-        that `step` returns holds only what Stable-Baselines3 itself reads, as dicts for each
-        environment and step would take longer than the step: at the end of an episode its last
-        observation, whether it was truncated, and its return and length.
+        that `step` returns holds only what Stable-Baselines3 itself reads at the end of an
+        episode, as dicts for each environment and step would take longer than the step.
 
     Raises
     ------
@@ -141,24 +130,20 @@ class GymnasiumVecEnv(VecEnv):
     """
 
     def __init__(self, *batches: VectorEnv, spec: EnvSpec | None = None) -> None:
+        spaces = batches[0].single_observation_space, batches[0].single_action_space
         for batch in batches:
             mode = batch.metadata.get("autoreset_mode")
             if mode is not AutoresetMode.SAME_STEP:
                 raise ValueError(f"batches must have autoreset_mode 'SameStep', got {mode}")
-        observation_space = batches[0].single_observation_space
-        action_space = batches[0].single_action_space
-        for batch in batches:
-            spaces = batch.single_observation_space, batch.single_action_space
-            if spaces != (observation_space, action_space):
+            if (batch.single_observation_space, batch.single_action_space) != spaces:
                 raise ValueError(f"batches must have the same spaces, got {batches}")
-        self.batches = batches
+        self.batches, self.spec = batches, spec
         self.infos: dict[str, Any] = {}
         starts = np.cumsum([0, *(batch.num_envs for batch in batches)]).tolist()
         self._parts = list(zip(batches, map(slice, starts, starts[1:]), strict=True))
-        self.spec = spec
-        super().__init__(starts[-1], observation_space, action_space)
+        super().__init__(starts[-1], *spaces)
         if spec is not None:
-            observation_space.trained_on = spec.to_json()  # type: ignore[attr-defined]
+            self.observation_space.trained_on = spec.to_json()  # type: ignore[attr-defined]
         self._began = time.time()
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, np.int64)
@@ -189,18 +174,16 @@ class GymnasiumVecEnv(VecEnv):
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in ended]
         if ended.any():
-            last = [
-                each
-                for *_, flags, found in steps
-                for each in found.get("final_obs", itertools.repeat(None, len(flags)))
-            ]
+            last = np.concatenate(
+                [found.get("final_obs", [None] * len(flags)) for *_, flags, found in steps]
+            )
             seconds = round(time.time() - self._began, 6)
             for i in np.flatnonzero(ended).tolist():
-                length = int(self._lengths[i])
+                episode = {"r": float(self._returns[i]), "l": int(self._lengths[i])}
                 infos[i] = {
                     "terminal_observation": last[i],
                     "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                    "episode": {"r": float(self._returns[i]), "l": length, "t": seconds},
+                    "episode": {**episode, "t": seconds},
                 }
             self._returns[ended], self._lengths[ended] = 0.0, 0
         return observations, rewards.astype(np.float32), ended, infos
@@ -217,8 +200,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def get_images(self) -> list[NDArray[np.uint8]]:
         """Return a picture of each environment, if the batch has the mode "rgb_array"."""
-        pictures: Any = [batch.render() or () for batch in self.batches]
-        return list(itertools.chain(*pictures))
+        return [image for batch in self.batches for image in cast("Any", batch.render() or ())]
 
     def close(self) -> None:
         """Close the batches."""
@@ -227,7 +209,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of each environment's batch."""
-        if attr_name == "render_mode" and hasattr(self, "spec"):
+        if attr_name == "render_mode":
             # Asked by a wrapper that is put around these: a model may see something else then,
             # so that it does not know how it was trained from its space, but by `save` alone.
             vars(self.observation_space).pop("trained_on", None)
@@ -317,21 +299,17 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
     ValueError
         If it is not known how the policy was trained.
     """
-    if isinstance(policy, str | Path):
-        name, trained = str(policy), _saved_spec(policy)
-    else:
-        name, trained = type(policy).__name__, trained_on(policy)
+    in_file = isinstance(policy, str | Path)
+    trained = _saved_spec(policy) if in_file else trained_on(policy)
     if trained is None:
         allowed = (
             "one that knows how it was trained: train it on mptc_gym.sb3.make_vec_env, or save "
             "it by mptc_gym.sb3.save"
         )
-        reject("policy", name, allowed)
+        reject("policy", str(policy) if in_file else type(policy).__name__, allowed)
     windows: dict[str, Any] = {n: trained.kwargs[n] for n in WINDOWS if n in trained.kwargs}
-    single = make_one(env, {**windows, **arguments})
-    spec = single.spec
-    single.close()
-    assert spec is not None
+    with closing(make_one(env, {**windows, **arguments})) as single:
+        spec = cast("EnvSpec", single.spec)
     spec.additional_wrappers = tuple(action_wrappers(trained))
     return spec
 

@@ -196,7 +196,7 @@ class TestRefusals:
             (lambda seen: np.full((len(seen), 1), np.nan), "policy must return finite actions"),
             (lambda seen: [["open"]] * len(seen), "actions of policy must be an array of numb"),
             (lambda seen: [[0.0], 0.0], "actions of policy must be an array of numbers, got "),
-            (3, "policy must be a function, or an object with predict or with act, got 3"),
+            (3, "policy must be a function, or an object .* with act, not a class, got 3"),
             (PIController, "policy must be a function, or an object .* with act, not a class"),
         ],
     )

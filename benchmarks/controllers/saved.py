@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from benchmarks.controllers.records import Cost, Factory
 from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
-from mptc_gym.evaluation import WINDOWS, acting
+from mptc_gym.evaluation import WINDOWS
 from mptc_gym.parameters import ARGUMENTS
+from mptc_gym.policies import acting
 from mptc_gym.wrappers import NUMBERS, Actuator
 
 LIBRARIES = "stable_baselines3", "sb3_contrib"

@@ -33,9 +33,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
 
         v(k) = v(k-1) + w(k) max_move (u_max - u_min) / 2,   limited to [u_min, u_max]
 
-    and the command is u(k) = v(k). So the flow changes by no more than `max_move` times half
-    the actuator's range a sample, whatever a policy does. That is kind to the valve, and it
-    lets a policy explore, as what it changes lasts.
+    and the command is u(k) = v(k). That is kind to the valve, and it lets a policy explore, as
+    what it changes lasts.
 
     With `undo_dead_zone`, the command leaves out the dead zone, of half width z::
 
@@ -50,9 +49,9 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
 
     The action space is `Box(-1, 1, (1,), float32)`; an action beyond it counts as one on its
     edge. Observation, reward (`move_weight`, too) and info are those of the environment, which
-    gets absolute actions. A policy has to know v. `action_window` shows past absolute actions,
-    the newest of which tells v: with the nominal delay, `action_window=20` makes the noise-free
-    problem Markov while the set point holds.
+    gets absolute actions. A policy has to know v, which the newest action of `action_window`
+    tells: with the nominal delay, `action_window=20` makes the noise-free problem Markov while
+    the set point holds.
 
     Parameters
     ----------
@@ -69,8 +68,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     Raises
     ------
     ValueError
-        From the constructor if an argument is out of range, it names it. From `step` if the
-        action is not one finite number; nothing has changed then.
+        From the constructor, if an argument is out of range. From `step`, if the action is not
+        one finite number; nothing has changed then.
     ResetNeeded
         From `step`, if the environment has never been reset.
 
@@ -90,16 +89,14 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         undo_dead_zone: bool | float = False,
     ) -> None:
         if isinstance(env, VectorEnv):
-            raise ValueError(
-                "env must be one environment; the wrapper of many is "
-                f"mptc_gym.wrappers.vector.IncrementalAction, got {env}"
-            )
+            allowed = "one environment; mptc_gym.wrappers.vector.IncrementalAction takes many"
+            reject("env", env, allowed)
         RecordConstructorArgs.__init__(self, max_move=max_move, undo_dead_zone=undo_dead_zone)
         gymnasium.ActionWrapper.__init__(self, env)
         check_arguments(max_move, undo_dead_zone)
         parameters = getattr(env.unwrapped, "parameters", None)
         if not isinstance(parameters, Parameters):
-            raise ValueError(f"env must be a MiddlePointEnv, in wrappers or not, got {env}")
+            reject("env", env, "a MiddlePointEnv, in wrappers or not")
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self._arguments = max_move, undo_dead_zone
         self._numbers = {name: parameters.range_of(name)[0] for name in NUMBERS}

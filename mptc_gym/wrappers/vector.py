@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mptc_gym.checks import many_actions
+from mptc_gym.checks import many_actions, reject
 from mptc_gym.parameters import Parameters
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import NUMBERS, Actuator, check_arguments
@@ -23,8 +24,8 @@ __all__ = ["IncrementalAction"]
 class IncrementalAction(VectorActionWrapper):
     """The action changes the flow: `mptc_gym.wrappers.IncrementalAction` for many plants.
 
-    Every plant has a wanted flow of its own, which is 0 when an episode of it begins. All that
-    `reset` and `step` return equals what the same number of wrapped environments return.
+    Every plant has a wanted flow of its own. All that `reset` and `step` return equals what the
+    same number of wrapped environments return.
 
     Parameters
     ----------
@@ -36,12 +37,9 @@ class IncrementalAction(VectorActionWrapper):
 
     Raises
     ------
-    ValueError
-        From the constructor if an argument is out of range, it names it. From `step` if the
-        actions have another shape than (num_envs, 1), or one is not finite; nothing has
-        changed then.
-    ResetNeeded
-        From `step`, if the environments have never been reset.
+    ValueError, ResetNeeded
+        As of one environment; from `step` also if the actions have another shape than
+        (num_envs, 1).
     """
 
     def __init__(
@@ -52,10 +50,8 @@ class IncrementalAction(VectorActionWrapper):
         undo_dead_zone: bool | float = False,
     ) -> None:
         if not isinstance(env, VectorEnv):
-            raise ValueError(
-                "env must be a vector environment; the wrapper of one environment is "
-                f"mptc_gym.wrappers.IncrementalAction, got {env}"
-            )
+            allowed = "a vector environment; mptc_gym.wrappers.IncrementalAction takes one"
+            reject("env", env, allowed)
         super().__init__(env)
         check_arguments(max_move, undo_dead_zone)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
@@ -110,12 +106,9 @@ def _parameters(env: VectorEnv[Any, Any, Any]) -> list[Parameters]:
     inner = env.unwrapped
     if isinstance(inner, MiddlePointVectorEnv):
         return [inner.parameters] * env.num_envs
-    try:
+    plants: list[Any] = []
+    with suppress(AttributeError):  # of environments that are no plants
         plants = list(inner.get_attr("parameters"))  # type: ignore[attr-defined]
-    except AttributeError:
-        plants = []
     if not plants or not all(isinstance(plant, Parameters) for plant in plants):
-        raise ValueError(
-            f"env must be a vector environment of MiddlePointEnv in NumPy, got {env}"
-        )
+        reject("env", env, "a vector environment of MiddlePointEnv in NumPy")
     return plants

@@ -1,0 +1,132 @@
+"""Read what a policy says of itself: how it acts, and what it was trained on."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec, WrapperSpec
+from numpy.typing import NDArray
+
+from mptc_gym.checks import reject
+from mptc_gym.parameters import Parameters
+
+Act = Callable[[NDArray[np.float32]], Any]  # observations, shape (n, size), to actions
+
+
+def acting(policy: Any) -> Act:
+    """Bring a policy to the start of a batch of episodes, and return how it acts in it."""
+    predicts, acts = (callable(getattr(policy, name, None)) for name in ("predict", "act"))
+    if isinstance(policy, type) or not (predicts or acts or callable(policy)):
+        reject(
+            "policy", policy, "a function, or an object with predict or with act, not a class"
+        )
+    if predicts:
+        return _predicting(policy)
+    if not acts:
+        return cast("Act", policy)
+    getattr(policy, "reset", lambda: None)()
+    return cast("Act", policy.act)
+
+
+def _predicting(policy: Any) -> Act:
+    """Return how a policy in the form of Stable-Baselines3 acts, from the start of episodes."""
+    known = inspect.signature(policy.predict).parameters
+    normalise = normaliser_of(policy)
+    state, begins = None, True
+
+    def act(observations: NDArray[np.float32]) -> Any:
+        nonlocal state, begins
+        starts = np.full(len(observations), begins)
+        begins = False
+        offered = {"state": state, "episode_start": starts, "deterministic": True}
+        told = {name: value for name, value in offered.items() if name in known}
+        actions = policy.predict(normalise(observations), **told)
+        if isinstance(actions, tuple):
+            actions, state = actions
+        return actions
+
+    return act
+
+
+def normaliser_of(policy: Any) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    """Return what normalises the observations of a policy as in its training.
+
+    It is a ValueError if the statistics of a `VecNormalize` are lost.
+    """
+    live = getattr(policy, "get_vec_normalize_env", lambda: None)()
+    if live is not None:
+        return cast("Callable[[NDArray[Any]], NDArray[Any]]", live.normalize_obs)
+    space = getattr(policy, "observation_space", None)
+    kept = getattr(space, "normalised", None)
+    if kept is not None:
+        mean, most = np.array(kept["mean"]), kept["clip_obs"]
+        deviation = np.sqrt(np.array(kept["var"]) + kept["epsilon"])
+        return lambda seen: np.clip((seen - mean) / deviation, -most, most).astype(np.float32)
+    # A model that learns on policy has these where, and only where, it is normalised.
+    normalised = getattr(policy, "_last_original_obs", None) is not None
+    if normalised and hasattr(policy, "rollout_buffer") and not hasattr(space, "trained_on"):
+        raise ValueError(
+            "policy must come with the statistics of the VecNormalize that it was trained in: "
+            "save it by mptc_gym.sb3.save"
+        )
+    return lambda seen: seen
+
+
+def trained_on(policy: Any) -> EnvSpec | None:
+    """Return the spec of the environment that a policy was trained on, if that is known.
+
+    `mptc_gym.sb3` notes it in the observation space; models of Stable-Baselines3 that were not
+    loaded from a file still have their environments.
+    """
+    text = getattr(getattr(policy, "observation_space", None), "trained_on", None)
+    if text is not None:
+        return EnvSpec.from_json(text)
+    with suppress(AttributeError):  # no model, or no environments, or they have no spec
+        return cast("EnvSpec | None", policy.get_env().get_attr("spec")[0])
+    return None
+
+
+def action_wrappers(spec: EnvSpec) -> list[WrapperSpec]:
+    """Return the wrappers of a spec but those that only look on."""
+    watching = "Monitor", "RecordEpisodeStatistics", "RecordVideo"
+    return [each for each in spec.additional_wrappers if each.name not in watching]
+
+
+def check_fit(policy: Any, env: gymnasium.Env[Any, Any], parameters: Parameters) -> None:
+    """Refuse an environment that does not show what a policy reads, or reads what it means."""
+    normaliser_of(policy)
+    shape, own = env.observation_space.shape, getattr(policy, "observation_space", None)
+    if own is not None and own.shape != shape:
+        raise ValueError(
+            f"env must have observations of shape {own.shape}, as policy reads them, got "
+            f"{shape}: give it the windows of the training, such as action_window=20, or take "
+            "mptc_gym.sb3.spec_of(policy)"
+        )
+    place, wanted = getattr(policy, "error_index", None), getattr(policy, "observation", {})
+    if place is not None:
+        if place != parameters.heads[0] or not parameters.error_window:
+            raise ValueError(
+                f"env must show its newest error as element {place} of the observation, where "
+                f"policy reads it, got windows {parameters.windows}"
+            )
+    elif isinstance(wanted, Mapping) and any(
+        getattr(parameters, name) != value for name, value in wanted.items()
+    ):
+        asked = ", ".join(f"{name}={value}" for name, value in wanted.items())
+        raise ValueError(
+            f"env must have the windows that policy wants, {asked}, got {parameters.windows}"
+        )
+    spec = trained_on(policy)
+    if spec is not None and env.spec is not None:
+        there = action_wrappers(env.spec)
+        for each in action_wrappers(spec):
+            if each not in there:
+                raise ValueError(
+                    f"env must have the wrapper that policy was trained with, {each.name}"
+                    f"({each.kwargs}): give it as an EnvSpec, see mptc_gym.sb3.spec_of"
+                )
