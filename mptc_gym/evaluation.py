@@ -51,50 +51,37 @@ _INCREMENTAL: Final = f"{IncrementalAction.__module__}:{IncrementalAction.__name
 class Evaluation:
     """What `evaluate` found. `str` gives a line to read.
 
-    Attributes
-    ----------
-    env
-        The environment's id.
-    mean_error
-        Mean of |e(k)| over k = 1 to N and over all episodes, degC.
-    travel
-        Mean distance that the valve moves in an episode, t/h.
-    errors, travels
-        The same of each episode, shape (episodes,).
-    seeds
-        Of the episodes.
-    least_possible
-        The least possible mean error of these episodes, degC; `python -m benchmarks.limits`
-        explains it. It and what follows is None where the package has no bound, as for
-        arguments that are no preset's.
-    multiple
-        `mean_error / least_possible`.
-    score
-        0 for a valve that is left alone, 1 for the least possible error.
-    interval
-        The ends of the score's 95 % interval, from drawing episodes.
-    least
-        The least possible error of each episode. Where nothing but noise and load is drawn it
-        is the same for all: an expectation over these.
-    scores
-        The score of each episode against its own bound.
-    missing
-        Where there is no bound: what to do about it. Otherwise "".
+    What compares with the least possible error is None where the package has no bound, as for
+    arguments that are no preset's. Arrays have an element for each episode.
     """
 
     env: str
+    """The environment's id."""
     mean_error: float
+    """Mean of |e(k)| over k = 1 to N and over all episodes, degC."""
     travel: float
+    """Mean distance that the valve moves in an episode, t/h."""
     errors: Values
+    """Mean of |e(k)| over k = 1 to N, degC."""
     travels: Values
+    """How far the valve moves, t/h."""
     seeds: range
+    """Of the episodes."""
     least_possible: float | None = None
+    """The least possible mean error of these episodes, degC: see `benchmarks/limits`."""
     multiple: float | None = None
+    """`mean_error / least_possible`."""
     score: float | None = None
+    """0 for a valve that is left alone, 1 for the least possible error."""
     interval: tuple[float, float] | None = None
+    """The ends of the score's 95 % interval, from drawing episodes."""
     least: Values | None = None
+    """The least possible errors, degC. Where nothing but noise and load is drawn they are all
+    the same: an expectation over these."""
     scores: Values | None = None
+    """Of each episode against its own bound."""
     missing: str = ""
+    """Where there is no bound: what to do about it."""
 
     def __str__(self) -> str:
         parts = [f"{self.env}: mean error {self.mean_error:.3f} degC"]

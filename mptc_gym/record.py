@@ -29,10 +29,10 @@ class Axis:
     step: float  # from tick to tick
 
     def ticks(self) -> Iterator[float]:
-        """Yield the round numbers within the range."""
-        first, last = math.ceil(self.low / self.step - 1e-9), self.high / self.step + 1e-9
-        for i in range(first, math.floor(last) + 1):
-            yield i * self.step
+        """Return the round numbers within the range."""
+        first = math.ceil(self.low / self.step - 1e-9)
+        last = math.floor(self.high / self.step + 1e-9)
+        return (i * self.step for i in range(first, last + 1))
 
     def share(self, value: float) -> float:
         """Return how far up the range a value lies, from 0 to 1; its ends stand for more."""
@@ -51,21 +51,13 @@ class Record:
         self.k = 0
         self.samples: deque[Sample] = deque([(setpoint, 0.0, 0.0, 0.0)], maxlen=self.span + 1)
         # Of the whole episode, so that the axis need not move again and again.
-        self._lowest = self._highest = 0.0
-        self._stretch(setpoint)
+        self._lowest, self._highest = min(0.0, setpoint), max(0.0, setpoint)
 
     def add(self, setpoint: float, output: float, command: float, applied: float) -> None:
         """Add a step: y_d(k+1) and y(k+1), degC, and u(k) and u_a(k), t/h."""
         self.k += 1
         self.samples.append((setpoint, output, command, applied))
-        if not (
-            self._lowest <= output <= self._highest
-            and self._lowest <= setpoint <= self._highest
-        ):
-            self._stretch(setpoint, output)
-
-    def _stretch(self, *temperatures: float) -> None:
-        for temperature in temperatures:
+        for temperature in (setpoint, output):
             bounded = max(-FARTHEST, min(FARTHEST, temperature))
             self._lowest = min(self._lowest, bounded)
             self._highest = max(self._highest, bounded)

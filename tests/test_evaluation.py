@@ -141,13 +141,12 @@ class TestEvaluate:
         assert bare.mean_error != pytest.approx(by_spec.mean_error, abs=0.1)
 
     def test_any_other_wrapper_is_applied(self):
-        class Backwards(gymnasium.ActionWrapper):
-            def action(self, action):
-                return -action
+        def backwards():
+            env = gymnasium.make(HARD)
+            return gymnasium.wrappers.TransformAction(env, np.negative, env.action_space)
 
-        env = lambda: Backwards(gymnasium.make(HARD))  # noqa: E731
-        turned = evaluate(proportional, env, episodes=3)
-        expected = evaluate(lambda seen: -proportional(seen), HARD, episodes=3)
+        turned = evaluate(proportional, backwards, episodes=2)
+        expected = evaluate(lambda seen: -proportional(seen), HARD, episodes=2)
         np.testing.assert_allclose(turned.errors, expected.errors, atol=1e-12)
 
     def test_other_episodes_and_lengths(self):
@@ -177,14 +176,15 @@ class TestEvaluate:
 
     def test_it_needs_numpy_and_gymnasium_alone(self):
         code = (
-            "import sys, mptc_gym, numpy as np\n"
-            "print(mptc_gym.evaluate(lambda seen: np.zeros((len(seen), 1)), episodes=2))\n"
-            "heavy = 'torch pandas matplotlib pygame stable_baselines3 benchmarks agents'\n"
-            "print({'scipy', *heavy.split()} & set(sys.modules))"
+            "import sys, mptc_gym\n"
+            "mptc_gym.evaluate(lambda seen: 0.0 * seen[:, :1], episodes=2)\n"
+            "print({'torch', 'scipy', 'pygame', 'stable_baselines3'} & set(sys.modules))"
         )
-        first, second = python("-c", code, check=True).stdout.splitlines()
-        assert first.startswith("MiddlePoint-v0: mean error 5.000 degC, 5.4")
-        assert second == "set()"
+        assert python("-c", code, check=True).stdout == "set()\n"
+
+
+def normalised():
+    return gymnasium.wrappers.NormalizeObservation(gymnasium.make("MiddlePoint-v0"))
 
 
 class TestRefusals:
@@ -205,55 +205,41 @@ class TestRefusals:
             evaluate(policy, episodes=4)
 
     @pytest.mark.parametrize(
-        ("env", "message"),
+        ("arguments", "message"),
         [
-            ("MiddlePointEasy-v0", "env must be the id of an environment.*MiddlePointHard-v0"),
-            ("no_such_module:Plant-v0", "env must be the id of an environment"),
-            ("CartPole-v1", "env must be a MiddlePointEnv, in wrappers or not, got .*CartPole"),
-            (7, "env must be an id, an EnvSpec or a function that makes an environment, got 7"),
-            (lambda: None, "env must be a MiddlePointEnv, in wrappers or not, got None"),
+            ({"env": "MiddlePointEasy-v0"}, "env must be the id of an env.*MiddlePointHard-v0"),
+            ({"env": "no_such_module:Plant-v0"}, "env must be the id of an environment"),
+            ({"env": "CartPole-v1"}, "env must be a MiddlePointEnv, in wrappers or not, got <"),
+            ({"env": 7}, "env must be an id, an EnvSpec or a function that makes an env.* 7"),
+            ({"env": lambda: None}, "env must be a MiddlePointEnv, in wrappers or not, got No"),
+            ({"env": normalised}, "env must not be in NormalizeObservation, whose statistics"),
             (
-                lambda: gymnasium.wrappers.NormalizeObservation(
-                    gymnasium.make("MiddlePoint-v0")
-                ),
-                "env must not be in NormalizeObservation, whose statistics would begin anew",
+                {"env": MiddlePointEnv, "delay": 3},
+                "delay must be given in the function that is",
+            ),
+            ({"delay": -1}, "delay must be"),
+            *(
+                ({"episodes": n}, "episodes must be an integer from 2")
+                for n in (1, 2.5, "many")
             ),
         ],
     )
-    def test_environments(self, env, message):
+    def test_arguments(self, arguments, message):
         with pytest.raises(ValueError, match=message):
-            evaluate(idle, env, episodes=2)
-
-    @pytest.mark.parametrize("episodes", [1, 0, -3, 2.5, "many"])
-    def test_too_few_episodes(self, episodes):
-        with pytest.raises(ValueError, match="episodes must be an integer from 2"):
-            evaluate(idle, episodes=episodes)
-
-    def test_arguments(self):
-        with pytest.raises(ValueError, match="delay must be"):
-            evaluate(idle, delay=-1)
-        with pytest.raises(TypeError, match="did you mean 'delay'"):
-            evaluate(idle, delai=3)
-        with pytest.raises(ValueError, match="delay must be given in the function that is env"):
-            evaluate(idle, MiddlePointEnv, delay=3)
+            evaluate(idle, **arguments)
 
     def test_observations_that_do_not_fit(self):
         class Trained:
             observation_space = Box(-1.0, 1.0, (26,))
             predict = staticmethod(idle)
 
-        with pytest.raises(
-            ValueError, match=r"shape \(26,\), as policy reads them, got \(6,\)"
-        ):
+        with pytest.raises(ValueError, match=r"shape \(26,\), as policy reads them, got \(6"):
             evaluate(Trained())
         with pytest.warns(UserWarning, match="does not say how it was trained"):
             evaluate(Trained(), action_window=20, episodes=2)
         evaluate(Trained(), wrapped().spec, episodes=2)  # who gives wrappers has thought of it
         network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
-        with pytest.raises(
-            ValueError,
-            match=r"env must have the windows that policy wants, .*n_window=\d+, got",
-        ):
+        with pytest.raises(ValueError, match=r"the windows that policy wants, .*=\d+, got"):
             evaluate(network)
         with pytest.raises(ValueError, match="newest error as element 3"):
             evaluate(PIController(), setpoint_window=7)

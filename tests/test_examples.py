@@ -105,7 +105,7 @@ class TestPPOInPyTorch:
     )
 
     def test_it_runs(self, capsys):
-        ppo_torch.main(["--steps", "1024", "--num-envs", "8", "--evaluations", "2"])
+        ppo_torch.app(["--steps", "1024", "--num-envs", "8", "--evaluations", "2"])
         assert capsys.readouterr().out.count("mean error") == 2
 
     def test_the_seed_is_all_that_differs(self):
@@ -166,40 +166,37 @@ runpy.run_module("benchmarks.examples.torch_free", run_name="__main__")
 
 
 class TestOffline:
-    SMALL = offline.Arguments(steps=4, batch=8, width=8)
+    HIGH = np.repeat([50.0, 100.0, 1.0], [3, 3, 20]).astype(np.float32)
 
-    def transitions(self):
+    @pytest.fixture
+    def data(self):
         logged = record("paper", "smith", 2)
-        return offline.Transitions.of(
+        return offline.transitions_of(
             SimpleNamespace(observations=o, actions=a, rewards=r)
             for o, a, r in zip(logged.observations, logged.actions, logged.rewards, strict=True)
         )
 
-    def test_transitions_follow_one_another_within_an_episode(self):
-        data = self.transitions()
-        assert data.observations.shape == data.following.shape == (2400, 26)
-        assert torch.equal(data.following[:1199], data.observations[1:1200])
-        assert not torch.equal(data.following[1199], data.observations[1200])
+    def test_transitions_follow_one_another_within_an_episode(self, data):
+        observations, actions, rewards, following = data.tensors
+        assert observations.shape == following.shape == (2400, 26)
+        assert torch.equal(following[:1199], observations[1:1200])
+        assert not torch.equal(following[1199], observations[1200])
         # The reward is minus the error that the step leads to, and the action is seen after it.
-        torch.testing.assert_close(data.rewards, -data.following[:, 3].abs())
-        assert torch.equal(data.following[:, offline.LAST_ACTION], data.actions[:, 0])
+        torch.testing.assert_close(rewards[:, 0], -following[:, 3].abs())
+        assert torch.equal(following[:, offline.LAST_ACTION], actions[:, 0])
 
     @pytest.mark.parametrize("alpha", [0.0, 2.5])
-    def test_the_seed_is_all_that_differs(self, alpha):
-        data, high = self.transitions(), np.repeat([50.0, 100.0, 1.0], [3, 3, 20])
-        settings = replace(self.SMALL, alpha=alpha)
-        assert_the_seed_is_all_that_differs(
-            lambda seed: weights(offline.learn(data, high.astype(np.float32), settings, seed))
-        )
+    def test_the_seed_is_all_that_differs(self, data, alpha):
+        learn = partial(offline.learn, data, self.HIGH, alpha=alpha, steps=4)
+        assert_the_seed_is_all_that_differs(lambda seed: weights(learn(seed=seed)))
 
     def test_an_actor_that_changes_nothing_leaves_the_valve_alone(self):
-        actor = offline.Actor(np.repeat([50.0, 100.0, 1.0], [3, 3, 20]).astype(np.float32), 8)
+        actor = offline.Actor(self.HIGH)
         torch.nn.init.zeros_(actor.layers[-1].weight)
         torch.nn.init.zeros_(actor.layers[-1].bias)
-        spec = gymnasium.make("MiddlePoint-v0", **arguments_of("paper")).spec
         # 5 degC, and nothing done: the square wave's error is 5 all the time.
-        spec.kwargs |= {"setpoint": "square"}
-        found = evaluate(offline.policy_of(actor), spec, episodes=2)
+        arguments = {**arguments_of("paper"), "setpoint": "square"}
+        found = evaluate(offline.policy_of(actor), episodes=2, **arguments)
         assert found.mean_error == pytest.approx(5.0)
 
 

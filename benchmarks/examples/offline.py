@@ -7,69 +7,42 @@ not in the data. A score of 1 is the least possible mean error, 0 that of an idl
 
 from __future__ import annotations
 
-import argparse
 import copy
 import sys
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import Any
 
+import cyclopts
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.data import TensorDataset
 
 import mptc_gym
 
+BATCH = 256  # transitions a step
+WIDTH = 64  # nodes of each of two hidden layers
+LEARNING_RATE = 1e-3  # at the start; it falls linearly to a tenth
+GAMMA = 0.97  # discount a sample
+TAU = 0.01  # share by which target networks follow in a step
+ALPHA = 0.05  # weight of the value against that of staying near the data
+SMOOTHING, CLIP = 0.1, 0.25  # spread of the noise on target actions, and its limit
+DELAY = 2  # steps of the critics for each of the actor
 LAST_ACTION = 6  # its place in an observation: after three set points and three errors
 
 
-@dataclass(frozen=True)
-class Arguments:
-    """What there is to set."""
+def transitions_of(episodes: Iterable[Any]) -> TensorDataset:
+    """Return observations, actions, rewards and next observations of a Minari data set.
 
-    steps: int = 3000
-    """Gradient steps."""
-    batch: int = 256
-    """Transitions a step."""
-    width: int = 64
-    """Nodes of each of two hidden layers."""
-    learning_rate: float = 1e-3
-    """At the start; it falls linearly to a tenth."""
-    gamma: float = 0.97
-    """Discount a sample."""
-    tau: float = 0.01
-    """Share by which target networks follow in a step."""
-    alpha: float = 0.05
-    """Weight of the value against that of staying near the data; 0 is behaviour cloning."""
-    smoothing: float = 0.1
-    """Spread of the noise on target actions."""
-    clip: float = 0.25
-    """Its limit."""
-    delay: int = 2
-    """Steps of the critics for each of the actor."""
-
-
-@dataclass(frozen=True)
-class Transitions:
-    """All transitions of a data set; the first axis counts them."""
-
-    observations: Tensor
-    actions: Tensor
-    rewards: Tensor
-    following: Tensor
-    """The next observations. No episode terminates, so that all have a future."""
-
-    @classmethod
-    def of(cls, dataset: Any) -> Transitions:
-        """Read those of a Minari data set."""
-        episodes = list(dataset)
-        arrays = (
-            [each.observations[:-1] for each in episodes],
-            [each.actions for each in episodes],
-            [each.rewards.astype(np.float32) for each in episodes],
-            [each.observations[1:] for each in episodes],
-        )
-        return cls(*(torch.as_tensor(np.concatenate(each)) for each in arrays))
+    No episode terminates, so that all transitions have a future.
+    """
+    rows = [
+        (each.observations[:-1], each.actions, each.rewards[:, None], each.observations[1:])
+        for each in episodes
+    ]
+    columns = (np.concatenate(column) for column in zip(*rows, strict=True))
+    return TensorDataset(*(torch.as_tensor(each, dtype=torch.float32) for each in columns))
 
 
 class Network(nn.Module):
@@ -77,13 +50,12 @@ class Network(nn.Module):
 
     scale: Tensor
 
-    def __init__(self, high: np.ndarray, width: int) -> None:
+    def __init__(self, high: np.ndarray) -> None:
         super().__init__()
         # Fixed factors are the same in training and in use.
-        bounds = torch.as_tensor(high)
-        self.register_buffer("scale", torch.where(bounds > 1.0, 0.2, 1.0))
-        layers = [nn.Linear(len(high), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()]
-        self.layers = nn.Sequential(*layers, nn.Linear(width, 1))
+        self.register_buffer("scale", torch.where(torch.as_tensor(high) > 1.0, 0.2, 1.0))
+        layers = nn.Linear(len(high), WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU()
+        self.layers = nn.Sequential(*layers, nn.Linear(WIDTH, 1))
 
     def forward(self, values: Tensor) -> Tensor:
         """Return one number a row, shape (n, 1)."""
@@ -96,12 +68,13 @@ class Actor(Network):
 
     def act(self, observations: Tensor) -> Tensor:
         """Return actions within [-1, 1], shape (n, 1)."""
-        last = observations[:, LAST_ACTION, None]
-        changed: Tensor = last + self(observations)
+        changed: Tensor = observations[:, LAST_ACTION, None] + self(observations)
         return changed.clamp(-1.0, 1.0)
 
 
-def learn(data: Transitions, high: np.ndarray, arguments: Arguments, seed: int) -> Actor:
+def learn(
+    data: TensorDataset, high: np.ndarray, *, alpha: float, steps: int, seed: int
+) -> Actor:
     """Return an actor: TD3+BC (Fujimoto & Gu 2021), or behaviour cloning if alpha is 0.
 
     Parameters
@@ -110,53 +83,45 @@ def learn(data: Transitions, high: np.ndarray, arguments: Arguments, seed: int) 
         All that it sees.
     high
         Upper bounds of the observation, shape (n_obs,).
-    arguments
-        Settings.
+    alpha
+        Weight of the value against that of staying near the data.
+    steps
+        Gradient steps.
     seed
         Of the weights, the batches and the noise.
     """
     torch.manual_seed(seed)
-    actor = Actor(high, arguments.width)
-    with_action = np.append(high, np.float32(1.0))
-    critics = nn.ModuleList(Network(with_action, arguments.width) for _ in range(2))
+    actor = Actor(high)
+    critics = nn.ModuleList(Network(np.append(high, np.float32(1.0))) for _ in range(2))
     target_actor = copy.deepcopy(actor).requires_grad_(False)
     target_critics = copy.deepcopy(critics).requires_grad_(False)
-    optimizers = [
-        torch.optim.Adam(module.parameters(), arguments.learning_rate)
-        for module in (actor, critics)
+    leaders = [*actor.parameters(), *critics.parameters()]
+    followers = [*target_actor.parameters(), *target_critics.parameters()]
+    actor_optimizer, critic_optimizer = optimizers = [
+        torch.optim.Adam(module.parameters(), LEARNING_RATE) for module in (actor, critics)
     ]
-    for step in range(arguments.steps):
+    for step in range(steps):
         for optimizer in optimizers:
-            left = 1.0 - step / arguments.steps
-            optimizer.param_groups[0]["lr"] = arguments.learning_rate * (0.1 + 0.9 * left)
-        rows = torch.randint(len(data.rewards), (arguments.batch,))
-        seen, taken, following = (
-            each[rows] for each in (data.observations, data.actions, data.following)
-        )
-        if arguments.alpha > 0.0:
-            noise = (torch.randn_like(taken) * arguments.smoothing).clamp(
-                -arguments.clip, arguments.clip
-            )
+            optimizer.param_groups[0]["lr"] = LEARNING_RATE * (0.1 + 0.9 * (1.0 - step / steps))
+        seen, taken, rewards, following = data[torch.randint(len(data), (BATCH,))]
+        if alpha > 0.0:
+            noise = (torch.randn_like(taken) * SMOOTHING).clamp(-CLIP, CLIP)
             next_action = (target_actor.act(following) + noise).clamp(-1.0, 1.0)
             ahead = torch.hstack((following, next_action))
             worth = torch.min(*(critic(ahead) for critic in target_critics))
-            goal = data.rewards[rows, None] + arguments.gamma * worth
+            goal = rewards + GAMMA * worth
             now = torch.hstack((seen, taken))
-            _descend(optimizers[1], sum(functional.mse_loss(c(now), goal) for c in critics))
-        if step % arguments.delay == 0 or arguments.alpha == 0.0:
+            _descend(critic_optimizer, sum(functional.mse_loss(c(now), goal) for c in critics))
+        if step % DELAY == 0 or alpha == 0.0:
             action = actor.act(seen)
             loss = functional.mse_loss(action, taken)
-            if arguments.alpha > 0.0:
+            if alpha > 0.0:
                 value = critics[0](torch.hstack((seen, action)))
-                loss = loss - arguments.alpha * value.mean() / value.abs().mean().detach()
-            _descend(optimizers[0], loss)
+                loss = loss - alpha * value.mean() / value.abs().mean().detach()
+            _descend(actor_optimizer, loss)
         with torch.no_grad():
-            for followers, leaders in zip(
-                (target_actor, target_critics), (actor, critics), strict=True
-            ):
-                pairs = zip(followers.parameters(), leaders.parameters(), strict=True)
-                for follower, leader in pairs:
-                    follower.lerp_(leader, arguments.tau)
+            for follower, leader in zip(followers, leaders, strict=True):
+                follower.lerp_(leader, TAU)
     return actor
 
 
@@ -171,39 +136,39 @@ def policy_of(actor: Actor) -> Any:
     return lambda observations: actor.act(torch.as_tensor(observations)).detach().numpy()
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Learn with the options of a command line, without the program's name."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.examples.offline",
-        description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--data", default="middlepoint/paper/smith-v0", help="data set")
-    parser.add_argument("--steps", type=int, default=Arguments.steps, help="gradient steps")
-    parser.add_argument("--seeds", type=int, default=5, help="how many runs of each learner")
-    options = parser.parse_args(arguments)
+def main(
+    *, data: str = "middlepoint/paper/smith-v0", steps: int = 3000, seeds: int = 5
+) -> None:
+    """Learn offline from a data set, and score what was learnt.
+
+    Parameters
+    ----------
+    data
+        Data set.
+    steps
+        Gradient steps.
+    seeds
+        How many runs of each learner.
+    """
     try:
         import minari
 
-        dataset = minari.load_dataset(options.data)
+        dataset: Any = minari.load_dataset(data)
     except ImportError:
-        parser.error('it needs Minari: pip install -e ".[data]"')
+        sys.exit('It needs Minari: pip install -e ".[data]"')
     except FileNotFoundError:
-        parser.error(f"--data: no {options.data}; python -m benchmarks.datasets writes it")
-    about = dataset.storage.metadata
+        sys.exit(f"--data: no {data}; python -m benchmarks.datasets writes it")
+    about, high = dataset.storage.metadata, dataset.observation_space.high
     idle, least = about["idle_error"], about["least_possible_error"]
-    data, high = Transitions.of(dataset), dataset.observation_space.high
     own = f"the data's own mean |e| {about['behaviour_error']:.3f} degC"
-    print(f"{options.data}: {own}, least possible {least:.3f}, idle {idle:.3f}")
-    for name, alpha in (("behaviour cloning", 0.0), ("TD3+BC", Arguments.alpha)):
-        settings = Arguments(steps=options.steps, alpha=alpha)
-        for seed in range(options.seeds):
-            policy = policy_of(learn(data, high, settings, seed))
-            episodes = len(about["evaluation_seeds"])
-            found = mptc_gym.evaluate(policy, dataset.env_spec, episodes=episodes)
+    print(f"{data}: {own}, least possible {least:.3f}, idle {idle:.3f}")
+    transitions, episodes = transitions_of(dataset), len(about["evaluation_seeds"])
+    for name, alpha in (("behaviour cloning", 0.0), ("TD3+BC", ALPHA)):
+        for seed in range(seeds):
+            actor = learn(transitions, high, alpha=alpha, steps=steps, seed=seed)
+            found = mptc_gym.evaluate(policy_of(actor), dataset.env_spec, episodes=episodes)
             print(f"{name}, seed {seed}: {found}", flush=True)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    cyclopts.run(main)

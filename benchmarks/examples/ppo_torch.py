@@ -68,6 +68,7 @@ OBSERVATION: dict[str, Any] = {"action_window": 20, "output_window": 2}
 # Returns of about 1 in size: the gradient of larger ones would crowd out that of the policy.
 TRAINING = {"setpoint": "random", "reward": "absolute", "error_scale": 50.0, **OBSERVATION}
 DEGREES = 5.0  # what temperatures are divided by before they enter a network
+app = App(help=__doc__, version_flags=(), result_action="return_value")
 
 
 class Agent(nn.Module):
@@ -119,6 +120,7 @@ def estimate(
     return advantages
 
 
+@app.default
 def train(arguments: Annotated[Arguments, Parameter(name="*")] = DEFAULTS) -> Agent:
     """Train a policy and return it."""
     torch.manual_seed(arguments.seed)
@@ -187,12 +189,5 @@ def train(arguments: Annotated[Arguments, Parameter(name="*")] = DEFAULTS) -> Ag
     return agent
 
 
-def main(words: list[str] | None = None) -> None:
-    """Train with the arguments of a command line, without the program's name."""
-    app = App(help=__doc__, version_flags=())
-    app.default(train)
-    app(words, result_action="return_value")
-
-
 if __name__ == "__main__":
-    main()
+    app()

@@ -8,11 +8,10 @@ RLlib asks for one version of Gymnasium, and so for a virtual environment of its
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable
 from typing import Any, cast
 
+import cyclopts
 import numpy as np
 import ray
 import torch
@@ -37,18 +36,18 @@ def policy_of(module: Any) -> Callable[[NDArray[np.float32]], NDArray[np.float32
     return act
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Train with the options of a command line, without the program's name."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.examples.rllib",
-        description=__doc__,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--steps", type=int, default=200_000, help="in all")
-    parser.add_argument("--seed", type=int, default=0, help="of policy and exploration")
-    parser.add_argument("--batch", type=int, default=4000, help="an iteration")
-    options = parser.parse_args(arguments)
+def main(*, steps: int = 200_000, seed: int = 0, batch: int = 4000) -> None:
+    """Train PPO of RLlib on one plant.
 
+    Parameters
+    ----------
+    steps
+        In all.
+    seed
+        Of policy and exploration.
+    batch
+        Steps of an iteration.
+    """
     config = (
         PPOConfig()
         # The name says what to import: RLlib's own processes have not imported mptc_gym.
@@ -56,21 +55,20 @@ def main(arguments: list[str] | None = None) -> int:
         # sqrt(vf_clip_param), about 3, and returns are some -50; error_scale makes them -0.5.
         .environment("mptc_gym:MiddlePoint-v0", env_config={**OBSERVATION, "error_scale": 50.0})
         .env_runners(num_env_runners=0)  # one plant is quickest in this very process
-        .training(train_batch_size_per_learner=options.batch, lr=3e-4)
-        .debugging(seed=options.seed, log_level="ERROR")
+        .training(train_batch_size_per_learner=batch, lr=3e-4)
+        .debugging(seed=seed, log_level="ERROR")
     )
     # "local": a cluster that happens to run here, or that RAY_ADDRESS names, is left alone.
     ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False)
     torch.set_num_threads(1)  # the network is too small for more
     algorithm = config.build_algo()
-    for iteration in range(-(-options.steps // options.batch)):
+    for iteration in range(-(-steps // batch)):
         algorithm.train()
         found = evaluate(policy_of(algorithm.get_module()), **OBSERVATION)
-        print(f"{(iteration + 1) * options.batch:9,} steps: {found}", flush=True)
+        print(f"{(iteration + 1) * batch:9,} steps: {found}", flush=True)
     algorithm.stop()
     ray.shutdown()
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    cyclopts.run(main)

@@ -40,33 +40,15 @@ EPISODE = 1200
 BATCHES = (8, 64, 1024, 16384)
 LOOPS = (64, 1000)
 MEMORY_PLANTS = 100
-NOISE: dict[str, Any] = {"noise_variance": 0.5}
-RANDOM = {**NOISE, "setpoint": "random"}
-IN_TORCH: dict[str, dict[str, Any]] = {
-    "in PyTorch": {},
-    "in PyTorch, R = 0.5": NOISE,
-    "in PyTorch, hard": PRESETS["hard"],
-}
 DEVICE_BATCHES = tuple(4**power for power in range(5, 12))  # 1,024 to 4,194,304 plants
 DEVICE_STEPS = 200
 GRADIENTS, BACKWARD = 1024, 300  # plants, and samples
 PEER_STEPS = 100  # of each environment of EnvPool and gymnax
 INSTALL_PEERS = "pip install envpool gymnax six"
 REFERENCE = "CartPole-v1"
-# Arguments, by the environment's id and what is special about it.
-SINGLE: dict[str, dict[str, Any]] = {
-    REFERENCE: {},
-    "Pendulum-v1": {},
-    "MiddlePoint-v0": {},
-    "MiddlePoint-v0, R = 0.5": NOISE,
-    "MiddlePoint-v0, 20 past actions": {"action_window": 20},
-}
-VECTOR: dict[str, dict[str, Any]] = {
-    REFERENCE: {},
-    "MiddlePoint-v0": {},
-    "MiddlePoint-v0, R = 0.5": NOISE,
-    "MiddlePoint-v0, hard": PRESETS["hard"],  # everything is on
-}
+# Arguments of a plant, by what is special about it.
+NOISE: dict[str, Any] = {"noise_variance": 0.5}
+PLANTS: dict[str, dict[str, Any]] = {"": {}, ", R = 0.5": NOISE, ", hard": PRESETS["hard"]}
 
 
 @dataclass(frozen=True)
@@ -92,9 +74,15 @@ def execute(options: Options, console: Console) -> str:
             MiddlePointTorchEnv(1, device=options.device)
         show(f"Steps a second on {options.device}", on_device(options.device, rounds))
         return f"Medians of {rounds} rounds."
-    single = [_single(name, **arguments) for name, arguments in SINGLE.items()]
-    pictured = REFERENCE, "MiddlePoint-v0"
-    drawn = [_single(name, FRAMES, render_mode="rgb_array") for name in pictured]
+    plant = "MiddlePoint-v0"
+    single = [
+        _single(REFERENCE),
+        _single("Pendulum-v1"),
+        _single(plant),
+        _single(plant, ", R = 0.5", **NOISE),
+        _single(plant, ", 20 past actions", action_window=20),
+    ]
+    drawn = [_single(name, render_mode="rgb_array") for name in (REFERENCE, plant)]
     learners = f"Plants with R = 0.5 and NNs that learn, one each: {EPISODE} samples together"
     policy = "Through the plant: a policy of two layers of 64, forward and backward"
     show("One environment, from gymnasium.make", compare(single, rounds))
@@ -143,12 +131,12 @@ def compare(cases: list[Case], rounds: int) -> pd.DataFrame:
 def memory() -> pd.DataFrame:
     """Measure the memory of a plant, in a batch and alone."""
     rows = []
-    for name, arguments in {"R = 0": {}, "R = 0.5, random set point": RANDOM}.items():
-        batch = MiddlePointVectorEnv(
-            MEMORY_PLANTS, max_episode_steps=EPISODE, action_window=20, **arguments
-        )
-        alone = MiddlePointEnv(action_window=20, **arguments)
-        sizes = _memory(batch) / MEMORY_PLANTS, _memory(alone)
+    for name, given in {"R = 0": {}, "R = 0.5, random set point": NOISE}.items():
+        arguments = {**given, "action_window": 20}
+        if given:
+            arguments["setpoint"] = "random"
+        batch = MiddlePointVectorEnv(MEMORY_PLANTS, max_episode_steps=EPISODE, **arguments)
+        sizes = _memory(batch) / MEMORY_PLANTS, _memory(MiddlePointEnv(**arguments))
         rows.append([name, *(f"{size / 1024:.1f} KiB" for size in sizes)])
     return pd.DataFrame(rows, columns=["case", f"in a batch of {MEMORY_PLANTS:,}", "alone"])
 
@@ -164,12 +152,12 @@ def _memory(env: Any) -> int:
     return size
 
 
-def _single(name: str, steps: int | None = None, **arguments: Any) -> Case:
+def _single(name: str, special: str = "", **arguments: Any) -> Case:
     """Return one environment, with a picture of each step if it has a render mode."""
-    env = gymnasium.make(name.partition(",")[0], **arguments)
+    env = gymnasium.make(name, **arguments)
     env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(steps or SINGLE_STEPS)]
     draws = env.render_mode is not None
+    actions = [env.action_space.sample() for _ in range(FRAMES if draws else SINGLE_STEPS)]
 
     def run() -> None:
         env.reset(seed=0)
@@ -180,22 +168,19 @@ def _single(name: str, steps: int | None = None, **arguments: Any) -> Case:
             if draws:
                 env.render()
 
-    return Case(name, run, len(actions))
+    return Case(name + special, run, len(actions))
 
 
 def _vector(n: int) -> Iterable[Case]:
     """Yield vector environments; a call is one of our episodes, with its reset."""
-    for name, arguments in VECTOR.items():
-        env_id, _, _ = name.partition(",")
-        envs = gymnasium.make_vec(
-            env_id, n, vectorization_mode="vector_entry_point", **arguments
-        )
+    kinds = [(REFERENCE, "", {}), *(("MiddlePoint-v0", *plant) for plant in PLANTS.items())]
+    for name, special, arguments in kinds:
+        envs = gymnasium.make_vec(name, n, vectorization_mode="vector_entry_point", **arguments)
         envs.reset(seed=0)
         envs.action_space.seed(0)
         actions = [envs.action_space.sample() for _ in range(20)]
-        yield Case(name, _stepper(envs, actions, EPISODE + 1), n * (EPISODE + 1))
-    for name, arguments in IN_TORCH.items():
-        yield _in_torch(name, n, "cpu", EPISODE + 1, arguments)
+        yield Case(name + special, _stepper(envs, actions, EPISODE + 1), n * (EPISODE + 1))
+    yield from _in_torch(n, "cpu", EPISODE + 1)
     for peer in filter(importlib.util.find_spec, PEERS):
         yield from PEERS[peer](n)
 
@@ -251,19 +236,14 @@ def _gymnax(n: int) -> Iterable[Case]:
 PEERS: dict[str, Callable[[int], Iterable[Case]]] = {"envpool": _envpool, "gymnax": _gymnax}
 
 
-def _in_torch(name: str, n: int, device: str, steps: int, arguments: dict[str, Any]) -> Case:
-    """Return the environment in PyTorch; a call ends when the device is done."""
-    envs = MiddlePointTorchEnv(n, device=device, **arguments)
-    envs.reset(seed=0)
-    actions = [2.0 * torch.rand(n, 1, device=device) - 1.0 for _ in range(20)]
-    step = _stepper(envs, actions, steps)
-
-    def run() -> None:
-        step()
-        if device != "cpu":
-            torch.accelerator.synchronize()
-
-    return Case(name, run, n * steps)
+def _in_torch(n: int, device: str, steps: int) -> Iterable[Case]:
+    """Yield environments in PyTorch; a call ends when the device is done."""
+    for special, arguments in PLANTS.items():
+        envs = MiddlePointTorchEnv(n, device=device, **arguments)
+        envs.reset(seed=0)
+        actions = [2.0 * torch.rand(n, 1, device=device) - 1.0 for _ in range(20)]
+        wait = torch.accelerator.synchronize if device != "cpu" else None
+        yield Case(f"in PyTorch{special}", _stepper(envs, actions, steps, wait), n * steps)
 
 
 def on_device(device: str, rounds: int) -> pd.DataFrame:
@@ -271,11 +251,10 @@ def on_device(device: str, rounds: int) -> pd.DataFrame:
     rows = []
     for n in DEVICE_BATCHES:
         row = {"n": f"{n:,}"}
-        for name, arguments in IN_TORCH.items():
-            case = _in_torch(name, n, device, DEVICE_STEPS, arguments)
+        for case in _in_torch(n, device, DEVICE_STEPS):
             case.run()  # what is done once, the first time
-            rates = n * DEVICE_STEPS / _alternately([case], rounds)[name]
-            row[name] = f"{rates.median():.3g}"
+            rates = case.steps / _alternately([case], rounds)[case.name]
+            row[case.name] = f"{rates.median():.3g}"
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -299,15 +278,22 @@ def _through_the_plant(n: int) -> Case:
     return Case(f"gradient through {n:,} plants and {BACKWARD} samples", train, n * BACKWARD)
 
 
-def _stepper(envs: Any, actions: list[Any], steps: int) -> Callable[[], None]:
+def _stepper(
+    envs: Any, actions: list[Any], steps: int, wait: Callable[[], object] | None = None
+) -> Callable[[], None]:
+    """Return a function that takes the actions in turn, and waits for a device then."""
+
     def step() -> None:
         for k in range(steps):
             envs.step(actions[k % len(actions)])
+        if wait is not None:
+            wait()
 
     return step
 
 
 def _alone() -> Case:
+    """Return one plant and its network, without a batch."""
     env = gymnasium.make("MiddlePoint-v0", **NOISE)
     controller = DirectNNController()
 
@@ -321,11 +307,10 @@ def _alone() -> Case:
 
 
 def _closed_loop(n: int) -> Case:
-    plants = make_plants(n, EPISODE, **NOISE)
-    controller = DirectNNController(num_envs=n)
-    return Case(
-        f"batch of {n:,}", lambda: rollout(plants, controller, EPISODE, seed=0), n * EPISODE
-    )
+    """Return a batch of plants and their networks."""
+    plants, controller = make_plants(n, EPISODE, **NOISE), DirectNNController(num_envs=n)
+    run = partial(rollout, plants, controller, EPISODE, seed=0)
+    return Case(f"batch of {n:,}", run, n * EPISODE)
 
 
 def _alternately(cases: list[Case], rounds: int) -> pd.DataFrame:
