@@ -10,6 +10,7 @@ episode begins is dropped.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -156,58 +157,54 @@ class RandomSetPoint:
     """A set point that holds each random level for a random number of samples."""
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
-        self._levels, self._episodes = levels, episodes
+        self._law, self._episodes = levels, episodes
         zeros = episodes.zeros
         self._rows = torch.arange(LONGEST, dtype=zeros.dtype).to(zeros.device)
-        # The present level, and in how many samples it changes: whole numbers of type float,
-        # with which a processor is quickest. Then each change to come, in how many samples it
-        # is, and what the level and the next change are from there.
-        self._level = self._left = zeros
-        self._ahead: list[tuple[Tensor, Tensor, Tensor]] = []
-        self._horizon = self._passed = 0  # samples that it is known for, and that are over
+        # The present level and those to come, each with the sample where it ends, as whole
+        # numbers of type float, with which a processor is quickest.
+        self._levels = [(zeros, zeros)]
+        # How many samples are known, of which those that have passed count from the same place.
+        self._horizon = self._passed = 0
 
     def reset(self, which: Tensor | None) -> Tensor:
         """Begin an episode of some plants."""
         self._catch_up()
-        level, hold = self._following()
-        self._level = replaced(self._level, which, level)
-        self._left = replaced(self._left, which, hold)
-        return self._level
+        (end, level), (hold, first) = self._levels[0], self._drawn()
+        self._levels = [(replaced(end, which, hold), replaced(level, which, first))]
+        return self._levels[0][1]
 
     def next(self, samples: int) -> Tensor:
         """Draw the next samples, if they are not known yet."""
-        shortest, taken = self._levels.shortest, self._episodes.taken
+        shortest, taken = self._law.shortest, self._episodes.taken
         if self._passed + taken + samples > self._horizon:
             self._catch_up()
-            self._horizon, left = max(samples, shortest), self._left
+            self._horizon = max(samples, shortest)
             for _ in range(1 + (self._horizon - 1) // shortest):
-                level, hold = self._following()
-                self._ahead.append((left, level, left + hold))
-                left = left + hold
+                hold, level = self._drawn()
+                self._levels.append((self._levels[-1][0] + hold, level))
         else:
             self._passed += taken
-        # Known are the samples that the next change is away from that before the first one.
         rows = (self._rows[:samples] + (self._passed + 1))[:, None]
-        levels = self._level.expand(samples, -1)
-        for change, level, _ in self._ahead:
+        levels = self._levels[0][1].expand(samples, -1)
+        for (change, _), (_, level) in pairwise(self._levels):
             levels = torch.lerp(levels, level, _reached(rows, change))
         return levels
 
-    def _following(self) -> tuple[Tensor, Tensor]:
-        """Draw levels, and for how many samples they hold, each of shape (n,)."""
-        levels = self._levels
-        level = self._episodes.within_one(1)[0] * levels.amplitude
-        return level, self._episodes.within(levels.shortest, levels.longest, whole=True)
+    def _drawn(self) -> tuple[Tensor, Tensor]:
+        """Draw for how many samples levels hold, and the levels, each of shape (n,)."""
+        level = self._episodes.within_one(1)[0] * self._law.amplitude
+        hold = self._episodes.within(self._law.shortest, self._law.longest, whole=True)
+        return hold, level
 
     def _catch_up(self) -> None:
-        """Bring level and next change to the sample that was taken last."""
-        passed = self._level.new_full((), self._passed + self._episodes.taken)
-        for change, level, next_change in self._ahead:
+        """Count from the sample that was taken last, and keep the level there alone."""
+        end, level = self._levels[0]
+        passed = level.new_full((), self._passed + self._episodes.taken)
+        for (change, _), (later, following) in pairwise(self._levels):
             reached = _reached(passed, change)
-            self._level = torch.lerp(self._level, level, reached)
-            self._left = torch.lerp(self._left, next_change, reached)
-        self._left = self._left - passed
-        self._ahead, self._horizon, self._passed = [], 0, 0
+            end, level = torch.lerp(end, later, reached), torch.lerp(level, following, reached)
+        self._levels = [(end - passed, level)]
+        self._horizon = self._passed = 0
 
 
 class RepeatedSetPoint:

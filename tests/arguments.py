@@ -1,5 +1,6 @@
 """Draws arguments of the environment from all that is valid, by how they are declared."""
 
+from gymnasium.vector import AutoresetMode
 from hypothesis import strategies as st
 
 from mptc_gym import checks
@@ -39,6 +40,8 @@ def _strategy(name, argument):
 
 
 STRATEGIES = {name: _strategy(name, argument) for name, argument in ARGUMENTS.items()}
+MODES = [mode.value for mode in AutoresetMode]
+NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
 WINDOWS = ("setpoint_window", "error_window", "output_window", "action_window")
 
 

@@ -60,6 +60,14 @@ def run_closed(
     return {key: np.array([info[key] for info in infos]) for key in info}
 
 
+def random_actions(rng: np.random.Generator, n: int) -> NDArray[np.float32]:
+    """Return actions of n plants, some of them huge or on the edge of the dead zone."""
+    actions = rng.normal(0, 1, (n, 1)).astype(np.float32)
+    actions[rng.random(n) < 0.1] *= 1e6
+    actions[rng.random(n) < 0.1] = rng.choice([0.5, -0.5])
+    return actions
+
+
 def assert_the_seed_is_all_that_differs(made: Callable[[int], ArrayLike]) -> None:
     """Make it twice with a seed and once with another, and compare."""
     first, again, other = (np.asarray(made(seed)) for seed in (1, 1, 2))

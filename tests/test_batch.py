@@ -13,10 +13,9 @@ from gymnasium.vector import AutoresetMode
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters
 from mptc_gym.batch import FACTORS, INFO
+from tests.arguments import MODES, NOISY
 from tests.conftest import assert_the_seed_is_all_that_differs
 
-MODES = [mode.value for mode in AutoresetMode]
-NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
 SHELL = {"num_envs", "max_episode_steps", "autoreset_mode"}
 
 

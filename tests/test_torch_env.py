@@ -1,6 +1,7 @@
 """The environment in PyTorch: equal to that in NumPy, its draws, gradients, and no waiting."""
 
 import gc
+from collections import defaultdict
 from typing import ClassVar
 
 import numpy as np
@@ -15,109 +16,29 @@ from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv  # noqa: E402
 from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
-from mptc_gym.signals import Streams  # noqa: E402
+from mptc_gym.ranges import Ranges  # noqa: E402
+from mptc_gym.signals import Signals, Streams  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv  # noqa: E402
-from tests.arguments import valid_arguments  # noqa: E402
-from tests.conftest import python  # noqa: E402
-
-MODES = [mode.value for mode in AutoresetMode]
+from tests.arguments import MODES, valid_arguments  # noqa: E402
+from tests.conftest import python, random_actions  # noqa: E402
 
 
-class Recording:
-    """Runs the environment in NumPy, and keeps all that goes in and comes out.
-
-    What comes from outside is kept for each plant, episode by episode.
-    """
-
-    def __init__(self, envs):
-        self.envs, self.calls = envs, []
-        self.episodes = [[] for _ in range(envs.num_envs)]
-        self._ended = np.zeros(envs.num_envs)
-
-    def reset(self, **given):
-        returned = self.envs.reset(**given)
-        if "seed" in given:
-            seeds = self.envs.np_random_seed
-            self._readings = [Streams.of_seed(seed).measurement_noise for seed in seeds]
-        mask = (given.get("options") or {}).get("reset_mask")
-        self._begin(np.ones(self.envs.num_envs, bool) if mask is None else mask, returned[1])
-        self.calls.append(("reset", mask, returned))
-
-    def step(self, actions):
-        returned = self.envs.step(actions)
-        infos = returned[-1]
-        restarted = infos.get("_final_info", self._ended if self._next_step else None)
-        if restarted is None:
-            restarted = np.zeros(self.envs.num_envs, bool)
-        for i in range(self.envs.num_envs):
-            if "_final_info" in infos and infos["_final_info"][i]:
-                self._add(i, infos["final_info"])
-            elif not restarted[i]:
-                self._add(i, infos)
-        self._begin(restarted, infos)
-        self._ended = returned[3].copy()
-        self.calls.append(("step", actions.copy(), returned))
-
-    @property
-    def _next_step(self):
-        return self.envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-
-    def _add(self, i, infos):
-        episode = self.episodes[i][-1]
-        for name in ("noise", "setpoint", "disturbance"):
-            if name in infos:
-                episode[name].append(infos[name][i])
-        # The one signal that no info shows.
-        name = "measurement_noise_variance"
-        variance = episode.get(name, self.envs.parameters.range_of(name)[0])
-        draw = self._readings[i].generator.standard_normal()
-        episode["measurement_noise"].append(variance**0.5 * draw)
-
-    def _begin(self, mask, infos):
-        for i in np.flatnonzero(mask):
-            names = ("noise", "setpoint", "disturbance")
-            episode = {name: [infos[name][i]] for name in names if name in infos}
-            ranges = {name: infos[name][i] for name in self.envs.parameters.ranges}
-            self.episodes[i].append({**episode, "measurement_noise": [0.0], **ranges})
-            self._readings[i].next_episode()
-
-    def signals(self):
-        """Return what is to be handed in to meet the same."""
-        episodes = max(map(len, self.episodes))
-        samples = max(len(each["noise"]) for own in self.episodes for each in own) + 1
-        signals = {}
-        for name, first in self.episodes[0][0].items():
-            shape = (episodes, samples) if isinstance(first, list) else (episodes,)
-            signals[name] = np.zeros((*shape, self.envs.num_envs))
-            for i, own in enumerate(self.episodes):
-                for j, each in enumerate(own):
-                    if isinstance(first, list):
-                        signals[name][j, : len(each[name]), i] = each[name]
-                    else:
-                        signals[name][j:, i] = each[name]
-        return {name: torch.tensor(values) for name, values in signals.items()}
-
-
-def random_actions(rng, n):
-    actions = rng.normal(0, 1, (n, 1)).astype(np.float32)
-    actions[rng.random(n) < 0.1] *= 1e6
-    actions[rng.random(n) < 0.1] = rng.choice([0.5, -0.5])  # the edge of the dead zone
-    return actions
-
-
-def record(envs, *, steps, rng, partial_resets):
-    recording = Recording(envs)
-    recording.reset(seed=int(rng.integers(2**30)))
-    n = envs.num_envs
-    for _ in range(steps):
-        recording.step(random_actions(rng, n))
-        mask = rng.random(n) < partial_resets
-        if envs.metadata["autoreset_mode"] is AutoresetMode.DISABLED:
-            mask |= recording.calls[-1][2][3]
-        if mask.any():
-            recording.reset(options={"reset_mask": mask})
-            recording._ended = recording._ended.astype(bool) & ~mask
-    return recording
+def met(envs, seed, *, episodes, samples):
+    """Return what the plants of an environment in NumPy meet, to be handed in."""
+    parameters, n = envs.parameters, envs.num_envs
+    signals, ranges = Signals.of(parameters, n, samples), Ranges(parameters)
+    streams = [Streams.of_seed(seed + i) for i in range(n)]
+    found = defaultdict(list)
+    for _ in range(episodes):
+        numbers = ranges.draw([each.plant for each in streams])
+        first = {"setpoint": signals.reset(np.arange(n), streams, numbers)}
+        for name, signal in signals._asdict().items():
+            if signal is not None:
+                rows = [signal.next().copy() for _ in range(samples)]
+                found[name].append([first.get(name, np.zeros(n)), *rows])
+        for name, values in numbers.chosen(ranges.names).items():
+            found[name].append(values)
+    return {name: torch.tensor(np.array(values)) for name, values in found.items()}
 
 
 def assert_close(ours, theirs, name, rtol, atol):
@@ -139,22 +60,28 @@ def assert_close(ours, theirs, name, rtol, atol):
         np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=atol, err_msg=name)
 
 
-def replay(recording, env, rtol=1e-9, atol=1e-9):
-    mode = env.autoreset_mode
-    assert mode is recording.envs.metadata["autoreset_mode"]
-    for call, given_, theirs in recording.calls:
-        if call == "step":
-            ours = env.step(torch.tensor(given_))
-        elif given_ is None:
-            ours = env.reset(options={"signals": recording.signals()})
-        else:
-            ours = env.reset(options={"reset_mask": torch.tensor(given_)})
-        names = "reset" if call == "reset" else "observation reward terminated truncated infos"
-        for own, other, name in zip(
-            ours, theirs, ("observation", "infos") if call == "reset" else names.split(),
-            strict=True,
-        ):  # fmt: skip
-            assert_close(own, other, name, rtol, atol)
+def compare(env, envs, *, steps, rng, partial_resets, episodes, rtol=1e-9, atol=1e-9):
+    """Let the environment in PyTorch meet the same as that in NumPy."""
+
+    def checked(ours, theirs):
+        for own, other in zip(ours, theirs, strict=True):
+            assert_close(own, other, "", rtol, atol)
+        return theirs
+
+    n, seed = envs.num_envs, int(rng.integers(2**30))
+    signals = met(envs, seed, episodes=episodes, samples=steps)
+    checked(env.reset(options={"signals": signals}), envs.reset(seed=seed))
+    for _ in range(steps):
+        actions = random_actions(rng, n)
+        truncated = checked(env.step(torch.tensor(actions)), envs.step(actions))[3]
+        mask = rng.random(n) < partial_resets
+        if envs.autoreset_mode is AutoresetMode.DISABLED:
+            mask |= truncated
+        if mask.any():
+            masks = ({"reset_mask": each} for each in (torch.tensor(mask), mask))
+            checked(
+                *(e.reset(options=each) for e, each in zip((env, envs), masks, strict=True))
+            )
 
 
 @settings(max_examples=60, deadline=None)
@@ -171,27 +98,27 @@ def test_it_equals_the_environment_in_numpy(
     arguments, num_envs, mode, limit, partial_resets, differentiable, randomness
 ):
     rng = np.random.default_rng(randomness)
-    made = {"max_episode_steps": limit, "autoreset_mode": mode, **arguments}
-    recording = record(
-        MiddlePointVectorEnv(num_envs, **made), steps=60, rng=rng, partial_resets=partial_resets
-    )
-    made |= {"dtype": torch.float64, "differentiable": differentiable}
-    replay(recording, MiddlePointTorchEnv(num_envs, **made))
+    shell = {"max_episode_steps": limit, "autoreset_mode": mode}
+    env = make(num_envs, differentiable=differentiable, **shell, **arguments)
+    envs = MiddlePointVectorEnv(num_envs, **shell, **arguments)
+    compare(env, envs, steps=60, rng=rng, partial_resets=partial_resets, episodes=121)
 
 
+# float32 has 24 bits. Errors of rounding grow with the slowest pole's time constant of some 20
+# samples, and temperatures are some 10 degC: 10 * 20 * 2^-24 = 1e-5.
+@pytest.mark.parametrize(
+    ("dtype", "rtol", "atol"), [(torch.float64, 1e-9, 1e-9), (torch.float32, 1e-5, 1e-4)]
+)
 @pytest.mark.parametrize("mode", MODES)
-def test_it_equals_it_over_long_episodes_in_both_types(mode, rng):
+def test_it_equals_it_over_long_episodes_in_both_types(mode, dtype, rtol, atol, rng):
     arguments = {
         **PRESETS["hard"], "action_window": 20, "output_window": 2, "move_weight": 0.1,
         "max_episode_steps": 400, "autoreset_mode": mode,
     }  # fmt: skip
-    recording = record(
-        MiddlePointVectorEnv(3, **arguments), steps=600, rng=rng, partial_resets=0.002
+    env, envs = make(3, dtype=dtype, **arguments), MiddlePointVectorEnv(3, **arguments)
+    compare(
+        env, envs, steps=600, rng=rng, partial_resets=0.002, episodes=9, rtol=rtol, atol=atol
     )
-    replay(recording, MiddlePointTorchEnv(3, dtype=torch.float64, **arguments))
-    # float32 has 24 bits. Errors of rounding grow with the slowest pole's time constant of
-    # some 20 samples, and temperatures are some 10 degC: 10 * 20 * 2^-24 = 1e-5.
-    replay(recording, MiddlePointTorchEnv(3, **arguments), rtol=1e-5, atol=1e-4)
 
 
 class TestEdgeOfTheDeadZone:

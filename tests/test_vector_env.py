@@ -17,10 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mptc_gym import MiddlePointVectorEnv
-from tests.arguments import valid_arguments
+from tests.arguments import MODES, NOISY, valid_arguments
+from tests.conftest import random_actions
 
-NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
-MODES = [mode.value for mode in AutoresetMode]
 TONNES = np.float32(10.0)  # Gymnasium warns of a loss of precision with others
 
 
@@ -46,9 +45,7 @@ def assert_equal(ours, theirs):
 def compare(native, sync, *, steps, rng, partial_resets):
     n = native.num_envs
     for _ in range(steps):
-        actions = rng.normal(0, 1, (n, 1)).astype(np.float32)
-        actions[rng.random(n) < 0.1] *= 1e6
-        actions[rng.random(n) < 0.1] = rng.choice([0.5, -0.5])  # the edge of the dead zone
+        actions = random_actions(rng, n)
         ours, theirs = native.step(actions), sync.step(actions)
         assert_equal(ours, theirs)
         mask = rng.random(n) < partial_resets
