@@ -214,7 +214,9 @@ class TestKeptTrials:
         with pytest.raises(ValueError, match="with other code: to begin anew, remove"):
             search(3)
 
-    @pytest.mark.parametrize("edited", ["agents.direct_nn", "benchmarks.tune.search"])
+    @pytest.mark.parametrize(
+        "edited", ["benchmarks.controllers.engineered", "benchmarks.tune.search"]
+    )
     def test_an_edit_elsewhere_does_not_matter(self, search, edited, monkeypatch):
         before = search(2)
         self.edit(edited, monkeypatch)
