@@ -18,17 +18,11 @@ import pandas as pd
 import pytest
 
 from agents import DirectNNController, PIController
-from benchmarks.compare import command, comparison, plots, report
+from benchmarks.compare import command, plots, report
 from benchmarks.compare import tables as compare_tables
 from benchmarks.compare.__main__ import main
-from benchmarks.compare.estimates import (
-    beaten,
-    estimate,
-    scale_of,
-    scores,
-    standing,
-    verdict,
-)
+from benchmarks.compare.estimates import estimate, scale_of, score, standing, verdict
+from benchmarks.controllers import records
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage, tables
 from benchmarks.lib.drawing import drawn
@@ -110,21 +104,22 @@ class TestTables:
         found = tables.percentiles(np.array(values))
         assert found == dict(zip(("median", "p10", "p90"), expected, strict=True))
 
-    def test_of_numbers_and_estimates_in_csv(self):
+    def test_of_numbers_and_estimates_in_csv(self, tmp_path):
         columns = {
             "a": ["x", "y"],
             "s": [1.5, np.inf],
             "e": [Estimate(2.0, 1.0, 3.0, 4), np.nan],
         }
-        table = compare_tables.for_csv(pd.DataFrame(columns)).to_csv(index=False)
-        assert table == "a,s,e,e_low,e_high\nx,1.5,2.0,1.0,3.0\ny,not settled,,,\n"
+        compare_tables.write(tmp_path / "table.csv", pd.DataFrame(columns))
+        written = (tmp_path / "table.csv").read_text()
+        assert written == "a,s,e,e_low,e_high\nx,1.5,2.0,1.0,3.0\ny,not settled,,,\n"
 
 
 def some_runs(**errors):
-    """Make up runs on the constant set point: errors of agents by policy and seed."""
+    """Make up runs: errors of agents by policy and seed."""
     return pd.DataFrame(
         [
-            {"scenario": "constant", "agent": agent, "policy": p, "seed": i, "mae": error}
+            {"agent": agent, "policy": p, "seed": i, "mae": error}
             for agent, policies in errors.items()
             for p, row in enumerate(policies)
             for i, error in enumerate(row)
@@ -134,10 +129,10 @@ def some_runs(**errors):
 
 class TestEstimates:
     def test_by_hand(self):
-        scales = {"constant": scale_of(SCENARIOS["constant"], 3)}
-        limit = scales["constant"].least.value
+        scale = scale_of(SCENARIOS["constant"], 3)
+        limit = scale.least.value
         runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
-        nn, ppo_ = estimate(runs, scales, "nn").to_dict("records")
+        nn, ppo_ = estimate(runs, scale, "nn").to_dict("records")
         assert (nn["mean"].value, nn["limit"]) == (2.0, limit)
         assert nn["ratio"].value == 2.0 / limit
         assert ppo_["mean"].value == pytest.approx(1.5)
@@ -146,31 +141,25 @@ class TestEstimates:
         assert math.isnan(nn["difference"])
         assert nn["mean"].low < nn["mean"].value < nn["mean"].high
 
-    def test_who_beats_a_limit_is_named(self):
-        scales = {"constant": scale_of(SCENARIOS["constant"], 2)}
-        limit = scales["constant"].least.value
-        runs = some_runs(
-            a=[[limit, limit]], b=[[0.9 * limit] * 2], c=[[0.9 * limit, 1.2 * limit]]
+    def test_who_comes_below_a_bound_by_more_than_chance_is_named(self):
+        scale = scale_of(SCENARIOS["square"], 2)
+        limit, preview = scale.least.value, scale.preview.value
+        assert preview < 0.95 * limit
+        between = (preview + limit) / 2
+        runs = some_runs(a=[[limit] * 2], b=[[between] * 2], c=[[between, 1.2 * limit]])
+        assert "beforehand: b in square. Such a controller uses the future" in verdict(
+            estimate(runs, scale, "a")
         )
-        assert list(beaten(estimate(runs, scales, "a"))["agent"]) == ["b"]
+        runs = some_runs(a=[[2.0] * 2], b=[[0.1] * 2])
+        assert "bound of every controller, beyond the interval: b in square." in verdict(
+            estimate(runs, scale, "a")
+        )
 
     def test_one_run_of_many_cannot_tell(self):
-        scales = {"constant-noise": scale_of(SCENARIOS["constant-noise"], 1)}
-        runs = some_runs(a=[[0.5]], b=[[2.0]]).assign(scenario="constant-noise")
-        found = estimate(runs, scales, "a")
-        assert found["mean"].iloc[0].value < scales["constant-noise"].least.value
-        assert beaten(found).empty
+        scale = scale_of(SCENARIOS["constant-noise"], 1)
+        found = estimate(some_runs(a=[[0.5]], b=[[2.0]]), scale, "a")
+        assert found["mean"].iloc[0].value < scale.least.value
         assert verdict(found).startswith("No controller")
-
-    def test_who_uses_the_future_is_told_so(self):
-        scales = {"square": scale_of(SCENARIOS["square"], 3)}
-        square = scales["square"]
-        assert square.preview.value < 0.95 * square.least.value
-        between = (square.preview.value + square.least.value) / 2
-        runs = some_runs(a=[[2.0] * 3], b=[[between] * 3]).assign(scenario="square")
-        assert "uses the future" in verdict(estimate(runs, scales, "a"))
-        runs = some_runs(a=[[2.0] * 3], b=[[0.1] * 3]).assign(scenario="square")
-        assert "bound of every controller" in verdict(estimate(runs, scales, "a"))
 
     def test_who_is_best_and_who_cannot_be_told_apart(self):
         scales = {"constant-noise": scale_of(SCENARIOS["constant-noise"], 40)}
@@ -179,14 +168,15 @@ class TestEstimates:
         runs = some_runs(
             a=[limit + 0.9 + noise[0]], b=[limit + 0.1 + noise[1]], c=[limit + 0.1 + noise[2]]
         ).assign(scenario="constant-noise", total_variation=12.0)
-        text = standing(runs, scales, scores(runs, scales))
+        scores = {agent: score(runs[runs["agent"] == agent], scales) for agent in "abc"}
         assert re.fullmatch(
             r"[bc] is best, with a score of 0.97\d at 12 t/h of valve travel a run; "
             r"[bc] follows with 0.97\d at 12 t/h. "
-            r"Not to be told apart, at 95 %: (b and c|c and b)\.", text
-        )  # fmt: skip
-        alone = runs[(runs["agent"] != "c")]
-        assert standing(alone, scales, scores(alone, scales)).endswith(
+            r"Not to be told apart, at 95 %: (b and c|c and b)\.",
+            standing(runs, scales, scores),
+        )
+        del scores["c"]
+        assert standing(runs, scales, scores).endswith(
             "The runs tell all of them apart, at 95 %."
         )
 
@@ -211,20 +201,10 @@ class TestReport:
         assert "http" not in html  # nothing is fetched
 
 
-def acting(actions):
-    """Return a controller that always acts like this."""
-    agent = PIController()
-    agent.act = lambda observation: np.array(actions)
-    return agent
-
-
-def test_a_wrong_shape_of_actions_is_named():
-    with pytest.raises(ValueError, match=r"shape \(2, 1\), got \(3,\)"):
-        rollout(make_plants(2, 10), acting([0.0, 0.0, 0.0]), 10, seed=0)
-
-
 def test_samples_line_up():
-    runs = rollout(make_plants(2, 50, setpoint=5.0), acting([[-1.0], [-1.0]]), 50, seed=0)
+    down = PIController()
+    down.act = lambda observation: np.array([[-1.0], [-1.0]])
+    runs = rollout(make_plants(2, 50, setpoint=5.0), down, 50, seed=0)
     assert np.all(runs.command == -10.0)  # u(0) is in row 0 ...
     assert np.all(runs.output[:19] == 0.0)
     assert np.all(runs.output[19] == pytest.approx(0.456))  # ... and shows in row 19
@@ -461,20 +441,6 @@ class TestCompare:
         runs = pd.read_csv(tmp_path / "out/runs.csv")
         assert runs["mae"].iloc[0] == pytest.approx(0.283, abs=0.001)  # that of the gains
 
-    def test_files_of_an_earlier_run_do_not_stay(self, tmp_path):
-        out = tmp_path / "out"
-        options = ("--agents", "pi", "--runs", 1, "--scenarios")
-        run_compare(out, *options, "constant", "square")
-        (out / "mine.txt").write_text("not of the comparison")
-        run_compare(out, *options, "constant")
-        names = {path.name for path in out.iterdir()}
-        assert names == {
-            "runs.csv", "summary.csv", "estimates.csv", "report.md", "report.html",
-            "limits.png", "runs.png", "travel.png", "constant.csv", "constant.png",
-            "provenance.json",
-            "mine.txt",
-        }  # fmt: skip
-
     def run_and_stop(self, out, monkeypatch, error, after):
         calls = itertools.count()
 
@@ -483,7 +449,7 @@ class TestCompare:
                 raise error
             return rollout(*arguments)
 
-        monkeypatch.setattr(comparison, "rollout", stopped)
+        monkeypatch.setattr(records, "rollout", stopped)
         return run_compare(
             out, "--agents", "pi", "nn", "--scenarios", "constant", "square", "--runs", 1
         )
@@ -519,7 +485,7 @@ class TestCompare:
             saved.append(len(pd.read_csv(runs)) if runs.exists() else 0)
             return rollout(*arguments)
 
-        monkeypatch.setattr(comparison, "rollout", watched)
+        monkeypatch.setattr(records, "rollout", watched)
         monkeypatch.setattr(command, "PAUSE", 0.0)
         scenarios = ("constant", "square", "constant-noise")
         run_compare(tmp_path / "out", "--agents", "pi", "--runs", 2, "--scenarios", *scenarios)
@@ -538,21 +504,9 @@ class TestCompare:
         assert "Interrupted" in capsys.readouterr().out
         assert self.the_first_is_kept(out)
 
-    @pytest.mark.parametrize("text", ["", '{"files": 3}'])
-    def test_damaged_provenance_is_named_and_written_anew(self, text, tmp_path, capsys):
-        out = tmp_path / "out"
-        out.mkdir()
-        (out / "provenance.json").write_text(text)
-        options = ("--agents", "pi", "--runs", 1, "--scenarios", "constant")
-        assert run_compare(out, *options) == 0
-        complaint = capsys.readouterr().err
-        assert f"{out / 'provenance.json'} is damaged" in complaint
-        assert "may stay" in complaint
-        assert json.loads((out / "provenance.json").read_text())["complete"] is True
-
     def test_a_folder_that_cannot_be_written_to(self, tmp_path, monkeypatch, refused):
         (tmp_path / "file").write_text("in the way")
-        monkeypatch.setattr(comparison, "rollout", None)  # nothing is run before
+        monkeypatch.setattr(records, "rollout", None)  # nothing is run before
         for out in (tmp_path / "file", tmp_path / "file" / "below"):
             assert f"--out: {out} cannot be written to" in refused(main, ["--out", out])
 

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,6 @@ from benchmarks.loop import designs
 from benchmarks.loop.designs import SPANS, WIDE, grid, random_design
 from benchmarks.sweep import command, report, tasks
 from benchmarks.sweep.__main__ import main
-from benchmarks.sweep.options import Options
 from benchmarks.sweep.tasks import agent_task, limit_task
 from mptc_gym import Parameters
 
@@ -24,7 +24,7 @@ NOMINAL = {"delay": 18}
 
 def run_task(agent, plant, *numbers):
     (factory,) = ROSTER[agent].members()
-    return agent_task(factory, {}, plant, *numbers)
+    return agent_task(factory, {}, plant, *numbers)  # samples, runs
 
 
 class TestDesigns:
@@ -75,7 +75,7 @@ class TestDesigns:
 
 class TestCells:
     def test_no_control_leaves_the_error_at_the_set_point(self):
-        task = run_task("nothing", NOMINAL, 1200, 2, 0)
+        task = run_task("nothing", NOMINAL, 1200, 2)
         assert task["mae"] == task["late"] == [5.0, 5.0]
         assert task["swing"] == [0.0, 0.0]
 
@@ -86,24 +86,24 @@ class TestCells:
         assert tasks.swing(error, steady) == pytest.approx([np.sqrt(7.75 / 2)])
 
     def test_the_limit_is_that_of_the_plant(self):
-        nominal = limit_task(NOMINAL, 1200)["mae"]
+        nominal = limit_task(NOMINAL, 1200)
         assert nominal == pytest.approx(0.911, abs=0.001)
-        assert limit_task({"delay": 30}, 1200)["mae"] > nominal
+        assert limit_task({"delay": 30}, 1200) > nominal
         # As the gain falls, 5 degC come to be out of reach.
-        assert limit_task({"gain_drift": 0.5}, 1200)["mae"] > 1.4 * nominal
+        assert limit_task({"gain_drift": 0.5}, 1200) > 1.4 * nominal
 
     def test_a_frozen_network_starts_from_what_was_learnt(self):
         learning = ROSTER["nn"].members()[0].in_service({}, 3, 0)
         frozen = ROSTER["nn-frozen"].members()[0]({}, 3, 0)
         np.testing.assert_array_equal(learning.weights.W, frozen.weights.W)
         # Commissioned, it knows the plant: better than one that begins to learn.
-        experienced = run_task("nn-frozen", NOMINAL, 1200, 3, 0)["mae"]
+        experienced = run_task("nn-frozen", NOMINAL, 1200, 3)["mae"]
         assert np.median(experienced) < 1.6
 
     def test_a_loop_with_too_much_delay_oscillates(self):
-        slow = run_task("pi", {"delay": 40}, 1200, 1, 0)
+        slow = run_task("pi", {"delay": 40}, 1200, 1)
         assert slow["swing"][0] > report.OSCILLATES
-        calm = run_task("pi-simc", NOMINAL, 1200, 1, 0)
+        calm = run_task("pi-simc", NOMINAL, 1200, 1)
         assert calm["swing"][0] < 0.2
 
 
@@ -135,15 +135,21 @@ class TestSweep:
 
     def test_tasks_of_other_options_are_not_taken(self, tmp_path, monkeypatch):
         monkeypatch.setattr(command, "report", lambda *_: [])  # which takes its time to draw
-        first = ["--design", "random", "--plants", 2, "--agents", "pi-simc"]
-        run_sweep(tmp_path / "one", *first)
-        for out in ("one", "two"):
-            run_sweep(tmp_path / out, *first, "--samples", 650)
-        ours, theirs = (pd.read_csv(tmp_path / name / "runs.csv") for name in ("one", "two"))
-        pd.testing.assert_frame_equal(ours, theirs)
-        run_sweep(tmp_path / "one", *first, "--design", "wide")
-        wide = pd.read_csv(tmp_path / "one" / "runs.csv")["delay"].unique()
-        assert wide.tolist() == [plant["delay"] for plant in random_design(2, 0, 700, WIDE)]
+        given = ["--design", "random", "--plants", 2, "--agents", "pi-simc", "--samples", 60]
+        changes = [  # and how many folders are new: of the limit, of nothing, of the controller
+            ([], 3), (["--runs", 3], 2), (["--samples", 50], 3), (["--design-seed", 1], 3),
+            (["--design", "wide"], 3), (["--told", "each"], 2), (["--agents", "pi"], 1),
+            (["--set", "dead_zone=7"], 2), ([], 0),
+        ]  # fmt: skip
+        for options, anew in changes:
+            kept = len(list(tmp_path.glob("tasks/*")))
+            run_sweep(tmp_path, *given, *options)
+            assert len(list(tmp_path.glob("tasks/*"))) == kept + anew
+        # Neither are those of another training.
+        trained = Factory(simc_pi, provenance={"file": "b"})
+        monkeypatch.setitem(ROSTER, "pi-simc", replace(ROSTER["pi-simc"], made_by=trained))
+        run_sweep(tmp_path, *given)
+        assert len(list(tmp_path.glob("tasks/*"))) == kept + anew + 1
 
     def test_told_each_plant_a_controller_does_better(self, tmp_path, monkeypatch):
         monkeypatch.setattr(command, "report", lambda *_: [])
@@ -153,20 +159,6 @@ class TestSweep:
             assert run_sweep(tmp_path, *given) == 0
             errors[told] = pd.read_csv(tmp_path / "runs.csv")["mae"]
         assert errors["each"].mean() < errors["nominal"].mean() - 0.05
-
-    def test_everything_that_shapes_a_task_is_in_the_key(self):
-        common = {
-            "plants": [{"delay": 18}], "told": [{}], "factories": [Factory(simc_pi)],
-            "options": Options(runs=2, samples=700), "name": "pi",
-        }  # fmt: skip
-        changes = [
-            {}, {"plants": [{"delay": 19}]}, {"told": [{"dead_zone": 7.0}]},
-            {"factories": [Factory(simc_pi, provenance={"file": "b"})]}, {"name": "nn"},
-            {"options": Options(runs=3, samples=700)},
-            {"options": Options(runs=2, samples=650)},
-        ]  # fmt: skip
-        keys = {command.agent_key(**{**common, **change}) for change in changes}
-        assert len(keys) == len(changes)
 
     def test_grid(self, tmp_path, monkeypatch):
         monkeypatch.setitem(designs.GRID, "delay", range(10, 22, 10))
@@ -230,7 +222,7 @@ class TestFindings:
         return pd.DataFrame(rows)
 
     def test_differences(self):
-        table = report.differences(self.runs(), report.LEARNING, "late").set_index("plants")
+        table = report.differences(self.runs(), [("nn", "pi-simc")], "late").set_index("plants")
         pair = "NN - PI, SIMC"
         assert table.loc["no drift", pair] == "-0.500; 100 %"
         assert table.loc["gain falls to less than 0.8 times", pair].startswith("-0.500")

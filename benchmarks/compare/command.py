@@ -6,23 +6,22 @@ import hashlib
 import itertools
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.compare import report
+from benchmarks.compare import report, tables
 from benchmarks.compare.comparison import Comparison
 from benchmarks.compare.estimates import scale_of
 from benchmarks.compare.options import COMPARED, RUNS, Options
-from benchmarks.compare.record import Record
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.records import Factory, provenances
 from benchmarks.lib.command_line import UsageError, blame, known, out_folder
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.options import flat
-from benchmarks.lib.report import Section, show
-from benchmarks.lib.storage import origin
+from benchmarks.lib.report import Section, provenance_line, show
+from benchmarks.lib.storage import origin, write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
 from mptc_gym.evaluation import SEED
 
@@ -37,61 +36,72 @@ def execute(options: Options, console: Console) -> str:
     plant = options.plant.chosen()
     if options.presets and plant.arguments:
         raise UsageError("--presets: goes without --plant, --preset and --set")
-    scenarios = PRESET_SCENARIOS if options.presets else SCENARIOS
+    known_cases = PRESET_SCENARIOS if options.presets else SCENARIOS
     if plant.arguments:
-        scenarios = scenarios_of(plant.name, plant.arguments)
-    given = list(scenarios) if options.scenarios is None else options.scenarios
-    names = known("--scenarios", given, list(scenarios))
+        known_cases = scenarios_of(plant.name, plant.arguments)
+    given = list(known_cases) if options.scenarios is None else options.scenarios
+    names = known("--scenarios", given, list(known_cases))
     if not names:
         raise UsageError("--scenarios: none to run")
+    scenarios = {name: known_cases[name] for name in names}
     training = options.controllers.training()
     members = {name: entry.members(training) for name, entry in controllers.items()}
     if plant.arguments:
-        _try_out(members, [scenarios[name] for name in names], options.runs)
+        _try_out(members, scenarios.values(), options.runs)
     out = options.out or _folder(
         [*controllers] if (*controllers,) != COMPARED else [],
-        names if names != [*scenarios] else [],
+        names if names != [*known_cases] else [],
         [plant.name] if plant.arguments else ["presets"] if options.presets else [],
         [f"{options.runs}-runs"] if options.runs != RUNS else [],
     )
-    comparison = Comparison({name: scenarios[name] for name in names}, members, options.runs)
+    folder, made = out_folder(out), origin()
     about = {
         "options": {**flat(options), "agents": list(members)},
         "seeds": list(range(SEED, SEED + options.runs)),
         "scenarios": {
             name: {"samples": each.samples, "arguments": each.arguments}
-            for name, each in comparison.scenarios.items()
+            for name, each in scenarios.items()
         },
         "policies": provenances(members),
     }
-    record = Record(out_folder(out), {**origin(), **about})
+    comparison = Comparison(scenarios, members, options.runs)
+    began, saved = time.perf_counter(), -math.inf
 
-    def write(fan_out: FanOut, *, complete: bool) -> list[Section]:
-        return report.write(comparison, controllers, record, fan_out, complete=complete)
+    def save(*, complete: bool = False) -> None:
+        tables.write(folder / "runs.csv", comparison.runs)
+        seconds = round(time.perf_counter() - began, 1)
+        state = {"complete": complete, "seconds": seconds}
+        write_json(folder / "provenance.json", {**state, **made, **about})
+
+    def write(fan_out: FanOut) -> list[Section]:
+        save()
+        return report.write(comparison, folder, provenance_line("compare", made), fan_out)
 
     try:
-        written = -math.inf
         for _ in comparison.run(training.fan_out):
-            if time.monotonic() - written >= PAUSE:
-                record.write_runs(comparison.runs, complete=False)
-                written = time.monotonic()
+            if time.perf_counter() - saved >= PAUSE:
+                save()
+                saved = time.perf_counter()
     except BaseException:  # Ctrl-C, too
-        write(FanOut(jobs=1), complete=False)
+        if comparison.cases:
+            write(FanOut(jobs=1))
         raise
-    show(write(FanOut(options.controllers.fan_out.jobs), complete=True)[:3], console)
+    sections = write(FanOut(options.controllers.fan_out.jobs))
+    save(complete=True)
+    show(sections[:3], console)
     return f"The report, tables, data and plots are in {out}/"
 
 
 def _try_out(
-    members: Mapping[str, list[Factory]], scenarios: Sequence[Scenario], runs: int
+    members: Mapping[str, list[Factory]], scenarios: Collection[Scenario], runs: int
 ) -> None:
     """Refuse a plant that has no score, or that a controller cannot be set up for."""
     for scenario in scenarios:
         with blame(scenario.title):
             scale_of(scenario, runs).least.score(0.0)
-    for name, scenario in itertools.product(members, scenarios):
+    for (name, (first, *_)), scenario in itertools.product(members.items(), scenarios):
         with blame(f"{name} on {scenario.title}"):
-            members[name][0](scenario.arguments, 1, 0)
+            first(scenario.arguments, 1, 0)
 
 
 def _folder(*differences: list[str]) -> Path:

@@ -13,13 +13,21 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from benchmarks.controllers.roster import label
-from benchmarks.lib.statistics import bootstrap, improvement, interquartile_mean, student
+from benchmarks.lib.statistics import (
+    Estimate,
+    bootstrap,
+    improvement,
+    interquartile_mean,
+    student,
+)
 from benchmarks.lib.tables import groups
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
 
 if TYPE_CHECKING:
     from benchmarks.limits import LeastPossible
+
+Score = tuple[Estimate, dict[str, float]]  # overall, and in each scenario
 
 BOOTSTRAP = 0  # seed of the bootstraps
 TOLERANCE = 1e-4  # relative error that a bound may have
@@ -29,6 +37,7 @@ TOLERANCE = 1e-4  # relative error that a bound may have
 class Scale:
     """What the errors of a scenario are measured against."""
 
+    scenario: str
     least: LeastPossible
     """The least possible error that applies, of the kind "reference" or "news" where the set
     point changes, or "preview"; see `benchmarks.limits`."""
@@ -36,10 +45,12 @@ class Scale:
     """The least possible error of any controller at all."""
     drawn: bool
     """Whether runs differ: whether anything is random."""
+    frontier: tuple[tuple[float, float], ...] = ()
+    """The least error for a given travel of the valve, t/h and degC, if known; see `bounds`."""
 
 
 def scale_of(scenario: Scenario, runs: int) -> Scale:
-    """Return what the errors of a scenario are measured against.
+    """Return what the errors of a scenario are measured against, but for the frontier.
 
     The bounds of drawn plants and set points are the means over the episodes that are run.
     """
@@ -51,32 +62,35 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
         **scenario.arguments,
     }
     least, preview = least_possible(**case), least_possible(kind="preview", **case)
-    return Scale(least, preview, is_random(scenario.parameters))
+    return Scale(scenario.name, least, preview, is_random(scenario.parameters))
 
 
-def travel_frontier(scenario: Scenario) -> list[tuple[float, float]]:
-    """Return the least error for a given travel of the valve, t/h and degC; empty if drawn.
+def bounds(scenario: Scenario, runs: int) -> Scale:
+    """Return what the errors of a scenario are measured against.
 
-    Between two points the bound is the straight line.
+    Between two points of the frontier, which comes by descending travel, the bound is the
+    straight line. Drawn plants and set points have none: it would take as many programmes as
+    there are episodes, more than a picture is worth.
     """
     from benchmarks.limits import frontier
 
-    parameters = scenario.parameters
+    scale, parameters = scale_of(scenario, runs), scenario.parameters
     if parameters.ranges or parameters.setpoint == "random":
-        return []  # as many programmes as episodes: more than a picture is worth
+        return scale
     case: dict[str, Any] = {"samples": scenario.samples, **scenario.arguments}
     try:
         points = frontier(kind="reference", **case)
     except ValueError:  # it does not settle between changes
         points = frontier(**case)
-    return [(travel * scenario.samples, error) for travel, error in points]
+    travels = tuple((travel * scenario.samples, error) for travel, error in points)
+    return replace(scale, frontier=travels)
 
 
-def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) -> pd.DataFrame:
-    """Return one row for each scenario and agent: estimates with 95 % intervals.
+def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
+    """Return one row for each agent in a scenario: estimates with 95 % intervals.
 
-    There is one row a run, with `scenario`, `agent`, `policy`, `seed` and `mae`. The reference
-    is the agent that the others are compared with, run by run.
+    There is one row a run, with `agent`, `policy`, `seed` and `mae`. The reference is the agent
+    that the others are compared with, run by run.
 
     Returns
     -------
@@ -88,62 +102,50 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale], reference: str) ->
         mean. Ends are infinite where runs differ and there is only one.
     """
     rows = []
-    for scenario, cases in groups(runs, "scenario"):
-        scale = scales[scenario]
-        limit = scale.least.value
-        errors = {agent: _errors(group) for agent, group in groups(cases, "agent")}
-        base = errors[reference].mean(axis=0) if reference in errors else None
-        for agent, values in errors.items():
-            mean, by_run = bootstrap(values, seed=BOOTSTRAP), student(values.mean(axis=0))
-            student_high = by_run.high if scale.drawn else by_run.value
-            if scale.drawn and by_run.runs == 1:
-                student_high = math.inf
-                if values.size == 1:
-                    mean = replace(mean, low=-math.inf, high=math.inf)
-            row: dict[str, Any] = {
-                "scenario": scenario,
-                "agent": agent,
-                "limit": limit,
-                "preview": scale.preview.value,
-                "mean": mean,
-                "student_high": student_high,
-                "interquartile_mean": bootstrap(
-                    values, seed=BOOTSTRAP, statistic=interquartile_mean
-                ),
-                "ratio": replace(
-                    mean, value=mean.value / limit, low=mean.low / limit, high=mean.high / limit
-                ),
-            }
-            if base is not None and agent != reference:
-                row["difference"] = bootstrap(values - base, seed=BOOTSTRAP)
-                row["improvement"] = improvement(values, base, BOOTSTRAP)
-            rows.append(row)
+    limit = scale.least.value
+    errors = {agent: _errors(group) for agent, group in groups(runs, "agent")}
+    base = errors[reference].mean(axis=0) if reference in errors else None
+    for agent, values in errors.items():
+        mean, by_run = bootstrap(values, seed=BOOTSTRAP), student(values.mean(axis=0))
+        student_high = by_run.high if scale.drawn else by_run.value
+        if scale.drawn and by_run.runs == 1:
+            student_high = math.inf
+            if values.size == 1:
+                mean = replace(mean, low=-math.inf, high=math.inf)
+        middle = bootstrap(values, seed=BOOTSTRAP, statistic=interquartile_mean)
+        row: dict[str, Any] = {
+            "scenario": scale.scenario,
+            "agent": agent,
+            "limit": limit,
+            "preview": scale.preview.value,
+            "mean": mean,
+            "student_high": student_high,
+            "interquartile_mean": middle,
+            "ratio": replace(
+                mean, value=mean.value / limit, low=mean.low / limit, high=mean.high / limit
+            ),
+        }
+        if base is not None and agent != reference:
+            row["difference"] = bootstrap(values - base, seed=BOOTSTRAP)
+            row["improvement"] = improvement(values, base, BOOTSTRAP)
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
-def scores(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
-    """Return how much of what is possible each agent achieves, over all scenarios.
+def score(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> Score:
+    """Return how much of what is possible an agent achieves, in all and in each scenario.
 
     The score of a run is 0 for the mean error of a valve that is left alone and 1 for the least
-    possible error. Scenarios weigh the same, however hard they are.
-
-    Returns
-    -------
-    DataFrame
-        A row an agent: `score`, the interquartile mean over the runs of all scenarios, with a
-        95 % interval from drawing policies and runs within each scenario; and the mean score in
-        each scenario.
+    possible error. The first is the interquartile mean over the runs of all scenarios, which
+    weigh the same however hard they are, with a 95 % interval from drawing policies and runs
+    within each. The others are means.
     """
-    rows = []
-    for agent, cases in groups(runs, "agent"):
-        tables = {
-            scenario: scales[scenario].least.score(_errors(group))
-            for scenario, group in groups(cases, "scenario")
-        }
-        score = bootstrap(*tables.values(), seed=BOOTSTRAP, statistic=interquartile_mean)
-        means = {scenario: float(table.mean()) for scenario, table in tables.items()}
-        rows.append({"agent": agent, "score": score, **means})
-    return pd.DataFrame(rows)
+    tables = {
+        scenario: scales[scenario].least.score(_errors(group))
+        for scenario, group in groups(runs, "scenario")
+    }
+    overall = bootstrap(*tables.values(), seed=BOOTSTRAP, statistic=interquartile_mean)
+    return overall, {scenario: float(table.mean()) for scenario, table in tables.items()}
 
 
 def _errors(runs: pd.DataFrame) -> NDArray[np.float64]:
@@ -151,18 +153,14 @@ def _errors(runs: pd.DataFrame) -> NDArray[np.float64]:
     return runs.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
 
 
-def standing(runs: pd.DataFrame, scales: Mapping[str, Scale], scored: pd.DataFrame) -> str:
-    """Say in two sentences who is best at what valve travel, and who cannot be told apart.
-
-    `runs` and `scales` are those of `estimate`, `scored` is what `scores` returns.
-    """
-    score: dict[str, float] = {
-        agent: found.value
-        for agent, found in zip(scored["agent"], scored["score"], strict=True)
-    }
-    agents = sorted(score, key=lambda agent: -score[agent])
+def standing(
+    runs: pd.DataFrame, scales: Mapping[str, Scale], scores: Mapping[str, Score]
+) -> str:
+    """Say in two sentences who is best at what valve travel, and who cannot be told apart."""
+    overall = {agent: found.value for agent, (found, _) in scores.items()}
+    agents = sorted(overall, key=lambda agent: -overall[agent])
     travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
-    at = [f"{score[each]:.3f} at {travels[each].mean():,.0f} t/h" for each in agents]
+    at = [f"{overall[each]:.3f} at {travels[each].mean():,.0f} t/h" for each in agents]
     if len(agents) == 1:
         return f"{label(agents[0])} has a score of {at[0]} of valve travel a run."
     best = (
@@ -184,39 +182,39 @@ def _alike(runs: pd.DataFrame, scales: Mapping[str, Scale], one: str, other: str
     for scenario, cases in groups(runs, "scenario"):
         errors = [_errors(cases[cases["agent"] == agent]) for agent in (one, other)]
         if not all(each.size for each in errors):
-            continue  # after an interruption
+            continue  # after an interruption not all have run
         # Policies are drawn of the one that has more of them.
         many, few = sorted(map(scales[scenario].least.score, errors), key=len, reverse=True)
         tables.append(many - few.mean(axis=0))
+    if not tables:
+        return True
     difference = bootstrap(*tables, seed=BOOTSTRAP)
     return difference.low <= 0.0 <= difference.high
 
 
-def beaten(estimates: pd.DataFrame, bound: str = "limit") -> pd.DataFrame:
-    """Return the rows of `estimate` whose mean lies below a bound by more than chance.
-
-    The whole interval lies below. Where there are few runs a bootstrap makes it too narrow, so
-    that Student's interval must lie below, too. The bound is "limit" or "preview".
-    """
-    ends = zip(estimates["mean"], estimates["student_high"], strict=True)
-    highest = np.array([max(mean.high, student_high) for mean, student_high in ends])
-    return estimates[highest < estimates[bound] * (1.0 - TOLERANCE)]
-
-
 def verdict(estimates: pd.DataFrame) -> str:
     """Say in a sentence whether a controller came below a bound, and what that means."""
-
-    def cases(rows: pd.DataFrame) -> str:
-        return ", ".join(f"{row.agent} in {row.scenario}" for row in rows.itertuples())
-
-    if impossible := cases(beaten(estimates, "preview")):
+    if impossible := _below(estimates, "preview"):
         return (
             f"Below the bound of every controller, beyond the interval: {impossible}. "
             "The plant or the bound is another one than was run."
         )
-    if below := cases(beaten(estimates)):
+    if below := _below(estimates, "limit"):
         return (
             f"Below what is possible without knowing the set point beforehand: {below}. "
             "Such a controller uses the future, or reckons with the next change."
         )
     return "No controller comes below the least possible error, in any scenario."
+
+
+def _below(estimates: pd.DataFrame, bound: str) -> str:
+    """Name those whose mean error lies below a bound by more than chance.
+
+    The whole interval lies below. Where there are few runs a bootstrap makes it too narrow, so
+    that Student's interval must lie below, too.
+    """
+    return ", ".join(
+        f"{row['agent']} in {row['scenario']}"
+        for row in estimates.to_dict("records")
+        if max(row["mean"].high, row["student_high"]) < row[bound] * (1.0 - TOLERANCE)
+    )

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
+from benchmarks.compare.estimates import Scale
 from benchmarks.controllers.roster import label
 from benchmarks.lib.drawing import COLOURS, colours, draw_actuator, drawn, panels
 from benchmarks.lib.tables import groups
@@ -58,8 +59,8 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
 def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
     """Draw the mean errors as points with 95 % intervals; each axis begins at the limit."""
     shades = colours(list(estimates["agent"].unique()))
-    with _scenario_panels(path, estimates) as (_, found):
-        for axes, (_, rows) in zip(found, groups(estimates, "scenario"), strict=True):
+    with _scenario_panels(path, estimates) as found:
+        for axes, rows in found:
             worst = rows["mean"].map(lambda mean: mean.value).max()
             for place, (agent, mean) in enumerate(
                 zip(rows["agent"], rows["mean"], strict=True)
@@ -71,84 +72,86 @@ def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
                 axes.errorbar(
                     mean.value, place, xerr=ends, fmt="o", capsize=3, color=shades[agent]
                 )
-            _list_agents(axes, list(rows["agent"]))
+            _list_agents(axes, rows, "mean |e| (°C)")
             limit = rows["limit"].iloc[0]
             # A little to the left of it, so that a point on the limit is whole.
             axes.axvline(limit, color="0.4", linewidth=1)
             axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
-            axes.set_xlabel("mean |e| (°C)")
 
 
 def plot_runs(runs: pd.DataFrame, path: Path) -> None:
     """Draw the mean error of every single run, so that no failure is averaged away."""
     generator = np.random.default_rng(0)  # scatters points that would hide each other
     shades = colours(list(runs["agent"].unique()))
-    with _scenario_panels(path, runs) as (_, found):
-        for axes, (_, cases) in zip(found, groups(runs, "scenario"), strict=True):
+    with _scenario_panels(path, runs) as found:
+        for axes, cases in found:
             for place, (agent, rows) in enumerate(groups(cases, "agent")):
                 around = place + generator.uniform(-0.3, 0.3, len(rows))
                 axes.plot(
                     rows["mae"], around, ".", markersize=3, alpha=0.4, color=shades[agent]
                 )
-            _list_agents(axes, list(cases["agent"].unique()))
+            _list_agents(axes, cases, "mean |e| of a run (°C)")
             axes.set_xlim(left=0)
-            axes.set_xlabel("mean |e| of a run (°C)")
 
 
-def _list_agents(axes: Axes, agents: Sequence[str]) -> None:
+def _list_agents(axes: Axes, rows: pd.DataFrame, measure: str) -> None:
+    agents = rows["agent"].unique()
     axes.set_yticks(range(len(agents)), [label(agent) for agent in agents])
     axes.invert_yaxis()
+    axes.set_xlabel(measure)
 
 
+@contextmanager
 def _scenario_panels(
-    path: Path, rows: pd.DataFrame, height: float | None = None
-) -> AbstractContextManager[tuple[Figure, list[Axes]]]:
-    height = height or 1.2 + 0.28 * rows["agent"].nunique()
-    return panels(path, list(rows["scenario"].unique()), (4.2, height), 3)
+    path: Path, table: pd.DataFrame, height: float | None = None
+) -> Iterator[list[tuple[Axes, pd.DataFrame]]]:
+    """Give a panel for each scenario, with its rows; a legend has what is labelled in any."""
+    height = height or 1.2 + 0.28 * table["agent"].nunique()
+    names = list(table["scenario"].unique())
+    with panels(path, names, (4.2, height), 3) as (figure, found):
+        by_scenario = (rows for _, rows in groups(table, "scenario"))
+        yield list(zip(found, by_scenario, strict=True))
+        shown = [axes.get_legend_handles_labels() for axes in found]
+        entries = {name: handle for pair in shown for handle, name in zip(*pair, strict=True)}
+        if entries:
+            figure.legend(entries.values(), entries, loc="outside lower center", ncols=5)
 
 
-def plot_travel(
-    summary: pd.DataFrame,
-    limits: Mapping[str, float],
-    frontiers: Mapping[str, Sequence[tuple[float, float]]],
-    path: Path,
-) -> None:
+def plot_travel(summary: pd.DataFrame, scales: Mapping[str, Scale], path: Path) -> None:
     """Draw the error of every agent against its valve travel, a panel for each scenario.
 
-    `summary` is what `tables.summarise` returns; the limits are the least possible errors,
-    degC, and the frontiers those for a given travel: t/h and degC, by descending travel.
+    `summary` is what `tables.summarise` returns.
     """
     medians = summary.pivot_table(
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
-    with _scenario_panels(path, medians, 3.0) as (figure, found):
-        agents = list(medians["agent"].unique())
-        shades = colours(agents)
-        # Not as many as hues, so that two of like colour have other marks.
-        marks = dict(zip(agents, itertools.cycle("osD^v"), strict=False))
-        for axes, (name, rows) in zip(found, groups(medians, "scenario"), strict=True):
+    agents = list(medians["agent"].unique())
+    shades = colours(agents)
+    # Not as many as hues, so that two of like colour have other marks.
+    marks = dict(zip(agents, itertools.cycle("osD^v"), strict=False))
+    with _scenario_panels(path, medians, 3.0) as found:
+        for axes, rows in found:
             # A valve that never moves has no place on this axis.
             moving = rows[rows["total_variation"] > 0.0]
-            for _, row in moving.iterrows():
+            for row in moving.to_dict("records"):
                 agent = row["agent"]
                 axes.plot(
                     row["total_variation"], row["mae"], marks[agent], color=shades[agent],
                     label=label(agent),
                 )  # fmt: skip
-            limit, travels = limits[name], moving["total_variation"]
             if moving.empty:
                 continue
+            scale, travels = scales[rows["scenario"].iloc[0]], moving["total_variation"]
             across = np.geomspace(0.7 * travels.min(), 1.4 * travels.max(), 200)
-            if frontiers[name]:
-                travel, error = np.transpose(frontiers[name][::-1])
+            line: dict[str, Any] = {"color": "0.4", "linewidth": 1}
+            if scale.frontier:
+                travel, error = np.transpose(scale.frontier[::-1])
                 axes.plot(
-                    across, np.interp(across, travel, error), color="0.4", linewidth=1,
+                    across, np.interp(across, travel, error), **line,
                     label="least possible for this travel",
                 )  # fmt: skip
-            axes.axhline(
-                limit, color="0.4", linewidth=1, linestyle="--",
-                label="least possible for any travel",
-            )  # fmt: skip
+            limit = scale.least.value
+            axes.axhline(limit, linestyle="--", **line, label="least possible for any travel")
             axes.set_xscale("log")
             axes.set_xlim(across[0], across[-1])
             axes.set_ylim(0.9 * min(limit, moving["mae"].min()), 1.1 * moving["mae"].max())
@@ -157,10 +160,6 @@ def plot_travel(
             axes.xaxis.set_minor_locator(NullLocator())
             axes.set_xlabel("valve travel (t/h)")
             axes.set_ylabel("mean |e| (°C)")
-        shown = [axes.get_legend_handles_labels() for axes in found]
-        # Each once, although not every panel has all.
-        entries = {name: handle for pair in shown for handle, name in zip(*pair, strict=True)}
-        figure.legend(entries.values(), entries, loc="outside lower center", ncols=5)
 
 
 def plot_learning(curves: pd.DataFrame, path: Path) -> None:

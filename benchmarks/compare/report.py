@@ -2,74 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from benchmarks.compare import tables
 from benchmarks.compare.comparison import TWICE, Comparison
-from benchmarks.compare.estimates import estimate, scale_of, scores, standing, verdict
-from benchmarks.compare.record import Record
-from benchmarks.controllers.records import RosterEntry
-from benchmarks.controllers.roster import label
+from benchmarks.compare.estimates import (
+    Scale,
+    Score,
+    estimate,
+    scale_of,
+    score,
+    standing,
+    verdict,
+)
+from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.report import Section, provenance_line, write_report
+from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.storage import NotWrittenError
 
 
-def write(
-    comparison: Comparison,
-    entries: Mapping[str, RosterEntry],
-    record: Record,
-    fan_out: FanOut,
-    *,
-    complete: bool,
-) -> list[Section]:
+def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -> list[Section]:
     """Write the report of all that has finished, with its tables and pictures, and return it.
 
     The fan-out makes the estimates and draws the pictures; one that cannot be drawn is a
-    sentence in the report. Nothing is written as long as nothing has finished. `complete` says
-    whether all has.
+    sentence in the report.
     """
-    if not comparison.cases:
-        return []
     runs, names, agents = comparison.runs, comparison.names, comparison.agents
-    record.write_runs(runs, complete=False)
-    for name in names:  # after an interruption not all may be known
-        if name not in comparison.scales:
-            scale = scale_of(comparison.scenarios[name], comparison.count)
-            comparison.scales[name] = scale
-    scales = {name: comparison.scales[name] for name in names}
-    of_scenarios = {
-        name: partial(estimate, runs[runs["scenario"] == name], scales, agents[0])
+    scales = {  # after an interruption not all may be known
+        name: comparison.scales.get(name)
+        or scale_of(comparison.scenarios[name], comparison.count)
         for name in names
     }
-    of_agents = {
-        agent: partial(scores, runs[runs["agent"] == agent], scales) for agent in agents
+    to_estimate: dict[str, Callable[[], Any]] = {
+        f"estimates, {name}": partial(
+            estimate, runs[runs["scenario"] == name], scales[name], agents[0]
+        )
+        for name in names
     }
-    made = dict(fan_out.stream(of_scenarios | of_agents))
-    estimates = pd.concat([made[name] for name in names], ignore_index=True)
-    scored = pd.concat([made[agent] for agent in agents], ignore_index=True)
+    to_score: dict[str, Callable[[], Any]] = {
+        f"score, {agent}": partial(score, runs[runs["agent"] == agent], scales)
+        for agent in agents
+    }
+    made = dict(fan_out.stream(to_estimate | to_score))
+    estimates = pd.concat([made[key] for key in to_estimate], ignore_index=True)
+    scores = dict(zip(agents, (made[key] for key in to_score), strict=True))
     summary = tables.summarise(runs)
-    record.write_table("summary.csv", summary)
-    record.write_table("estimates.csv", estimates)
+    tables.write(folder / "summary.csv", summary)
+    tables.write(folder / "estimates.csv", estimates)
 
-    limits = {name: scale.least.value for name, scale in scales.items()}
-    frontiers = {name: comparison.frontiers.get(name, []) for name in names}
-    pictures: dict[str, tuple[Any, ...]] = {
-        "travel.png": ("travel", summary, limits, frontiers),
+    plots: dict[str, tuple[Any, ...]] = {
+        "travel.png": ("travel", summary, scales),
         "limits.png": ("limits", estimates),
         "runs.png": ("runs", runs),
     }
-    drawn = [agent for agent in agents if entries[agent].drawn] or agents
+    drawn = [agent for agent in agents if agent not in ROSTER or ROSTER[agent].drawn] or agents
     for name in names:
-        rows = comparison.responses(name)
-        record.write_table(f"{name}.csv", rows)
-        rows = rows[rows["agent"].isin(drawn)]
-        pictures[f"{name}.png"] = ("responses", rows, comparison.scenarios[name])
+        cases = [case for case in comparison.finished if case.scenario == name]
+        responses = pd.concat([case.responses for case in cases], ignore_index=True)
+        tables.write(folder / f"{name}.csv", responses)
+        shown = responses[responses["agent"].isin(drawn)]
+        plots[f"{name}.png"] = ("responses", shown, comparison.scenarios[name])
     curves = [
         pd.DataFrame(member.curve).assign(agent=name, policy=number)
         for name, members in comparison.controllers.items()
@@ -78,20 +77,21 @@ def write(
     ]
     if curves:
         learning = pd.concat(curves, ignore_index=True)
-        record.write_table("learning.csv", learning)
-        pictures["learning.png"] = ("learning", learning)
-    draw = {name: partial(_draw, *what, record.path(name)) for name, what in pictures.items()}
-    faults = dict(fan_out.stream(draw))
+        tables.write(folder / "learning.csv", learning)
+        plots["learning.png"] = ("learning", learning)
+    draw = {name: partial(_draw, *what, folder / name) for name, what in plots.items()}
+    faults = {name: fault for name, fault in fan_out.stream(draw) if fault}
 
-    sections = [
-        _with_pictures(section, faults)
-        for section in _sections(comparison, entries, summary, estimates, scored)
-    ]
-    for page in ("report.md", "report.html"):
-        record.path(page)
-    title = "Comparison of controllers"
-    write_report(record.folder, title, sections, provenance_line("compare", record.origin))
-    record.write_runs(runs, complete=complete)
+    sections = []
+    for section in _sections(comparison, scales, summary, estimates, scores):
+        pictures = [name for name in section.pictures if name not in faults]
+        missing = [
+            f"{name} could not be drawn ({faults[name]})."
+            for name in section.pictures
+            if name in faults
+        ]
+        sections.append(replace(section, text=[*section.text, *missing], pictures=pictures))
+    write_report(folder, "Comparison of controllers", sections, made_by)
     return sections
 
 
@@ -108,27 +108,18 @@ def _draw(kind: str, *arguments: Any) -> str:
     return ""
 
 
-def _with_pictures(section: Section, faults: Mapping[str, str]) -> Section:
-    """Return a section whose pictures that are not there are sentences."""
-    missing = [name for name in section.pictures if faults[name]]
-    sentences = [f"{name} could not be drawn ({faults[name]})." for name in missing]
-    pictures = [name for name in section.pictures if name not in missing]
-    return replace(section, text=[*section.text, *sentences], pictures=pictures)
-
-
 def _sections(
     comparison: Comparison,
-    entries: Mapping[str, RosterEntry],
+    scales: Mapping[str, Scale],
     summary: pd.DataFrame,
     estimates: pd.DataFrame,
-    scored: pd.DataFrame,
+    scores: Mapping[str, Score],
 ) -> list[Section]:
     """Return the report, the parts of most interest first."""
-    names, reference = comparison.names, comparison.agents[0]
-    scales = {name: comparison.scales[name] for name in names}
+    names = comparison.names
     titles = [(name, comparison.scenarios[name].title) for name in names]
     sections = [
-        Section("", [standing(comparison.runs, scales, scored)]),
+        Section("", [standing(comparison.runs, scales, scores)]),
         Section(
             "Score: 0 for leaving the valve alone, 1 for the least possible error",
             [
@@ -139,7 +130,7 @@ def _sections(
                 f"The picture: {titles[0][1]}. A line is the median over all runs at each "
                 "sample, a band the 10th to 90th percentile. The grey band is the dead zone.",
             ],
-            tables.score_table(scored),
+            tables.score_table(scores),
             [f"{names[0]}.png"],
         ),
         Section(
@@ -175,7 +166,7 @@ def _sections(
                 "do the same twice. Training: of one policy, the median. Runs: all scenarios, "
                 "including what is measured."
             ],
-            _costs(comparison, entries),
+            _costs(comparison),
         ),
         Section(
             "Every run",
@@ -199,29 +190,28 @@ def _sections(
     if any(member.curve for each in comparison.controllers.values() for member in each):
         sections.append(Section("Training", pictures=["learning.png"]))
     if len(comparison.agents) > 1:
-        title = f"Difference to {label(reference)} (°C), 95 % interval"
+        title = f"Difference to {label(comparison.agents[0])} (°C), 95 % interval"
         text = ["And the share of runs in which the error is smaller, in the same noise."]
         sections.insert(4, Section(title, text, tables.paired_table(estimates)))
     return sections
 
 
-def _costs(comparison: Comparison, entries: Mapping[str, RosterEntry]) -> pd.DataFrame:
+def _costs(comparison: Comparison) -> pd.DataFrame:
     rows = []
     for name in comparison.agents:
         members = comparison.controllers[name]
-        cost = members[0].cost or entries[name].cost
-        cases = [case for (_, agent), case in comparison.cases.items() if agent == name]
-        curves = [member.curve for member in members if member.curve]
-        training = pd.Series([curve[-1]["seconds"] for curve in curves]).median()
-        twice = comparison.cases.get((TWICE, name))
+        cost = members[0].cost
+        training = [member.curve[-1]["seconds"] for member in members if member.curve]
+        runs = [case.seconds for case in comparison.finished if case.agent == name]
+        twice = comparison.cases.get((name, TWICE))
         rows.append(
             {
-                "agent": entries[name].label,
+                "agent": label(name),
                 "prior knowledge": cost.prior_knowledge,
                 "parameters": cost.parameters,
                 "samples before": cost.samples,
-                "training (s)": "" if pd.isna(training) else f"{training:.0f}",
-                "runs (s)": f"{sum(case.seconds for case in cases):.1f}",
+                "training (s)": f"{np.median(training):.0f}" if training else "",
+                "runs (s)": f"{sum(runs):.1f}",
                 "first run": f"{twice.runs['mae'].mean():.3f}" if twice else "",
                 "second run": f"{twice.again:.3f}" if twice else "",
             }

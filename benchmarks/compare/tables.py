@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from benchmarks.compare.estimates import Scale
+from benchmarks.compare.estimates import Scale, Score
 from benchmarks.controllers.roster import label
 from benchmarks.lib.statistics import Estimate
-from benchmarks.lib.tables import PERCENTILES, groups, percentiles
+from benchmarks.lib.tables import PERCENTILES, groups, percentiles, write_csv
 from benchmarks.loop.metrics import METRICS
 from benchmarks.loop.rollout import Trajectory
 from benchmarks.loop.scenarios import Scenario
@@ -55,25 +56,20 @@ def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) 
     return pd.DataFrame(columns)
 
 
-def for_csv(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of numbers and texts.
+def write(path: Path, table: pd.DataFrame) -> None:
+    """Write a table of numbers, texts and estimates as CSV.
 
     An estimate becomes three columns, its value and the ends of its interval; infinite values,
     which apart from such ends only a settling time can have, are written in words.
     """
     columns: dict[Any, Any] = {}
     for name, cells in table.items():
+        columns[name] = cells
         if any(isinstance(cell, Estimate) for cell in cells):
-            for end, column in (
-                ("value", name),
-                ("low", f"{name}_low"),
-                ("high", f"{name}_high"),
-            ):
-                columns[column] = [getattr(cell, end, math.nan) for cell in cells]
-        else:
-            columns[name] = cells
+            for end, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
+                columns[f"{name}{suffix}"] = [getattr(cell, end, math.nan) for cell in cells]
     flat = pd.DataFrame(columns)
-    return flat.astype(object).where(flat != math.inf, NOT_SETTLED)
+    write_csv(path, flat.astype(object).where(flat != math.inf, NOT_SETTLED))
 
 
 def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
@@ -87,24 +83,23 @@ def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.Data
     return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
 
 
-def score_table(scores: pd.DataFrame) -> pd.DataFrame:
-    """Return the scores: a row for each agent, the overall score first."""
-    forms: dict[Any, Any] = {"agent": label, "score": "{:.3f}".format}
-    return pd.DataFrame(
-        {name: cells.map(forms.get(name, "{:.2f}".format)) for name, cells in scores.items()}
-    )
+def score_table(scores: Mapping[str, Score]) -> pd.DataFrame:
+    """Return the scores by agent: a row for each, the overall score first."""
+    rows = [
+        {"agent": label(agent), "score": f"{overall:.3f}"}
+        | {scenario: f"{mean:.2f}" for scenario, mean in means.items()}
+        for agent, (overall, means) in scores.items()
+    ]
+    return pd.DataFrame(rows).fillna("")  # after an interruption not all have run
 
 
 def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
     """Return differences to the reference: a row for each other agent."""
     others = estimates.dropna(subset=["difference"])
-    cells = [
-        f"{difference:+.3f}; {100 * improvement.value:.0f} %"
-        for difference, improvement in zip(
-            others["difference"], others["improvement"], strict=True
-        )
-    ]
-    return _by_agent(others, cells)
+    pairs = zip(others["difference"], others["improvement"], strict=True)
+    return _by_agent(
+        others, [f"{mean:+.3f}; {100 * better.value:.0f} %" for mean, better in pairs]
+    )
 
 
 def _by_agent(rows: pd.DataFrame, cells: Any) -> pd.DataFrame:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +25,8 @@ from benchmarks.controllers.step_test import step_test
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 from mptc_gym.plant import action_from_command
+
+Made = TypeVar("Made")
 
 
 class Nothing:
@@ -56,9 +60,39 @@ def step_test_and_data_sheet(plant: Parameters) -> dict[str, Any]:
     return {**asdict(step_test(plant)), **limits(plant), "dead_zone": dead_zone}
 
 
-def nothing(plant: Parameters, runs: int, seed: int) -> Nothing:
-    """Return what leaves the valve alone."""
-    return Nothing(**limits(plant))
+def with_limits(
+    make: Callable[..., Made], plant: Parameters, runs: int, seed: int, **gains: Any
+) -> Made:
+    """Return a controller that is told its gains and the limits of the flow, no more."""
+    return make(**gains, **limits(plant))
+
+
+def with_step_test(
+    make: Callable[..., Made], plant: Parameters, runs: int = 1, seed: int = 0
+) -> Made:
+    """Return a controller that is told a step test and the actuator's data sheet."""
+    return make(**step_test_and_data_sheet(plant))
+
+
+nothing = partial(with_limits, Nothing)
+paper_pi = partial(with_limits, PIController)
+searched_pi = partial(paper_pi, **SEARCHED_GAINS)
+self_tuning = partial(with_step_test, SelfTuningController)
+nn_smith = partial(with_step_test, NeuralSmithPredictor)
+nn_self_tuning = partial(with_step_test, NeuralSelfTuningController)
+mpc = PredictiveController  # which is told the whole plant
+
+
+def simc_pi(plant: Parameters, runs: int = 1, seed: int = 0) -> PIController:
+    """Return a PI controller tuned by rule, from a step test of the plant alone."""
+    return PIController.simc(**asdict(step_test(plant)), **limits(plant))
+
+
+def smith(plant: Parameters, runs: int = 1, seed: int = 0) -> SmithPredictor:
+    """Return a Smith predictor whose closed loop has half the plant's time constant."""
+    known = step_test_and_data_sheet(plant)
+    half = float(f"{known['time_constant'] / 2:.2g}")
+    return SmithPredictor(**known, closed_loop_time_constant=half)
 
 
 def direct_nn(plant: Parameters, runs: int, seed: int, **gains: Any) -> DirectNNController:
@@ -75,45 +109,3 @@ def frozen_nn(plant: Parameters, runs: int, seed: int) -> DirectNNController:
     assert isinstance(controller, DirectNNController)
     controller.learning = False
     return controller
-
-
-def paper_pi(plant: Parameters, runs: int, seed: int, **gains: Any) -> PIController:
-    """Return the paper's PI controller, with its own gains or others."""
-    return PIController(**gains, **limits(plant))
-
-
-def searched_pi(plant: Parameters, runs: int, seed: int) -> PIController:
-    """Return the paper's PI controller with the gains of `python -m benchmarks.tune pi`."""
-    return paper_pi(plant, runs, seed, **SEARCHED_GAINS)
-
-
-def simc_pi(plant: Parameters, runs: int = 1, seed: int = 0) -> PIController:
-    """Return a PI controller tuned by rule, from a step test of the plant alone."""
-    return PIController.simc(**asdict(step_test(plant)), **limits(plant))
-
-
-def smith(plant: Parameters, runs: int = 1, seed: int = 0) -> SmithPredictor:
-    """Return a Smith predictor whose closed loop has half the plant's time constant."""
-    known = step_test_and_data_sheet(plant)
-    half = float(f"{known['time_constant'] / 2:.2g}")
-    return SmithPredictor(**known, closed_loop_time_constant=half)
-
-
-def self_tuning(plant: Parameters, runs: int, seed: int) -> SelfTuningController:
-    """Return a self-tuning controller that starts from what a step test shows."""
-    return SelfTuningController(**step_test_and_data_sheet(plant))
-
-
-def nn_smith(plant: Parameters, runs: int = 1, seed: int = 0) -> NeuralSmithPredictor:
-    """Return the network behind a model, told what a Smith predictor is told."""
-    return NeuralSmithPredictor(**step_test_and_data_sheet(plant))
-
-
-def nn_self_tuning(plant: Parameters, runs: int, seed: int) -> NeuralSelfTuningController:
-    """Return the network behind a bank of models that starts from what a step test shows."""
-    return NeuralSelfTuningController(**step_test_and_data_sheet(plant))
-
-
-def mpc(plant: Parameters, runs: int, seed: int) -> PredictiveController:
-    """Return the predictive controller, which knows everything except the future."""
-    return PredictiveController(plant, runs, seed)

@@ -16,11 +16,8 @@ from benchmarks.lib.command_line import UsageError, known, out_folder
 from benchmarks.lib.options import Count, FanOutOptions, Names, Repeated, options
 from benchmarks.train.ppo import KEPT, PolicyRequest
 
-LOCATION = "MODULE:FACTORY or NEW_NAME=PPO:FILE.zip"
-
 AgentNames = Annotated[
-    Names,
-    Parameter(help=f"Controllers to run, out of {', '.join(ROSTER)}."),
+    Names, Parameter(help=f"Controllers to run, out of {', '.join(ROSTER)}.")
 ]
 
 
@@ -44,13 +41,7 @@ class ControllerOptions:
     """Train policies of PPO anew, which takes many minutes."""
 
     def training(self) -> PolicyRequest:
-        """Return which trained policies are asked for.
-
-        Raises
-        ------
-        UsageError
-            If policies are to be trained and their folder cannot be written to.
-        """
+        """Return which trained policies are asked for, if their folder can be written to."""
         is_folder = self.kept.is_dir() or not self.kept.exists()
         if self.retrain or self.training_steps or self.policies or not is_folder:
             out_folder(self.kept, "--kept")
@@ -60,9 +51,7 @@ class ControllerOptions:
 
 
 def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEntry]:
-    """Return controllers by name: some of the roster, then a user's own.
-
-    The latter are given as `NAME=MODULE:FACTORY` or `NAME=ALGORITHM:FILE.zip`.
+    """Return controllers of the roster by name, then a user's own, as `--agent` has them.
 
     Raises
     ------
@@ -73,11 +62,11 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEnt
     locations: dict[str, list[str]] = {}
     for text in own:
         name, equals, location = text.partition("=")
-        if not (name and equals):
-            raise UsageError(f"--agent must be NEW_NAME={LOCATION}, got {text!r}")
-        if name.lower() in {*ROSTER, *found}:
+        taken = f", and {name!r} is taken" if name.lower() in ROSTER else ""
+        if taken or not (name and equals):
             raise UsageError(
-                f"--agent must be NEW_NAME={LOCATION}, and {name!r} is taken, got {text!r}"
+                "--agent must be NEW_NAME=MODULE:FACTORY or NEW_NAME=PPO:FILE.zip"
+                f"{taken}, got {text!r}"
             )
         locations.setdefault(name, []).append(location)
     found |= {name: own_entry(name, each) for name, each in locations.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from agents import LawNetwork, PolicyNetwork
@@ -19,12 +20,8 @@ from mptc_gym import Parameters
 def trained(network: PolicyNetwork, plant: Parameters, runs: int, seed: int) -> PolicyNetwork:
     """Return a controller that has the network, and is told the actuator's limits.
 
-    In velocity form it is told the dead zone, too, if that is a number.
-
-    Raises
-    ------
-    ValueError
-        If the dead zone that it is to undo leaves no flow on one side.
+    In velocity form it is told the dead zone, too, if that is a number; ValueError if it leaves
+    no flow on one side.
     """
     increments = network.increments
     if increments and not isinstance(plant.dead_zone, Sequence):
@@ -32,12 +29,12 @@ def trained(network: PolicyNetwork, plant: Parameters, runs: int, seed: int) -> 
     return replace(network, increments=increments, **limits(plant))
 
 
-def told_network(make: Callable[..., Agent]) -> Members:
-    """Return the members of a controller that has the told network."""
+def told_network(make: Callable[..., Agent], cost: Cost) -> Members:
+    """Return the one member of a controller that has the told network, read when it is run."""
 
     def members(_: ppo.PolicyRequest) -> list[Factory]:
-        about = dict(LawNetwork.load().provenance)
-        return [Factory(make, provenance={"file": "nn-smith.npz", **about})]
+        about = {"file": "nn-smith.npz", **LawNetwork.load().provenance}
+        return [Factory(make, cost, provenance=about)]
 
     return members
 
@@ -45,9 +42,8 @@ def told_network(make: Callable[..., Agent]) -> Members:
 def ppo_policies(
     request: ppo.PolicyRequest, arguments: PPOArguments | None = None
 ) -> list[Factory]:
-    """Return PPO's policies for the paper's plant; those that are missing are trained."""
-    policies = ppo.members(request, arguments)
-    return [_factory(each.arguments, each.network, each.file.name) for each in policies]
+    """Return PPO's policies, those for the paper's plant unless `arguments` say otherwise."""
+    return [_factory(policy) for policy in ppo.members(request, arguments)]
 
 
 def randomised_policies(request: ppo.PolicyRequest) -> list[Factory]:
@@ -59,20 +55,21 @@ def tuned_policy(*, final: bool, member: int, **gains: Any) -> Factory:
     """Train a policy with other settings for a search, of a seed that no comparison has."""
     first = ppo.FINAL_SEED if final else ppo.TUNING_SEED
     arguments = PPOArguments(seed=first + member, **gains)
-    return _factory(arguments, ppo.train(arguments))
+    return _factory(ppo.Policy(arguments, Path(), ppo.train(arguments)))
 
 
-def _factory(arguments: PPOArguments, network: PolicyNetwork, file: str = "") -> Factory:
+def _factory(policy: ppo.Policy) -> Factory:
+    network, steps = policy.network, policy.arguments.steps
     about = {name: value for name, value in network.provenance.items() if name != "curve"}
     weights = sum(W.size + b.size for W, b in network.layers)
     return Factory(
         partial(trained, network),  # which goes along to machines where its file is not
-        network.observation,
-        provenance={"file": file, **about},
-        curve=network.provenance.get("curve", []),
-        cost=Cost(
+        Cost(
             "dead zone; delay, by the past actions it sees",
             f"{weights:,} weights a policy",
-            f"{arguments.steps / 1e6:g} M a policy",
+            f"{steps / 1e6:g} M a policy",
         ),
+        network.observation,
+        provenance={"file": policy.file.name, **about},
+        curve=policy.curve,
     )

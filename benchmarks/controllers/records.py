@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from agents.controller import PAPER_WINDOWS
-from benchmarks.loop.rollout import Agent, make_plants, rollout
+from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from benchmarks.train.ppo import PolicyRequest
 from mptc_gym import Parameters
 
@@ -30,11 +30,12 @@ class Cost:
 
 @dataclass(frozen=True)
 class Factory:
-    """Makes controllers: all that a command may ask of a controller before it runs."""
+    """Makes controllers and runs them, with all that a command has to know of them."""
 
     make: Callable[..., Agent]
     """Called with the plant that the controllers are made for (`Parameters`), how many runs
-    there are, and a seed: run i is to use `seed + i`. A search adds gains by name."""
+    there are, and a seed: run i is to use `seed + i`. Searched gains are given by name."""
+    cost: Cost = Cost()
     observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
     """The windows of the environment that the controllers want."""
     learns: bool = False
@@ -45,8 +46,6 @@ class Factory:
     """Where a trained policy comes from, in a form for JSON; empty if nothing was trained."""
     curve: Sequence[Mapping[str, float]] = ()
     """Its learning curve, a row an evaluation."""
-    cost: Cost | None = None
-    """What it costs, where that is not known before the training."""
 
     @property
     def module(self) -> str:
@@ -62,6 +61,20 @@ class Factory:
         """Return a controller of `runs` plants, made for a plant given by its arguments."""
         return self.make(Parameters(**self.arguments(plant)), runs, seed)
 
+    def run(
+        self,
+        plant: Mapping[str, Any],
+        samples: int,
+        runs: int,
+        seed: int,
+        controller: Agent | None = None,
+    ) -> Trajectory:
+        """Run a controller, one made for this plant or another that is given; see `rollout`."""
+        plants = make_plants(runs, samples, **self.arguments(plant))
+        trajectory = rollout(plants, controller or self(plant, runs, seed), samples, seed)
+        plants.close()
+        return trajectory
+
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
         """Return a controller as it comes to plants that it was not made for.
 
@@ -69,11 +82,8 @@ class Factory:
         """
         controller = self(plant, runs, seed)
         if self.learns:
-            plants = make_plants(
-                runs, LEARNING, **{**self.arguments(plant), "setpoint": "square"}
-            )
-            rollout(plants, controller, LEARNING, COMMISSIONING_SEED)
-            plants.close()
+            square = {**plant, "setpoint": "square"}
+            self.run(square, LEARNING, runs, COMMISSIONING_SEED, controller)
         return controller
 
 
@@ -106,7 +116,7 @@ class Tuning:
 
 @dataclass(frozen=True)
 class RosterEntry:
-    """A controller and all that any command has to know of it."""
+    """A controller, and how commands treat it."""
 
     name: str
     """In options and files."""
@@ -114,17 +124,12 @@ class RosterEntry:
     """In tables and plots."""
     made_by: Factory | Members
     """Makes it; or a function that returns several, for policies that were trained apart."""
-    cost: Cost = Cost()
-    """What it costs before it runs."""
-    told: bool = True
-    """Whether it is set up for the plant that it is told. Otherwise it is made for the paper's
-    plant, and is told no more than the actuator."""
     trained: bool = False
     """Whether `made_by` may have to train."""
     tuning: Tuning | None = None
     """How its gains are searched, if they are."""
     compared: bool = True
-    swept: bool = False
+    swept: bool = True
     """Whether `compare` and `sweep` run it unless told otherwise."""
     drawn: bool = False
     """Whether its responses are drawn in a comparison."""
@@ -142,8 +147,8 @@ class RosterEntry:
 
 def provenances(members: Mapping[str, Sequence[Factory]]) -> dict[str, list[dict[str, Any]]]:
     """Return the provenance of every trained policy, by the name of its controller."""
-    found = {
-        name: [dict(each.provenance) for each in factories if each.provenance]
+    return {
+        name: [dict(each.provenance) for each in factories]
         for name, factories in members.items()
+        if factories[0].provenance
     }
-    return {name: each for name, each in found.items() if each}

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import importlib.util
 from functools import cache, partial
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from mptc_gym import Parameters
 from mptc_gym.evaluation import WINDOWS
 from mptc_gym.parameters import ARGUMENTS
 from mptc_gym.policies import acting
+from mptc_gym.sb3 import spec_of
 from mptc_gym.wrappers import NUMBERS, Actuator
 
 LIBRARIES = "stable_baselines3", "sb3_contrib"
@@ -44,12 +46,6 @@ def policies(location: str) -> list[Factory]:
 
 
 def _policy(algorithm: str, file: Path) -> Factory:
-    try:
-        from mptc_gym.sb3 import spec_of
-    except ImportError as error:
-        raise ValueError(
-            f'{file.name} needs Stable-Baselines3: pip install -e ".[sb3]" ({error})'
-        ) from error
     spec = spec_of(file)
     wrappers = [wrapper.name for wrapper in spec.additional_wrappers]
     if wrappers not in ([], ["IncrementalAction"]):
@@ -61,45 +57,42 @@ def _policy(algorithm: str, file: Path) -> Factory:
     model = _loaded(algorithm, str(file))
     weights = sum(weight.numel() for weight in model.policy.parameters())
     return Factory(
-        partial(_made, algorithm, str(file), increments),
+        partial(SavedPolicy, algorithm, str(file), increments),
+        Cost(
+            parameters=f"{weights:,} weights a policy",
+            samples=f"{model.num_timesteps / 1e6:.3g} M a policy",
+        ),
         {name: spec.kwargs.get(name, ARGUMENTS[name].default) for name in WINDOWS},
-        code=__name__,
         provenance={
             "file": file.name,
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
             "trained_on": spec.to_json(),
         },
-        cost=Cost(
-            parameters=f"{weights:,} weights a policy",
-            samples=f"{model.num_timesteps / 1e6:.3g} M a policy",
-        ),
     )
 
 
-def _made(
-    algorithm: str,
-    file: str,
-    increments: dict[str, Any] | None,
-    plant: Parameters,
-    runs: int,
-    seed: int,
-) -> SavedPolicy:
-    """Return a controller of a zip; `increments` are the arguments of `IncrementalAction`."""
-    actuator = None
-    if increments is not None:
-        actuator = Actuator(drawn_numbers(plant, runs, seed).chosen(NUMBERS), **increments)
-    return SavedPolicy(_loaded(algorithm, file), actuator, runs)
-
-
 class SavedPolicy:
-    """A policy as a controller, deterministic.
+    """A policy of a zip as a controller, deterministic.
 
-    The actuator turns wanted flows into actions, if the policy moves them; see
-    `IncrementalAction`.
+    `increments` are the arguments of `IncrementalAction`, if the policy moves the flow: an
+    actuator turns the flows that it wants into actions.
     """
 
-    def __init__(self, model: Any, actuator: Actuator | None, runs: int) -> None:
-        self._model, self._actuator, self._runs = model, actuator, runs
+    def __init__(
+        self,
+        algorithm: str,
+        file: str,
+        increments: dict[str, Any] | None,
+        plant: Parameters,
+        runs: int,
+        seed: int,
+    ) -> None:
+        self._model = _loaded(algorithm, file)
+        self._actuator = None
+        if increments is not None:
+            numbers = drawn_numbers(plant, runs, seed).chosen(NUMBERS)
+            self._actuator = Actuator(numbers, **increments)
+        self._runs = runs
         self.reset()
 
     def reset(self) -> None:
@@ -120,9 +113,10 @@ class SavedPolicy:
 @cache
 def _loaded(algorithm: str, file: str) -> Any:
     """Return the model; ValueError if the zip does not hold one of this algorithm."""
-    there = [name for name in LIBRARIES if importlib.util.find_spec(name)]
-    modules = [importlib.import_module(name) for name in there]
-    found: Any = next((getattr(m, algorithm) for m in modules if hasattr(m, algorithm)), None)
+    there = [import_module(name) for name in LIBRARIES if find_spec(name)]
+    found: Any = next(
+        (vars(each)[algorithm] for each in there if algorithm in vars(each)), None
+    )
     if not hasattr(found, "load"):
         raise ValueError(f"{algorithm!r} is no algorithm of {' or '.join(LIBRARIES)}")
     try:

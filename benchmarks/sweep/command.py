@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from benchmarks.controllers.options import chosen
-from benchmarks.controllers.records import Factory, provenances
+from benchmarks.controllers.records import provenances
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import blame, out_folder
 from benchmarks.lib.fingerprint import fingerprint
@@ -19,13 +20,12 @@ from benchmarks.lib.options import flat
 from benchmarks.lib.report import provenance_line, show, write_report
 from benchmarks.lib.storage import origin, write_json
 from benchmarks.lib.tables import write_csv
-from benchmarks.loop.designs import SPANS, WIDE, Arguments, grid, random_design
+from benchmarks.loop.designs import SPANS, WIDE, grid, random_design
 from benchmarks.sweep.options import Options
 from benchmarks.sweep.report import report, table
 from benchmarks.sweep.tasks import agent_task, limit_task
 from mptc_gym import Parameters
 
-SEED = 0  # of a plant's first run
 NOTHING = "nothing"  # the controller that sets the scale
 
 
@@ -49,30 +49,27 @@ def execute(options: Options, console: Console) -> str:
     known = {NOTHING: ROSTER[NOTHING], **controllers}
     members = {name: entry.members(training) for name, entry in known.items()}
     began = time.perf_counter()
-    of_limits = fingerprint(limit_task.__module__, plants=plants, samples=options.samples)
-    limits = training.fan_out.run(
-        {
-            f"limit {i}": partial(limit_task, plant, options.samples)
-            for i, plant in enumerate(plants)
-        },
-        out / "tasks" / of_limits,
-        title="limit",
-    )
-    results: dict[str, Any] = {}
-    common = {"samples": options.samples, "runs": options.runs, "seed": SEED}
+
+    def run(
+        name: str, tasks: Iterable[Callable[[], Any]], *modules: str, **shaped_by: Any
+    ) -> list[Any]:
+        """Run a task for each plant, or take what is kept of the very same task."""
+        numbers = {"plants": plants, "samples": options.samples, **shaped_by}
+        kept = out / "tasks" / fingerprint(limit_task.__module__, *modules, **numbers)
+        named = {f"{name} {i}": task for i, task in enumerate(tasks)}
+        return list(training.fan_out.run(named, kept, title=name).values())
+
+    limits = run("limit", (partial(limit_task, plant, options.samples) for plant in plants))
+    results = {}
     for name, factories in members.items():
-        results |= training.fan_out.run(
-            {
-                # Every plant has a member, in turn: how much they differ shows in the maps.
-                f"{name} {i}": partial(
-                    agent_task, factories[i % len(factories)], told[i], plant, **common
-                )
-                for i, plant in enumerate(plants)
-            },
-            # A folder for each, so that one more controller leaves the others' tasks valid.
-            out / "tasks" / agent_key(name, factories, plants, told, options),
-            title=name,
+        # Every plant has a member, in turn: how much they differ shows in the maps.
+        tasks = (
+            partial(agent_task, *given, options.samples, options.runs)
+            for given in zip(cycle(factories), told, plants, strict=False)
         )
+        about = {"told": told, "runs": options.runs, "controller": name}
+        policies = provenances({name: factories})
+        results[name] = run(name, tasks, factories[0].module, **about, policies=policies)
     seconds = time.perf_counter() - began
 
     runs = table(differing, list(controllers), limits, results)
@@ -84,24 +81,5 @@ def execute(options: Options, console: Console) -> str:
     title = f"Controllers on plants that they {knowing}"
     write_report(out, title, sections, provenance_line("sweep", made))
     show(sections, console)
-    count = len(limits) + len(results)
+    count = len(plants) * (1 + len(results))
     return f"{count} tasks in {seconds:.0f} s. The report, data and maps are in {out}/"
-
-
-def agent_key(
-    name: str,
-    factories: Sequence[Factory],
-    plants: list[Arguments],
-    told: list[Arguments],
-    options: Options,
-) -> str:
-    """Return a name made of everything that shapes the results of a controller."""
-    return fingerprint(
-        agent_task.__module__,
-        factories[0].module,
-        options=[options.runs, options.samples],
-        plants=plants,
-        told=told,
-        controller=name,
-        policies=provenances({name: factories}),
-    )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from benchmarks.controllers.roster import label
@@ -30,52 +29,76 @@ _MARKS: dict[str, dict[str, Any]] = {
         "label": "no better than no control",
     },
 }  # fmt: skip
+_OF_A_GRID: tuple[dict[str, Any], ...] = (
+    {
+        "marker": "+", "color": "black", "markersize": 10, "markeredgewidth": 2,
+        "label": "the paper's plant",
+    },
+    {
+        "color": "black", "linestyle": ":",
+        "label": "above: 5 °C needs a flow within the dead zone",
+    },
+)  # fmt: skip
+_OF_PLANTS: tuple[dict[str, Any], ...] = (
+    {"marker": "s", "color": "0.4", "label": "as it is"},
+    {"marker": "^", "color": "0.4", "label": "drifts"},
+)
 
 
-def plot_grid(runs: pd.DataFrame, path: Path) -> None:
-    """Draw the ratio to the limit over delay and gain, a map for each controller of a grid."""
-    points = _by_plant(runs, ["delay", "gain_factor"])
+def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
+    """Draw how well each controller does over delay and gain, a map for each.
+
+    On a grid, where delay and gain alone differ, that is the ratio to the limit; on plants that
+    differ in everything it is the mean error.
+    """
+    drift = runs.get("gain_drift", pd.Series(np.nan, runs.index))
+    largest = runs["gain_factor"] * drift.fillna(1.0).clip(1.0)
+    points = _by_plant(runs.assign(gain=largest, drifts=drift.notna()))
+    names = [label(agent) for agent in points["agent"].unique()]
+    with panels(path, names, (3.4, 3.2), 4, (1.0, 0.6), grid=not grid) as (figure, found):
+        for axes, (_, rows) in zip(found, groups(points, "agent"), strict=True):
+            for name, mark in _MARKS.items():
+                marked = rows[rows[name] >= _OFTEN]
+                axes.plot(marked["delay"], marked["gain"], linestyle="", **mark)
+            image = _draw_grid(axes, rows) if grid else _draw_plants(axes, rows)
+            axes.set_xlabel("delay (samples)")
+            axes.set_ylabel(f"{'' if grid else 'largest '}gain (of the paper's)")
+        text = "mean |e|, of the least possible" if grid else "mean |e| (°C)"
+        bar = figure.colorbar(image, ax=found, label=text, extend="max")
+        _tick(bar.set_ticks, [1, 1.25, 1.5, 2, 3, 4])
+        bar.ax.minorticks_off()
+        marks = [*(_OF_A_GRID if grid else _OF_PLANTS), *_MARKS.values()]
+        handles = [Line2D([], [], **{"linestyle": "", **mark}) for mark in marks]
+        figure.legend(handles=handles, loc="outside lower center", ncols=4)
+
+
+def _by_plant(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return one row for each controller and plant: medians, and shares of runs."""
+    runs = runs.assign(**{name: runs[name].astype(float) for name in _MARKS})
+    measures = dict.fromkeys(("mae", "ratio"), "median") | dict.fromkeys(_MARKS, "mean")
+    firsts = dict.fromkeys(("delay", "gain", "drifts"), "first")
+    by = runs.groupby(["agent", "plant"], sort=False)
+    return by.agg(measures | firsts).reset_index()
+
+
+def _draw_grid(axes: Axes, rows: pd.DataFrame) -> Any:
     nominal = Parameters()
     gain = abs(sum(nominal.b) / sum(nominal.a))
     dead_zone, _ = nominal.range_of("dead_zone")
-    with _maps(path, points, grid=False) as (figure, found):
-        for axes, (_, rows) in zip(found, groups(points, "agent"), strict=True):
-            table = rows.pivot_table(index="gain_factor", columns="delay", values="ratio")
-            image = axes.pcolormesh(
-                table.columns, table.index, table, shading="nearest", **_COLOURS
-            )
-            _mark(axes, rows, "gain_factor", "gain (of the paper's)")
-            axes.plot(18, 1.0, "+", color="black", markersize=12, markeredgewidth=2)
-            # From here on, the flow that 5 degC needs lies in the dead zone.
-            axes.axhline(5.0 / (gain * dead_zone), color="black", linestyle=":")
-        plant = {
-            "marker": "+", "color": "black", "markersize": 10, "markeredgewidth": 2,
-            "label": "the paper's plant",
-        }  # fmt: skip
-        line = {
-            "color": "black", "linestyle": ":",
-            "label": "above: 5 °C needs a flow within the dead zone",
-        }  # fmt: skip
-        _finish(figure, found, image, "mean |e|, of the least possible", [plant, line])
+    table = rows.pivot_table(index="gain", columns="delay", values="ratio")
+    axes.plot(18, 1.0, "+", color="black", markersize=12, markeredgewidth=2)
+    # From here on, the flow that 5 degC needs lies in the dead zone.
+    axes.axhline(5.0 / (gain * dead_zone), color="black", linestyle=":")
+    return axes.pcolormesh(table.columns, table.index, table, shading="nearest", **_COLOURS)
 
 
-def plot_plants(runs: pd.DataFrame, path: Path) -> None:
-    """Draw the mean error on plants that differ in everything, over delay and gain."""
-    runs = runs.assign(largest=runs["gain_factor"] * runs["gain_drift"].fillna(1.0).clip(1.0))
-    points = _by_plant(runs, ["delay", "largest", "gain_drift"])
-    with _maps(path, points) as (figure, found):
-        for axes, (_, rows) in zip(found, groups(points, "agent"), strict=True):
-            for drifts, marker in ((False, "s"), (True, "^")):
-                some = rows[rows["gain_drift"].notna() == drifts]
-                image = axes.scatter(
-                    some["delay"], some["largest"], 34, some["mae"], marker=marker, **_COLOURS
-                )
-            _mark(axes, rows, "largest", "largest gain (of the paper's)")
-        kinds = [
-            {"marker": marker, "color": "0.4", "label": text}
-            for marker, text in (("s", "as it is"), ("^", "drifts"))
-        ]
-        _finish(figure, found, image, "mean |e| (°C)", kinds)
+def _draw_plants(axes: Axes, rows: pd.DataFrame) -> Any:
+    for drifts, marker in ((False, "s"), (True, "^")):
+        some = rows[rows["drifts"] == drifts]
+        image = axes.scatter(
+            some["delay"], some["gain"], 34, some["mae"], marker=marker, **_COLOURS
+        )
+    return image
 
 
 def plot_drift(runs: pd.DataFrame, pair: tuple[str, str], path: Path) -> None:
@@ -110,42 +133,6 @@ def plot_drift(runs: pd.DataFrame, pair: tuple[str, str], path: Path) -> None:
             fontsize="medium",
         )
         figure.colorbar(image, label="delay (samples)")
-
-
-def _by_plant(runs: pd.DataFrame, plant: list[str]) -> pd.DataFrame:
-    """Return one row for each controller and plant: medians, and shares of runs."""
-    runs = runs.assign(**{name: runs[name].astype(float) for name in _MARKS})
-    measures = dict.fromkeys(("mae", "ratio"), "median") | dict.fromkeys(_MARKS, "mean")
-    firsts = dict.fromkeys(plant, "first")
-    by = runs.groupby(["agent", "plant"], sort=False)
-    return by.agg(measures | firsts).reset_index()
-
-
-def _maps(
-    path: Path, points: pd.DataFrame, *, grid: bool = True
-) -> AbstractContextManager[tuple[Figure, list[Axes]]]:
-    names = [label(agent) for agent in points["agent"].unique()]
-    return panels(path, names, (3.4, 3.2), 4, (1.0, 0.6), grid=grid)
-
-
-def _mark(axes: Axes, points: pd.DataFrame, gain: str, text: str) -> None:
-    """Mark the plants where a controller is often of no use, and name the axes."""
-    for name, mark in _MARKS.items():
-        marked = points[points[name] >= _OFTEN]
-        axes.plot(marked["delay"], marked[gain], linestyle="", **mark)
-    axes.set_xlabel("delay (samples)")
-    axes.set_ylabel(text)
-
-
-def _finish(
-    figure: Figure, found: list[Axes], image: Any, text: str, lines: Sequence[dict[str, Any]]
-) -> None:
-    bar = figure.colorbar(image, ax=found, label=text, extend="max")
-    _tick(bar.set_ticks, [1, 1.25, 1.5, 2, 3, 4])
-    bar.ax.minorticks_off()
-    marks = [*lines, *_MARKS.values()]
-    handles = [Line2D([], [], **{"linestyle": "", **mark}) for mark in marks]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4)
 
 
 def _tick(set_ticks: Any, ticks: Sequence[float]) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,58 +25,26 @@ GROUPS = (  # of the plants that drift, with half-open intervals; each has a row
     ("delay from 14 to 22 samples", "delay", 14, 23),
     ("delay above 22 samples", "delay", 23, np.inf),
 )
-# What is asked of two controllers at a time: whether the first makes the smaller error.
-LEARNING = (("nn", "pi-simc"), ("nn", "nn-frozen"), ("nn-frozen", "pi-simc"))
-ADAPTING = (
-    ("nn-self-tuning", "nn-smith"),
-    ("nn-self-tuning", "self-tuning"),
-    ("nn-smith", "smith"),
-    ("self-tuning", "smith"),
-)
-
-
-def table(
-    plants: Sequence[Arguments],
-    agents: Sequence[str],
-    limits: dict[str, Any],
-    results: dict[str, Any],
-) -> pd.DataFrame:
-    """Return one row for each run: the plant, the measures, and how they compare.
-
-    A plant is what it differs in from the nominal one. Results are those of tasks by name:
-    "limit I"; "nothing I" and "AGENT I" for plant I.
-    """
-    rows = []
-    for i, plant in enumerate(plants):
-        limit = limits[f"limit {i}"]["mae"]
-        nothing = pd.DataFrame(results[f"nothing {i}"])
-        for agent in agents:
-            measures = pd.DataFrame(results[f"{agent} {i}"])
-            about = pd.DataFrame({"plant": i, "agent": agent, "run": range(len(measures))})
-            task = pd.concat([about, measures], axis=1)
-            task["limit"] = np.nan if limit is None else limit
-            task["ratio"] = task["mae"] / task["limit"]
-            # The same noise with no control, which sets both scales.
-            task["oscillates"] = task["swing"] > nothing["swing"] + OSCILLATES
-            task["useless"] = task["mae"] >= nothing["mae"]
-            rows.append(task.assign(**plant))
-    return pd.concat(rows, ignore_index=True)
-
-
 MEASURES = {"mae": "over a whole run", "late": "over the second half of a run"}
+# What is asked of two controllers at a time: whether the first makes the smaller error.
 QUESTIONS = (
     (
         "Does online learning help when the plant drifts?",
         "All were made for the nominal plant: the networks learnt on it, the PI is tuned by "
         "rule from its step test.",
-        LEARNING,
+        (("nn", "pi-simc"), ("nn", "nn-frozen"), ("nn-frozen", "pi-simc")),
         "drift_learning.png",
     ),
     (
         "What does adaptation buy?",
         "The self-tuning controllers identify the plant while they control it. The Smith "
         "predictor and the network behind a model are told the nominal plant.",
-        ADAPTING,
+        (
+            ("nn-self-tuning", "nn-smith"),
+            ("nn-self-tuning", "self-tuning"),
+            ("nn-smith", "smith"),
+            ("self-tuning", "smith"),
+        ),
         "drift_adapting.png",
     ),
 )
@@ -97,18 +64,45 @@ DIFFERENCES_TEXT = (
 )
 
 
+def table(
+    plants: Sequence[Arguments],
+    agents: Sequence[str],
+    limits: Sequence[float | None],
+    results: Mapping[str, Sequence[dict[str, list[float]]]],
+) -> pd.DataFrame:
+    """Return one row for each run: the plant, the measures, and how they compare.
+
+    A plant is what it differs in from the nominal one. Limits are those of the plants, and
+    results, by name, those of the agents and of "nothing" on each.
+    """
+    rows = []
+    for i, (plant, limit) in enumerate(zip(plants, limits, strict=True)):
+        nothing = pd.DataFrame(results["nothing"][i])
+        for agent in agents:
+            measures = results[agent][i]
+            numbers = range(len(measures["mae"]))
+            task = pd.DataFrame({"plant": i, "agent": agent, "run": numbers, **measures})
+            task["limit"] = np.nan if limit is None else limit
+            task["ratio"] = task["mae"] / task["limit"]
+            # The same noise with no control, which sets both scales.
+            task["oscillates"] = task["swing"] > nothing["swing"] + OSCILLATES
+            task["useless"] = task["mae"] >= nothing["mae"]
+            rows.append(task.assign(**plant))
+    return pd.concat(rows, ignore_index=True)
+
+
 def report(runs: pd.DataFrame, out: Path, design: str, told: str) -> list[Section]:
     """Draw the maps of a "grid", "random" or "wide" design, and return the report.
 
     What adaptation is good for is asked where controllers are `told` a "nominal" plant.
     """
+    picture = "map.png" if design == "grid" else "plants.png"
+    maps.plot_maps(runs, out / picture, grid=design == "grid")
     title = "How many plants each controller works on"
-    if design == "grid":
-        maps.plot_grid(runs, out / "map.png")
-        return [Section(title, [OVERVIEW_TEXT], overview(runs), ["map.png"])]
-    maps.plot_plants(runs, out / "plants.png")
-    sections = [Section(title, [OVERVIEW_TEXT], overview(runs), ["plants.png"])]
-    for title, text, pairs, picture in QUESTIONS if told == "nominal" else ():
+    sections = [Section(title, [OVERVIEW_TEXT], overview(runs), [picture])]
+    if design == "grid" or told == "each":
+        return sections
+    for title, text, pairs, picture in QUESTIONS:
         asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
         if not asked:
             continue
@@ -154,17 +148,12 @@ def differences(
     rows = []
     for name, group in groups.items():
         row = {"plants": name, "number": str(group["plant"].nunique())}
-        for pair in pairs:
-            ours, theirs = (
-                group[group["agent"] == agent]
-                .pivot_table(index="plant", columns="run", values=measure)
-                .to_numpy()
-                for agent in pair
-            )
-            if len(ours) > 1:
-                difference = bootstrap(ours - theirs, seed=SEED)
-                better = improvement(ours, theirs, SEED)
-                shown = f"{difference:+.3f}; {100 * better.value:.0f} %"
-                row[" - ".join(map(label, pair))] = shown
+        errors = group.pivot_table(index="plant", columns=["agent", "run"], values=measure)
+        for pair in pairs if len(errors) > 1 else ():
+            ours, theirs = (errors[agent].to_numpy() for agent in pair)
+            difference = bootstrap(ours - theirs, seed=SEED)
+            better = improvement(ours, theirs, SEED)
+            shown = f"{difference:+.3f}; {100 * better.value:.0f} %"
+            row[" - ".join(map(label, pair))] = shown
         rows.append(row)
     return pd.DataFrame(rows).fillna("")
