@@ -17,6 +17,7 @@ Flags = NDArray[np.bool_]
 # The largest root of C beyond which xi is not to be recovered, and the largest magnitude of
 # other roots: nearer to the unit circle, they cancel poles that fit a log by chance.
 LARGEST, LARGEST_OTHER = 0.998, 0.8
+MOST_LEVELS = 12  # stretches of a random walk, the longest, that have a level of their own
 
 
 @dataclass(frozen=True)
@@ -51,14 +52,10 @@ def invertible(c: Array) -> bool:
 
 
 class Rows:
-    """The rows of a log in which everything is known that (28) needs.
+    """The rows k of a log in which everything is known that (28) needs.
 
-    Parameters
-    ----------
-    known
-        Which rows k to predict, shape (samples,).
-    counted
-        Which of them to count: the others are bridges, with temperatures that were filled in.
+    Of those that are `known`, some are not `counted`: bridges, with temperatures that were
+    filled in.
     """
 
     def __init__(self, known: Flags, counted: Flags) -> None:
@@ -73,14 +70,15 @@ class Rows:
 
     def lagged(self, values: Array, lags: Sequence[int]) -> Array:
         """Return a column for each lag, shape (rows, lags)."""
-        return values[self.index[:, np.newaxis] - np.array(lags, dtype=np.intp)]
+        known = np.nan_to_num(values)  # what is not known is in no row
+        return known[self.index[:, np.newaxis] - np.array(lags, dtype=np.intp)]
 
     def levels(self, orders: Orders) -> Array:
         """Return the columns of what is constant: one, or with a walk one a stretch."""
         if not orders.walk:
             return np.ones((len(self.index), 1))
         # The walk starts from the first row of a stretch, and from there at an unknown level.
-        longest = sorted(self._stretches, key=lambda ends: ends[0] - ends[1])[:12]
+        longest = sorted(self._stretches, key=lambda ends: ends[0] - ends[1])[:MOST_LEVELS]
         columns = np.zeros((len(self.index), len(longest)))
         for i, (start, stop) in enumerate(longest):
             columns[start + 1 : stop, i] = 1.0
@@ -96,36 +94,30 @@ class Rows:
             parts.append(signal.lfilter([1.0], [1.0, *c], part, axis=0) if len(c) else part)
         return np.concatenate(parts)
 
+    def square(self, errors: Array) -> float:
+        """Return the sum of the squares of errors, in the rows that count."""
+        counted = errors[self.counts]
+        return float(counted @ counted)
+
     def _slopes(self, errors: Array, c: Array) -> Array:
         """Return what each coefficient of C does to the errors, with its sign turned."""
-        whitened, slopes = self.whitened(errors, c), np.zeros((len(errors), len(c)))
-        for lag in range(1, len(c) + 1):
-            for start, stop in self._stretches:
-                slopes[start + lag : stop, lag - 1] = whitened[start : max(stop - lag, start)]
+        white, slopes = self.whitened(errors, c), np.zeros((len(errors), len(c)))
+        for lag, (start, stop) in itertools.product(range(1, len(c) + 1), self._stretches):
+            slopes[start + lag : stop, lag - 1] = white[start : max(stop - lag, start)]
         return slopes
 
     def solve(
         self, table: Array, orders: Orders, start: Array | None = None
     ) -> tuple[Array, Array, Array]:
-        """Minimise the squares of xi = (target - regressors @ linear) / C over linear and C.
+        """Return coefficients of the regressors, C from z^-1 on, and xi of all rows.
 
-        For a given C the problem is linear, so that only C is searched: variable projection
-        (G. H. Golub and V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973, 413-432), with
-        L. Kaufman's approximation of the Jacobian (BIT 15, 1975, 49-57).
+        They make the squares of xi = (target - regressors @ linear) / C least. For a given C
+        the problem is linear, so that only C is searched: variable projection (G. H. Golub and
+        V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973, 413-432), with L. Kaufman's
+        approximation of the Jacobian (BIT 15, 1975, 49-57).
 
-        Parameters
-        ----------
-        table
-            The target and the regressors, shape (rows, 1 + n).
-        orders
-            C has as many coefficients; with a walk, C'.
-        start
-            C from z^-1 on, to search from.
-
-        Returns
-        -------
-        linear, c, errors
-            Coefficients of the regressors; C from z^-1 on; xi of all rows.
+        The table holds the target and the regressors, shape (rows, 1 + n). The search begins
+        at `start`, with zeros after it.
         """
 
         @lru_cache(maxsize=1)  # the search asks twice
@@ -159,16 +151,13 @@ class Rows:
         errors, _, linear = project(tuple(c))
         return linear, c, errors
 
-    def covariance(
-        self, table: Array, linear: Array, c: Array, square: float, walk: bool
-    ) -> Array:
+    def covariance(self, table: Array, orders: Orders, c: Array, errors: Array) -> Array:
         """Return the covariance of `linear` and C, from the curvature of the likelihood."""
-        white = self.whitened(table[:, 1:], c, walk)
-        errors = self.whitened(table[:, 0], c, walk) - white @ linear
+        white = self.whitened(table[:, 1:], c, orders.walk)
         jacobian = np.hstack([white, self._slopes(errors, c)])[self.counts]
         scale = np.linalg.norm(jacobian, axis=0)
         scale[scale == 0.0] = 1.0  # of a flow that never leaves a dead zone
         information = (jacobian / scale).T @ (jacobian / scale)
-        variance = square / max(len(self) - jacobian.shape[1], 1)
+        variance = self.square(errors) / max(len(self) - jacobian.shape[1], 1)
         spread: Array = variance * linalg.pinvh(information) / np.outer(scale, scale)
         return spread

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.identify.armax import Array
 from benchmarks.identify.model import CannotTellError
@@ -12,31 +13,24 @@ FOLLOWS = 0.98  # share of the flow's moves that, explained by the temperature, 
 
 
 def check_excitation(command: Array, output: Array) -> None:
-    """Refuse a log in which nothing moves, or nothing but the feedback.
-
-    Raises
-    ------
-    CannotTellError
-        The message says what is missing.
-    """
-    known = command[np.isfinite(command)]
-    if len(known) < LEAST_SAMPLES:
+    """Refuse a log in which nothing moves, or nothing but the feedback."""
+    flows, temperatures = command[np.isfinite(command)], output[np.isfinite(output)]
+    if len(flows) < LEAST_SAMPLES:
         raise CannotTellError(
-            f"the log is too short: {len(known)} rows with a flow, and at least "
+            f"the log is too short: {len(flows)} rows with a flow, and at least "
             f"{LEAST_SAMPLES} are needed"
         )
-    if np.ptp(known) == 0.0:
+    if np.ptp(flows) == 0.0:
         raise CannotTellError(
-            f"the flow is constant, {known[0]:g} t/h from its operating point: nothing moves "
+            f"the flow is constant, {flows[0]:g} t/h from its operating point: nothing moves "
             "that the temperature could answer. Record it while the flow is moved in steps"
         )
-    temperatures = output[np.isfinite(output)]
     if not len(temperatures) or np.ptp(temperatures) == 0.0:
         raise CannotTellError(
             "the temperature is constant: it answers nothing. See whether the sensor works, or "
             "name another column"
         )
-    share = _explained_by_feedback(command, output)
+    share = _explained_by_feedback(pd.Series(command), pd.Series(output))
     if share > FOLLOWS:
         raise CannotTellError(
             f"the flow follows from the temperature alone ({100 * share:.1f} % of its moves): "
@@ -45,21 +39,12 @@ def check_excitation(command: Array, output: Array) -> None:
         )
 
 
-def _explained_by_feedback(command: Array, output: Array) -> float:
-    """Return which share of the flow's moves the temperature explains, linearly.
-
-    It is a share of what the flow's own past leaves open.
-    """
-    lags = 3
-    index = np.arange(lags, len(command))
-    moves = command[index] - command[index - 1]
-    own = [command[index - i] for i in (1, 2)] + [np.ones(len(index))]
-    temperatures = [output[index - i] for i in range(lags)]
-    table = np.column_stack([*own, *temperatures, moves])
+def _explained_by_feedback(u: pd.Series[float], y: pd.Series[float]) -> float:
+    """Return which share of the flow's moves, beyond its past, the temperature explains."""
+    own = [u.shift(1), u.shift(2), u.notna()]
+    table = np.column_stack([*own, y, y.shift(1), y.shift(2), u.diff()])
     # Where a limit holds the flow, it does not follow anything.
-    free = np.isfinite(table).all(axis=1)
-    free &= (command[index] > np.nanmin(command)) & (command[index] < np.nanmax(command))
-    table = table[free]
+    table = table[np.isfinite(table).all(axis=1) & (u > u.min()) & (u < u.max())]
     if len(table) < LEAST_SAMPLES:
         return 0.0
 

@@ -8,16 +8,15 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from benchmarks.identify import simulation
 from benchmarks.identify.armax import Orders
 from benchmarks.identify.cleaning import cleaned
-from benchmarks.identify.likelihood import Fit, Gap, Likelihood
+from benchmarks.identify.likelihood import Fit, Likelihood
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError, HeldOut, Model
 from benchmarks.identify.options import Knowledge
 from benchmarks.identify.plant import noise_of
-from benchmarks.identify.posterior import Posterior
-from benchmarks.loop.linear import LinearModel
+from benchmarks.identify.posterior import posterior
+from benchmarks.identify.simulation import explained, of_impulse_response
 
 OWN_LAGS = 0.6, 0.75, 0.85, 0.92, 0.96  # poles of the plant that are not poles of the noise
 FIRST_ORDERS = Orders(2, 1, 2)  # to look for the delay with, before the orders are known
@@ -37,17 +36,8 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
 
     Orders of A, B and C, with and without a random walk of the base line, are fitted by maximum
     likelihood. Those with the best information criteria are fitted again to the first two
-    thirds of the log, and simulate the last one; what is clearly worse there is left out. What
-    remains has a posterior: over orders by the criterion, over all delays and all gaps between
-    neighbours among the magnitudes of the commands, as the likelihood is the same all over a
-    gap, and over the coefficients. All intervals are its quantiles.
-
-    Parameters
-    ----------
-    log
-        What was recorded.
-    knowledge
-        What is known.
+    thirds of the log, and simulate the last one; what is clearly worse there is left out. All
+    intervals are quantiles of the posterior over what remains.
 
     Raises
     ------
@@ -67,10 +57,15 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
     fits = likelihood.first_fits([given]) if given else _fits(likelihood)
     _check_answer(likelihood, fits[0])
     fits, held_out = _tried(likelihood, fits)
-    posterior = Posterior(likelihood, fits)
-    chosen, estimates = posterior.chosen, posterior.estimates
+    chosen, possible, estimates = posterior(likelihood, fits)
     plant, *known = likelihood.models(chosen)
-    _check_stable(plant)
+    largest = float(np.max(np.abs(plant.poles), initial=0.0))
+    if largest >= 1.0 - 1e-4:
+        raise CannotTellError(
+            "the log does not show where the temperature settles: the best model has a "
+            f"pole at {largest:.4f}, and one below 1 is asked for. Hold the flow longer, "
+            "and see whether the temperature drifts"
+        )
     noise, c = noise_of(
         replace(plant, c=(1.0, *chosen.c)), chosen.orders, estimates["noise_variance"].value
     )
@@ -79,7 +74,7 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
     model = Model(
         plant=replace(plant, c=c), noise=noise,
         known=dict(zip(log.disturbances, known, strict=True)),
-        estimates=estimates, possible=posterior.draws,
+        estimates=estimates, possible=possible,
         u_min=likelihood.u_min, u_max=likelihood.u_max,
         operating_flow=likelihood.operating_flow, operating_temperature=level,
         orders=chosen.orders, errors=likelihood.errors(chosen, bridged=False),
@@ -96,17 +91,15 @@ def _fits(likelihood: Likelihood) -> list[Fit]:
         for a, b in itertools.product(OF_A, OF_B):
             orders = Orders(a, b, 2, base.orders.walk)
             place = likelihood.scan(orders, base.c, [base.place.gap])[0]
-            scanned.append(
-                (likelihood.criterion(orders, place.deviance), orders, place, base.c)
-            )
-    scanned.sort(key=lambda entry: entry[0])
+            scanned.append((orders, place, base.c))
+    scanned.sort(key=lambda each: likelihood.criterion(each[0], each[1].deviance))
     # Of each kind one at least: a common C is no measure for all.
-    kinds = itertools.product((False, True), repeat=2)
     of_kinds = [
-        next(e for e in scanned if (e[1].walk, e[1].b > LONG) == kind) for kind in kinds
+        next(each for each in scanned if (each[0].walk, each[0].b > LONG) == kind)
+        for kind in itertools.product((False, True), repeat=2)
     ]
     fits: dict[Orders, Fit] = {}
-    for _, orders, place, c in [*scanned[:WORTH_A_FIT], *of_kinds]:
+    for orders, place, c in [*scanned[:WORTH_A_FIT], *of_kinds]:
         if orders not in fits:
             fits[orders] = likelihood.best_fit(place, orders, c)
     for fit in likelihood.ranked(fits.values())[:3]:
@@ -117,8 +110,7 @@ def _fits(likelihood: Likelihood) -> list[Fit]:
     found = likelihood.ranked(fits.values())
     # A second time constant of the plant that is not one of the noise has a peak of its own.
     lags = []
-    for b in (1, 2):
-        orders = Orders(2, b, 1)
+    for orders in (Orders(2, 1, 1), Orders(2, 2, 1)):
         tried = []
         for pole in OWN_LAGS:
             c = np.array([-pole])
@@ -132,18 +124,13 @@ def _tried(likelihood: Likelihood, fits: list[Fit]) -> tuple[list[Fit], HeldOut]
     """Return the fits that simulate the last third well, and how well the best of them does."""
     cut = int(likelihood.rows.index[len(likelihood.rows.index) * 2 // 3])
     last, start = np.arange(len(likelihood.output)) >= cut, likelihood.first(cut)
-    inputs = [likelihood.applied(Gap(0.0, 0.0)), *likelihood.known]
-    impulse, _ = simulation.of_impulse_response(
-        [simulation.held(each) for each in inputs], likelihood.output, ~last
-    )
     mild = likelihood.ranked(fits, mild=True)
     long = [fit for fit in fits if fit.orders.b > LONG]
     own_lag = [fit for fit in fits if fit.has_own_lag]
     shares = {}
-    for fit in [*fits[:WORTH_A_TRIAL], *mild[:2], *long[:1], *own_lag]:
-        if fit not in shares:
-            simulated = start.simulated(start.fit(fit.place, fit.orders, fit.c))
-            shares[fit] = simulation.explained(likelihood.output, simulated, last)
+    for fit in dict.fromkeys([*fits[:WORTH_A_TRIAL], *mild[:2], *long[:1], *own_lag]):
+        simulated = start.simulated(start.fit(fit.place, fit.orders, fit.c))
+        shares[fit] = explained(likelihood.output, simulated, last)
     # What a better simulation leaves open, and a part of the noise that no one foresees.
     left = 1.0 - max(shares.values())
     least = max(WORSE * left, left + 0.005)
@@ -160,9 +147,10 @@ def _tried(likelihood: Likelihood, fits: list[Fit]) -> tuple[list[Fit], HeldOut]
             orders = fit.orders
             kind = orders.walk, orders.b > LONG, fit.has_own_lag, orders.b > 1
             kinds.setdefault(kind, fit)
-    near = [fit for fit in kinds.values() if fit is not good[0]]
-    found = simulation.explained(likelihood.output, impulse, last)
-    return [good[0], *near], HeldOut(float(shares[good[0]]), float(found))
+    inputs = [likelihood.command, *likelihood.known]
+    impulse, _ = of_impulse_response(inputs, likelihood.output, ~last)
+    rival = explained(likelihood.output, impulse, last)
+    return list(dict.fromkeys([good[0], *kinds.values()])), HeldOut(shares[good[0]], rival)
 
 
 def _check_answer(likelihood: Likelihood, best: Fit) -> None:
@@ -176,7 +164,7 @@ def _check_answer(likelihood: Likelihood, best: Fit) -> None:
             "told from noise: move it further, or move the set point of a closed loop more"
         )
     # As many delays and dead zones have been tried, the best of them gains by chance.
-    tried = (likelihood.knowledge.longest_delay + 1) * len(likelihood.gaps())
+    tried = len(likelihood.delays) * len(likelihood.gaps())
     least = float(stats.chi2.isf(CHANCE / tried, best.orders.b))
     if gained < least:
         raise CannotTellError(
@@ -190,60 +178,40 @@ def _check_answer(likelihood: Likelihood, best: Fit) -> None:
 def _gained_when_swapped(likelihood: Likelihood) -> float:
     """Return what the temperature adds to the likelihood of the flow."""
     log, longest_delay = likelihood.log, likelihood.knowledge.longest_delay
+    mirrored = Log(log.temperature, log.flow, log.sampling_interval)
     try:
-        swapped = Likelihood(
-            Log(log.temperature, log.flow, log.sampling_interval),
-            Knowledge(longest_delay=longest_delay), FIRST_ORDERS,
-        )  # fmt: skip
+        swapped = Likelihood(mirrored, Knowledge(longest_delay=longest_delay), FIRST_ORDERS)
         return swapped.gained(swapped.first_fits([FIRST_ORDERS])[0])
     except ValueError:
         return 0.0
 
 
-def _check_stable(plant: LinearModel) -> None:
-    largest = float(np.max(np.abs(plant.poles), initial=0.0))
-    if largest >= 1.0 - 1e-4:
-        raise CannotTellError(
-            "the log does not show where the temperature settles: the best model has a "
-            f"pole at {largest:.4f}, and one below 1 is asked for. Hold the flow longer, "
-            "and see whether the temperature drifts"
-        )
-
-
 def _notes(model: Model, likelihood: Likelihood) -> list[str]:
     """Return what the user should know about the fit."""
-    notes = []
-    longest, samples = likelihood.knowledge.longest_delay, len(likelihood.output)
+    longest, log = likelihood.knowledge.longest_delay, model.log
     gain, constant = model.estimates["gain"], model.estimates["time_constant"]
     walk = model.noise["disturbance_walk_variance"]
-    if gain.value > 0:
-        notes.append(
-            "The direction is unusual for a boiler: the temperature rises with the flow. "
-            "If it should not, see whether the columns are swapped."
-        )
-    if model.plant.delay >= longest - 1:
-        notes.append(
-            f"The delay is as long as was looked for, {longest} "
-            "samples: try a longer --longest-delay, or a longer sampling interval."
-        )
-    if likelihood.knowledge.operating_flow is None and likelihood.operating_flow:
-        notes.append(
-            f"The operating point is taken at the log's first flow, {model.operating_flow:g} "
-            "t/h, and a dead zone would lie around it: say --operating-flow if it is elsewhere."
-        )
-    if walk > likelihood.resolution:
-        notes.append(
-            f"The base line wanders by {np.sqrt(walk):.2g} °C a sample, as a random walk: "
-            "`disturbance_walk_variance`. What the plant settles at is known less well."
-        )
-    if not np.isfinite([gain.low, gain.high, constant.high]).all():
-        notes.append(
-            "The plant may be integrating: an interval has no end, as the log does not show "
-            "where the temperature settles. Hold the flow longer."
-        )
-    elif SLOW * constant.value > samples * model.log.sampling_interval:
-        notes.append(
-            f"The log holds less than {SLOW:g} time constants of the plant. Its gain rests on "
-            "how the response goes on, which no one has seen."
-        )
-    return notes
+    endless = not np.isfinite([gain.low, gain.high, constant.high]).all()
+    short = SLOW * constant.value > len(log.flow) * log.sampling_interval
+    at_first_flow = likelihood.knowledge.operating_flow is None and model.operating_flow != 0.0
+    notes = [
+        (gain.value > 0.0,
+         "The direction is unusual for a boiler: the temperature rises with the flow. If it "
+         "should not, see whether the columns are swapped."),
+        (model.plant.delay >= longest - 1,
+         f"The delay is as long as was looked for, {longest} samples: try a longer "
+         "--longest-delay, or a longer sampling interval."),
+        (at_first_flow,
+         f"The operating point is taken at the log's first flow, {model.operating_flow:g} "
+         "t/h, and a dead zone would lie around it: say --operating-flow if it is elsewhere."),
+        (walk > likelihood.resolution,
+         f"The base line wanders by {np.sqrt(walk):.2g} °C a sample, as a random walk: "
+         "`disturbance_walk_variance`. What the plant settles at is known less well."),
+        (endless,
+         "The plant may be integrating: an interval has no end, as the log does not show "
+         "where the temperature settles. Hold the flow longer."),
+        (short and not endless,
+         f"The log holds less than {SLOW:g} time constants of the plant. Its gain rests on "
+         "how the response goes on, which no one has seen."),
+    ]  # fmt: skip
+    return [note for holds, note in notes if holds]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 
 from benchmarks.identify.armax import Array, Flags, Orders, Rows
@@ -19,7 +18,7 @@ from benchmarks.identify.excitation import LEAST_SAMPLES, check_excitation
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError
 from benchmarks.identify.options import Knowledge
-from benchmarks.identify.simulation import from_rest, held
+from benchmarks.identify.simulation import from_rest
 from benchmarks.loop.linear import LinearModel
 
 COARSE = 40  # dead zones that are tried first
@@ -51,28 +50,18 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What is likeliest for some orders at a place.
-
-    Attributes
-    ----------
-    orders, place
-        Of what is fitted.
-    linear
-        Coefficients of the regressors.
-    c
-        C, or C' with a walk, from z^-1 on.
-    errors
-        The prediction errors xi of the rows that are predicted.
-    square
-        The sum of their squares, in the rows that count.
-    """
+    """What is likeliest for some orders at a place."""
 
     orders: Orders
     place: Place
     linear: Array
+    """Coefficients of the regressors."""
     c: Array
+    """C, or C' with a walk, from z^-1 on."""
     errors: Array
+    """The prediction errors xi of the rows that are predicted."""
     square: float
+    """The sum of their squares, in the rows that count."""
 
     @property
     def has_own_lag(self) -> bool:
@@ -89,32 +78,7 @@ class Fit:
 class Likelihood:
     """A log in deviations from its operating point, and how well models explain it.
 
-    Parameters
-    ----------
-    log
-        What was recorded.
-    knowledge
-        What is known.
-    longest
-        Orders with the longest A and B that are tried.
-
-    Attributes
-    ----------
-    operating_flow : float
-        What is subtracted from the flow, t/h.
-    u_min, u_max : float
-        Limits of the flow, t/h.
-    command, output
-        u(k), t/h, and y(k), degC, of the log; NaN where they are not known.
-    known
-        The known disturbances, as deviations from their first values.
-    lags
-        The delay of each of them, samples.
-    magnitudes
-        Of the commands, ascending, without 0, t/h.
-    rows : Rows
-        Those that are predicted: in them all is known that (28) takes, for every delay and all
-        orders that are tried.
+    `longest` has the longest A and B that are tried.
 
     Raises
     ------
@@ -129,14 +93,15 @@ class Likelihood:
         self.operating_flow = _operating_flow(log.flow, knowledge)
         command = log.flow - self.operating_flow
         self.u_min, self.u_max = _limits(command, knowledge)
+        # u(k), y(k) and the known disturbances, as deviations; NaN where they are not known.
         self.command = np.clip(command, self.u_min, self.u_max)
-        level = float(np.nanmean(log.temperature)) if len(log.temperature) else 0.0
-        self.output = log.temperature - level
+        check_excitation(self.command, log.temperature)
+        self.output = log.temperature - float(np.nanmean(log.temperature))
         self.known = [each - each[np.isfinite(each)][0] for each in log.disturbances.values()]
-        self.lags = [0] * len(self.known)
+        self.lags = [0] * len(self.known)  # samples
+        self.delays = range(knowledge.longest_delay + 1)
         # Smaller errors than this are rounding, and no reason for higher orders.
-        self.resolution = FINEST**2 * float(np.nanvar(self.output)) if len(self.output) else 0.0
-        check_excitation(self.command, self.output)
+        self.resolution = FINEST**2 * float(np.nanvar(self.output))
         magnitudes = np.unique(np.abs(self.command[np.isfinite(self.command)]))
         self.magnitudes = magnitudes[magnitudes > 0.0]
         self._find_rows(longest)
@@ -149,17 +114,17 @@ class Likelihood:
             )
 
     def _find_rows(self, longest: Orders) -> None:
+        """Find where all is known that (28) takes, for every delay and all orders."""
         reach = self.knowledge.longest_delay + longest.b
         missing = ~np.isfinite(self.output)
-        filled = pd.Series(self.output).interpolate(limit_direction="both").fillna(0.0)
+        filled = pd.Series(self.output).interpolate(limit_direction="both")
         self._filled = np.asarray(filled, np.float64)
         bridged = missing & ~_runs(missing, BRIDGE + 1)
-        flows = _all_of_last(np.isfinite(self.command), reach)
-        for known in self.known:
-            flows &= _all_of_last(np.isfinite(known), reach + OF_KNOWN)
         self._usable = _all_of_last(~missing | bridged, longest.a + 1)
-        self._usable[1:] &= flows[:-1]
-        self._usable[: max(longest.a, reach + (OF_KNOWN if self.known else 0))] = False
+        for each, lags in [(self.command, reach), *((d, reach + OF_KNOWN) for d in self.known)]:
+            self._usable[1:] &= _all_of_last(np.isfinite(each), lags)[:-1]
+            self._usable[:lags] = False
+        self._usable[: longest.a] = False
         self._counted = _all_of_last(~missing, longest.a + 1)
         self.rows = Rows(_runs(self._usable, SHORTEST), self._counted)
 
@@ -171,8 +136,7 @@ class Likelihood:
 
     def applied(self, gap: Gap) -> Array:
         """Return u_a for a dead zone within a gap."""
-        applied = np.where(np.abs(self.command) <= gap.low, 0.0, self.command)
-        return np.asarray(np.nan_to_num(applied))  # what is not known is in no row
+        return np.where(np.abs(self.command) <= gap.low, 0.0, self.command)
 
     def table(self, orders: Orders, place: Place | None = None, but: int = -1) -> Array:
         """Return y(k), and its regressors: -y(k-1) ..., u_a(k-d-1) ..., disturbances, levels.
@@ -181,22 +145,25 @@ class Likelihood:
         """
         inputs = [] if place is None else [(self.applied(place.gap), place.delay, orders.b)]
         inputs += [
-            (np.nan_to_num(known), lag, OF_KNOWN)
+            (known, lag, OF_KNOWN)
             for i, (known, lag) in enumerate(zip(self.known, self.lags, strict=True))
             if i != but
         ]
         return np.hstack([
-            self._filled[self.rows.index, np.newaxis],
+            self.rows.lagged(self._filled, [0]),
             -self.rows.lagged(self._filled, range(1, orders.a + 1)),
             *(self.rows.lagged(u, range(d + 1, d + 1 + count)) for u, d, count in inputs),
             self.rows.levels(orders),
         ])  # fmt: skip
 
+    def white(self, table: Array, c: Array, orders: Orders) -> Array:
+        """Return columns whitened by C, in the rows that count."""
+        return self.rows.whitened(table, c, orders.walk)[self.rows.counts]
+
     def fit(self, place: Place, orders: Orders, start: Array | None = None) -> Fit:
         """Return the fit of maximum likelihood."""
-        return self._fit(
-            place, orders, *self.rows.solve(self.table(orders, place), orders, start)
-        )
+        table = self.table(orders, place)
+        return self._fit(place, orders, *self.rows.solve(table, orders, start))
 
     def with_c(self, place: Place, orders: Orders, c: Array) -> Fit:
         """Return the fit with a given C."""
@@ -207,7 +174,7 @@ class Likelihood:
         return self._fit(place, orders, linear, c, white[:, 0] - white[:, 1:] @ linear)
 
     def _fit(self, place: Place, orders: Orders, linear: Array, c: Array, errors: Array) -> Fit:
-        square = self._square(errors)
+        square = self.rows.square(errors)
         there = place._replace(deviance=float(self.deviance(square)))
         return Fit(orders, there, linear, c, errors, square)
 
@@ -222,20 +189,16 @@ class Likelihood:
         """Return fits of orders, the best first, and find the delays of known disturbances."""
         place = self.scan(replace(tried[0], c=0), np.zeros(0), self.gaps())[0]
         if self.known:
-            self._place_known(place, tried[0], self.fit(place, tried[0]).c)
+            c, orders = self.fit(place, tried[0]).c, replace(tried[0], b=OF_KNOWN)
+            for i, known in enumerate(self.known):
+                table = self.table(tried[0], place, but=i)
+                [deviances] = self._profile(table, orders, c, [known], self.delays)
+                self.lags[i] = int(np.argmin(deviances))
         fits = []
         for orders in tried:
             c = self.fit(place, orders).c
             fits.append(self.fit(self.scan(orders, c, self.gaps())[0], orders, c))
         return self.ranked(fits)
-
-    def white(self, table: Array, c: Array, orders: Orders) -> Array:
-        """Return columns whitened by C, in the rows that count."""
-        return self.rows.whitened(table, c, orders.walk)[self.rows.counts]
-
-    def _square(self, errors: Array) -> float:
-        counted = errors[self.rows.counts]
-        return float(counted @ counted)
 
     def deviance(self, squares: Array | float) -> Array:
         """Return twice the negative log likelihood, but for a constant."""
@@ -270,31 +233,22 @@ class Likelihood:
         self, orders: Orders, c: Array, gaps: list[Gap], delays: range | None = None
     ) -> list[Place]:
         """Return the deviance of every delay and gap with a given C, the best first."""
-        delays = delays or range(self.knowledge.longest_delay + 1)
-        profile = self._profile(self.table(orders), orders, c)
-        found = [
-            Place(delay, gap, deviance)
-            for gap in gaps
-            for delay, deviance in zip(
-                delays, profile(self.applied(gap), delays, orders.b).tolist(), strict=True
-            )
-        ]
-        return sorted(found, key=lambda place: place.deviance)
-
-    def _place_known(self, place: Place, orders: Orders, c: Array) -> None:
-        """Find the delay of each known disturbance, with all else as it is."""
-        delays = range(self.knowledge.longest_delay + 1)
-        for i, known in enumerate(self.known):
-            profile = self._profile(self.table(orders, place, but=i), orders, c)
-            self.lags[i] = int(np.argmin(profile(np.nan_to_num(known), delays, OF_KNOWN)))
+        delays = delays or self.delays
+        applied = [self.applied(gap) for gap in gaps]
+        found = self._profile(self.table(orders), orders, c, applied, delays)
+        return sorted(
+            (
+                Place(delay, gap, deviance)
+                for gap, deviances in zip(gaps, found, strict=True)
+                for delay, deviance in zip(delays, deviances.tolist(), strict=True)
+            ),
+            key=lambda place: place.deviance,
+        )
 
     def _profile(
-        self, table: Array, orders: Orders, c: Array
-    ) -> Callable[[Array, range, int], Array]:
-        """Return what gives, for every delay, the deviance with one more input.
-
-        It takes the input, the delays and the number of its coefficients.
-        """
+        self, table: Array, orders: Orders, c: Array, inputs: list[Array], delays: range
+    ) -> Iterator[Array]:
+        """Return the deviances of every delay with one more input, of B's length, for each."""
         white = self.white(table, c, orders)
         basis, _ = np.linalg.qr(white[:, 1:])
 
@@ -303,40 +257,36 @@ class Likelihood:
             return result
 
         target = left(white[:, 0])
-
-        def deviances(signal: Array, delays: range, length: int) -> Array:
-            lagged = self.rows.lagged(signal, range(delays[0] + 1, delays[-1] + 1 + length))
-            inputs = left(self.white(lagged, c, orders))
-            gram, moments = inputs.T @ inputs, inputs.T @ target
+        length = orders.b
+        places = np.arange(len(delays))[:, np.newaxis] + np.arange(length)
+        for each in inputs:
+            lagged = self.rows.lagged(each, range(delays[0] + 1, delays[-1] + 1 + length))
+            columns = left(self.white(lagged, c, orders))
+            gram, moments = columns.T @ columns, columns.T @ target
             ridge = 1e-10 * max(float(np.trace(gram)) / len(gram), 1e-300)
-            places = np.arange(len(delays))[:, np.newaxis] + np.arange(length)
             blocks = gram[places[:, :, np.newaxis], places[:, np.newaxis, :]]
-            shares = sliding_window_view(moments, length)
+            shares = moments[places]
             solved = np.linalg.solve(blocks + ridge * np.eye(length), shares[:, :, np.newaxis])
-            return self.deviance(
+            yield self.deviance(
                 float(target @ target) - np.sum(shares * solved[:, :, 0], axis=1)
             )
 
-        return deviances
-
     def covariance(self, fit: Fit) -> Array:
         """Return the covariance of the linear coefficients and C."""
-        table = self.table(fit.orders, fit.place)
-        return self.rows.covariance(table, fit.linear, fit.c, fit.square, fit.orders.walk)
+        return self.rows.covariance(
+            self.table(fit.orders, fit.place), fit.orders, fit.c, fit.errors
+        )
 
     def models(self, fit: Fit) -> list[LinearModel]:
         """Return what the flow does by (28), and what each known disturbance does."""
-        a, b, count = fit.orders.a, fit.orders.b, OF_KNOWN * len(self.known)
-        of_known = fit.linear[a + b : a + b + count].reshape(-1, OF_KNOWN)
+        poles, rest = np.split(fit.linear, [fit.orders.a])
+        lengths = [fit.orders.b, *[OF_KNOWN] * len(self.known)]
+        parts, delays = np.split(rest, np.cumsum(lengths))[:-1], [fit.place.delay, *self.lags]
+        a, interval = [1.0, *poles.tolist()], self.log.sampling_interval
         return [
-            LinearModel(
-                [1.0, *fit.linear[:a].tolist()], each.tolist(),
-                delay=delay, sampling_interval=self.log.sampling_interval,
-            )
-            for each, delay in zip(
-                [fit.linear[a : a + b], *of_known], [fit.place.delay, *self.lags], strict=True
-            )
-        ]  # fmt: skip
+            LinearModel(a, b.tolist(), delay=delay, sampling_interval=interval)
+            for b, delay in zip(parts, delays, strict=True)
+        ]
 
     def errors(self, fit: Fit, *, bridged: bool = True) -> Array:
         """Return the prediction errors, one a row of the log, NaN where there is none."""
@@ -346,17 +296,14 @@ class Likelihood:
 
     def simulated(self, fit: Fit) -> Array:
         """Return what flow and known disturbances do to the temperature, degC."""
-        flow = np.where(np.isfinite(self.command), self.applied(fit.place.gap), np.nan)
-        parts = [
-            from_rest(model, held(each))
-            for model, each in zip(self.models(fit), [flow, *self.known], strict=True)
-        ]
+        inputs = [self.applied(fit.place.gap), *self.known]
+        parts = [from_rest(*each) for each in zip(self.models(fit), inputs, strict=True)]
         return np.asarray(np.sum(parts, axis=0))
 
     def gained(self, best: Fit) -> float:
         """Return what the flow adds to twice the log likelihood."""
         *_, errors = self.rows.solve(self.table(best.orders), best.orders, best.c)
-        return float(self.deviance(self._square(errors))) - best.place.deviance
+        return float(self.deviance(self.rows.square(errors))) - best.place.deviance
 
 
 def _operating_flow(flow: Array, knowledge: Knowledge) -> float:

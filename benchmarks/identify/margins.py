@@ -23,28 +23,17 @@ POINTS = 20_000  # of the frequency response
 
 @dataclass(frozen=True)
 class Margins:
-    """What a loop bears before it is unstable.
+    """What a loop bears before it is unstable. All are NaN if it is not stable."""
 
-    Attributes
-    ----------
-    gain
-        Factor on the gain of the plant; infinite if none makes it unstable.
-    phase
-        Phase shift in either direction, degrees; infinite if the loop gain is below 1
-        everywhere.
-    delay
-        Further delay, s; infinite likewise.
-    sensitivity
-        Ms, the largest factor by which the loop amplifies a disturbance, 1 or more. 1 / Ms is
-        the least distance of the loop's frequency response from -1.
-
-    All are NaN if the loop is not stable.
-    """
-
-    gain: float
-    phase: float
-    delay: float
-    sensitivity: float
+    gain: float = math.nan
+    """Factor on the gain of the plant; infinite if none makes it unstable."""
+    phase: float = math.nan
+    """Phase shift in either direction, degrees; infinite if the loop gain is below 1."""
+    delay: float = math.nan
+    """Further delay, s; infinite likewise."""
+    sensitivity: float = math.nan
+    """Ms, the largest factor by which the loop amplifies a disturbance, 1 or more. 1 / Ms is
+    the least distance of the loop's frequency response from -1."""
 
     @property
     def stable(self) -> bool:
@@ -55,27 +44,23 @@ class Margins:
 class Loop:
     """A controller and a plant, (28) without the actuator, opened at the error.
 
+    L is what e comes back as.
+
     Parameters
     ----------
     controller
         Linear between the limits of the flow: its method `transfer` says how.
     parameters
         The plant's. A range stands for its middle, and a plant that drifts is taken at k = 0.
-
-    Attributes
-    ----------
-    numerator, denominator
-        Of the loop's transfer function L, in powers of z^-1: what e comes back as.
-    frequency
-        Up to Nyquist's, rad/s, dense enough to see every crossing.
     """
 
     def __init__(self, controller: PIController, parameters: Parameters) -> None:
-        # u follows e, and y follows u: L = G_u G.
+        # u follows e, and y follows u: L = G_u G, in powers of z^-1.
         (up, down), (b, a) = controller.transfer(), nominal(parameters).transfer()
         self.numerator, self.denominator = np.convolve(up, b), np.convolve(down, a)
         self._interval = parameters.sampling_interval
         nyquist = math.pi / self._interval
+        # rad/s, dense enough to see every crossing
         self.frequency = np.union1d(
             np.geomspace(SLOWEST * nyquist, nyquist, POINTS),
             np.linspace(nyquist / POINTS, nyquist, POINTS),
@@ -96,7 +81,7 @@ class Loop:
         """The margins, while no limit and no dead zone is met."""
         closed = polyadd(self.denominator, self.numerator)
         if not np.all(np.abs(np.roots(closed)) < 1.0):
-            return Margins(math.nan, math.nan, math.nan, math.nan)
+            return Margins()
         values = self.response
         at = self.response_at(self._crossings(values.imag)).real
         at = np.append(at, values[-1].real)  # at Nyquist's frequency L is real, too

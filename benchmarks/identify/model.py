@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from benchmarks.identify.armax import Array, Orders
@@ -36,53 +36,34 @@ class HeldOut(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """A plant that a log has shown. Deviations from the operating point, as in (28) and (29).
-
-    Attributes
-    ----------
-    plant
-        The likeliest A, B, C and delay.
-    noise
-        `noise_variance`, `measurement_noise_variance` and `disturbance_walk_variance` of the
-        environment, degC^2.
-    known
-        What each known disturbance does, by its column of the log.
-    estimates
-        With their intervals: `delay` (samples), `dead_zone` (t/h), `gain` (degC per t/h),
-        `time_constant` (s, of the slowest pole), `noise_variance` (degC^2, of the prediction
-        errors), and the coefficients `a1`, `b1` and so on.
-    possible
-        Plants drawn from what the log leaves open.
-    u_min, u_max
-        Limits of the flow, t/h.
-    operating_flow, operating_temperature
-        t/h and degC: where u and y are 0.
-    orders
-        Of A, B and C.
-    errors
-        The prediction errors xi, one a row of the log, NaN where they are not known, degC.
-    held_out
-        How good simulations are.
-    log
-        What was fitted: the log, mended.
-    simulated
-        What the model makes of flow and known disturbances alone, degC.
-    notes
-        What the user should know about the fit.
-    """
+    """A plant that a log has shown, in deviations from the operating point as in (28)."""
 
     plant: LinearModel
+    """The likeliest A, B, C and delay."""
     noise: dict[str, float]
+    """`noise_variance`, `measurement_noise_variance` and `disturbance_walk_variance` of the
+    environment, degC^2."""
     known: dict[str, LinearModel]
+    """What each known disturbance does, by its column of the log."""
     estimates: dict[str, Interval]
+    """`delay` (samples), `dead_zone` (t/h), `gain` (degC per t/h), `time_constant` (s, of the
+    slowest pole), `noise_variance` (degC^2, of the prediction errors), and the coefficients
+    `a1`, `b1` and so on."""
     possible: list[LinearModel]
+    """Plants drawn from what the log leaves open."""
     u_min: float
     u_max: float
+    """t/h."""
     operating_flow: float
     operating_temperature: float
+    """t/h and degC: where u and y are 0."""
     orders: Orders
     errors: Array
+    """The prediction errors xi, one a row of the log, NaN where they are not known, degC."""
     held_out: HeldOut
     log: Log
+    """What was fitted: the log, mended."""
     simulated: Array
-    notes: list[str] = field(default_factory=list)
+    """What the model makes of flow and known disturbances alone, degC."""
+    notes: list[str]
+    """What the user should know about the fit."""

@@ -11,8 +11,8 @@ from benchmarks.controllers.step_test import StepTest
 from benchmarks.identify.armax import Array
 from benchmarks.identify.margins import Loop
 from benchmarks.identify.model import Model
-from benchmarks.identify.plant import step_band
 from benchmarks.lib.drawing import COLOURS, colours, drawn
+from benchmarks.lib.statistics import ENDS
 
 LAGS = 40  # of the autocorrelation
 LONGEST = 5_000  # samples of a step response that is drawn
@@ -77,7 +77,9 @@ def plot_step(model: Model, tested: StepTest, path: Path) -> None:
     length = tested.delay + 6.0 * tested.time_constant
     samples = min(int(np.ceil(length / model.plant.sampling_interval)), LONGEST) + 1
     response = model.plant.step_response(samples)
-    low, high = step_band(model, samples)
+    with np.errstate(over="ignore", invalid="ignore"):  # of plants that are not stable
+        possible = np.array([plant.step_response(samples) for plant in model.possible])
+    low, high = np.nanquantile(possible, ENDS, axis=0, method="nearest")
     times = np.arange(samples) * model.plant.sampling_interval
     since = np.maximum(times - tested.delay + model.plant.sampling_interval, 0.0)
     first_order = np.where(

@@ -33,215 +33,191 @@ class Entry(NamedTuple):
     place: Place
 
 
-class Posterior:
-    """The posterior of the plant, and draws from it.
+def posterior(
+    likelihood: Likelihood, fits: list[Fit]
+) -> tuple[Fit, list[LinearModel], dict[str, Interval]]:
+    """Return the likeliest fit, plants that are drawn, and the estimates of a `Model`.
 
-    Parameters
-    ----------
-    likelihood
-        Of the log.
-    fits
-        Of orders that take part, the best first.
-
-    Attributes
-    ----------
-    chosen : Fit
-        The one with the delay and the dead zone of the estimates.
-    draws : list of LinearModel
-        Plants.
-    estimates : dict
-        Those of a `Model`.
+    The fits are of the orders that take part, the best first.
     """
+    entries = _entries(likelihood, fits)
+    # The likeliest plant is of the simplest orders that will do. What is possible gives all
+    # orders that are about as good the same weight: a second time constant may stand for a
+    # part of the delay, and a log tells little of it.
+    likeliest, weights = (_weights(likelihood, entries, possible=p) for p in (False, True))
+    # A B with more coefficients than it need have may begin with some that are nearly 0: its
+    # delay is not when the response begins.
+    lengths = np.array([entry.fit.orders.b for entry in entries])
+    short = weights * (lengths <= lengths[np.argmax(likeliest)])
+    delay = _of_delay([entry.place.delay for entry in entries], likeliest, short / short.sum())
+    slack = ENDS_OF_ERRORS * likelihood.log.flow_error
+    dead_zone = _of_dead_zone([entry.place.gap for entry in entries], weights, slack)
+    chosen = _choose(likelihood, entries, likeliest, delay.value, dead_zone.value)
+    drawn = _draw(likelihood, entries, weights)
+    plant, interval = likelihood.models(chosen)[0], likelihood.log.sampling_interval
+    endless = math.copysign(math.inf, plant.gain)  # where nothing settles
+    return chosen, drawn, {
+        "delay": delay,
+        "dead_zone": dead_zone,
+        "gain": _interval(
+            plant.gain, [each.gain if sum(each.a) > 0.0 else endless for each in drawn]
+        ),
+        "time_constant": _interval(
+            interval * slowest(plant.a), [interval * slowest(each.a) for each in drawn]
+        ),
+        **_of_errors(likelihood, chosen),
+    }  # fmt: skip
 
-    def __init__(self, likelihood: Likelihood, fits: list[Fit]) -> None:
-        self._likelihood = likelihood
-        entries = self._entries(fits)
-        places = [entry.place for entry in entries]
-        # The likeliest plant is of the simplest orders that will do. What is possible gives
-        # all orders that are about as good the same weight: a second time constant may stand
-        # for a part of the delay, and a log tells little of it.
-        likeliest, weights = self._weights(entries), self._weights(entries, possible=True)
-        # A B with more coefficients than it need have may begin with some that are nearly 0:
-        # its delay is not when the response begins.
-        lengths = np.array([entry.fit.orders.b for entry in entries])
-        short = weights * (lengths <= lengths[np.argmax(likeliest)])
-        delay = _of_delay(places, likeliest, short / short.sum())
-        slack = ENDS_OF_ERRORS * likelihood.log.flow_error
-        dead_zone = _of_dead_zone([place.gap for place in places], weights, slack)
-        self.chosen = self._choose(entries, likeliest, delay.value, dead_zone.value)
-        self.draws = self._draw(entries, weights)
-        plant, interval = likelihood.models(self.chosen)[0], likelihood.log.sampling_interval
-        endless = math.copysign(math.inf, plant.gain)  # where nothing settles
-        self.estimates = {
-            "delay": delay,
-            "dead_zone": dead_zone,
-            "gain": _interval(
-                plant.gain, [d.gain if sum(d.a) > 0.0 else endless for d in self.draws]
-            ),
-            "time_constant": _interval(
-                interval * slowest(plant.a), [interval * slowest(d.a) for d in self.draws]
-            ),
-            **self._of_errors(self.chosen),
-        }
 
-    def _entries(self, fits: list[Fit]) -> list[Entry]:
-        """Return places for all orders that are near the best."""
-        likelihood, found = self._likelihood, []
-        gaps = likelihood.gaps()
-        for i, fit in enumerate(fits):
-            places = likelihood.scan(fit.orders, fit.c, gaps)
-            near = [p.delay for p in places if p.deviance < places[0].deviance + 2.0 * NEAR]
-            delays = range(min(near), max(near) + 1)
-            if i == 0:
-                gaps = self._refined(fit, places, delays)
-                at_its_own = range(fit.place.delay, fit.place.delay + 1)
-                gap = likelihood.scan(fit.orders, fit.c, gaps, at_its_own)[0].gap
-            # Another delay may ask for another C.
-            stride = max(len(delays) // MOST_FITS, 1)
-            for delay in delays[::stride]:
-                around = range(delay, min(delay + stride, delays.stop))
-                refit = likelihood.fit(Place(around[len(around) // 2], gap), fit.orders, fit.c)
-                if fit.has_own_lag and not refit.has_own_lag:
-                    refit = fit
-                places = likelihood.scan(fit.orders, refit.c, gaps, around)
-                found += [Entry(i, refit, place) for place in places]
-        return found
+def _entries(likelihood: Likelihood, fits: list[Fit]) -> list[Entry]:
+    """Return places for all orders that are near the best."""
+    found, gaps = [], likelihood.gaps()
+    for i, fit in enumerate(fits):
+        places = likelihood.scan(fit.orders, fit.c, gaps)
+        near = [p.delay for p in places if p.deviance < places[0].deviance + 2.0 * NEAR]
+        delays = range(min(near), max(near) + 1)
+        if i == 0:
+            gaps = _refined(likelihood, fit, places, delays)
+            at_its_own = range(fit.place.delay, fit.place.delay + 1)
+            gap = likelihood.scan(fit.orders, fit.c, gaps, at_its_own)[0].gap
+        # Another delay may ask for another C.
+        stride = max(len(delays) // MOST_FITS, 1)
+        for around in (delays[k : k + stride] for k in range(0, len(delays), stride)):
+            refit = likelihood.fit(Place(around[len(around) // 2], gap), fit.orders, fit.c)
+            if fit.has_own_lag and not refit.has_own_lag:
+                refit = fit
+            places = likelihood.scan(fit.orders, refit.c, gaps, around)
+            found += [Entry(i, refit, place) for place in places]
+    return found
 
-    def _refined(self, fit: Fit, places: list[Place], delays: range) -> list[Gap]:
-        """Return gaps near the best, with all gaps between commands told apart there."""
-        magnitudes = self._likelihood.magnitudes
-        best: dict[Gap, float] = {}
-        for place in places:
-            best.setdefault(place.gap, place.deviance)  # the best of a gap comes first
-        while len(best) < MOST_GAPS:
-            gaps = sorted(best)
-            limit = min(best.values()) + NEAR
-            middles = {}
-            for gap, above in zip(gaps, [*gaps[1:], gaps[-1]], strict=True):
-                inside = magnitudes[(magnitudes > gap.low) & (magnitudes < gap.high)]
-                if len(inside) and min(best[gap], best[above]) < limit:
-                    middles[gap] = float(inside[len(inside) // 2])
-            if not middles:
-                break
-            # The lower half has the same commands at rest as the whole.
-            for gap, middle in middles.items():
-                best[Gap(gap.low, middle)] = best.pop(gap)
-            upper = [Gap(middle, gap.high) for gap, middle in middles.items()]
-            for place in self._likelihood.scan(fit.orders, fit.c, upper, delays):
-                best.setdefault(place.gap, place.deviance)
-        return sorted(gap for gap in best if best[gap] < min(best.values()) + NEAR)
 
-    def _weights(self, entries: list[Entry], *, possible: bool = False) -> Array:
-        """Return the probabilities of places."""
-        likelihood = self._likelihood
-        deviances = np.array([entry.place.deviance for entry in entries])
-        member = np.array([entry.number for entry in entries])
-        weights = np.array([self._prior(entry.place.gap) for entry in entries])
-        behind = np.zeros(member.max() + 1)
-        for number in range(len(behind)):
-            own = member == number
-            least, fit = deviances[own].min(), entries[int(np.argmax(own))].fit
-            behind[number] = likelihood.criterion(fit.orders, least, mild=possible)
-            # How a response with a lag sets in is a matter of few samples, and of chance: the
-            # likelihood of delays is trusted half as far.
-            trust = 0.5 if possible and fit.has_own_lag else 1.0
-            weights[own] *= np.exp(trust * (least - deviances[own]) / 2.0)
-            if possible:
-                weights[own] /= weights[own].sum()
-        behind = np.maximum(behind - behind.min() - AS_GOOD * possible, 0.0)
-        weights *= np.exp(-behind / 2.0)[member]
-        weights /= weights.sum()
-        return weights
+def _refined(likelihood: Likelihood, fit: Fit, places: list[Place], delays: range) -> list[Gap]:
+    """Return gaps near the best, with all gaps between commands told apart there."""
+    magnitudes = likelihood.magnitudes
+    best: dict[Gap, float] = {}
+    for place in places:
+        best.setdefault(place.gap, place.deviance)  # the best of a gap comes first
+    while len(best) < MOST_GAPS:
+        gaps, limit, middles = sorted(best), min(best.values()) + NEAR, {}
+        for gap, above in zip(gaps, [*gaps[1:], gaps[-1]], strict=True):
+            inside = magnitudes[(magnitudes > gap.low) & (magnitudes < gap.high)]
+            if len(inside) and min(best[gap], best[above]) < limit:
+                middles[gap] = float(inside[len(inside) // 2])
+        if not middles:
+            break
+        # The lower half has the same commands at rest as the whole.
+        for gap, middle in middles.items():
+            best[Gap(gap.low, middle)] = best.pop(gap)
+        upper = [Gap(middle, gap.high) for gap, middle in middles.items()]
+        for place in likelihood.scan(fit.orders, fit.c, upper, delays):
+            best.setdefault(place.gap, place.deviance)
+    return sorted(gap for gap in best if best[gap] < min(best.values()) + NEAR)
 
-    def _prior(self, gap: Gap) -> float:
-        """Return the probability beforehand: a half that there is no dead zone."""
-        if self._likelihood.knowledge.applied:
-            return 1.0
-        share = (gap.high - gap.low) / float(self._likelihood.magnitudes[-1])
-        return 0.5 * share + 0.5 * (gap.low == 0.0)
 
-    def _choose(
-        self, entries: list[Entry], weights: Array, delay: float, dead_zone: float
-    ) -> Fit:
-        """Return the fit of the likeliest orders with the delay and the dead zone."""
-        there = np.array([entry.place.delay == delay for entry in entries])
-        number = int(np.argmax(np.bincount([e.number for e in entries], weights * there)))
-        best = max(
-            (e for e in entries if e.number == number and e.place.delay == delay),
-            key=lambda e: (e.place.gap.low <= dead_zone <= e.place.gap.high, -e.place.deviance),
-        )
-        return self._likelihood.fit(best.place, best.fit.orders, best.fit.c)
+def _weights(likelihood: Likelihood, entries: list[Entry], *, possible: bool) -> Array:
+    """Return the probabilities of places."""
+    deviances = np.array([entry.place.deviance for entry in entries])
+    member = np.array([entry.number for entry in entries])
+    low, high = np.array([entry.place.gap for entry in entries]).T
+    # Beforehand, the probability is a half that there is no dead zone.
+    weights: Array = 0.5 * (high - low) / likelihood.magnitudes[-1] + 0.5 * (low == 0.0)
+    behind = np.zeros(member.max() + 1)
+    for number in range(len(behind)):
+        own = member == number
+        least, fit = deviances[own].min(), entries[int(np.argmax(own))].fit
+        behind[number] = likelihood.criterion(fit.orders, least, mild=possible)
+        # How a response with a lag sets in is a matter of few samples, and of chance: the
+        # likelihood of delays is trusted half as far.
+        trust = 0.5 if possible and fit.has_own_lag else 1.0
+        weights[own] *= np.exp(trust * (least - deviances[own]) / 2.0)
+        if possible:
+            weights[own] /= weights[own].sum()
+    behind = np.maximum(behind - behind.min() - AS_GOOD * possible, 0.0)
+    weights *= np.exp(-behind / 2.0)[member]
+    weights /= weights.sum()
+    return weights
 
-    def _draw(self, entries: list[Entry], weights: Array) -> list[LinearModel]:
-        generator = np.random.default_rng(0)
-        points = (np.arange(PLACES) + generator.random()) / PLACES
-        picked = np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
-        walks: dict[Fit, tuple[list[tuple[Orders, Array]], Array]] = {}
-        draws = []
-        for i, times in zip(*np.unique(picked, return_counts=True), strict=True):
-            _, fit, place = entries[i]
-            if fit not in walks:
-                walks[fit] = self._walks(fit)
-            likely, shares = walks[fit]
-            counts = generator.multinomial(times * DRAWS_EACH, shares)
-            for (orders, c), count in zip(likely, counts, strict=True):
-                if not count:
-                    continue
-                found = self._likelihood.with_c(place, orders, c)
-                size = len(found.linear)
-                covariance = self._likelihood.covariance(found)[:size, :size]
-                drawn = generator.multivariate_normal(
-                    found.linear, covariance, count, method="eigh"
-                )
-                draws += [
-                    self._likelihood.models(replace(found, linear=linear))[0]
-                    for linear in drawn
-                ]
-        return draws
 
-    def _walks(self, fit: Fit) -> tuple[list[tuple[Orders, Array]], Array]:
-        """Return orders and C' for random walks of all sizes, and their probabilities.
+def _choose(
+    likelihood: Likelihood, entries: list[Entry], weights: Array, delay: float, zone: float
+) -> Fit:
+    """Return the fit of the likeliest orders with the delay and the dead zone."""
+    there = np.array([entry.place.delay == delay for entry in entries])
+    number = int(np.argmax(np.bincount([e.number for e in entries], weights * there)))
+    best = max(
+        (e for e in entries if e.number == number and e.place.delay == delay),
+        key=lambda e: (e.place.gap.low <= zone <= e.place.gap.high, -e.place.deviance),
+    )
+    return likelihood.fit(best.place, best.fit.orders, best.fit.c)
 
-        A walk that no criterion asks for may still move the base line, above all where the
-        noise is slow as well. Its size is the root of C' nearest 1: there the walk is none. The
-        probability beforehand is a half for that, and the rest is even over the logarithm of
-        the root's distance from 1. The coefficients of A, B and the levels are integrated over.
-        """
-        rest = np.roots([1.0, *fit.c])
-        if fit.orders.walk:
-            rest = np.delete(rest, np.argmax(rest.real - 9.0 * (rest.imag != 0.0)))
-        c = np.atleast_1d(np.real(np.poly(rest)))
-        orders = replace(fit.orders, walk=True)
-        table = np.roll(self._likelihood.table(orders, fit.place), -1, axis=1)
-        found, scores = [], []
-        for distance in WALKS:
-            of_walk = np.convolve(c, [1.0, distance - 1.0])[1:]
-            white = self._likelihood.white(table, of_walk, orders)
-            sizes = np.abs(np.diag(np.linalg.qr(white, mode="r")))
-            sizes = np.maximum(sizes, 1e-300)
-            freedom = len(white) - len(sizes) + 1
-            scores.append(-freedom * math.log(sizes[-1]) - float(np.log(sizes[:-1]).sum()))
-            found.append((orders, of_walk))
-        found[0] = replace(orders, walk=False), c[1:]
-        shares = np.exp(np.array(scores) - max(scores))
-        shares[0] *= len(WALKS) - 1
-        return found, shares / shares.sum()
 
-    def _of_errors(self, fit: Fit) -> dict[str, Interval]:
-        """Return the variance of the prediction errors, degC^2, and A, B and C, by name."""
-        freedom = max(len(self._likelihood.rows) - fit.orders.count, 1)
-        a, b, c = fit.orders.a, fit.orders.b, fit.orders.noise
-        names = [f"a{i + 1}" for i in range(a)] + [f"b{i + 1}" for i in range(b)]
-        names += [f"c{i + 1}" for i in range(c)]
-        values = np.concatenate([fit.linear[: a + b], fit.c])
-        spreads = ENDS_OF_ERRORS * np.sqrt(np.diag(self._likelihood.covariance(fit)))
-        spreads = np.concatenate([spreads[: a + b], spreads[len(fit.linear) :]])
-        bounds = np.column_stack([values, values - spreads, values + spreads]).tolist()
-        high, low = (fit.square / stats.chi2.ppf(ENDS, freedom)).tolist()
-        return {
-            "noise_variance": Interval(fit.square / freedom, low, high),
-            **{name: Interval(*each) for name, each in zip(names, bounds, strict=True)},
-        }
+def _draw(likelihood: Likelihood, entries: list[Entry], weights: Array) -> list[LinearModel]:
+    """Return plants: of systematically drawn places, with drawn walks and coefficients."""
+    generator = np.random.default_rng(0)
+    points = (np.arange(PLACES) + generator.random()) / PLACES
+    picked = np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
+    fits = dict.fromkeys(entries[i].fit for i in picked)
+    walks = {fit: _walks(likelihood, fit) for fit in fits}
+    draws = []
+    for i, times in zip(*np.unique(picked, return_counts=True), strict=True):
+        likely, shares = walks[entries[i].fit]
+        counts = generator.multinomial(times * DRAWS_EACH, shares)
+        for (orders, c), count in zip(likely, counts, strict=True):
+            if not count:
+                continue
+            found = likelihood.with_c(entries[i].place, orders, c)
+            size = len(found.linear)
+            covariance = likelihood.covariance(found)[:size, :size]
+            drawn = generator.multivariate_normal(
+                found.linear, covariance, count, method="eigh"
+            )
+            draws += [likelihood.models(replace(found, linear=each))[0] for each in drawn]
+    return draws
+
+
+def _walks(likelihood: Likelihood, fit: Fit) -> tuple[list[tuple[Orders, Array]], Array]:
+    """Return orders and C' for random walks of all sizes, and their probabilities.
+
+    A walk that no criterion asks for may still move the base line, above all where the noise is
+    slow as well. Its size is the root of C' nearest 1: there the walk is none. The probability
+    beforehand is a half for that, and the rest is even over the logarithm of the root's
+    distance from 1. The coefficients of A, B and the levels are integrated over.
+    """
+    rest = np.roots([1.0, *fit.c])
+    if fit.orders.walk:
+        rest = np.delete(rest, np.argmax(rest.real - 9.0 * (rest.imag != 0.0)))
+    c = np.atleast_1d(np.real(np.poly(rest)))
+    orders = replace(fit.orders, walk=True)
+    table = np.roll(likelihood.table(orders, fit.place), -1, axis=1)
+    found, scores = [], []
+    for distance in WALKS:
+        of_walk = np.convolve(c, [1.0, distance - 1.0])[1:]
+        white = likelihood.white(table, of_walk, orders)
+        sizes = np.abs(np.diag(np.linalg.qr(white, mode="r")))
+        logs = np.log(np.maximum(sizes, 1e-300))
+        scores.append(-(len(white) - len(logs)) * logs[-1] - logs.sum())
+        found.append((orders, of_walk))
+    found[0] = replace(orders, walk=False), c[1:]
+    shares = np.exp(np.array(scores) - max(scores))
+    shares[0] *= len(WALKS) - 1
+    return found, shares / shares.sum()
+
+
+def _of_errors(likelihood: Likelihood, fit: Fit) -> dict[str, Interval]:
+    """Return the variance of the prediction errors, degC^2, and A, B and C, by name."""
+    freedom = max(len(likelihood.rows) - fit.orders.count, 1)
+    counts = {"a": fit.orders.a, "b": fit.orders.b, "c": fit.orders.noise}
+    names = [f"{letter}{i + 1}" for letter, count in counts.items() for i in range(count)]
+    of_c = np.arange(len(fit.c)) + len(fit.linear)
+    named = np.append(np.arange(counts["a"] + counts["b"]), of_c)
+    values = np.append(fit.linear, fit.c)[named]
+    spreads = ENDS_OF_ERRORS * np.sqrt(np.diag(likelihood.covariance(fit)))[named]
+    bounds = np.column_stack([values, values - spreads, values + spreads]).tolist()
+    high, low = (fit.square / stats.chi2.ppf(ENDS, freedom)).tolist()
+    return {
+        "noise_variance": Interval(fit.square / freedom, low, high),
+        **{name: Interval(*each) for name, each in zip(names, bounds, strict=True)},
+    }
 
 
 def slowest(a: Sequence[float]) -> float:
@@ -263,9 +239,9 @@ def _interval(value: float, drawn: Sequence[float]) -> Interval:
     return Interval(value, min(low, value), max(high, value))
 
 
-def _of_delay(places: list[Place], likeliest: Array, weights: Array) -> Interval:
+def _of_delay(delays: list[int], likeliest: Array, weights: Array) -> Interval:
     """Return the delay that has most probability within one sample, and its interval."""
-    tried, member = np.unique([place.delay for place in places], return_inverse=True)
+    tried, member = np.unique(delays, return_inverse=True)
     shares, of_interval = (np.bincount(member, each) for each in (likeliest, weights))
     near = np.abs(tried[:, np.newaxis] - tried) <= 1
     # Of equal ones, the delay that is itself the likelier.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from scipy import signal
+from scipy import linalg, signal
 
 from benchmarks.identify.armax import Array, Flags
 from benchmarks.loop.linear import LinearModel
@@ -23,8 +23,9 @@ def from_rest(model: LinearModel, flow: Array) -> Array:
     """Return the response to a flow, from rest at its first value; NaN of an unstable plant."""
     if np.max(np.abs(model.poles), initial=0.0) >= 1.0:
         return np.full(len(flow), np.nan)
-    start = float(flow[0])
-    return model.response(flow - start) + start * sum(model.b) / sum(model.a)
+    known = held(flow)
+    start = float(known[0])
+    return model.response(known - start) + start * model.gain
 
 
 def explained(output: Array, simulated: Array, rows: Flags) -> float:
@@ -48,22 +49,21 @@ def of_impulse_response(
 
     It has `LAGS` coefficients and four slow exponentials for each input, and is fitted to some
     rows by least squares with a ridge, which generalised cross-validation chooses (G. H. Golub,
-    M. Heath and G. Wahba, Technometrics 21, 1979, 215-223).
+    M. Heath and G. Wahba, Technometrics 21, 1979, 215-223). The gain is of the first input.
     """
     columns = []
-    for each in inputs:
+    for each in map(held, inputs):
         moved = each - each[0]
-        columns += [np.concatenate([np.zeros(lag), moved[:-lag]]) for lag in range(1, LAGS + 1)]
-        for samples in TAILS:
-            pole = np.exp(-1.0 / samples)
-            columns.append(
-                signal.lfilter([0.0] * (LAGS + 1) + [1.0 - pole], [1.0, -pole], moved)
-            )
-    table = np.column_stack(columns)
+        columns.append(linalg.toeplitz(moved, np.zeros(LAGS + 1))[:, 1:])
+        for pole in np.exp(-1.0 / np.array(TAILS)):
+            tail = signal.lfilter([0.0] * (LAGS + 1) + [1.0 - pole], [1.0, -pole], moved)
+            columns.append(tail[:, np.newaxis])
+    table = np.hstack(columns)
     known = fitted & np.isfinite(output)
     centre, level = table[known].mean(axis=0), output[known].mean()
     left, sizes, right = np.linalg.svd(table[known] - centre, full_matrices=False)
-    shares, target = left.T @ (output[known] - level), output[known] - level
+    target = output[known] - level
+    shares = left.T @ target
     least, best = np.inf, np.zeros(table.shape[1])
     for ridge in RIDGES:
         kept = sizes**2 / (sizes**2 + (ridge * sizes[0]) ** 2 + 1e-300)
@@ -71,5 +71,4 @@ def of_impulse_response(
         score = float(error @ error) / (1.0 - kept.sum() / len(target)) ** 2
         if score < least:
             least, best = score, right.T @ (kept * shares / np.maximum(sizes, 1e-300))
-    gain = float(best[: LAGS + len(TAILS)].sum())  # of the first input
-    return (table - centre) @ best + level, gain
+    return (table - centre) @ best + level, float(best[: LAGS + len(TAILS)].sum())

@@ -27,37 +27,24 @@ SLOWEST = 60  # times at most
 
 @dataclass(frozen=True)
 class Recommended:
-    """A controller that all plants bear which the log leaves possible, and how it came about.
-
-    Attributes
-    ----------
-    controller
-        Linear between the limits.
-    loop
-        That with the identified plant.
-    worst
-        Ms that 95 % of the possible plants stay below.
-    slowed
-        By which factor the closed loop is slower than by the rule.
-    """
+    """A controller that the plants bear which a log leaves possible, and how it came about."""
 
     controller: PIController
+    """Linear between the limits."""
     loop: Loop
+    """That with the identified plant."""
     worst: float
+    """Ms that 95 % of the possible plants stay below."""
     slowed: float
+    """By which factor the closed loop is slower than by the rule."""
 
 
 def reduced(plant: LinearModel) -> StepTest:
-    """Return a model of first order with delay that has the plant's whole response.
+    """Return a model of first order with delay that has the whole response of a stable plant.
 
     By areas (K. J. Astrom and T. Hagglund, "PID Controllers", 2nd edition, 1995, section 2.4):
     that between the step response and its end is T + L, and that under it up to T + L is T / e.
     The sample that any input takes to show is part of the delay.
-
-    Parameters
-    ----------
-    plant
-        Stable, with a gain other than 0.
     """
     samples, interval = 3 * settling(plant) + 10, plant.sampling_interval
     shape = plant.step_response(samples) / plant.gain
@@ -100,12 +87,12 @@ def recommended(model: Model) -> dict[str, Recommended | None]:
     stable = [p for p in model.possible if np.max(np.abs(p.poles), initial=0.0) < 1.0]
     # A plant that settles in the log is stable; if most of what is possible is not, it did not.
     known = len(stable) > len(model.possible) / 2
-    plants = Plants([model.plant, *stable])
+    sensitivity = _sensitivity([model.plant, *stable])
 
     def slowed(make: Callable[[float], PIController]) -> Recommended | None:
         for times in range(SLOWEST if known else 0):
             controller = make(SLOWER**times)
-            own, *peaks = plants.sensitivity(controller)
+            own, *peaks = sensitivity(controller)
             worst = float(np.quantile(peaks, SHARE, method="higher"))
             if max(worst, own) <= MOST_SENSITIVE:
                 loop = Loop(controller, parameters)
@@ -116,35 +103,29 @@ def recommended(model: Model) -> dict[str, Recommended | None]:
     return {"PI, SIMC": slowed(pi), "Smith": slowed(smith)}
 
 
-class Plants:
-    """The frequency responses of stable plants, of which the first says how slow they are."""
+def _sensitivity(plants: list[LinearModel]) -> Callable[[PIController], Array]:
+    """Return what gives Ms of stable plants, of which the first says how slow they are.
 
-    def __init__(self, plants: list[LinearModel]) -> None:
-        slowest = 0.01 / max(settling(plants[0]), 1)
-        turns = 8 * (max(plant.delay + len(plant.b) for plant in plants) + 50)
-        self._at = np.union1d(
-            np.geomspace(slowest, np.pi, 400), np.linspace(np.pi / turns, np.pi, turns)
-        )
-        back = np.exp(-1j * self._at)
-        self._responses = np.array([
-            signal.freqz(plant.b, plant.a, self._at)[1] * back ** (plant.delay + 1)
-            for plant in plants
-        ])  # fmt: skip
+    It takes the controller. Ms is infinite where the loop is not stable: 1 + L begins at -90
+    degrees, for the integrator, and ends real. By Nyquist's criterion the loop is stable if it
+    does so without a turn around 0, and the controller has no poles beyond the unit circle.
+    """
+    slowest = 0.01 / max(settling(plants[0]), 1)
+    turns = 8 * (max(plant.delay + len(plant.b) for plant in plants) + 50)
+    at = np.union1d(np.geomspace(slowest, np.pi, 400), np.linspace(np.pi / turns, np.pi, turns))
+    back = np.exp(-1j * at)
+    responses = np.array([
+        signal.freqz(plant.b, plant.a, at)[1] * back ** (plant.delay + 1) for plant in plants
+    ])  # fmt: skip
 
-    def sensitivity(self, controller: PIController) -> Array:
-        """Return Ms of each plant with a controller, infinite where the loop is not stable.
-
-        1 + L begins at -90 degrees, for the integrator, and ends real. By Nyquist's criterion
-        the loop is stable if it does so without a turn around 0, and the controller has no
-        poles beyond the unit circle.
-        """
+    def sensitivity(controller: PIController) -> Array:
         numerator, denominator = controller.transfer()
         if np.any(np.abs(np.roots(denominator)) > 1.0 + 1e-6):
-            return np.full(len(self._responses), np.inf)
-        of_controller = signal.freqz(numerator, denominator, self._at)[1]
-        difference = 1.0 + self._responses * of_controller
+            return np.full(len(plants), np.inf)
+        difference = 1.0 + responses * signal.freqz(numerator, denominator, at)[1]
         steps = np.angle(difference[:, 1:] / difference[:, :-1])
         start = np.angle(difference[:, 0])
         stable = (start < 0.0) & (np.abs(start + steps.sum(axis=1)) < 1.0)
-        peaks = 1.0 / np.abs(difference).min(axis=1)
-        return np.where(stable, peaks, np.inf)
+        return np.where(stable, 1.0 / np.abs(difference).min(axis=1), np.inf)
+
+    return sensitivity
