@@ -142,10 +142,3 @@ def test_a_place_that_cannot_be_written_to_is_named(minari, tmp_path, monkeypatc
     (tmp_path / "file").touch()
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "file"))
     assert "MINARI_DATASETS_PATH: " in refused(main, ["middlepoint/paper/pi-v0"])
-
-
-def test_bad_names_are_named():
-    with pytest.raises(ValueError, match="plant must be one of paper"):
-        history.record("hard", "pi")
-    with pytest.raises(ValueError, match="behaviour must be one of pi"):
-        history.record("paper", "expert")

@@ -6,8 +6,6 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -50,15 +48,14 @@ def execute(options: Options, console: Console) -> str:
             f"{VARIABLE}: {error.filename} cannot be written to: {error.strerror}"
         ) from error
     out_folder(root, VARIABLE)
-    given = options.episodes
     for name in ids:
-        needed = len(BEHAVIOURS[IDS[name][1]])  # one for each controller
-        if given < needed:
+        needed, given = len(BEHAVIOURS[IDS[name][1]]), options.episodes
+        if given < needed:  # one for each controller
             text = f"episodes must be at least {needed} for {name}, got {given}"
             raise UsageError(f"--episodes: {text}")
     rows = []
     for name in ids:
-        history, judged_by = record(*IDS[name], given), scale(IDS[name][0])
+        history, judged_by = record(*IDS[name], options.episodes), scale(IDS[name][0])
         write(name, history, judged_by)
         rows.append(
             {
@@ -85,25 +82,15 @@ def write(name: str, history: History, judged_by: Evaluation) -> None:
     root, place = get_dataset_path(), get_dataset_path(name)
     # Minari does not list what is in a hidden folder.
     with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as partial:
-        with _datasets_at(partial):
+        os.environ[VARIABLE] = partial  # it takes no folder as an argument
+        try:
             _create(name, history, judged_by)
+        finally:
+            os.environ[VARIABLE] = str(root)
         if place.exists():
             shutil.rmtree(place)
         place.parent.mkdir(parents=True, exist_ok=True)
         (Path(partial) / name).replace(place)
-
-
-@contextmanager
-def _datasets_at(root: str) -> Iterator[None]:
-    """Have Minari keep data sets in a folder; it takes none as an argument."""
-    kept = os.environ.get(VARIABLE)
-    os.environ[VARIABLE] = root
-    try:
-        yield
-    finally:
-        del os.environ[VARIABLE]
-        if kept is not None:
-            os.environ[VARIABLE] = kept
 
 
 def _create(name: str, history: History, judged_by: Evaluation) -> None:

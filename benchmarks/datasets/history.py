@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from benchmarks.controllers.engineered import Nothing
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.datasets.options import EPISODES, SAMPLES
-from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.rollout import Agent, make_plants, rollout
 from mptc_gym import PRESETS, Evaluation, Parameters, evaluate
 
 PLANTS = ("paper", "disturbed", "fouling")  # presets
@@ -76,21 +74,10 @@ def arguments_of(plant: str) -> dict[str, Any]:
 def record(plant: str, behaviour: str, episodes: int = EPISODES, seed: int = SEED) -> History:
     """Log one of `PLANTS` under one or several controllers, as `BEHAVIOURS` name them.
 
-    Episode i is the one that the environment draws with seed `seed + i`.
-
-    Raises
-    ------
-    ValueError
-        If there is no such plant or behaviour, or no episode for one of its controllers.
+    Episode i is the one that the environment draws with seed `seed + i`. There must be one for
+    each controller.
     """
-    known = {"plant": (plant, PLANTS), "behaviour": (behaviour, BEHAVIOURS)}
-    for argument, (value, values) in known.items():
-        if value not in values:
-            raise ValueError(f"{argument} must be one of {', '.join(values)}, got {value!r}")
-    names = BEHAVIOURS[behaviour]
-    if episodes < len(names):
-        raise ValueError(f"episodes must be at least {len(names)}, got {episodes!r}")
-    arguments = arguments_of(plant)
+    names, arguments = BEHAVIOURS[behaviour], arguments_of(plant)
     size = Parameters(**arguments).observation_size
     history = History(
         plant,
@@ -101,16 +88,17 @@ def record(plant: str, behaviour: str, episodes: int = EPISODES, seed: int = SEE
         np.empty((episodes, SAMPLES)),
     )
     for j, name in enumerate(names):
-        which = slice(j, episodes, len(names))
-        own = history.seeds[which]
-        plants = _Recorder(make_plants(len(own), SAMPLES, **arguments), own)
+        own = slice(j, episodes, len(names))
+        seeds = history.seeds[own]
         (factory,) = ROSTER[name].members()
-        controller = factory.in_service(arguments, len(own), seed)
-        rollout(plants, controller, SAMPLES, seed)
+        controller = _Recorder(factory.in_service(arguments, len(seeds), seed))
+        # One sample more, for what is observed at the end.
+        plants = make_plants(len(seeds), SAMPLES + 1, **arguments)
+        trajectory = rollout(plants, controller, SAMPLES + 1, seeds)  # type: ignore[arg-type]
         plants.close()
-        history.observations[which] = np.stack(plants.observations, axis=1)
-        history.actions[which] = np.stack(plants.actions, axis=1)
-        history.rewards[which] = np.stack(plants.rewards, axis=1)
+        history.observations[own] = np.stack(controller.observations, axis=1)
+        history.actions[own] = np.stack(controller.actions[:-1], axis=1)
+        history.rewards[own] = -np.abs(trajectory.error[:-1].T)
     return history
 
 
@@ -123,25 +111,18 @@ def scale(plant: str, episodes: int = EVALUATIONS) -> Evaluation:
     return evaluate(Nothing(), episodes=episodes, **arguments_of(plant))
 
 
-class _Recorder(VectorWrapper):
-    """Keeps what goes in and what comes out; actions go in as the action space has them."""
+class _Recorder:
+    """A controller whose observations and actions are kept."""
 
-    def __init__(self, plants: VectorEnv, seeds: Sequence[int]) -> None:
-        super().__init__(plants)
-        self._seeds = list(seeds)
+    def __init__(self, controller: Agent) -> None:
+        self._controller = controller
+        self.reset = controller.reset
         self.observations: list[NDArray[np.float32]] = []
         self.actions: list[NDArray[np.float32]] = []
-        self.rewards: list[NDArray[np.float64]] = []
 
-    def reset(self, **_: Any) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        found = self.env.reset(seed=self._seeds)  # type: ignore[arg-type]
-        self.observations.append(found[0])
-        return found
-
-    def step(self, actions: NDArray[np.float32]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        self.observations.append(observation)
         # Beyond +-1 the actuator saturates, so that this changes nothing that the plant does.
-        self.actions.append(np.clip(actions, -1.0, 1.0).astype(np.float32))
-        found = self.env.step(self.actions[-1])
-        self.observations.append(found[0])
-        self.rewards.append(found[1])
-        return found
+        action = np.clip(self._controller.act(observation), -1.0, 1.0)
+        self.actions.append(action.astype(np.float32))
+        return self.actions[-1]
