@@ -31,14 +31,7 @@ JUMP, MOST_JUMPS = 24.0, 3  # robust deviations of a jump of the sensor; how man
 def cleaned(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
     """Return the log as it can be fitted, with a note of all that was mended.
 
-    Parameters
-    ----------
-    log
-        What was recorded.
-    knowledge
-        What is known.
-    given
-        The orders, if they are known.
+    `given` are the orders, if they are known.
     """
     log = without_noise_of_held_flow(_at_one_rate(without_standstill(log)))
     log = _without_spikes(log, knowledge, given or TO_FORESEE)
@@ -51,7 +44,7 @@ def _at_one_rate(log: Log) -> Log:
     if len(known) < 2 or 2 * len(known) > len(log.temperature) + 1:
         return log
     rate = int(np.median(np.diff(known)))
-    first = int(np.bincount(known % rate).argmax()) if rate in RATES else 0
+    first = int(np.bincount(known % rate).argmax())
     if rate not in RATES or np.mean(known % rate == first) < 0.95:
         return log
 
@@ -60,15 +53,13 @@ def _at_one_rate(log: Log) -> Log:
         means: Array = sliding_window_view(values, rate)[first::rate].mean(axis=1)
         return means
 
-    note = (
-        f"Only one row in {rate} has a temperature. The log is fitted at these rows, "
-        f"{rate * log.sampling_interval:g} s apart, with the mean of the flow between them."
-    )
+    interval = rate * log.sampling_interval
     return log.mended(
-        note,
+        f"Only one row in {rate} has a temperature. The log is fitted at these rows, "
+        f"{interval:g} s apart, with the mean of the flow between them.",
         flow=mean(log.flow),
         temperature=log.temperature[first : len(log.flow) - rate + 1 : rate],
-        sampling_interval=rate * log.sampling_interval,
+        sampling_interval=interval,
         disturbances={name: mean(each) for name, each in log.disturbances.items()},
     )
 
@@ -85,25 +76,23 @@ def without_noise_of_held_flow(log: Log) -> Log:
     spread = deviation(moves) / math.sqrt(2.0) if np.isfinite(moves).any() else 0.0
     if spread == 0.0:  # it stands still in most samples
         return log
-    steps = _steps(flow, spread)
-    holds = np.split(flow, steps)
+    holds = np.split(flow, _steps(flow, spread))
     long = [len(hold) for hold in holds if len(hold) >= SHORTEST_HOLD]
     means = np.concatenate([np.full(len(hold), hold.mean()) for hold in holds])
     left = flow - means
     left = left[np.isfinite(left)]
-    if len(steps) < 3 or sum(long) < 0.9 * len(flow) or len(left) < 2 or not left.any():
+    if len(holds) < 4 or sum(long) < 0.9 * len(flow) or len(left) < 2 or not left.any():
         return log
     # What a controller or a hand does is not white; what a transmitter adds is.
-    together = np.corrcoef(left[1:], left[:-1])[0, 1]
-    if abs(together) > 0.2 or np.std(left) > 0.25 * np.nanstd(flow):
+    together, noise = np.corrcoef(left[1:], left[:-1])[0, 1], float(np.std(left))
+    if abs(together) > 0.2 or noise > 0.25 * np.nanstd(flow):
         return log
-    noise = float(np.std(left))
-    note = (
+    return log.mended(
         f"The flow is held for stretches and has noise of {noise:.2g} t/h, which is "
-        "taken as the flow meter's: the means of the stretches are used."
+        "taken as the flow meter's: the means of the stretches are used.",
+        flow=means,
+        flow_error=noise / math.sqrt(float(np.median(long))),
     )
-    error = noise / math.sqrt(float(np.median(long)))
-    return log.mended(note, flow=means, flow_error=error)
 
 
 def _steps(flow: Array, spread: float) -> list[int]:
@@ -137,11 +126,11 @@ def without_standstill(log: Log) -> Log:
     if not still.any() or still.all() or np.mean(lengths[~still] == 1) < 0.9:
         return log  # a coarse sensor, or none that stood still
     stuck = still[run] & ~ends  # the first of each may be right
-    note = (
+    return log.mended(
         f"In {int(stuck.sum())} rows the temperature stands still to the last digit, and moves "
-        "elsewhere: they are left out, as those of a sensor that was stuck."
+        "elsewhere: they are left out, as those of a sensor that was stuck.",
+        temperature=np.where(stuck, np.nan, temperature),
     )
-    return log.mended(note, temperature=np.where(stuck, np.nan, temperature))
 
 
 def _protrusion(log: Log) -> Array:
@@ -173,13 +162,15 @@ def _without_spikes(log: Log, knowledge: Knowledge, orders: Orders) -> Log:
     outlying |= ~known & (apart > PLAIN) & bool(outlying[found & known].all())
     runs = np.cumsum(np.diff(found, prepend=False))
     spikes = found & np.isin(runs, runs[found & outlying])
-    count = int(spikes.sum())
-    if not count:
+    rows = [str(row + 1) for row in np.flatnonzero(spikes)]
+    if not rows:
         return log
-    rows = ", ".join(str(row + 1) for row in np.flatnonzero(spikes)[:5])
-    what = "spikes of the temperature are" if count > 1 else "spike of the temperature is"
-    note = f"{count} {what} left out (samples {rows}{', ...' if count > 5 else ''})."
-    return log.mended(note, temperature=np.where(spikes, np.nan, log.temperature))
+    what = "spikes of the temperature are" if len(rows) > 1 else "spike of the temperature is"
+    shown = ", ".join([*rows[:5], *["..."] * (len(rows) > 5)])
+    return log.mended(
+        f"{len(rows)} {what} left out (samples {shown}).",
+        temperature=np.where(spikes, np.nan, log.temperature),
+    )
 
 
 def _without_jumps(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
@@ -202,10 +193,10 @@ def _without_jumps(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
         many = np.sum(np.diff(large) > TO_FORESEE.b) >= MOST_JUMPS
         if many or not min(abs(height), abs(moves[row])) > least:
             return log
-        note = (
-            f"At sample {row + 1} the temperature jumps by {height:.3g} °C, which no flow "
-            "explains: it is subtracted from there on. See whether the sensor was changed."
-        )
         later = np.arange(len(log.flow)) >= row
-        log = log.mended(note, temperature=log.temperature - np.where(later, height, 0.0))
+        log = log.mended(
+            f"At sample {row + 1} the temperature jumps by {height:.3g} °C, which no flow "
+            "explains: it is subtracted from there on. See whether the sensor was changed.",
+            temperature=log.temperature - np.where(later, height, 0.0),
+        )
     return log

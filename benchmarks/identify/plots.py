@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.controllers.step_test import StepTest
-from benchmarks.identify.armax import Array
 from benchmarks.identify.margins import Loop
 from benchmarks.identify.model import Model
 from benchmarks.lib.drawing import COLOURS, colours, drawn
@@ -17,15 +16,6 @@ from benchmarks.lib.statistics import ENDS
 LAGS = 40  # of the autocorrelation
 LONGEST = 5_000  # samples of a step response that is drawn
 SHOWN = 3_000  # rows of a log: more cannot be told apart
-
-
-def autocorrelation(errors: Array) -> Array:
-    """Return the autocorrelation of the errors that are known, from lag 0 to `LAGS`."""
-    known = np.isfinite(errors)
-    centred = np.where(known, errors - np.mean(errors[known]), 0.0)
-    pairs = [np.sum(centred[lag:] * centred[: len(centred) - lag]) for lag in range(LAGS + 1)]
-    result: Array = np.array(pairs) / pairs[0]
-    return result
 
 
 def plot_log(model: Model, path: Path) -> None:
@@ -54,22 +44,32 @@ def plot_log(model: Model, path: Path) -> None:
         below.set_xlabel("time (min)")
 
 
-def plot_residuals(model: Model, path: Path) -> None:
-    """Draw the prediction errors and their autocorrelation."""
-    correlation = autocorrelation(model.errors)
-    chance = 1.96 / np.sqrt(np.isfinite(model.errors).sum())
+def plot_residuals(model: Model, path: Path) -> float:
+    """Draw the prediction errors and their autocorrelation up to `LAGS`.
+
+    Returns
+    -------
+    float
+        The share of autocorrelations beyond the band of chance.
+    """
+    known = np.isfinite(model.errors)
+    centred = np.where(known, model.errors - np.mean(model.errors[known]), 0.0)
+    pairs = [np.sum(centred[lag:] * centred[: len(centred) - lag]) for lag in range(LAGS + 1)]
+    correlation = np.array(pairs[1:]) / pairs[0]
+    chance = 1.96 / np.sqrt(known.sum())
     errors = model.errors[:SHOWN]
     minutes = np.arange(len(errors)) * model.plant.sampling_interval / 60.0
     with drawn(path, 10, 3.6) as figure:
         left, right = figure.subplots(1, 2)
         left.plot(minutes, errors, color=COLOURS[0], linewidth=0.6)
         left.set(xlabel="time (min)", ylabel="prediction error (°C)")
-        right.bar(np.arange(1, LAGS + 1), correlation[1:], width=0.5, color=COLOURS[0])
+        right.bar(np.arange(1, LAGS + 1), correlation, width=0.5, color=COLOURS[0])
         right.axhspan(
             -chance, chance, color="0.5", alpha=0.2, linewidth=0, label="by chance, 95 %"
         )
         right.set(xlabel="lag (samples)", ylabel="autocorrelation")
         right.legend(loc="upper right")
+    return float(np.mean(np.abs(correlation) > chance))
 
 
 def plot_step(model: Model, tested: StepTest, path: Path) -> None:

@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from benchmarks.identify import plots
@@ -33,19 +32,16 @@ POOR, BEHIND = 0.5, 0.1  # share that a model explains, absolutely and behind it
 
 
 def report(model: Model, out: Path) -> list[Section]:
-    """Draw the pictures, and return what there is to say.
-
-    Parameters
-    ----------
-    model
-        What was found.
-    out
-        Where to write the pictures.
-    """
+    """Draw the pictures in a folder, and return what there is to say."""
     step = reduced(model.plant)
     plots.plot_log(model, out / "log.png")
-    plots.plot_residuals(model, out / "residuals.png")
+    beyond = plots.plot_residuals(model, out / "residuals.png")
     plots.plot_step(model, step, out / "step.png")
+    verdict = (
+        "no more than chance would have"
+        if beyond <= 0.15
+        else "more than chance would have: the noise or the dynamics are not of this form"
+    )
     tuned = {} if fault(model) else recommended(model)
     found = {name: each for name, each in tuned.items() if each}
     sections = [
@@ -55,7 +51,15 @@ def report(model: Model, out: Path) -> list[Section]:
             ["The model is given the flow alone, over the whole log."],
             pictures=["log.png"],
         ),
-        _residuals(model),
+        Section(
+            "What the model leaves",
+            [
+                "The errors of predictions one sample ahead would be white noise if the model "
+                f"were right. Of their first {plots.LAGS} autocorrelations, {100 * beyond:.0f} "
+                f"% are beyond the band of chance (5 % expected): {verdict}."
+            ],
+            pictures=["residuals.png"],
+        ),
         Section(
             "Step response",
             [
@@ -102,7 +106,16 @@ def headline(model: Model) -> str:
 
 
 def _found(model: Model, found: dict[str, Recommended]) -> Section:
-    interval = model.plant.sampling_interval
+    interval, rest, orders = model.plant.sampling_interval, model.operating_flow, model.orders
+    rows = [
+        (name, f"{each.value:.4g}", f"[{each.low:.4g}, {each.high:.4g}]", UNITS.get(name, ""))
+        for name, each in model.estimates.items()
+    ]
+    parts = [
+        (name, f"{variance:.4g}", "", "°C²")
+        for name, variance in model.noise.items()
+        if variance and name != "noise_variance"
+    ]
     text = [
         headline(model),
         *(
@@ -111,60 +124,23 @@ def _found(model: Model, found: dict[str, Recommended]) -> Section:
             for name, each in found.items()
         ),
         *model.notes,
-        "All numbers are deviations from the operating point: a flow of "
-        f"{model.operating_flow:g} t/h, at which the temperature is "
-        f"{model.operating_temperature:.4g} °C. The flow was between "
-        f"{model.operating_flow + model.u_min:g} and {model.operating_flow + model.u_max:g} "
-        "t/h.",
-        f"A, B and C have the orders {model.orders.a}, {model.orders.b} and {model.orders.c}"
-        f"{', with a random walk' if model.orders.walk else ''}. Brackets are 95 % intervals.",
+        f"All numbers are deviations from the operating point: a flow of {rest:g} t/h, at "
+        f"which the temperature is {model.operating_temperature:.4g} °C. The flow was between "
+        f"{rest + model.u_min:g} and {rest + model.u_max:g} t/h.",
+        f"A, B and C have the orders {orders.a}, {orders.b} and {orders.c}"
+        f"{', with a random walk' if orders.walk else ''}. Brackets are 95 % intervals.",
         *(
             f"{name} is a known disturbance with a gain of {each.gain:.4g} °C a unit and a "
             f"delay of {each.delay} samples. `plant.json` does not have it."
             for name, each in model.known.items()
         ),
     ]
-    rows = [
-        (
-            name.replace("_", " "),
-            f"{each.value:.4g}",
-            f"[{each.low:.4g}, {each.high:.4g}]",
-            UNITS.get(name, ""),
-        )
-        for name, each in model.estimates.items()
-    ]
-    rows += [
-        (name.replace("_", " "), f"{variance:.4g}", "", "°C²")
-        for name, variance in model.noise.items()
-        if variance and name != "noise_variance"
-    ]
-    if len(rows) > len(model.estimates):
+    if parts:
         text.append(
             "Noise variance and C are those of all noise together; `plant.json` splits it."
         )
-    return Section(
-        "What the log shows", text, pd.DataFrame(rows, columns=["", "value", "95 %", "unit"])
-    )
-
-
-def _residuals(model: Model) -> Section:
-    known = int(np.isfinite(model.errors).sum())
-    correlation = plots.autocorrelation(model.errors)[1:]
-    beyond = np.mean(np.abs(correlation) > 1.96 / math.sqrt(known))
-    verdict = (
-        "no more than chance would have"
-        if beyond <= 0.15
-        else "more than chance would have: the noise or the dynamics are not of this form"
-    )
-    return Section(
-        "What the model leaves",
-        [
-            "The errors of predictions one sample ahead would be white noise if the model were "
-            f"right. Of their first {len(correlation)} autocorrelations, {100 * beyond:.0f} % "
-            f"are beyond the band of chance (5 % expected): {verdict}."
-        ],
-        pictures=["residuals.png"],
-    )
+    table = pd.DataFrame([*rows, *parts], columns=["", "value", "95 %", "unit"])
+    return Section("What the log shows", text, table.replace("_", " ", regex=True))
 
 
 def _controllers(tuned: dict[str, Recommended | None], out: Path) -> Section:
@@ -237,21 +213,21 @@ def _on_the_plant(found: dict[str, Recommended], arguments: dict[str, Any]) -> S
 
 def _bounds(arguments: dict[str, Any], samples: int) -> tuple[float, str]:
     """Return the least possible mean error, degC, NaN if it is not known, and a sentence."""
-    if samples > LONGEST:
-        return (
-            math.nan,
-            f"The least possible mean error is not known: {samples} samples are many.",
-        )
+    values: list[float] = []
+    why = f"{samples} samples are many"
     try:
-        found = least_possible(samples=samples, kind="preview", folder=None, **arguments)
-    except NotSolvedError as error:
-        return math.nan, f"The least possible mean error is not known: {error}."
-    anyone = f"{found.value:.4g} °C for a controller that knows the set point beforehand"
-    try:
-        unaware = least_possible(samples=samples, kind="reference", folder=None, **arguments)
-    except (NotSolvedError, ValueError):  # it does not settle before the set point changes
-        return found.value, f"The least possible mean error is {anyone}."
-    return unaware.value, (
-        f"The least possible mean error is {unaware.value:.4g} °C if a change of the set point "
-        f"is news and finds the plant settled, and {anyone}."
+        for kind in ("preview", "reference") if samples <= LONGEST else ():
+            bound = least_possible(samples=samples, kind=kind, folder=None, **arguments)
+            values.append(bound.value)
+    except (NotSolvedError, ValueError) as error:  # the set point changes before it has settled
+        why = str(error)
+    if not values:
+        return math.nan, f"The least possible mean error is not known: {why}."
+    least = f"{values[-1]:.4g} °C"
+    if len(values) > 1:
+        least += " if a change of the set point is news and finds the plant settled, and "
+        least += f"{values[0]:.4g} °C"
+    return values[-1], (
+        f"The least possible mean error is {least} for a controller that knows the set point "
+        "beforehand."
     )

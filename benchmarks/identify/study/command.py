@@ -1,8 +1,8 @@
-"""Counts how often plants are identified right: logs of known plants, of several kinds.
+"""Counts how often plants are identified right, and how recommended loops do on true plants.
 
-`python -m benchmarks.identify.study --help`. The plants are those of the random sweep that do
-not drift, and plants of second order. Each is run in the environment itself. SysIdentPy and a
-regularised impulse response get the same logs.
+The logs are of several kinds. Their plants are those of the random sweep that do not drift, and
+plants of second order, each run in the environment itself. SysIdentPy and a regularised impulse
+response get the same logs. The loops are tried on random plants, of which no two are alike.
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ from scipy import signal
 from benchmarks.controllers.engineered import simc_pi
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
+from benchmarks.identify.margins import Loop
 from benchmarks.identify.model import CannotTellError
 from benchmarks.identify.options import Knowledge
 from benchmarks.identify.simulation import explained, of_impulse_response
-from benchmarks.identify.study import loops, options
+from benchmarks.identify.study.options import Options
+from benchmarks.identify.tuning import MOST_SENSITIVE, recommended
 from benchmarks.lib.command_line import out_folder
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import share
@@ -42,16 +44,19 @@ LONG, SHORT = (15.0, 40.0), (5.0, 15.0)  # samples, time constants of second ord
 DATA_SHEET = Knowledge(operating_flow=0.0, u_min=LEVELS[0], u_max=LEVELS[1])  # of the actuator
 METER = 0.1  # t/h, of the noise of a flow meter
 DRIFT = 0.05  # degC, of each step of a random walk of the base line
-KINDS = {
-    "steps": "steps of the flow",
-    "loop": "a PI loop whose set point moves",
-    "meter": f"steps, and a flow meter with noise of {METER:g} t/h",
-    "drift": f"steps, and a base line that wanders by {DRIFT:g} °C a sample",
-    "second order": "steps, and plants of second order with a long lag",
-}
+KINDS = ("steps", "loop", "meter", "drift", "second order")  # of logs
 RIVALS = ("this one", "SysIdentPy", "impulse response")
 TELLING = 2.0  # t/h, dead zones that are counted
 PARTS = ("true", "found", "low", "high")  # of each estimate
+# Random plants for the loops: size of the slowest pole, by kind.
+POLES = {
+    "fast": (0.0, 0.6),
+    "ringing": (0.7, 0.97),
+    "integrating": (0.99, 0.999),
+    "slow": (0.9, 0.98),
+}
+OF_LOOPS, HELD_FOR_LOOPS = 1200, (8, 60)  # rows of a log; samples between two steps
+SHARES = 0.01, 0.1  # of the response's deviation: that of its noise
 # Of which estimate, and how far it may be off; None asks whether its interval covers the truth.
 QUESTIONS: dict[str, tuple[str, float | None]] = {
     "delay within one sample": ("delay", 1.0),
@@ -93,18 +98,10 @@ def synthetic_plants(
 
 
 def synthetic_log(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> Log:
-    """Return a log of a plant in the environment.
+    """Return a log of a plant in the environment; steps and noise are drawn with the seed.
 
-    Parameters
-    ----------
-    plant
-        Arguments of the environment.
-    samples
-        Number of rows.
-    seed
-        Of the steps and of the noise.
-    kind
-        One of `KINDS`.
+    Of the kinds, a "loop" is one of a PI controller whose set point moves; in all others the
+    flow moves in steps. "meter" adds noise to the flow, and "drift" a walk to the temperature.
     """
     generator = np.random.default_rng(seed)
     levels: list[float] = []
@@ -135,9 +132,9 @@ def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict
     Returns
     -------
     dict
-        `seconds` of processor time, and `refused`, why the log could not tell. If it could, of
-        each estimate its truth, its value and the ends of its interval, by `PARTS`; and of each
-        of `RIVALS` the share that it explains, its delay and its gain.
+        `kind`, the plant, `seconds` of processor time, and `refused`, why the log could not
+        tell. If it could, of each estimate its truth, its value and the ends of its interval,
+        by `PARTS`; and of each of `RIVALS` the share that it explains, its delay and its gain.
     """
     true = nominal(Parameters(**plant))
     truths = {
@@ -153,7 +150,7 @@ def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict
         model, refused = identify(log, DATA_SHEET), ""
     except CannotTellError as error:
         model, refused = None, str(error)
-    result: dict[str, Any] = {"seconds": time.process_time() - began, "refused": refused}
+    result = {"kind": kind, **plant, "seconds": time.process_time() - began, "refused": refused}
     if model is None:
         return result
     for name, truth in truths.items():
@@ -206,34 +203,83 @@ def narmax(log: Log) -> tuple[float, float, float]:
     return share_of_last, float(codes[flows].min() - 2001), gain
 
 
-def execute(options: options.Options, console: Console) -> str:
+def random_plant(number: int, seed: int) -> dict[str, Any]:
+    """Return arguments of a plant, of the kinds of `POLES` in turn: A, B and the delay."""
+    generator = np.random.default_rng([seed, number])
+    kind = list(POLES)[number % len(POLES)]
+    poles: list[complex] = [generator.uniform(*POLES[kind])]
+    if kind == "ringing":
+        poles[0] *= np.exp(1j * generator.uniform(0.1, 1.5))
+        poles.append(poles[0].conjugate())
+    else:
+        poles.append(generator.uniform(-0.5, 0.6))
+    zeros = generator.uniform(-1.5, 1.5, int(generator.integers(0, 3)))
+    a, shape = np.real(np.poly(poles)), np.atleast_1d(np.poly(zeros))
+    gain = generator.choice([-1.0, 1.0]) * 10.0 ** generator.uniform(-1.0, 1.0)
+    b = gain * a.sum() / shape.sum() * shape
+    delay = int(generator.integers(0, 30))
+    return {"a": a.tolist(), "b": b.tolist(), "delay": delay, "dead_zone": 0.0}
+
+
+def task_of_loops(number: int, seed: int) -> dict[str, Any]:
+    """Identify a random plant, and return Ms of the recommended loops on it.
+
+    Returns
+    -------
+    dict
+        `refused`, why, if the log could not tell; and `peaks`, infinite of a loop that is not
+        stable.
+    """
+    plant = random_plant(number, seed)
+    generator = np.random.default_rng([seed, number, 1])
+    flow: list[float] = []
+    while len(flow) < OF_LOOPS:
+        level = float(generator.uniform(*LEVELS))
+        flow += [level] * int(generator.integers(*HELD_FOR_LOOPS))
+    u = np.array(flow[:OF_LOOPS])
+    driven = signal.lfilter([0.0] * (plant["delay"] + 1) + plant["b"], plant["a"], u)
+    xi = signal.lfilter([1.0], plant["a"], generator.normal(size=OF_LOOPS))
+    noise = generator.uniform(*SHARES) * np.std(driven) * xi / np.std(xi)
+    try:
+        model = identify(Log(u, driven + noise, 1.0))
+    except ValueError as error:
+        return {"refused": str(error), "peaks": []}
+    margins = [
+        Loop(each.controller, Parameters(**plant)).margins
+        for each in recommended(model).values() if each
+    ]  # fmt: skip
+    return {"refused": "", "peaks": [m.sensitivity if m.stable else math.inf for m in margins]}
+
+
+def counted(found: list[dict[str, Any]]) -> str:
+    """Return how many loops were recommended, and how they do, in a sentence."""
+    peaks = np.concatenate([each["peaks"] for each in found])
+    refused = sum(bool(each["refused"]) for each in found)
+    return (
+        f"Of {len(found)} random plants ({', '.join(POLES)}), {refused} are refused, and "
+        f"{len(peaks)} loops are recommended. On the true plants, "
+        f"{np.sum(peaks > MOST_SENSITIVE)} of them have Ms above {MOST_SENSITIVE:g}, and "
+        f"{np.sum(np.isinf(peaks))} are unstable."
+    )
+
+
+def execute(options: Options, console: Console) -> str:
     """Run the study and print its tables."""
     out = out_folder(options.out)
-    plants = {
-        f"{kind} {i}": (kind, options.seed * 1_000_000 + i, plant)
+    tasks: dict[str, Callable[[], Any]] = {
+        f"{kind} {i}": partial(task, plant, options.samples, options.seed * 1_000_000 + i, kind)
         for kind in KINDS
         for i, plant in enumerate(
             synthetic_plants(options.logs, options.seed, options.samples, kind)
         )
     }
-    tasks: dict[str, Callable[[], Any]] = {
-        name: partial(task, plant, options.samples, seed, kind)
-        for name, (kind, seed, plant) in plants.items()
-    }
+    logs = list(tasks)
     for i in range(options.plants or 0):
-        tasks[f"plant {i}"] = partial(loops.task, i, options.seed)
-    key = fingerprint(
-        "benchmarks.identify.study.command",
-        "benchmarks.identify.study.loops",
-        samples=options.samples,
-        seed=options.seed,
-        logs=options.logs,
-    )
+        tasks[f"plant {i}"] = partial(task_of_loops, i, options.seed)
+    shaped_by = {name: getattr(options, name) for name in ("samples", "seed", "logs")}
+    key = fingerprint("benchmarks.identify.study.command", **shaped_by)
     results = options.fan_out.open().run(tasks, out / "tasks" / key, title="logs")
-    found = pd.DataFrame(
-        {"kind": kind, **plant, **results.pop(name)}
-        for name, (kind, _, plant) in plants.items()
-    )
+    found = pd.DataFrame([results.pop(name) for name in logs])
     write_csv(out / "identify_study.csv", _rounded(found))
     closing = (
         f"{options.logs} logs a kind of {options.samples} samples, seed {options.seed}. Those "
@@ -241,7 +287,7 @@ def execute(options: options.Options, console: Console) -> str:
         f"{found['seconds'].median():.1f} s, longest {found['seconds'].max():.1f} s."
     )
     if results:
-        closing = f"{loops.counted(list(results.values()))}\n\n{closing}"
+        closing = f"{counted(list(results.values()))}\n\n{closing}"
     tables = [table(found), beside_rivals(found)]
     text = [each.to_markdown(index=False, disable_numparse=True) for each in tables]
     write_text(out / "identify_study.md", "\n\n".join([*text, f"{closing}\n"]))

@@ -25,12 +25,13 @@ from benchmarks.identify.log import Log
 from benchmarks.identify.model import Model
 from benchmarks.identify.options import Knowledge
 from benchmarks.identify.plant import plant_arguments
-from benchmarks.identify.tclab_twin import options
+from benchmarks.identify.tclab_twin.options import Options
 from benchmarks.identify.tuning import recommended
 from mptc_gym import Parameters
 
 INTERVAL = 4.0  # s
 HEATER = 40.0  # %, the operating point
+LOW, HIGH = -HEATER, 100.0 - HEATER  # % from there, the heater's limits
 SETTLING = 1200.0  # s at the operating point before anything is recorded
 LEVELS = (55.0, 30.0, 65.0, 45.0, 25.0, 50.0, 35.0, 60.0)  # %, of the experiment
 HELD = 100  # samples that each is held
@@ -40,7 +41,7 @@ EACH = 200  # samples that a set point is held
 # Kc = 6 %/degC and tau_I = 75 s, without derivative action: the PI controller in the PID lesson
 # of the course that came with the hardware (J. D. Hedengren, APMonitor), and widely used since.
 COURSE = PIController(
-    kp=-6.0, ki=-6.0 * INTERVAL / 75.0, anti_windup=True, u_min=-HEATER, u_max=100.0 - HEATER
+    kp=-6.0, ki=-6.0 * INTERVAL / 75.0, anti_windup=True, u_min=LOW, u_max=HIGH
 )
 
 
@@ -48,34 +49,26 @@ class Twin:
     """TCLab's digital twin as a plant in deviations from an operating point.
 
     Its clock is turned by hand, so that a run takes milliseconds and is the same every time.
-
-    Parameters
-    ----------
-    seed
-        Of the sensor's noise.
+    The seed is that of the sensor's noise.
     """
 
     def __init__(self, seed: int) -> None:
         random.seed(seed)  # the twin draws from Python's own generator
-        make = tclab.setup(connected=False)
         with contextlib.redirect_stdout(io.StringIO()):  # it greets
-            self._lab = make(synced=False)
+            self._lab = tclab.setup(connected=False)(synced=False)
         self._time = 0.0
-        self._move(HEATER, SETTLING)
+        self.step(0.0, SETTLING)
         self.rest = float(np.mean([self._lab.T1 for _ in range(20)]))
-
-    def _move(self, heater: float, seconds: float) -> None:
-        self._lab.Q1(heater)
-        self._time += seconds
-        self._lab.update(self._time)
 
     def temperature(self) -> float:
         """Return what the sensor shows, degC from the operating point."""
         return float(self._lab.T1) - self.rest
 
-    def step(self, command: float) -> None:
-        """Hold a heater power for a sample, in percent from the operating point."""
-        self._move(float(np.clip(HEATER + command, 0.0, 100.0)), INTERVAL)
+    def step(self, command: float, seconds: float = INTERVAL) -> None:
+        """Hold a heater power for a time, in percent from the operating point."""
+        self._lab.Q1(HEATER + command)
+        self._time += seconds
+        self._lab.update(self._time)
 
 
 def experiment(seed: int = 0) -> Log:
@@ -92,11 +85,7 @@ def experiment(seed: int = 0) -> Log:
 def model_of(log: Log) -> Model:
     """Return what the record shows. The heater has no dead zone."""
     known = Knowledge(
-        longest_delay=20,
-        applied=True,
-        u_min=-HEATER,
-        u_max=100.0 - HEATER,
-        operating_flow=HEATER,
+        longest_delay=20, applied=True, u_min=LOW, u_max=HIGH, operating_flow=HEATER
     )
     return identify(log, known)
 
@@ -119,17 +108,16 @@ def run(controller: Controller, seed: int = 1) -> NDArray[np.float64]:
     rows, temperature = [], twin.temperature()
     for setpoint, following in zip(setpoints, [*setpoints[1:], setpoints[-1]], strict=True):
         controller.act([setpoint, 0.0, 0.0, setpoint - temperature])
-        command = float(np.clip(controller.command, -HEATER, 100.0 - HEATER))
+        command = float(np.clip(controller.command, LOW, HIGH))
         twin.step(command)
         temperature = twin.temperature()
         rows.append((following, temperature, command))
     return np.array(rows)
 
 
-def execute(_options: options.Options, console: Console) -> str:
+def execute(_options: Options, console: Console) -> str:
     """Print what was identified, and what the controllers make of the twin."""
-    log = experiment()
-    model = model_of(log)
+    model = model_of(experiment())
     for name in ("delay", "gain", "time_constant"):
         found = model.estimates[name]
         span = f"95 %: {found.low:.3g} to {found.high:.3g}"
