@@ -31,8 +31,8 @@ def members(folder, arguments=SMALL, *, jobs=1, policies=2, **request):
 
 
 def train(folder, arguments=SMALL, **request):
-    (policy,) = members(folder, arguments, policies=1, **request)
-    return policy.network
+    (policy,) = members(folder, arguments, policies=1, **request).values()
+    return policy
 
 
 def weights(network):
@@ -215,16 +215,15 @@ class TestMembers:
 
     def test_another_process_trains_the_same_policy(self, tmp_path, monkeypatch):
         monkeypatch.undo()  # other processes would not know of it
-        ones = members(tmp_path / "one")
-        others = members(tmp_path / "two", jobs=2, policies=1)
-        first, second, third = (weights(policy.network) for policy in (*ones, *others))
-        assert np.array_equal(first, third)
-        assert not np.array_equal(first, second)
-        assert [each.network.provenance["arguments"]["seed"] for each in ones] == [0, 1]
-        assert [policy.curve[-1]["steps"] for policy in ones] == [1024, 1024]
+        first, second = members(tmp_path / "one").values()
+        (again,) = members(tmp_path / "two", jobs=2, policies=1).values()
+        assert np.array_equal(weights(first), weights(again))
+        assert not np.array_equal(weights(first), weights(second))
+        assert [each.provenance["arguments"]["seed"] for each in (first, second)] == [0, 1]
+        assert [each.provenance["curve"][-1]["steps"] for each in (first, second)] == [1024] * 2
 
     def test_only_what_is_missing_is_trained(self, tmp_path):
-        files = [policy.file for policy in members(tmp_path)]
+        files = [*members(tmp_path)]
         stamps = [file.stat().st_mtime_ns for file in files]
         files[1].unlink()
         members(tmp_path)
@@ -252,10 +251,10 @@ class TestMembers:
         request = PolicyRequest(folder=tmp_path, policies=1)
         (factory,) = ppo_policies(request)
         packed = pickle.dumps(factory)
-        (policy,) = ppo.members(request)
-        policy.file.unlink()
+        ((file, policy),) = ppo.members(request).items()
+        file.unlink()
         made = pickle.loads(packed)({}, 1, 0)
-        assert np.array_equal(weights(made), weights(policy.network))
+        assert np.array_equal(weights(made), weights(policy))
 
     def test_published_policies_are_taken_if_they_were_trained_like_this(
         self, tmp_path, monkeypatch
@@ -263,25 +262,24 @@ class TestMembers:
         monkeypatch.setattr(ppo, "PRETRAINED", tmp_path / "shipped")
         own = members(tmp_path / "kept")
         (tmp_path / "shipped").mkdir()
-        for each in own:
-            each.network.save(tmp_path / "shipped" / ppo.file_name(each.arguments))
+        for seed, policy in enumerate(own.values()):
+            policy.save(tmp_path / "shipped" / ppo.file_name(seed))
         shipped = members(tmp_path / "none")
-        assert [policy.file.name for policy in shipped] == ["ppo-0.npz", "ppo-1.npz"]
-        for one, other in zip(own, shipped, strict=True):
-            assert np.array_equal(weights(one.network), weights(other.network))
+        assert [file.name for file in shipped] == ["ppo-0.npz", "ppo-1.npz"]
+        for one, other in zip(own.values(), shipped.values(), strict=True):
+            assert np.array_equal(weights(one), weights(other))
         # Those that were trained here come first, and others are trained where asked for.
-        assert {each.file.parent.parent for each in members(tmp_path / "kept")} == {
-            tmp_path / "kept"
-        }
-        anew = members(tmp_path / "anew", retrain=True)
-        assert anew[0].file.parent.parent == tmp_path / "anew"
-        other = members(tmp_path / "o", policies=1, steps=256)
-        assert other[0].file.parent.parent == tmp_path / "o"
+        assert members(tmp_path / "kept").keys() == own.keys()
+        for anew in (
+            members(tmp_path / "anew", policies=1, retrain=True),
+            members(tmp_path / "anew", policies=1, steps=256),
+        ):
+            assert [file.parent.parent for file in anew] == [tmp_path / "anew"]
 
     def test_the_policies_of_the_project_are_those_of_the_defaults(self):
-        for policy in ppo.members(PolicyRequest()):
-            assert policy.file.parent.name == "pretrained"
-            assert policy.curve[-1]["steps"] >= policy.arguments.steps
+        for file, policy in ppo.members(PolicyRequest()).items():
+            assert file.parent.name == "pretrained"
+            assert policy.provenance["curve"][-1]["steps"] >= 1_196_032
         factories = ppo_policies(PolicyRequest())
         assert [each.provenance["arguments"]["seed"] for each in factories] == [
             *range(10_000, 10_005)

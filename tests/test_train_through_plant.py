@@ -19,11 +19,11 @@ from benchmarks.train import __main__ as program  # noqa: E402
 from benchmarks.train import command, through_plant  # noqa: E402
 from benchmarks.train.through_plant import (  # noqa: E402
     Draw,
+    Loops,
     Net,
     Training,
     environment,
     loss_of,
-    run,
     train,
     training_key,
     validate,
@@ -71,7 +71,8 @@ class TestLaw:
         told["first"] = torch.tensor([first])
         told["uncertainty"] = torch.tensor([0.1])
         with torch.no_grad():
-            errors, _ = run(environment(n, samples), net, numbers, told, samples, 0)
+            plants = environment(n, samples)
+            errors, _ = Loops(plants, numbers, told, 0).run(net, samples)
         of = {name: values.item() for name, values in numbers.items() if values.ndim == 1}
         pole = 1.0 - through_plant.RATE / of["time_constant_factor"]
         alpha, scale, _ = through_plant.DYNAMICS.coefficients(
@@ -151,7 +152,7 @@ class TestGradient:
         plants = environment(3, samples, dtype=torch.double)
 
         def loss():
-            errors, applied = run(plants, net, numbers, told, samples, 0)
+            errors, applied = Loops(plants, numbers, told, 0).run(net, samples)
             return loss_of(errors, applied, numbers["small"], SMALL)
 
         torch.set_default_dtype(torch.double)

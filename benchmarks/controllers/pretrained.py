@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from agents import LawNetwork, PolicyNetwork
@@ -43,7 +42,8 @@ def ppo_policies(
     request: ppo.PolicyRequest, arguments: PPOArguments | None = None
 ) -> list[Factory]:
     """Return PPO's policies, those for the paper's plant unless `arguments` say otherwise."""
-    return [_factory(policy) for policy in ppo.members(request, arguments)]
+    policies = ppo.members(request, arguments)
+    return [_factory(network, file.name) for file, network in policies.items()]
 
 
 def randomised_policies(request: ppo.PolicyRequest) -> list[Factory]:
@@ -55,11 +55,10 @@ def tuned_policy(*, final: bool, member: int, **gains: Any) -> Factory:
     """Train a policy with other settings for a search, of a seed that no comparison has."""
     first = ppo.FINAL_SEED if final else ppo.TUNING_SEED
     arguments = PPOArguments(seed=first + member, **gains)
-    return _factory(ppo.Policy(arguments, Path(), ppo.train(arguments)))
+    return _factory(ppo.train(arguments))
 
 
-def _factory(policy: ppo.Policy) -> Factory:
-    network, steps = policy.network, policy.arguments.steps
+def _factory(network: PolicyNetwork, file: str = "") -> Factory:
     about = {name: value for name, value in network.provenance.items() if name != "curve"}
     weights = sum(W.size + b.size for W, b in network.layers)
     return Factory(
@@ -67,9 +66,9 @@ def _factory(policy: ppo.Policy) -> Factory:
         Cost(
             "dead zone; delay, by the past actions it sees",
             f"{weights:,} weights a policy",
-            f"{steps / 1e6:g} M a policy",
+            f"{about['arguments']['steps'] / 1e6:g} M a policy",
         ),
         network.observation,
-        provenance={"file": policy.file.name, **about},
-        curve=policy.curve,
+        provenance={"file": file, **about},
+        curve=network.provenance.get("curve", []),
     )

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from rich.console import Console
 
+from agents import LawNetwork, PolicyNetwork
 from agents.archive import PRETRAINED
-from agents.neural_law import LawNetwork
 from benchmarks.lib import command_line
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import commit, replacing
@@ -21,30 +22,21 @@ from benchmarks.train import kept, ppo
 from benchmarks.train.options import Options
 from benchmarks.train.through_plant import KINDS, Training, train, training_key
 
+# Networks that are put where they are kept, by file; what is shown of all; and what is said.
+Made = tuple[Mapping[str, LawNetwork | PolicyNetwork], list[dict[str, Any]], str]
+
 
 def execute(options: Options, console: Console) -> str:
     """Train, and say how the networks do in validation."""
     out = command_line.out_folder(options.out)
     target = PRETRAINED if options.keep else out
-    if options.network == "ppo":
-        return _ppo(options, console, out, target)
-    first = Training() if options.steps is None else replace(Training(), steps=options.steps)
-    seeds = range(first.seed, first.seed + (options.networks or 1))
-    trainings = [replace(first, seed=seed) for seed in seeds]
-    networks = trained(
-        trainings,
-        out,
-        options.fan_out.open(),
-        retrain=options.retrain,
-        here=options.fan_out.backend == "loky",
-    )
-    table = summary(networks)
-    console.print(on_screen(table.map("{:.4g}".format)))
-    best = networks[int(table["all"].argmin())]
-    with replacing(target / "nn-smith.npz") as file:
-        best.save(file)
-    seed = best.provenance["training"]["seed"]
-    return f"Validation chooses seed {seed}: it is in {target / 'nn-smith.npz'}"
+    networks, rows, said = (_ppo if options.network == "ppo" else _told)(options, out)
+    shown = pd.DataFrame(rows).map(lambda x: f"{x:.4g}" if isinstance(x, float) else str(x))
+    console.print(on_screen(shown))
+    for name, network in networks.items():
+        with replacing(target / name) as file:
+            network.save(file)
+    return f"{said} in {target}"
 
 
 def trained(
@@ -59,61 +51,63 @@ def trained(
 
     Where `out` is at hand, `here`, it also keeps how far a training got.
     """
-    files = {out / training_key(each) / "network.npz": each for each in trainings}
-    for file in files:
+    runs = {}
+    for each in trainings:
+        file = out / training_key(each) / "network.npz"
         file.parent.mkdir(parents=True, exist_ok=True)
+        state = file.with_name("state.pt")
         if retrain:
-            file.with_name("state.pt").unlink(missing_ok=True)
-    kept.train(
-        {
-            file: partial(train, each, file.with_name("state.pt") if here else None, commit())
-            for file, each in files.items()
-        },
-        fan_out,
-        retrain=retrain,
-    )
-    for file in files:
+            state.unlink(missing_ok=True)
+        runs[file] = partial(train, each, state if here else None, commit())
+    networks = kept.trained(runs, LawNetwork.load, fan_out, retrain=retrain)
+    for file in networks:
         file.with_name("state.pt").unlink(missing_ok=True)
-    return [LawNetwork.load(file) for file in files]
+    return [*networks.values()]
 
 
-def summary(networks: Sequence[LawNetwork]) -> pd.DataFrame:
-    """Return how networks do in validation: geometric means of |e|, as shares of the reach."""
+def _told(options: Options, out: Path) -> Made:
+    """Train told networks, of which validation chooses one.
+
+    What is shown are geometric means of |e|, as shares of the reach.
+    """
+    first = Training()
+    first = replace(first, steps=options.steps or first.steps)
+    seeds = range(first.seed, first.seed + (options.networks or 1))
+    networks = trained(
+        [replace(first, seed=seed) for seed in seeds],
+        out,
+        options.fan_out.open(),
+        retrain=options.retrain,
+        here=options.fan_out.backend == "loky",
+    )
     rows = []
-    for network in networks:
-        found = network.provenance["validation"]
-        logarithms = {kind: found[kind] for kind in KINDS}
-        logarithms["all"] = float(np.mean([*logarithms.values()]))
-        rows.append(
-            {
-                "seed": network.provenance["training"]["seed"],
-                **{kind: np.exp(value) for kind, value in logarithms.items()},
-                "CPU (s)": network.provenance["cpu_seconds"],
-            }
-        )
-    return pd.DataFrame(rows)
+    for seed, network in zip(seeds, networks, strict=True):
+        logarithms = {kind: network.provenance["validation"][kind] for kind in KINDS}
+        logarithms["all"] = np.mean([*logarithms.values()])
+        means = {kind: float(np.exp(value)) for kind, value in logarithms.items()}
+        rows.append({"seed": seed, **means, "CPU (s)": network.provenance["cpu_seconds"]})
+    best = min(range(len(rows)), key=lambda i: rows[i]["all"])
+    said = f"Validation chooses seed {seeds[best]}: it is nn-smith.npz"
+    return {"nn-smith.npz": networks[best]}, rows, said
 
 
-def _ppo(options: Options, console: Console, out: Path, target: Path) -> str:
-    """Train PPO's policies, say how they do, and put them where they are kept."""
+def _ppo(options: Options, out: Path) -> Made:
+    """Train PPO's policies, all of which are compared."""
     asked = ppo.PolicyRequest(
         options.fan_out.open(), out, options.steps, options.networks, options.retrain
     )
-    policies = ppo.members(asked, shipped=False)
-    rows = []
-    for policy in policies:
-        best = min(policy.curve, key=lambda point: point["validation_mae"])
+    policies, rows = {}, []
+    for policy in ppo.members(asked, shipped=False).values():
+        seed, curve = policy.provenance["arguments"]["seed"], policy.provenance["curve"]
+        best = min(curve, key=lambda point: point["validation_mae"])
         rows.append(
             {
-                "seed": policy.arguments.seed,
+                "seed": seed,
                 "best after": best["steps"],
                 "mean |e| in validation (°C)": best["validation_mae"],
                 "on the square wave (°C)": best["square_mae"],
-                "CPU (s)": policy.curve[-1]["seconds"],
+                "CPU (s)": curve[-1]["seconds"],
             }
         )
-    shown = pd.DataFrame(rows).map(lambda x: f"{x:.4g}" if isinstance(x, float) else str(x))
-    console.print(on_screen(shown))
-    for policy in policies:
-        policy.network.save(target / ppo.file_name(policy.arguments))
-    return f"The policies are in {target}"
+        policies[ppo.file_name(seed)] = policy
+    return policies, rows, "The policies are"

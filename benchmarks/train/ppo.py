@@ -40,25 +40,10 @@ class PolicyRequest:
     """Whether to train even where a finished policy is at hand."""
 
 
-@dataclass(frozen=True)
-class Policy:
-    """A trained policy: how it was trained, where it is kept, and what it is."""
-
-    arguments: PPOArguments
-    file: Path
-    network: PolicyNetwork
-
-    @property
-    def curve(self) -> list[dict[str, float]]:
-        """The learning curve, a row a point."""
-        curve: list[dict[str, float]] = self.network.provenance.get("curve", [])
-        return curve
-
-
 def members(
     request: PolicyRequest, arguments: PPOArguments | None = None, *, shipped: bool = True
-) -> list[Policy]:
-    """Return policies that differ in their seeds, and train those that are missing.
+) -> dict[Path, PolicyNetwork]:
+    """Return policies that differ in their seeds, by file, and train those that are missing.
 
     Policies that were trained here are taken first, then those that come with the project.
 
@@ -76,21 +61,16 @@ def members(
     ValueError
         If a file is damaged; the message names it, and what to do.
     """
-    arguments = arguments or PPOArguments()
-    if request.steps is not None:
-        arguments = replace(arguments, steps=request.steps)
-    seeds = range(arguments.seed, arguments.seed + (request.policies or POLICIES))
-    files: dict[Path, PPOArguments] = {}
-    missing = {}
-    for each in (replace(arguments, seed=seed) for seed in seeds):
-        own = request.folder / policy_key(each) / "policy.npz"
-        if shipped and not (request.retrain or own.exists()) and _comes(each):
-            files[PRETRAINED / file_name(each)] = each
-        else:
-            files[own] = each
-            missing[own] = partial(train, each)
-    kept.train(missing, request.fan_out, retrain=request.retrain)
-    return [Policy(each, file, _load(file)) for file, each in files.items()]
+    first = arguments or PPOArguments()
+    first = replace(first, steps=request.steps or first.steps)
+    seeds = range(first.seed, first.seed + (request.policies or POLICIES))
+    trainings = {}
+    for each in (replace(first, seed=seed) for seed in seeds):
+        file = request.folder / policy_key(each) / "policy.npz"
+        if shipped and not (request.retrain or file.exists()) and _comes(each):
+            file = PRETRAINED / file_name(each.seed)
+        trainings[file] = partial(train, each)
+    return kept.trained(trainings, PolicyNetwork.load, request.fan_out, retrain=request.retrain)
 
 
 def train(arguments: PPOArguments) -> PolicyNetwork:
@@ -100,9 +80,9 @@ def train(arguments: PPOArguments) -> PolicyNetwork:
     return ppo_training.train(arguments)
 
 
-def file_name(arguments: PPOArguments) -> str:
+def file_name(seed: int) -> str:
     """Return the name of the policy of this seed, among those that come with the project."""
-    return f"ppo-{arguments.seed}.npz"
+    return f"ppo-{seed}.npz"
 
 
 def policy_key(arguments: PPOArguments) -> str:
@@ -112,13 +92,6 @@ def policy_key(arguments: PPOArguments) -> str:
 
 def _comes(arguments: PPOArguments) -> bool:
     """Say whether a policy that was trained like this comes with the project."""
-    file = PRETRAINED / file_name(arguments)
+    file = PRETRAINED / file_name(arguments.seed)
     asked = json.loads(json.dumps(asdict(arguments)))
-    return file.exists() and bool(_load(file).provenance.get("arguments") == asked)
-
-
-def _load(file: Path) -> PolicyNetwork:
-    try:
-        return PolicyNetwork.load(file)
-    except ValueError as error:
-        raise ValueError(f"{error}: remove it, or --retrain") from error
+    return file.exists() and bool(PolicyNetwork.load(file).provenance["arguments"] == asked)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import copy
-import math
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, cast
 
 import gymnasium
@@ -56,7 +55,7 @@ def train(arguments: PPOArguments) -> PolicyNetwork:
         "versions": versions(),
         "curve": keeper.curve,
     }
-    return exported(keeper.best, arguments, provenance)
+    return replace(exported(keeper.best, arguments), provenance=provenance)
 
 
 def features(parameters: Parameters) -> NDArray[np.float64]:
@@ -136,11 +135,7 @@ def begin(arguments: PPOArguments, start: int = 0) -> PPO:
     return model
 
 
-def exported(
-    state: Mapping[str, torch.Tensor],
-    arguments: PPOArguments,
-    provenance: dict[str, Any] | None = None,
-) -> PolicyNetwork:
+def exported(state: Mapping[str, torch.Tensor], arguments: PPOArguments) -> PolicyNetwork:
     """Return the mean of a policy, given by its state in PyTorch, in NumPy alone."""
     # Stable-Baselines3 has an activation after each hidden layer, which counts as one, too.
     names = [f"mlp_extractor.policy_net.{2 * i}" for i in range(len(arguments.hidden))]
@@ -155,37 +150,26 @@ def exported(
         input_scale=np.ones(parameters.observation_size),
         activation="tanh",
         increments=Increments(arguments.max_move, arguments.undo_dead_zone),
-        provenance=provenance or {},
+        provenance={"arguments": asdict(arguments)},
     )
 
 
 class Keeper(BaseCallback):
-    """Lets the exploration fall, and records how far a training gets, start after start.
-
-    Attributes
-    ----------
-    share
-        Samples of a start.
-    curve
-        The learning curve, a row a point.
-    best
-        The parameters of the policy that did best in validation.
-    """
+    """Lets the exploration fall, and records how far a training gets, start after start."""
 
     def __init__(self, arguments: PPOArguments) -> None:
         super().__init__()
-        self.share = arguments.steps // arguments.starts
-        self.curve: list[dict[str, float]] = []
-        self.best: dict[str, torch.Tensor] = {}
+        self.share = arguments.steps // arguments.starts  # samples of a start
+        self.curve: list[dict[str, float]] = []  # the learning curve, a row a point
+        self.best: dict[str, torch.Tensor] = {}  # parameters that did best in validation
         self._arguments = arguments
         self._errors: list[float] = []
         self._before = -self.share  # samples of the starts before this one
-        self._recorded = 0  # when, in samples of this start
         self._began = time.process_time()
 
     def _on_training_start(self) -> None:
         self._before += self.share
-        self._recorded = 0
+        self._recorded = 0  # when, in samples of this start
 
     def _on_training_end(self) -> None:
         self.record()
@@ -196,9 +180,9 @@ class Keeper(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
+        done = self.num_timesteps / self.share
+        log_std = np.interp(done, (0.0, 1.0), self._arguments.log_std)
         with torch.no_grad():
-            done = self.num_timesteps / self.share
-            log_std = np.interp(done, (0.0, 1.0), self._arguments.log_std)
             cast("torch.Tensor", self.model.policy.log_std).fill_(float(log_std))
         if self.num_timesteps - self._recorded >= VALIDATION_INTERVAL:
             self.record()
@@ -208,26 +192,23 @@ class Keeper(BaseCallback):
         self._recorded = self.num_timesteps
         held = {**self._arguments.observation, "setpoint": HELD}
         noisy = {**self._arguments.training, "setpoint": HELD}
-        validation = np.mean(
-            [
-                self._mae(noisy, VALIDATION_RUNS, len(HELD), VALIDATION_SEED),
-                self._mae(held, 1, len(HELD), 0),
-                self._mae({**held, "dead_zone": VALIDATION_DEAD_ZONE}, 1, len(HELD), 0),
-            ]
-        )
-        if not self.curve or validation < min(each["validation_mae"] for each in self.curve):
-            self.best = copy.deepcopy(self.model.policy.state_dict())
         square = {**self._arguments.observation, **PROBE.arguments}
-        self.curve.append(
-            {
-                "steps": self._before + self.num_timesteps,
-                "seconds": time.process_time() - self._began,  # of the processor
-                "training_mae": float(np.mean(self._errors)) if self._errors else math.nan,
-                "validation_mae": float(validation),
-                "square_mae": self._mae(square, 1, PROBE.samples, PROBE_SEED),
-            }
-        )
+        errors = [
+            self._mae(noisy, VALIDATION_RUNS, len(HELD), VALIDATION_SEED),
+            self._mae(held, 1, len(HELD), 0),
+            self._mae({**held, "dead_zone": VALIDATION_DEAD_ZONE}, 1, len(HELD), 0),
+        ]
+        point = {
+            "steps": self._before + self.num_timesteps,
+            "seconds": time.process_time() - self._began,  # of the processor
+            "training_mae": float(np.mean(self._errors)),
+            "validation_mae": float(np.mean(errors)),
+            "square_mae": self._mae(square, 1, PROBE.samples, PROBE_SEED),
+        }
         self._errors.clear()
+        if all(point["validation_mae"] < each["validation_mae"] for each in self.curve):
+            self.best = copy.deepcopy(self.model.policy.state_dict())
+        self.curve.append(point)
 
     def _mae(self, arguments: dict[str, Any], runs: int, samples: int, seed: int) -> float:
         plants = make_plants(runs, samples, **arguments)

@@ -34,7 +34,23 @@ RATE = 1.0 - float(np.abs(np.roots(NOMINAL.a)).max())  # of the dominant pole
 LONGEST, BLOCK = 44, 4  # samples: the longest delay that is told, the shortest
 VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED = 64, 600, 3_000_000
 SAVED_EVERY = 50  # steps of a training of minutes
-KINDS = "calm", "noise", "load", "boiler", "drift"
+# Of plants in validation, and what is drawn for them: from, to, and the power of `small`.
+KINDS: dict[str, dict[str, tuple[float, float, int]]] = {
+    "calm": {},
+    "noise": {"noise_variance": (0.1, 1.0, 2)},
+    "load": {"disturbance_amplitude": (0.5, 2.5, 1)},
+    "boiler": {
+        "noise_variance": (0.3, 0.7, 2),
+        "measurement_noise_variance": (0.05, 0.15, 2),
+        "disturbance_amplitude": (1.0, 2.5, 1),
+        "disturbance_walk_variance": (2e-4, 8e-4, 2),
+    },
+    "drift": {
+        "noise_variance": (0.1, 1.0, 2),
+        "gain_drift": (0.6, 1.6, 0),
+        "time_constant_drift": (0.6, 1.6, 0),
+    },
+}
 
 Numbers = dict[str, Tensor]
 
@@ -123,9 +139,9 @@ class Draw:
         values: Tensor = low + drawn * (high - low)
         return values
 
-    def some(self, share: float, values: Tensor | float) -> Tensor:
-        """Return values for a share of the plants, and 0 for the others."""
-        return values * (self.uniform(0.0, 1.0) < share)
+    def some(self, share: float, low: float, high: float) -> Tensor:
+        """Draw uniformly for a share of the plants, and return 0 for the others."""
+        return self.uniform(low, high) * (self.uniform(0.0, 1.0) < share)
 
     def plants(self) -> Numbers:
         """Draw the numbers of the plants, those of `MiddlePointTorchEnv`, and `small`.
@@ -143,29 +159,24 @@ class Draw:
         u_max = torch.where(skewed, self.uniform(8.5, 13.0), 10.0 * one)
         small = torch.where(self.uniform(0.0, 1.0) < 0.25, self.uniform(0.1, 0.6), one)
         kind = self.uniform(0.0, 1.0)  # calm, load alone, or everything
-        noisy = (kind > 0.35).float()
+        loaded, noisy = small * (kind > 0.15), small**2 * (kind > 0.35)
         drifts = self.uniform(0.0, 1.0) < 0.2
         numbers = {
             "gain_factor": gain,
             "time_constant_factor": constant,
             "delay": self.uniform(6.0, 37.0).floor(),
-            "dead_zone": self.some(0.9, self.uniform(0.0, 8.0)) * small,
+            "dead_zone": self.some(0.9, 0.0, 8.0) * small,
             "u_min": u_min,
             "u_max": u_max,
-            "noise_variance": noisy * self.some(0.85, self.uniform(0.0, 1.0)) * small**2,
-            "measurement_noise_variance": noisy
-            * self.some(0.5, self.uniform(0.0, 0.2))
-            * small**2,
-            "disturbance_amplitude": self.some(0.45, self.uniform(0.0, 2.5)) * small,
+            "noise_variance": self.some(0.85, 0.0, 1.0) * noisy,
+            "measurement_noise_variance": self.some(0.5, 0.0, 0.2) * noisy,
+            "disturbance_amplitude": self.some(0.45, 0.0, 2.5) * loaded,
             "disturbance_interval": self.uniform(100.0, 300.0),
-            "disturbance_walk_variance": noisy
-            * self.some(0.4, self.uniform(0.0, 0.001))
-            * small**2,
+            "disturbance_walk_variance": self.some(0.4, 0.0, 0.001) * noisy,
             "small": small,
         }
-        numbers["disturbance_amplitude"] *= (kind > 0.15).float()
-        for name in ("gain", "time_constant"):
-            numbers[f"{name}_drift"] = torch.where(drifts, self.uniform(0.75, 1.33), one)
+        for name in ("gain_drift", "time_constant_drift"):
+            numbers[name] = torch.where(drifts, self.uniform(0.75, 1.33), one)
         numbers["setpoint"] = self.levels(numbers)
         return numbers
 
@@ -188,9 +199,9 @@ class Draw:
         """Draw what is told of plants: half of it by numbers of first order, some wrongly."""
         told = {name: numbers[name] for name in ("u_min", "u_max", "dead_zone")}
         told["first"] = self.uniform(0.0, 1.0) < 0.6
-        k = self.some(0.0 if exact else 0.5, self.uniform(0.0, self._spread))
+        k = self.some(0.0 if exact else 0.5, 0.0, self._spread)
         # Some were right once, and nobody knows that they are not any more.
-        aged = self.some(0.0 if exact else 0.1, self.uniform(0.0, 0.3))
+        aged = self.some(0.0 if exact else 0.1, 0.0, 0.3)
         wrong = torch.randn(3, self._n, generator=self._generator) * k
         wrong[:2] += self.uniform(-1.5, 1.5, 2, self._n) * aged
         told["uncertainty"] = k
@@ -200,82 +211,6 @@ class Draw:
         delay = numbers["delay"] + (20.0 * wrong[2]).round()
         told["delay"] = delay.clamp(BLOCK, LONGEST - BLOCK)
         return told
-
-
-class Loops:
-    """The law and the told models of a batch, as `NeuralSmithPredictor` has them."""
-
-    def __init__(self, told: Numbers) -> None:
-        gain, constant = told["gain_factor"], told["time_constant_factor"]
-        low, high, first = told["u_min"], told["u_max"], told["first"]
-        zero = self._zero = torch.zeros_like(gain)
-        self._first = first
-        self._low, self._half = low, (high - low) / 2.0
-        self.reach = gain * GAIN * self._half
-        alpha, _, unit = DYNAMICS.coefficients(gain, constant)
-        pole = 1.0 - RATE / constant
-        self._alpha = (
-            torch.where(first, pole, alpha[0] + zero),
-            torch.where(first, zero, alpha[1] + zero),
-        )
-        self._unit = torch.where(first, 1.0 - pole, unit + zero)
-        shares = [b / sum(NOMINAL.b) for b in NOMINAL.b]
-        self._beta = (
-            torch.where(first, self._unit, self._unit * shares[0]),
-            torch.where(first, zero, self._unit * shares[1]),
-        )
-        self._delay = told["delay"].long()
-        self.law = Law(
-            Prior(
-                unit=self._unit,
-                fading=pole ** (told["delay"] + 1.0 + 0.5 * first),
-                time_constant=constant,
-                delay=told["delay"],
-                dead_zone=told["dead_zone"] / self._half,
-                centre=-(high + low) / (high - low),
-                uncertainty=told["uncertainty"],
-            ),
-            torch,
-            Tensor.detach,
-        )
-        self._before = torch.zeros(LONGEST + BLOCK, len(gain))  # the model's outputs
-        self._new: list[Tensor] = []
-        self._model = self._last_model = self._flow = self._last_flow = zero
-        self._residual = self._last_residual = self._off = zero
-
-    def detach(self) -> None:
-        """Forget where everything came from."""
-        for owner in (self, self.law):
-            for name, value in vars(owner).items():
-                if isinstance(value, Tensor):
-                    setattr(owner, name, value.detach())
-        self._new = [each.detach() for each in self._new]
-
-    def act(self, net: Net, observations: Tensor) -> Tensor:
-        """Return actions, shape (n, 1)."""
-        setpoint, output = (observations / self.reach[:, None]).unbind(1)
-        k = len(self._new) % BLOCK
-        if k == 0:  # looked up for some samples at once: it costs less
-            if self._new:
-                self._before = torch.cat([self._before[BLOCK:], torch.stack(self._new)])
-                self._new = []
-            rows = len(self._before) - self._delay + torch.arange(BLOCK)[:, None]
-            self._delayed = self._before.gather(0, rows).unbind()
-        off = output - self._delayed[k]
-        residual = torch.where(self._first, (off + self._off) / 2.0, off)
-        self._off = off
-        load = residual - self._alpha[0] * self._residual - self._alpha[1] * self._last_residual
-        self._residual, self._last_residual = residual, self._residual
-        state = self._model, self._last_model, self._flow
-        wanted, passed = self.law.applied(self.law.flow(net, setpoint, residual, load, state))
-        self._new.append(self._model)
-        self._flow, self._last_flow = passed, self._flow
-        new = self._alpha[0] * self._model + self._alpha[1] * self._last_model
-        new = new + self._beta[0] * self._flow + self._beta[1] * self._last_flow
-        self._model, self._last_model = new, self._model
-        # The plant answers downwards.
-        action: Tensor = (-wanted * self._half - self._low) / self._half - 1.0
-        return action[:, None]
 
 
 def environment(
@@ -308,43 +243,90 @@ def environment(
     )
 
 
-def run(
-    plants: MiddlePointTorchEnv,
-    net: Net,
-    numbers: Numbers,
-    told: Numbers,
-    samples: int,
-    seed: int,
-) -> tuple[Tensor, Tensor]:
-    """Return e(k + 1) in multiples of the reach, u_a(k) of half the range: (samples, n)."""
-    return Rollout(plants, numbers, told, seed).go_on(net, samples)
+class Loops:
+    """A batch of plants under the network, from rest on.
 
-
-class Rollout:
-    """A batch of plants under the network, from rest on."""
+    The law and the told models are those of `NeuralSmithPredictor`.
+    """
 
     def __init__(
         self, plants: MiddlePointTorchEnv, numbers: Numbers, told: Numbers, seed: int
     ) -> None:
+        gain, constant = told["gain_factor"], told["time_constant_factor"]
+        low, high, first = told["u_min"], told["u_max"], told["first"]
+        self._plants, self._first = plants, first
+        self._low, self._half = low, (high - low) / 2.0
+        self._reach = gain * GAIN * self._half
+        alpha, _, unit = DYNAMICS.coefficients(gain, constant)
+        pole, zero = 1.0 - RATE / constant, torch.zeros_like(gain)
+        unit = torch.where(first, 1.0 - pole, unit)
+        self._alpha = torch.where(first, pole, alpha[0]), torch.where(first, zero, alpha[1])
+        newer, older = (unit * (b / sum(NOMINAL.b)) for b in NOMINAL.b)
+        self._beta = torch.where(first, unit, newer), torch.where(first, zero, older)
+        self._delay = told["delay"].long()
+        self._law = Law(
+            Prior(
+                unit=unit,
+                fading=pole ** (told["delay"] + 1.0 + 0.5 * first),
+                time_constant=constant,
+                delay=told["delay"],
+                dead_zone=told["dead_zone"] / self._half,
+                centre=-(high + low) / (high - low),
+                uncertainty=told["uncertainty"],
+            ),
+            torch,
+            Tensor.detach,
+        )
+        self._before = torch.zeros(LONGEST + BLOCK, len(gain))  # the model's outputs
+        self._new: list[Tensor] = []
+        self._model = self._last_model = self._flow = self._last_flow = zero
+        self._residual = self._last_residual = self._off = zero
         signals = {name: values for name, values in numbers.items() if name != "small"}
-        self._plants, self._loops = plants, Loops(told)
         self._observations, _ = plants.reset(seed=seed, options={"signals": signals})
 
-    def go_on(self, net: Net, samples: int) -> tuple[Tensor, Tensor]:
-        """Run on, and return what `run` does; gradients end where the call began."""
+    def run(self, net: Net, samples: int) -> tuple[Tensor, Tensor]:
+        """Run on; return e(k + 1) in multiples of the reach, u_a(k) of half the range.
+
+        Both have the shape (samples, n). Gradients end where the call began.
+        """
         self._plants.detach()
-        self._loops.detach()
-        observations = self._observations.detach()
+        for owner in (self, self._law):
+            for name, value in vars(owner).items():
+                if isinstance(value, Tensor):
+                    setattr(owner, name, value.detach())
+        self._new = [each.detach() for each in self._new]
         errors, applied = [], []
         for _ in range(samples):
-            observations, _, _, _, infos = self._plants.step(self._loops.act(net, observations))
+            self._observations, _, _, _, infos = self._plants.step(self._act(net))
             errors.append(infos["error"])
             applied.append(infos["applied"])
-        self._observations = observations
-        return (
-            torch.stack(errors) / self._loops.reach,
-            torch.stack(applied) / self._loops._half,
-        )
+        return torch.stack(errors) / self._reach, torch.stack(applied) / self._half
+
+    def _act(self, net: Net) -> Tensor:
+        """Return actions, shape (n, 1)."""
+        setpoint, output = (self._observations / self._reach[:, None]).unbind(1)
+        k = len(self._new) % BLOCK
+        if k == 0:  # looked up for some samples at once: it costs less
+            if self._new:
+                self._before = torch.cat([self._before[BLOCK:], torch.stack(self._new)])
+                self._new = []
+            rows = len(self._before) - self._delay + torch.arange(BLOCK)[:, None]
+            self._delayed = self._before.gather(0, rows).unbind()
+        off = output - self._delayed[k]
+        residual = torch.where(self._first, (off + self._off) / 2.0, off)
+        self._off = off
+        load = residual - self._alpha[0] * self._residual - self._alpha[1] * self._last_residual
+        self._residual, self._last_residual = residual, self._residual
+        state = self._model, self._last_model, self._flow
+        wanted, passed = self._law.applied(self._law.flow(net, setpoint, residual, load, state))
+        self._new.append(self._model)
+        self._flow, self._last_flow = passed, self._flow
+        new = self._alpha[0] * self._model + self._alpha[1] * self._last_model
+        new = new + self._beta[0] * self._flow + self._beta[1] * self._last_flow
+        self._model, self._last_model = new, self._model
+        # The plant answers downwards.
+        action: Tensor = (-wanted * self._half - self._low) / self._half - 1.0
+        return action[:, None]
 
 
 def loss_of(errors: Tensor, applied: Tensor, small: Tensor, training: Training) -> Tensor:
@@ -356,51 +338,33 @@ def loss_of(errors: Tensor, applied: Tensor, small: Tensor, training: Training) 
     return (huber.mean(0) + training.move_price * moves).clamp(min=tolerance).log().mean()
 
 
-def validation(training: Training) -> dict[str, tuple[Numbers, Numbers]]:
-    """Return plants of each kind, which training does not meet, and what is told of them."""
-    sets = {}
-    for i, kind in enumerate(KINDS):
-        draw = Draw(training, VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED, i)
-        numbers = draw.plants()
-        s, one = numbers["small"], torch.ones(VALIDATION_PLANTS)
-        for name in numbers:
-            if "disturbance" in name or "noise" in name:
-                numbers[name] = 0.0 * one if name != "disturbance_interval" else 200.0 * one
-            if name.endswith("_drift"):
-                numbers[name] = one
-        if kind in ("noise", "drift"):
-            numbers["noise_variance"] = draw.uniform(0.1, 1.0) * s**2
-        if kind == "drift":
-            numbers["gain_drift"], numbers["time_constant_drift"] = (
-                draw.uniform(0.6, 1.6) for _ in range(2)
-            )
-        if kind == "load":
-            numbers["disturbance_amplitude"] = draw.uniform(0.5, 2.5) * s
-        if kind == "boiler":
-            numbers["noise_variance"] = draw.uniform(0.3, 0.7) * s**2
-            numbers["measurement_noise_variance"] = draw.uniform(0.05, 0.15) * s**2
-            numbers["disturbance_amplitude"] = draw.uniform(1.0, 2.5) * s
-            numbers["disturbance_walk_variance"] = draw.uniform(2e-4, 8e-4) * s**2
-        sets[kind] = numbers, draw.told(numbers, exact=True)
-    return sets
-
-
 def validate(net: Net, training: Training) -> dict[str, float]:
-    """Return the mean logarithm of the mean |e|, and the travel, of each kind of plants."""
+    """Return the mean logarithm of the mean |e|, and the travel, of each kind of plants.
+
+    Training does not meet these plants. They are told exactly.
+    """
     plants = environment(VALIDATION_PLANTS, VALIDATION_SAMPLES)
     found = {}
-    with torch.no_grad():
-        for kind, (numbers, told) in validation(training).items():
-            errors, applied = run(
-                plants, net, numbers, told, VALIDATION_SAMPLES, VALIDATION_SEED
-            )
-            each = errors.abs().mean(0).log()
-            found[kind] = float(each.mean())
-            for first in (True, False):
-                found[f"{kind} {1 if first else 2}"] = float(
-                    each[told["first"] == first].mean()
-                )
-            found[f"{kind}, travel"] = 10.0 * float(applied.diff(dim=0).abs().mean())
+    for i, (kind, drawn) in enumerate(KINDS.items()):
+        draw = Draw(training, VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED, i)
+        numbers = draw.plants()
+        for name in numbers:
+            if "disturbance" in name or "noise" in name:
+                numbers[name] = torch.zeros(VALIDATION_PLANTS)
+            if name.endswith("_drift"):
+                numbers[name] = torch.ones(VALIDATION_PLANTS)
+        numbers["disturbance_interval"] = torch.full((VALIDATION_PLANTS,), 200.0)
+        for name, (low, high, power) in drawn.items():
+            numbers[name] = draw.uniform(low, high) * numbers["small"] ** power
+        told = draw.told(numbers, exact=True)
+        with torch.no_grad():
+            loops = Loops(plants, numbers, told, VALIDATION_SEED)
+            errors, applied = loops.run(net, VALIDATION_SAMPLES)
+        each, first = errors.abs().mean(0).log(), told["first"]
+        found[kind] = float(each.mean())
+        found[f"{kind} 1"] = float(each[first].mean())  # told a model of first order
+        found[f"{kind} 2"] = float(each[~first].mean())
+        found[f"{kind}, travel"] = 10.0 * float(applied.diff(dim=0).abs().mean())
     return found
 
 
@@ -460,11 +424,11 @@ def _advance(
     length = training.stretches * training.samples
     draw = Draw(training, training.plants, length, training.seed, step)
     numbers = draw.plants()
-    rollout = Rollout(plants, numbers, draw.told(numbers), step)
+    loops = Loops(plants, numbers, draw.told(numbers), step)
     for now in range(step, min(step + training.stretches, training.steps)):
         left = max(1.0 - now / training.steps, 0.01)
         optimiser.param_groups[0]["lr"] = training.learning_rate * left
-        errors, applied = rollout.go_on(net, training.samples)
+        errors, applied = loops.run(net, training.samples)
         loss = loss_of(errors, applied, numbers["small"], training)
         optimiser.zero_grad()
         loss.backward()
