@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from benchmarks.controllers.step_test import StepTest, step_test
+from benchmarks.lib.command_line import UsageError
 from benchmarks.loop.linear import nominal
 from benchmarks.loop.metrics import reversals
-from benchmarks.loop.plants import read_plant
+from benchmarks.loop.plants import PlantOptions
 from mptc_gym import Parameters
 
 
@@ -64,7 +65,7 @@ def test_plant_without_a_new_steady_state_is_refused(arguments, name):
 def test_plant_file_makes_an_environment(tmp_path):
     path = tmp_path / "plant.json"
     path.write_text(json.dumps({"delay": 20, "gain_factor": [1.0, 2.0]}))
-    arguments = read_plant(path)
+    arguments = PlantOptions(plant=path).chosen().arguments
     assert arguments == {"delay": 20, "gain_factor": [1.0, 2.0]}
     gymnasium.make("MiddlePoint-v0", **arguments)
 
@@ -72,9 +73,9 @@ def test_plant_file_makes_an_environment(tmp_path):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (None, "cannot be read: No such file"),
-        ("{", "must be a JSON file"),
-        ("[1, 2]", "must hold one object"),
+        (None, "plant.json cannot be read: No such file"),
+        ("{", "plant.json must be a JSON file"),
+        ("[1, 2]", "plant.json must hold one object"),
         ('{"dely": 3}', "'dely': did you mean 'delay'"),
         ('{"delay": -1}', "delay must be"),
     ],
@@ -83,9 +84,8 @@ def test_bad_plant_file_is_named(tmp_path, text, complaint):
     path = tmp_path / "plant.json"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(ValueError, match=complaint) as caught:
-        read_plant(path)
-    assert str(path) in str(caught.value)
+    with pytest.raises(UsageError, match=f"^--plant: .*{complaint}"):
+        PlantOptions(plant=path).chosen()
 
 
 def test_reversals_are_counted_across_stillness():

@@ -26,31 +26,27 @@ EXTRAS = {
 
 
 def command(
-    name: str,
-    *,
-    width: int = 120,
-    interrupted: str = "what has finished is kept.",
+    name: str, *, width: int = 120, interrupted: str = "what has finished is kept."
 ) -> Callable[[Sequence[str] | None], int]:
     """Return the `main` of `python -m benchmarks.<name>`.
+
+    Its package has two modules: `options`, with a dataclass `Options`, whose docstring is the
+    description in the help; and `command`, which is imported after the options were read. Its
+    function `execute` is called with the options and a `rich` console, does the work and
+    returns the closing line.
+
+    The main function takes the command line without the program's name and returns the exit
+    status: 0; 1 if tasks failed or a file could not be written; 130 after Ctrl-C. An option
+    that does not fit, or a package that is missing, ends the program with status 2.
 
     Parameters
     ----------
     name
-        Of the command. Its package has two modules: `options`, with a dataclass `Options`,
-        whose docstring is the description in the help; and `command`, with a function
-        `execute`, which is called with the options and a `rich` console, does the work and
-        returns the closing line. It is imported after the options were read.
+        Of the command.
     width
         Columns of the console where nothing says how wide it is.
     interrupted
         What the user is told after Ctrl-C.
-
-    Returns
-    -------
-    callable
-        It takes the command line without the program's name and returns the exit status: 0; 1
-        if tasks failed or a file could not be written; 130 if it was interrupted. An option
-        that does not fit, or a package that is missing, ends the program with status 2.
     """
 
     def main(arguments: Sequence[str] | None = None) -> int:

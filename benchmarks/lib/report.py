@@ -29,7 +29,7 @@ th:first-child, td:first-child { text-align: left; }
 img { max-width: 100%; margin-top: 1.5rem; }
 .made { color: #666; font-size: 0.85rem; overflow-wrap: anywhere; }
 """
-_INTERVAL = re.compile(r" (\([^()]* to [^()]*\))")
+_INTERVAL = re.compile(r" (\([^()]* to [^()]*\))")  # small, and below its number
 
 
 @dataclass(frozen=True)
@@ -68,19 +68,13 @@ def write_report(folder: Path, title: str, sections: Sequence[Section], made: st
     write_text(folder / "report.html", _html(folder, title, sections, made))
 
 
-def markdown_table(table: pd.DataFrame) -> str:
-    """Return a table of text in Markdown, with names as they are, whatever stands in them."""
-    rows = [
-        [_plain(str(text)).replace("|", r"\|") for text in row]
-        for row in (tuple(table.columns), *table.itertuples(index=False, name=None))
-    ]
-    shown = pd.DataFrame(rows[1:], columns=rows[0])
-    return str(shown.to_markdown(index=False, disable_numparse=True))
-
-
 def _plain(text: str) -> str:
     """Return a text that Markdown does not take for HTML."""
     return text.replace("&", "&amp;").replace("<", "&lt;")
+
+
+def _cell(text: str) -> str:
+    return _plain(text).replace("|", r"\|")
 
 
 def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
@@ -89,7 +83,8 @@ def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
         parts += [f"## {_plain(section.title)}"] * bool(section.title)
         parts += map(_plain, section.text)
         if section.table is not None:
-            parts.append(markdown_table(section.table))
+            table = section.table.map(_cell).rename(columns=_cell)
+            parts.append(table.to_markdown(index=False, disable_numparse=True))
         parts += [f"![{_plain(section.title)}]({picture})" for picture in section.pictures]
     return "\n\n".join([*parts, _plain(made)]) + "\n"
 
@@ -105,17 +100,13 @@ def _html(folder: Path, title: str, sections: Sequence[Section], made: str) -> s
         parts += [f"<h2>{html.escape(section.title)}</h2>"] * bool(section.title)
         parts += [f"<p>{html.escape(paragraph)}</p>" for paragraph in section.text]
         if section.table is not None:
-            parts.append(f'<div class="table">{_html_table(section.table)}</div>')
+            with pd.option_context("display.max_colwidth", None):
+                table = section.table.to_html(index=False, border=0)
+            smaller = _INTERVAL.sub(r'<span class="interval">\1</span>', table)
+            parts.append(f'<div class="table">{smaller}</div>')
         for picture in section.pictures:
             data = base64.b64encode((folder / picture).read_bytes()).decode()
             alternative = html.escape(f"{section.title}: {picture}")
             parts.append(f'<img alt="{alternative}" src="data:image/png;base64,{data}">')
     parts.append(f'<p class="made">{html.escape(made)}</p>')
     return "\n".join([*parts, "</body></html>", ""])
-
-
-def _html_table(table: pd.DataFrame) -> str:
-    """Return a table in HTML, with intervals small and below their numbers."""
-    with pd.option_context("display.max_colwidth", None):
-        text = table.to_html(index=False, border=0)
-    return _INTERVAL.sub(r'<span class="interval">\1</span>', text)

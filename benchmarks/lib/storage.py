@@ -28,8 +28,7 @@ class NotWrittenError(RuntimeError):
 def replacing(path: Path) -> Iterator[Path]:
     """Give a path to write to, and put what was written in place of `path` at the end.
 
-    After an error, such as a `NotWrittenError` of a full disk, or if the process is killed,
-    `path` is what it was before.
+    `path` is what it was before if there is an error, or if the process is killed.
     """
     # The suffix stays the last, as some writers choose a format by it or append it.
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
@@ -46,10 +45,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _move(partial: Path, path: Path) -> None:
-    """Put a file in place of another, also where that is open elsewhere for a moment.
-
-    Windows refuses then, for example while a virus scanner reads a file that was just written.
-    """
+    """Put a file in place of another: Windows refuses while that is open elsewhere."""
     for wait in WAITS:
         with suppress(PermissionError):
             partial.replace(path)
@@ -72,21 +68,16 @@ def write_json(path: Path, value: Any) -> None:
 
 def seal(value: Any) -> str:
     """Return a value as JSON, with a checksum that tells whether it is what was written."""
-    return json.dumps({"sha256": _checksum(value), "value": value})
+    checksum = hashlib.sha256(json.dumps(value).encode()).hexdigest()
+    return json.dumps({"sha256": checksum, "value": value})
 
 
 def unseal(text: str) -> Any:
     """Return the value of a text that `seal` has made; ValueError if it is damaged."""
     sealed = json.loads(text)
-    if not isinstance(sealed, dict) or sealed.keys() != {"sha256", "value"}:
-        raise ValueError("not a kept result")
-    if sealed["sha256"] != _checksum(sealed["value"]):
+    if not isinstance(sealed, dict) or text != seal(sealed.get("value")):
         raise ValueError("the checksum of a kept result does not fit")
     return sealed["value"]
-
-
-def _checksum(value: Any) -> str:
-    return hashlib.sha256(json.dumps(value).encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:

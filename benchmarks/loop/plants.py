@@ -54,7 +54,7 @@ class PlantOptions:
         if self.plant:
             names.append(self.plant.stem)
             with blame("--plant"):
-                arguments |= read_plant(self.plant)
+                arguments |= _read(self.plant)
         for text in self.set:
             name, equals, value = text.partition("=")
             if not (name and equals):
@@ -77,20 +77,10 @@ class PlantOptions:
         return ChosenPlant(", ".join(names) or "the paper's plant", arguments)
 
 
-def read_plant(path: str | Path) -> dict[str, Any]:
-    """Return the arguments of `MiddlePoint-v0` that a file holds, checked.
-
-    The file is JSON, with one object whose names are arguments of the environment, such as
-    `plant.json` or `ranges.json` of `python -m benchmarks.identify`.
-
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, is not JSON, or holds something else; the message names the
-        file, and the argument where there is one.
-    """
+def _read(path: Path) -> dict[str, Any]:
+    """Return the object that a JSON file holds, such as `plant.json`."""
     try:
-        arguments = json.loads(Path(path).read_text(encoding="utf-8"))
+        arguments = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
     except ValueError as error:  # not JSON, or not text
@@ -100,8 +90,4 @@ def read_plant(path: str | Path) -> dict[str, Any]:
             f"{path} must hold one object of arguments, such as "
             f'{{"delay": 20}}, got {type(arguments).__name__}'
         )
-    try:
-        Parameters.of_environment(arguments)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
     return arguments
