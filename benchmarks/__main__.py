@@ -21,16 +21,10 @@ def main() -> int:
     except ImportError as error:
         print(f"python -m benchmarks: error: {sentence(error)}", file=sys.stderr)
         return 2
-    lines = [
-        line for line in MAP.read_text(encoding="utf-8").splitlines() if line.startswith("|")
-    ]
-    rows = [
-        [
-            re.sub(r"\[([^]]*)\]\([^)]*\)|`", r"\1", cell.strip())
-            for cell in line[1:-1].split("|")
-        ]
-        for line in lines
-    ]
+    page = MAP.read_text(encoding="utf-8")
+    plain = re.sub(r"\[([^]]*)\]\([^)]*\)|`", r"\1", page)  # without links and code
+    lines = [line for line in plain.splitlines() if line.startswith("|")]
+    rows = [[cell.strip() for cell in line[1:-1].split("|")] for line in lines]
     header, _, *questions = rows
     Console(width=None if sys.stdout.isatty() else 150, highlight=False, markup=False).print(
         on_screen(pd.DataFrame(questions, columns=header)),

@@ -68,7 +68,6 @@ def test_exact_has_no_width():
     ("how", "values", "complaint"),
     [
         *((median, values, "must be numbers") for values in ([], [1.0, math.nan], [[1.0, 2]])),
-        *((share, flags, "must be booleans") for flags in ([], [0.5, 1.0], [[True]])),
         *(
             (lambda values: bootstrap(values, seed=0), values, "values must be finite")
             for values in ([], [1.0, math.inf], [math.nan], np.zeros((2, 2, 2)))

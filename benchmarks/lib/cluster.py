@@ -27,22 +27,12 @@ STAYS = [
 ]
 QUEUED = 4  # tasks a core that are handed out; also for nodes that come later
 
-START_RAY = (
-    "No Ray cluster can be reached: start one with `ray start --head`, or set RAY_ADDRESS"
-)
-
 # The name of a task, its result, what went wrong, and whether its worker is lost.
 Answer = tuple[str, Any, str, bool]
 
 
 def connect() -> None:
-    """Connect to the cluster of RAY_ADDRESS, or of this machine.
-
-    Raises
-    ------
-    ValueError
-        If no cluster is found.
-    """
+    """Connect to the cluster of RAY_ADDRESS or of this machine; ValueError if there is none."""
     import ray  # here: an extra, which takes a second to load
 
     if ray.is_initialized():
@@ -58,7 +48,10 @@ def connect() -> None:
             logging_level=logging.ERROR,
         )
     except OSError as error:
-        raise ValueError(f"{START_RAY} ({error})") from error
+        raise ValueError(
+            "No Ray cluster can be reached: start one with `ray start --head`, or set "
+            f"RAY_ADDRESS ({error})"
+        ) from error
 
 
 def answers(
@@ -66,14 +59,8 @@ def answers(
 ) -> Iterator[Answer]:
     """Run tasks on the cluster that is connected, and yield their answers as they come.
 
-    Parameters
-    ----------
-    tasks
-        What to run, by name.
-    jobs
-        How many at once; None for as many as the cluster has cores.
-    tries
-        How often a task is begun at most, if its worker or node is lost.
+    So many `jobs` run at once; None stands for as many as the cluster has cores. A task is
+    begun at most `tries` times, if its worker or node is lost.
     """
     import ray
 
@@ -103,13 +90,9 @@ def answers(
 def _answer(task: Callable[[], Any], here: dict[str, str]) -> tuple[Any, str, bool]:
     """Run a task; return its result, what went wrong, and whether that was the node's fault."""
     there = _versions()
-    other = [
-        f"{name} {there.get(name, 'missing')} instead of {here.get(name, 'none')}"
-        for name in {**here, **there}
-        if here.get(name) != there.get(name)
-    ]
-    if other:
-        return None, f"A node would compute other numbers: it has {', '.join(other)}", True
+    if there != here:
+        has, wanted = dict(there.items() - here.items()), dict(here.items() - there.items())
+        return None, f"A node computes other numbers: it has {has}, and not {wanted}", True
     return *attempt(task), False
 
 

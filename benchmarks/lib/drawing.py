@@ -61,10 +61,7 @@ def panels(
     """
     columns = min(columns, len(names))
     rows = math.ceil(len(names) / columns)
-    width, height = (
-        each * count + more
-        for each, count, more in zip(size, (columns, rows), margin, strict=True)
-    )
+    width, height = size[0] * columns + margin[0], size[1] * rows + margin[1]
     with drawn(path, width, height, grid=grid) as figure:
         axes = list(figure.subplots(rows, columns, squeeze=False).flat)
         for panel, name in zip(axes, names, strict=False):

@@ -39,11 +39,9 @@ class TasksFailedError(RuntimeError):
     def __init__(self, errors: Mapping[str, str], tasks: int) -> None:
         self.errors = dict(errors)
         lines = [f"{key}: {text.strip().splitlines()[-1]}" for key, text in errors.items()]
-        if len(lines) > NAMED:
-            lines[NAMED:] = [f"and {len(lines) - NAMED} more"]
         super().__init__(
             f"{len(errors)} of {tasks} tasks failed; the results of the others are kept\n"
-            + "\n".join(lines)
+            + "\n".join(lines[:NAMED])
             + f"\nThe first of them:\n{next(iter(errors.values()))}"
         )
 
@@ -73,24 +71,19 @@ class FanOut:
             cluster.connect()
 
     def run(self, tasks: Tasks, folder: Path | None = None, title: str = "") -> dict[str, Any]:
-        """Run the tasks that have no result yet, and return the results of all.
+        """Run the tasks that have no result yet; return the results of all, in their order.
 
         Parameters
         ----------
         tasks
-            What to run, by name: functions that can be pickled, such as `functools.partial`
-            of a function of a module, and return what JSON can hold.
+            What to run, by name: functions that return what JSON can hold, such as
+            `functools.partial` of a function of a module. Results are as JSON gives them back.
         folder
             Where results are saved, a file a task. What lies there under a task's name is taken
             for its result: tasks with other arguments or code need a folder of their own. A
             file that is not what was written is no result. None: they are not saved.
         title
             Stands before a progress bar; "" for none.
-
-        Returns
-        -------
-        dict
-            The results in the order of the tasks, as JSON gives them back.
 
         Raises
         ------
@@ -113,9 +106,8 @@ class FanOut:
     def stream(self, tasks: Tasks, title: str = "", done: int = 0) -> Iterator[tuple[str, Any]]:
         """Run tasks, and yield each name and result as they come.
 
-        As `run`, but what tasks return need only be such that it can be pickled, and those that
-        cannot be pickled themselves run in this process, after the others. `done` tasks have
-        been done before.
+        As `run`, but tasks may return whatever can be pickled, and those that cannot be pickled
+        themselves run in this process, after the others. `done` tasks have been done before.
         """
         from tqdm import tqdm
 
@@ -198,7 +190,6 @@ def _travels(task: Callable[[], Any]) -> bool:
 
 
 def _answer(key: str, task: Callable[[], Any], parent: int) -> tuple[str, Any, str]:
-    """Run a task; return its name, its result, and what went wrong, if anything."""
     _end_with(parent)
     return key, *cluster.attempt(task)
 
@@ -207,8 +198,7 @@ def _answer(key: str, task: Callable[[], Any], parent: int) -> tuple[str, Any, s
 def _end_with(parent: int) -> None:
     """See to it that this process ends when its parent does, even if that was killed.
 
-    Otherwise a worker would finish what it is at, and wait for more for some minutes. Windows
-    does not tell that a parent is gone, and workers do so there.
+    A worker would wait for more for some minutes, as it does on Windows, where nobody can tell.
     """
 
     def watch() -> None:

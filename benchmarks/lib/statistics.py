@@ -56,17 +56,12 @@ def student(values: ArrayLike) -> Estimate:
 
 
 def quantile(values: ArrayLike, probability: float) -> Estimate:
-    """Estimate a quantile over runs, shape (runs,).
+    """Estimate a quantile over runs, shape (runs,), none of them NaN.
 
     The interval lies between two of the ordered values (Conover, "Practical Nonparametric
     Statistics", 3rd edition, 1999, section 3.2; see `scipy.stats.quantile_test`). It assumes
     nothing about the distribution, accepts infinite values ("never"), and is infinite where
     there are too few runs to tell.
-
-    Raises
-    ------
-    ValueError
-        If there is no value, or one that is not a number.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     if ordered.ndim != 1 or not len(ordered) or np.isnan(ordered).any():
@@ -86,17 +81,8 @@ def median(values: ArrayLike) -> Estimate:
     return quantile(values, 0.5)
 
 
-def share(flags: ArrayLike) -> Estimate:
-    """Estimate how often something happens, from 0 to 1, with Wilson's interval.
-
-    Raises
-    ------
-    ValueError
-        If there is no run, or a value that is neither true nor false.
-    """
-    happened = np.asarray(flags)
-    if happened.ndim != 1 or not len(happened) or happened.dtype != np.bool_:
-        raise ValueError(f"flags must be booleans, one for each run, got {flags!r}")
+def share(happened: NDArray[np.bool_]) -> Estimate:
+    """Estimate how often something happens, from 0 to 1, with Wilson's interval."""
     count, runs = int(happened.sum()), len(happened)
     interval = scipy.stats.binomtest(count, runs).proportion_ci(CONFIDENCE, method="wilson")
     return Estimate(count / runs, float(interval.low), float(interval.high), runs)
@@ -158,8 +144,7 @@ def improvement(
 ) -> Estimate:
     """Estimate how probable it is that one controller does better than another in the same run.
 
-    Runs in which both do the same count as half. The shapes of `errors` are those of
-    `bootstrap`; `reference` is of the same runs, shape (runs,) or that of `errors`.
+    Runs in which both do the same count as half. Shapes are as of `bootstrap`.
     """
     better = (errors < reference) + 0.5 * (errors == reference)
     return bootstrap(better, seed=seed)

@@ -30,13 +30,7 @@ LONGEST = 1_000_000  # samples; a plant that needs more has no steady state to w
 
 
 def check_linear(parameters: Parameters) -> None:
-    """Refuse a plant that is more than (28) and (29).
-
-    Raises
-    ------
-    ValueError
-        If an argument that is not declared as linear is not at its default; it is named.
-    """
+    """Refuse a plant that is more than (28) and (29) by a ValueError that names why."""
     for name, argument in ARGUMENTS.items():
         value = getattr(parameters, name)
         if not argument.linear and value != argument.default:
@@ -152,21 +146,10 @@ class Coefficients:
 def coefficients(
     parameters: Parameters, numbers: PlantNumbers[Any], k: int | NDArray[np.int64]
 ) -> Coefficients:
-    """Return the coefficients of the step to sample k.
+    """Return the coefficients of the step to sample k; ValueError as `check_linear`.
 
-    Parameters
-    ----------
-    parameters
-        The environment's.
-    numbers
-        The plant numbers of the episode: of one plant, or arrays for many.
-    k
-        One sample, or an array of samples for one plant.
-
-    Raises
-    ------
-    ValueError
-        If the plant is not linear between its limits; see `check_linear`.
+    The plant numbers of an episode are those of one plant, or arrays for many; k is one sample,
+    or for one plant an array of samples.
     """
     check_linear(parameters)
     dynamics = Dynamics(parameters)
@@ -183,10 +166,7 @@ def coefficients(
 def nominal(parameters: Parameters) -> LinearModel:
     """Return the model of a plant: ranges at their middle, drifts at k = 0, nothing added.
 
-    Raises
-    ------
-    ValueError
-        If the plant is not linear between its limits; see `check_linear`.
+    ValueError as `check_linear`.
     """
     middle = {name: sum(parameters.range_of(name)) / 2 for name in PLANT_NUMBERS}
     at_start = coefficients(parameters, PlantNumbers(**middle), 0)
@@ -222,8 +202,8 @@ class Course(Coefficients):
 
     def first(self, samples: int) -> Course:
         """Return the same for the first samples."""
-        rows = {name: getattr(self, name)[:samples] for name in ("alpha", "beta", "load")}
-        return replace(self, **rows)
+        cut = slice(samples)
+        return replace(self, alpha=self.alpha[cut], beta=self.beta[cut], load=self.load[cut])
 
     def flow_response(self) -> Array:
         """Return G, shape (samples, samples): what 1 t/h at j adds to y(k) is G[k, j]."""
@@ -239,13 +219,7 @@ class Course(Coefficients):
 
 
 def course(parameters: Parameters, numbers: PlantNumbers[float], samples: int) -> Course:
-    """Return the course of an episode, given its plant numbers, for so many samples.
-
-    Raises
-    ------
-    ValueError
-        If the plant is not linear between its limits; see `check_linear`.
-    """
+    """Return the course of an episode with these numbers; ValueError as `check_linear`."""
     flows = [numbers.u_min, numbers.u_max]
     if numbers.dead_zone > 0.0:
         flows.append(0.0)

@@ -31,26 +31,21 @@ METRICS: dict[str, str] = {
 
 
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
-    """Compute every measure of `METRICS` for every run.
+    """Compute every measure of `METRICS` for every run, each of shape (runs,).
 
-    Returns
-    -------
-    dict of ndarray, shape (runs,)
-        In degC, t/h and minutes, and shares in percent:
+    - `mae`: mean of |e(k)| over k = 1 to N, as the rewards have it;
+    - `ise`: integral of e^2, likewise;
+    - `itae`: integral of t |e|, t counted from the latest set-point change;
+    - `total_variation`: of the applied input; see `travel`;
+    - `overshoot`: how far the output goes beyond the new set point, as a percentage of the
+      set-point change; the largest of all changes;
+    - `settling_time`: from a set-point change until the error stays within `SETTLING_BAND` of
+      the change; the longest of all changes, infinite if one of them is not settled when the
+      next comes or the run ends;
+    - `dead_zone_share`: samples whose command lies inside the dead zone;
+    - `saturation_share`: samples whose command lies at or beyond a limit.
 
-        - `mae`: mean of |e(k)| over k = 1 to N, as the rewards have it;
-        - `ise`: integral of e^2, likewise;
-        - `itae`: integral of t |e|, t counted from the latest set-point change;
-        - `total_variation`: of the applied input; see `travel`;
-        - `overshoot`: how far the output goes beyond the new set point, as a percentage of the
-          set-point change; the largest of all changes;
-        - `settling_time`: from a set-point change until the error stays within
-          `SETTLING_BAND` of the change; the longest of all changes, infinite if one of them is
-          not settled when the next comes or the run ends;
-        - `dead_zone_share`: samples whose command lies inside the dead zone;
-        - `saturation_share`: samples whose command lies at or beyond a limit.
-
-        The last two are NaN where the actuator's numbers are drawn from ranges.
+    The last two are NaN where the actuator's numbers are drawn from ranges.
     """
     interval = parameters.sampling_interval / 60.0  # min
     command = trajectory.command
@@ -110,24 +105,20 @@ def steady_stretches(setpoint: Array) -> NDArray[np.bool_]:
 
 def mean_error(trajectory: Trajectory) -> Array:
     """Return the mean of |e(k)| over k = 1 to N of each run, degC, shape (runs,)."""
-    error: Array = np.abs(trajectory.error).mean(axis=0)
-    return error
+    return np.asarray(np.abs(trajectory.error).mean(axis=0))
 
 
 def travel(trajectory: Trajectory) -> Array:
     """Return how far the valve moves in each run, from rest at 0, t/h, shape (runs,)."""
     moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
-    distance: Array = np.abs(moves).sum(axis=0)
-    return distance
+    return np.asarray(np.abs(moves).sum(axis=0))
 
 
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
     """Return for each run whether its last `LAST` errors are within `SETTLING_BAND`."""
     setpoint, output = trajectory.setpoint[-LAST:], trajectory.output[-LAST:]
-    within: NDArray[np.bool_] = np.all(
-        np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint), axis=0
-    )
-    return within
+    within = np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint)
+    return np.asarray(within.all(axis=0))
 
 
 def split(trajectory: Trajectory, sample: int) -> tuple[Trajectory, Trajectory]:
@@ -145,9 +136,8 @@ def join(trajectories: Sequence[Trajectory]) -> Trajectory:
 def reversals(applied: Array, sampling_interval: float) -> Array:
     """Return how often a minute the valve turns round, shape (runs,).
 
-    A reversal is a move against the direction of the last move before it, however long the
-    valve stood still in between. A run begins with the valve at rest at 0. `applied` is u_a(k),
-    t/h, shape (samples, runs), such as `Trajectory.applied`; the sampling interval is in s.
+    It turns where it moves against the direction of its last move, however long it stood still
+    in between. `applied` is u_a(k), t/h, shape (samples, runs); the sampling interval is in s.
     """
     moves = np.sign(np.diff(applied, axis=0, prepend=0.0))
     counts = [np.count_nonzero(np.diff(run[run != 0.0])) for run in moves.T]

@@ -26,7 +26,7 @@ class ChosenPlant:
 @options
 @dataclass(frozen=True, kw_only=True)
 class PlantOptions:
-    """Which plant to run on."""
+    """Which plant to run on: one of a file, a preset, or single arguments."""
 
     plant: Path | None = None
     """JSON file with arguments of the environment, such as the plant.json that
@@ -39,13 +39,7 @@ class PlantOptions:
     overrides those of --plant, and these override --preset)."""
 
     def chosen(self) -> ChosenPlant:
-        """Return the plant that is asked for.
-
-        Raises
-        ------
-        UsageError
-            If the file, an argument or a value does not fit.
-        """
+        """Return the plant that is asked for; `UsageError` if something does not fit."""
         names: list[str] = []
         arguments: dict[str, Any] = {}
         if self.preset:
@@ -67,13 +61,13 @@ class PlantOptions:
         given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
         try:
             parameters = Parameters.of_environment(arguments)
+            if abs(slowest_pole(parameters.a) or 0.0) > 1.0:
+                raise ValueError(
+                    "a must not have a root beyond the unit circle, as nothing holds such a "
+                    f"plant, got {list(parameters.a)}"
+                )
         except (TypeError, ValueError) as error:
             raise UsageError(f"{', '.join(given)}: {error}") from error
-        if abs(slowest_pole(parameters.a) or 0.0) > 1.0:
-            raise UsageError(
-                f"{', '.join(given)}: a must not have a root beyond the unit circle, as "
-                f"nothing holds such a plant, got {list(parameters.a)}"
-            )
         return ChosenPlant(", ".join(names) or "the paper's plant", arguments)
 
 

@@ -76,12 +76,10 @@ def rollout(
 
     Parameters
     ----------
-    plants
-        The batch.
-    agent
-        The controller of the batch; it is reset first.
+    plants, agent
+        The batch, and its controller, which is reset first.
     samples
-        Number of samples, k = 0 to samples - 1. Not more than an episode lasts.
+        k = 0 to samples - 1. Not more than an episode lasts.
     seed
         Run i meets the noise and the set point of seed `seed + i`.
     before
