@@ -9,13 +9,13 @@ from scipy import stats
 from benchmarks.lib import statistics
 from benchmarks.lib.statistics import (
     bootstrap,
-    exact,
     improvement,
     interquartile_mean,
     median,
     quantile,
     share,
 )
+from tests.conftest import assert_the_seed_is_all_that_differs
 
 
 def test_median_by_hand():
@@ -60,10 +60,6 @@ def test_intervals_hold_the_truth_as_often_as_they_promise(how, rng):
     assert 0.92 <= held / trials <= 0.99  # 95 %, and a little more as counts are whole
 
 
-def test_exact_has_no_width():
-    assert vars(exact(3)) == {"value": 3.0, "low": 3.0, "high": 3.0, "runs": 1}
-
-
 @pytest.mark.parametrize(
     ("how", "values", "complaint"),
     [
@@ -92,13 +88,7 @@ class TestBootstrap:
 
     def test_the_seed_is_all_that_it_depends_on(self, rng):
         values = rng.normal(size=50)
-        np.random.seed(5)  # noqa: NPY002
-        first = bootstrap(values, seed=1)
-        np.random.seed(6)  # noqa: NPY002
-        state = np.random.get_state()[1].tolist()  # noqa: NPY002
-        assert bootstrap(values, seed=1) == first
-        assert np.random.get_state()[1].tolist() == state  # noqa: NPY002
-        assert bootstrap(values, seed=2).low != first.low
+        assert_the_seed_is_all_that_differs(lambda seed: bootstrap(values, seed=seed).low)
 
     def test_tasks_are_not_drawn(self, rng):
         # How much they differ does not widen the interval.
