@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from mptc_gym import MiddlePointEnv
+from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers import vector as many
 
@@ -57,14 +57,7 @@ def test_a_move_is_a_share_of_half_the_range_within_the_limits(max_move, moves, 
         assert [info[name] for info in infos] == pytest.approx(flows, abs=1e-5)
 
 
-def test_reset_begins_again_with_no_flow():
-    env = make(undo_dead_zone=True)
-    first, second = (infos_of(env, [0.3, 0.7]) for _ in range(2))
-    assert first == second
-    assert first[1]["applied"] > 5.0
-
-
-@pytest.mark.parametrize("dead_zone", [0.1, 2.3, 5.0, 7.0, 9.9, 10.0])
+@pytest.mark.parametrize("dead_zone", [0.1, 5.0, 7.0, 10.0])
 def test_every_flow_passes_the_dead_zone_that_is_undone(dead_zone):
     env = make({"dead_zone": dead_zone}, max_move=2.0, undo_dead_zone=True)
     for wanted in (1e-12, 1e-3, 0.5, 1.0, -1e-12, -0.3, -1.0):
@@ -154,48 +147,32 @@ def test_bad_arguments_are_named(name, value):
 
 
 def test_other_environments_are_refused():
-    with pytest.raises(ValueError, match="env"):
+    with pytest.raises(ValueError, match="env must be a MiddlePointEnv"):
         IncrementalAction(gymnasium.make("CartPole-v1"))
     with pytest.raises(ValueError, match=r"mptc_gym\.wrappers\.vector\.IncrementalAction"):
         IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2))
     with pytest.raises(ValueError, match=r"mptc_gym\.wrappers\.IncrementalAction"):
         many.IncrementalAction(gymnasium.make("MiddlePoint-v0"))
-    for others in (
-        gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="sync"),
-        gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="vector_entry_point"),
-    ):
-        with pytest.raises(ValueError, match="env"):
-            many.IncrementalAction(others)
-
-
-def test_numpy_scalars_are_taken():
-    for wrapped in (
-        make(max_move=np.float32(0.5), undo_dead_zone=np.float32(2.0)),
-        many.IncrementalAction(
-            gymnasium.make_vec("MiddlePoint-v0", 2), max_move=np.float32(0.5)
-        ),
-    ):
-        wrapped.reset(seed=0)
-        wrapped.step(np.ones(wrapped.action_space.shape, np.float32))
+    others = [
+        gymnasium.make_vec("CartPole-v1", 2, vectorization_mode=mode)
+        for mode in ("sync", "vector_entry_point")
+    ]
+    torch_env = pytest.importorskip("mptc_gym.torch_env", reason="it is refused")
+    for env in (*others, torch_env.MiddlePointTorchEnv(2)):
+        with pytest.raises(ValueError, match="of MiddlePointEnv in NumPy"):
+            many.IncrementalAction(env)
 
 
 def test_tensors_are_actions_but_those_with_a_graph_are_refused_for_many():
     torch = pytest.importorskip("torch", reason="the action is a tensor")
-    env, envs = make(), many.IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2))
+    env = make(max_move=np.float32(0.5))
+    envs = many.IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2))
     env.reset(seed=0), envs.reset(seed=0)
-    assert env.step(torch.ones(1, requires_grad=True))[4]["command"] == pytest.approx(4.0)
+    assert env.step(torch.ones(1, requires_grad=True))[4]["command"] == pytest.approx(5.0)
     assert envs.step(torch.ones(2, 1))[4]["command"] == pytest.approx([4.0, 4.0])
     for each in (envs, envs.unwrapped):
         with pytest.raises(ValueError, match="actions must be numbers"):
             each.step(torch.ones(2, 1, requires_grad=True))
-    with pytest.raises(ValueError, match="options must be a dict or None"):
-        envs.reset(options=[True, False])
-
-
-def test_many_plants_in_pytorch_are_refused():
-    torch_env = pytest.importorskip("mptc_gym.torch_env", reason="it is what is refused")
-    with pytest.raises(ValueError, match="in NumPy"):
-        many.IncrementalAction(torch_env.MiddlePointTorchEnv(2))
 
 
 def test_the_spec_makes_it_again():
@@ -219,13 +196,10 @@ def test_both_checkers_have_no_complaint():
         checker.check_env(env)
 
 
-def test_reset_comes_first():
+@pytest.mark.parametrize("env", [make(), many.IncrementalAction(MiddlePointVectorEnv(2))])
+def test_reset_comes_first(env):
     with pytest.raises(ResetNeeded):
-        make().step(np.zeros(1, np.float32))
-    with pytest.raises(ResetNeeded):
-        many.IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2)).step(
-            np.zeros((2, 1), np.float32)
-        )
+        env.step(np.zeros(env.action_space.shape, np.float32))
 
 
 def batches(mode, *, undo):

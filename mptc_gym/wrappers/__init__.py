@@ -93,13 +93,13 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
             reject("env", env, allowed)
         RecordConstructorArgs.__init__(self, max_move=max_move, undo_dead_zone=undo_dead_zone)
         gymnasium.ActionWrapper.__init__(self, env)
-        check_arguments(max_move, undo_dead_zone)
         parameters = getattr(env.unwrapped, "parameters", None)
         if not isinstance(parameters, Parameters):
             reject("env", env, "a MiddlePointEnv, in wrappers or not")
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self._arguments = max_move, undo_dead_zone
         self._numbers = {name: parameters.range_of(name)[0] for name in NUMBERS}
+        self._actuator = Actuator(self._numbers, *self._arguments)
         self._flow: float | None = None
 
     def reset(
@@ -129,11 +129,18 @@ class Actuator:
     """What the wrappers know of an actuator, and how they make it apply a flow.
 
     `numbers` are its `dead_zone`, `u_min` and `u_max`, t/h: floats, or arrays for many plants.
+    The other arguments are those of the wrappers; ValueError if one is out of range.
     """
 
     def __init__(
         self, numbers: Mapping[str, Any], max_move: float, undo_dead_zone: bool | float
     ) -> None:
+        if not is_number(max_move) or not 0.0 < max_move <= 2.0:
+            reject("max_move", max_move, "a number above 0, up to 2")
+        if not isinstance(undo_dead_zone, bool) and not (
+            is_number(undo_dead_zone) and undo_dead_zone >= 0.0
+        ):
+            reject("undo_dead_zone", undo_dead_zone, "True, False or a number from 0 to 1e9")
         own, self.u_min, self.u_max = (numbers[name] for name in NUMBERS)
         half_range = (self.u_max - self.u_min) / 2.0
         self.move = max_move * half_range  # of the wanted flow by an action of 1, t/h
@@ -159,13 +166,3 @@ class Actuator:
             self._zone - self._below * flow
         )
         return float32_action(flow, self.u_min, self.u_max, self._zone)
-
-
-def check_arguments(max_move: Any, undo_dead_zone: Any) -> None:
-    """Refuse arguments of the wrappers that are out of range, with a ValueError."""
-    if not is_number(max_move) or not 0.0 < max_move <= 2.0:
-        reject("max_move", max_move, "a number above 0, up to 2")
-    if not isinstance(undo_dead_zone, bool) and not (
-        is_number(undo_dead_zone) and undo_dead_zone >= 0.0
-    ):
-        reject("undo_dead_zone", undo_dead_zone, "True, False or a number from 0 to 1e9")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mptc_gym.checks import many_actions, reject
 from mptc_gym.parameters import Parameters
 from mptc_gym.vector_env import MiddlePointVectorEnv
-from mptc_gym.wrappers import NUMBERS, Actuator, check_arguments
+from mptc_gym.wrappers import NUMBERS, Actuator
 
 __all__ = ["IncrementalAction"]
 
@@ -53,7 +53,6 @@ class IncrementalAction(VectorActionWrapper):
             allowed = "a vector environment; mptc_gym.wrappers.IncrementalAction takes one"
             reject("env", env, allowed)
         super().__init__(env)
-        check_arguments(max_move, undo_dead_zone)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._arguments = max_move, undo_dead_zone
@@ -61,6 +60,7 @@ class IncrementalAction(VectorActionWrapper):
         self._numbers = {
             name: np.array([plant.range_of(name)[0] for plant in plants]) for name in NUMBERS
         }
+        self._actuator = Actuator(self._numbers, *self._arguments)
         self._mode = AutoresetMode(env.metadata["autoreset_mode"])
         self._flows: NDArray[np.float64] | None = None
         self._ended = np.zeros(self.num_envs, np.bool_)  # and will be reset by the next step
