@@ -284,9 +284,9 @@ def _parameters(single: Env) -> Parameters:
 def native_batch(single: Env) -> Batch | None:
     """Return how to make many of an environment that step at once.
 
-    It is called with their number, and with an `autoreset_mode` if need be. It is None if there
-    is no such batch: for another environment, one without a spec, and in other wrappers than
-    `IncrementalAction`.
+    It is called with their number, and with an `autoreset_mode` and a `render_mode` if need be.
+    It is None if there is no such batch: for another environment, one without a spec, and in
+    other wrappers than `IncrementalAction`.
     """
     inner, spec = single.unwrapped, single.spec
     if type(inner) is not MiddlePointEnv or spec is None:
@@ -300,7 +300,7 @@ def native_batch(single: Env) -> Batch | None:
             return plants
         case (only,) if only.entry_point == _INCREMENTAL:
             moves = only.kwargs or {}
-            return lambda n, **mode: VectorIncrementalAction(plants(n, **mode), **moves)
+            return lambda n, **modes: VectorIncrementalAction(plants(n, **modes), **moves)
     return None
 
 

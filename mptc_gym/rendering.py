@@ -47,10 +47,10 @@ def render(mode: str | None, record: Record | None, fps: float) -> Frame | str |
         raise ResetNeeded("call reset before render")
     if mode == "ansi":
         return text(record)
-    if mode == "human":
-        _drawing().show(record, fps)
-        return None
-    return frame(record)
+    if mode == "rgb_array":
+        return frame(record)
+    _drawing().show(record, fps)
+    return None
 
 
 def frame(record: Record) -> Frame:

@@ -72,7 +72,7 @@ def make_vec_env(
     wrapper
         Asks for `IncrementalAction`: its arguments, or the class for its defaults.
     **arguments
-        More arguments for the id, as of `gymnasium.make`.
+        More arguments for the id, as of `gymnasium.make`; `render_mode` may be "rgb_array".
 
     Raises
     ------
@@ -82,6 +82,7 @@ def make_vec_env(
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     arguments = {name: plain(value) for name, value in arguments.items()}
+    render_mode = arguments.pop("render_mode", None)  # no part of how a policy is trained
     single = make_one(env, arguments)
     if getattr(wrapper, "func", wrapper) is VectorIncrementalAction:
         wrapper = getattr(wrapper, "keywords", {})
@@ -95,7 +96,8 @@ def make_vec_env(
     if batch is None:
         raise ValueError(f"wrapper must be IncrementalAction, got {single}")
     single.close()
-    many = batch(n_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+    mode = AutoresetMode.SAME_STEP
+    many = batch(n_envs, autoreset_mode=mode, render_mode=render_mode)
     plants = GymnasiumVecEnv(many, spec=single.spec)
     plants.seed(seed)
     return plants

@@ -1,6 +1,8 @@
 """Tests of `mptc_gym.evaluate`, of the bounds that come with it, and of the presets' ids."""
 
 import json
+from functools import partial
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -8,15 +10,14 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 
-import mptc_gym
 from agents import DirectNNController, PIController, PolicyNetwork
 from agents.archive import PRETRAINED
 from benchmarks.limits import least_possible
 from benchmarks.limits.command import PACKAGED as CASES
-from mptc_gym import IDS, PRESETS, MiddlePointEnv, evaluate
+from mptc_gym import IDS, PRESETS, MiddlePointEnv, Parameters, evaluate
 from mptc_gym.evaluation import SEED, least_errors
 from mptc_gym.wrappers import IncrementalAction
-from tests.conftest import python, run_closed
+from tests.conftest import ROOT, python, run_closed
 
 HARD = "MiddlePointHard-v0"
 
@@ -83,38 +84,25 @@ class TestEvaluate:
         assert np.ptp(alike.interval) == pytest.approx(0.0, abs=1e-12)
 
     def test_one_policy_in_three_forms(self):
-        class Acts:
-            act = staticmethod(proportional)
-
-        class Predicts:
-            def predict(self, observation, state=None, episode_start=None, deterministic=False):
-                assert deterministic
-                return proportional(observation), state
-
-        class Plainly:
-            def predict(self, observation):
-                return proportional(observation)
+        def predict(observation, state=None, episode_start=None, deterministic=False):
+            assert deterministic
+            return proportional(observation), state
 
         expected = evaluate(proportional, HARD, episodes=5)
-        for policy in (Acts(), Predicts(), Plainly()):
-            np.testing.assert_array_equal(
-                evaluate(policy, HARD, episodes=5).errors, expected.errors
-            )
+        for policy in ({"act": proportional}, {"predict": predict}, {"predict": proportional}):
+            found = evaluate(SimpleNamespace(**policy), HARD, episodes=5)
+            np.testing.assert_array_equal(found.errors, expected.errors)
 
     def test_what_a_policy_remembers_begins_anew_with_each_batch(self):
         begun = []
 
-        class Recurrent:
-            def predict(self, observation, state=None, episode_start=None, **_):
-                if state is None:
-                    begun.append(len(observation))
-                    assert episode_start.all()
-                    state = 0
-                else:
-                    assert not episode_start.any()
-                return idle(observation), state + 1
+        def predict(observation, state=None, episode_start=None, **_):
+            assert (episode_start == (state is None)).all()
+            if state is None:
+                begun.append(len(observation))
+            return idle(observation), (state or 0) + 1
 
-        evaluate(Recurrent(), episodes=130, max_episode_steps=4)
+        evaluate(SimpleNamespace(predict=predict), episodes=130, max_episode_steps=4)
         assert begun == [100, 30]
         learning = DirectNNController(num_envs=3, seed=0)
         first, again = (evaluate(learning, episodes=3) for _ in range(2))
@@ -124,14 +112,12 @@ class TestEvaluate:
         by_spec = evaluate(proportional, wrapped().spec, episodes=4)
         by_function = evaluate(proportional, wrapped, episodes=4)
         # Without a spec, environments are stepped one by one.
+        made = partial(MiddlePointEnv, **PRESETS["hard"], action_window=20)
         one_by_one = evaluate(
             proportional,
-            lambda: IncrementalAction(
-                MiddlePointEnv(**PRESETS["hard"], action_window=20),
-                max_move=0.2, undo_dead_zone=True,
-            ),
+            lambda: IncrementalAction(made(), max_move=0.2, undo_dead_zone=True),
             episodes=4,
-        )  # fmt: skip
+        )
         assert by_spec.least_possible is not None
         for other in (by_function, one_by_one):
             np.testing.assert_allclose(other.errors, by_spec.errors, atol=1e-12)
@@ -229,15 +215,12 @@ class TestRefusals:
             evaluate(idle, **arguments)
 
     def test_observations_that_do_not_fit(self):
-        class Trained:
-            observation_space = Box(-1.0, 1.0, (26,))
-            predict = staticmethod(idle)
-
+        trained = SimpleNamespace(observation_space=Box(-1.0, 1.0, (26,)), predict=idle)
         with pytest.raises(ValueError, match=r"shape \(26,\), as policy reads them, got \(6"):
-            evaluate(Trained())
+            evaluate(trained)
         with pytest.warns(UserWarning, match="does not say how it was trained"):
-            evaluate(Trained(), action_window=20, episodes=2)
-        evaluate(Trained(), wrapped().spec, episodes=2)  # who gives wrappers has thought of it
+            evaluate(trained, action_window=20, episodes=2)
+        evaluate(trained, wrapped().spec, episodes=2)  # who gives wrappers has thought of it
         network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
         with pytest.raises(ValueError, match=r"the windows that policy wants, .*=\d+, got"):
             evaluate(network)
@@ -257,7 +240,7 @@ class TestRefusals:
 class TestBounds:
     @pytest.mark.parametrize("name", CASES)
     def test_they_are_those_of_the_limits(self, name):
-        plant = mptc_gym.Parameters(**CASES[name])
+        plant = Parameters(**CASES[name])
         kept = least_errors(plant, 1200, range(SEED, SEED + 120))
         drawn = bool(plant.ranges) or plant.setpoint == "random"
         assert len(set(kept.tolist())) == (120 if drawn else 1)
@@ -268,13 +251,10 @@ class TestBounds:
             assert kept[i] == pytest.approx(least.value, abs=2e-6)
 
     def test_they_say_how_they_were_made(self):
-        path = mptc_gym.__path__[0] + "/bounds.json"
-        with open(path, encoding="utf-8") as file:  # noqa: PTH123
-            kept = json.load(file)
+        kept = json.loads((ROOT / "mptc_gym/bounds.json").read_text(encoding="utf-8"))
         assert {name: case["arguments"] for name, case in kept["cases"].items()} == CASES
         assert (kept["samples"], kept["seed"], kept["episodes"]) == (1200, SEED, 120)
-        assert kept["command"] == "python -m benchmarks.limits --package"
-        assert set(kept) >= {"commit", "code", "versions", "unit"}
+        assert set(kept) >= {"command", "commit", "code", "versions", "unit"}
 
     def test_what_an_agent_sees_and_is_paid_changes_no_bound(self):
         seen = evaluate(idle, episodes=2, action_window=9, reward="absolute", move_weight=0.1)

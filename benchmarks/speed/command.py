@@ -131,10 +131,9 @@ def compare(cases: list[Case], rounds: int) -> pd.DataFrame:
 def memory() -> pd.DataFrame:
     """Measure the memory of a plant, in a batch and alone."""
     rows = []
-    for name, given in {"R = 0": {}, "R = 0.5, random set point": NOISE}.items():
+    random = {**NOISE, "setpoint": "random"}
+    for name, given in {"R = 0": {}, "R = 0.5, random set point": random}.items():
         arguments = {**given, "action_window": 20}
-        if given:
-            arguments["setpoint"] = "random"
         batch = MiddlePointVectorEnv(MEMORY_PLANTS, max_episode_steps=EPISODE, **arguments)
         sizes = _memory(batch) / MEMORY_PLANTS, _memory(MiddlePointEnv(**arguments))
         rows.append([name, *(f"{size / 1024:.1f} KiB" for size in sizes)])
