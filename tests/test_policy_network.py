@@ -118,12 +118,9 @@ class TestFile:
         ("change", "message"),
         [
             ({"format": 99}, "format is 99"),
-            ({"activation": "swish"}, "activation"),
             ({"layers": 2}, r"weights of layers\[1\]"),
-            ({"observation": {"flow_window": 3}}, "flow_window"),
             ({"increments": {"step": 1}}, "step"),
             ({"observation": 3}, "damaged"),
-            ({}, r"weights of layers\[1\] must be finite"),
         ],
     )
     def test_what_does_not_fit_is_named(self, tmp_path, change, message):
@@ -131,10 +128,7 @@ class TestFile:
         policy().save(path)
         with np.load(path) as file:
             arrays = dict(file)
-        about = json.loads(str(arrays["about"])) | change
-        arrays["about"] = np.array(json.dumps(about))
-        if not change:
-            arrays["W1"][2, 3] = np.nan
+        arrays["about"] = json.dumps(json.loads(str(arrays["about"])) | change)
         np.savez(path, **arrays)
         with pytest.raises(ValueError, match=message):
             PolicyNetwork.load(path)
@@ -166,7 +160,7 @@ def test_layers_that_do_not_fit_are_named():
         ([], "layers must hold at least one"),
         (layers(4, 3, 1), r"weights of layers\[0\] must have shape \(3, 5\)"),
         (layers(5, 3, 2), r"weights of layers\[1\] must have shape \(1, 3\)"),
-        ([(np.zeros((3, 5)), np.zeros(2))], r"weights of layers\[0\]"),
+        ([(np.full((1, 5), np.nan), np.zeros(1))], r"weights of layers\[0\] must be finite"),
     ):
         with pytest.raises(ValueError, match=message):
             PolicyNetwork(bad, **given)

@@ -53,15 +53,6 @@ class TestPPO:
         assert provenance["arguments"]["n_envs"] == SMALL.n_envs
         assert {"python", "torch", "stable_baselines3"} <= set(provenance["versions"])
 
-    def test_an_interrupted_training_leaves_nothing(self, tmp_path, monkeypatch):
-        def interrupt(keeper):
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(ppo_training.Keeper, "_on_step", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            train(tmp_path)
-        assert not list(tmp_path.rglob("*.npz"))
-
     def test_starts_differ_in_all_that_is_random(self):
         first, second = (ppo_training.begin(SMALL, start=start) for start in (0, 1))
         assert not torch.equal(parameters_of(first), parameters_of(second))

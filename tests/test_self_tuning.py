@@ -181,25 +181,3 @@ def test_no_offset_remains_under_a_steady_load():
         disturbance_amplitude=2.0, disturbance_interval=1e6, delay=12,
     )  # fmt: skip
     assert mean_error(trajectory, 1300) < 0.05
-
-
-def test_a_batch_is_its_members_to_the_bit(rng):
-    plants = make_plants(4, 400, noise_variance=0.2, delay=[6, 36], dead_zone=[0, 8])
-    batch = SelfTuningController(**STEP_TEST)
-    singles = [SelfTuningController(**STEP_TEST) for _ in range(4)]
-    observation, _ = plants.reset(seed=5_900_100)
-    for _ in range(399):
-        actions = batch.act(observation)
-        alone = [single.act(own) for single, own in zip(singles, observation, strict=True)]
-        np.testing.assert_array_equal(actions, alone)
-        observation, *_ = plants.step(actions)
-    for i, single in enumerate(singles):
-        for name, values in single.estimates.items():
-            np.testing.assert_array_equal(values, batch.estimates[name][i : i + 1])
-
-
-def test_reset_forgets_what_was_learnt():
-    controller = SelfTuningController(**STEP_TEST)
-    control(controller, samples=300, delay=30)
-    controller.reset()
-    assert controller.estimates == {}
