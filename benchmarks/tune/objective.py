@@ -7,44 +7,38 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.controllers.records import Factory, Tuning
+from benchmarks.controllers.records import Factory
 from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import Scenario
+
+
+def _square(
+    name: str, more: str, samples: int, amplitude: float, period: int, **plant: float
+) -> Scenario:
+    arguments = {"setpoint_amplitude": amplitude, "setpoint_period": period, **plant}
+    return Scenario(name, f"square wave{more}", samples, arguments)
+
 
 # Neighbours of the paper's cases, each with its first sample that counts: three that begin with
 # an untrained controller, and two that show what comes after learning.
 SCENARIOS: tuple[tuple[Scenario, int], ...] = (
     (Scenario("constant", "constant set point", 600, {"setpoint": 4.8}), 0),
-    *(
-        (
-            Scenario(
-                name, f"square wave{more}", samples,
-                {"setpoint_amplitude": amplitude, "setpoint_period": period, **plant},
-            ),
-            first,
-        )
-        for name, more, samples, first, amplitude, period, plant in (
-            ("dead zone", ", dead zone 6.5 t/h", 1280, 0, 5.1, 640, {"dead_zone": 6.5}),
-            ("noise", ", R = 0.4 °C²", 1040, 0, 4.9, 520, {"noise_variance": 0.4}),
-            ("learnt", "", 2240, 1120, 5.2, 560, {}),
-            ("learnt, slow", "", 1920, 1280, 5.4, 640, {}),
-        )
-    ),
-)  # fmt: skip
+    (_square("dead zone", ", dead zone 6.5 t/h", 1280, 5.1, 640, dead_zone=6.5), 0),
+    (_square("noise", ", R = 0.4 °C²", 1040, 4.9, 520, noise_variance=0.4), 0),
+    (_square("learnt", "", 2240, 5.2, 560), 1120),
+    (_square("learnt, slow", "", 1920, 5.4, 640), 1280),
+)
 
 
 def score(
-    factory: Factory,
-    runs: int,
-    first_run: int,
-    penalty: float = Tuning.penalty,
-    plant: Mapping[str, Any] | None = None,
+    factory: Factory, plant: Mapping[str, Any], runs: int, first_run: int, penalty: float
 ) -> dict[str, float]:
     """Judge a controller on the tuning scenarios, each of so many runs.
 
-    `first_run` is the seed of the first; every scenario has seeds of its own. The penalty,
-    degC, is for failing to settle. A plant that is not the paper's is given by its arguments.
+    `plant` has arguments of the environment that are not the paper's. `first_run` is the seed
+    of the first run; every scenario has seeds of its own. The penalty, degC, is for failing to
+    settle.
 
     Returns
     -------
@@ -56,7 +50,7 @@ def score(
     medians: dict[str, float] = {}
     for i, (scenario, first_sample) in enumerate(SCENARIOS):
         seed = first_run + i * 100_000
-        arguments = {**(plant or {}), **scenario.arguments}
+        arguments = {**plant, **scenario.arguments}
         controller = factory(arguments, runs, seed)
         plants = make_plants(runs, scenario.samples, **factory.arguments(arguments))
         trajectory = rollout(plants, controller, scenario.samples, seed)
