@@ -437,80 +437,109 @@ def table(samples=400):
     return pd.DataFrame({"time": times, "flow": log.flow, "temperature": log.temperature})
 
 
+def csv(log=None, **options):
+    return (table() if log is None else log).to_csv(index=False, **options)
+
+
+def dated(form):
+    # Over the end of a month; a month that was taken for the day would go backwards.
+    dates = pd.date_range("2026-01-31T23:50:00", periods=400, freq="8s")
+    return csv(table().assign(time=dates.strftime(form)))
+
+
+def in_other_units():
+    log = table()
+    return csv(
+        pd.DataFrame(
+            {
+                "Time (min)": log["time"] / 60.0,
+                "Flow [kg/s]": log["flow"] / 3.6,
+                "temperature": log["temperature"] * 1.8 + 32.0,
+            }
+        )
+    )
+
+
+def with_line(line):
+    """Return a log whose line 4 is this one."""
+    good = [f"{8 * k},1.0,1.0" for k in range(50)]
+    return "\n".join(["time,flow,temperature", *good[:2], line, *good[3:]])
+
+
+# Text and options of the same log.
+WAYS = {
+    "commas": (csv(), {}),
+    "semicolons": (csv(sep=";"), {}),
+    "tabs": (csv(sep="\t"), {}),
+    "semicolons, decimal commas": (csv(sep=";", decimal=","), {}),
+    "tabs, decimal commas": (csv(sep="\t", decimal=","), {}),
+    "quoted decimal commas": (
+        csv(table().map(lambda value: f"{value!r}".replace(".", ",")), quoting=2), {},
+    ),
+    "commas at the ends": (csv(lineterminator=",\n").replace(",\n", "\n", 1), {}),
+    "ISO dates": (dated("%Y-%m-%dT%H:%M:%S"), {}),
+    "dates with points": (dated("%d.%m.%Y %H:%M:%S"), {}),
+    "other units": (in_other_units(), {"temperature_unit": "degF"}),
+    "no times": (csv(table().drop(columns="time")), {"sampling_interval": 8.0}),
+}  # fmt: skip
+# Text and options of what is no log, by what is said.
+FAULTS = {
+    "is empty": ("", {}),
+    "is not a table: No columns": ("\n", {}),
+    "too short: 0 rows": ("time,flow,temperature\n", {}),
+    "too short: 0 rows, and hundreds": ("flow,temperature\n", {"sampling_interval": 8.0}),
+    "longer than the heading": (csv(lineterminator=",0\n").replace(",0", "", 1), {}),
+    "Expected 3 fields in line 4, saw 5. With decimal": (with_line("16,1,0,1,5"), {}),
+    "line 4: flow must be a number, got 'broken'": (with_line("16,broken,1.0"), {}),
+    "line 4: temperature must be a number, got 'inf'": (with_line("16,1.0,inf"), {}),
+    "line 4: temperature must be a number, got '4e.300'": (with_line("16,1.0,4e300"), {}),
+    "line 4: temperature must be a number, got '1.2.3'": (with_line("16,1.0,1.2.3"), {}),
+    "line 4: temperature must be a number, got 'broken'": (
+        with_line("16,1.0,broken").replace(",", ";").replace(".", ","), {},
+    ),
+    "line 4: time must be a number, or a date .*, got 'soon'": (with_line("soon,1.0,1.0"), {}),
+    "line 4: time must be a number, or a date .*, got 'nan'": (with_line(",1.0,1.0"), {}),
+    "line 4: the time must increase, .* from 8 s by -4 s": (with_line("4,1.0,1.0"), {}),
+    "line 4: the time must increase, .* from 8 s by 0 s": (with_line("8,1.0,1.0"), {}),
+    "line 4: .* unequal, 11 s here where most are 8 s": (with_line("19,1.0,1.0"), {}),
+    "unit of 'flow' must be one of .* got 'gpm'": (csv(), {"flow_unit": "gpm"}),
+    "unit of .* got 'furlongs'": (csv().replace("flow", "flow (furlongs)"), {}),
+    "no column 'flow'; it has 'time', 'flown', 'temp": (csv().replace("flow", "flown"), {}),
+    "no column 'time'.* or give --sampling-interval": (csv().replace("time", "t"), {}),
+    "one thing only": (csv(), {"temperature": "flow"}),
+    "sampling_interval must be above 0": (csv(), {"sampling_interval": 0.0}),
+    "rows have no flow: too many": (csv(table().assign(flow=np.r_[[np.nan] * 250, :150])), {}),
+}  # fmt: skip
+
+
 @pytest.fixture
 def written(tmp_path):
     """Return a function that writes a log as a file, and its path."""
 
-    def write(text=None, name="log.csv", **columns):
-        path = tmp_path / name
-        if text is None:
-            text = table().assign(**columns).to_csv(index=False)
-        path.write_text(text, encoding="utf-8")
-        return path
+    def write(text):
+        (tmp_path / "log.csv").write_text(text, encoding="utf-8")
+        return tmp_path / "log.csv"
 
     return write
 
 
 class TestLog:
-    def same(self, first, second):
-        np.testing.assert_allclose(first.flow, second.flow, rtol=1e-9)
-        np.testing.assert_allclose(first.temperature, second.temperature, rtol=1e-9)
-        assert first.sampling_interval == second.sampling_interval
-
-    @pytest.mark.parametrize(
-        "options",
-        [
-            {"sep": ","},
-            {"sep": ";"},
-            {"sep": "\t"},
-            {"sep": ";", "decimal": ","},
-            {"sep": "\t", "decimal": ","},
-            {"sep": ",", "decimal": ",", "quoting": 2},
-        ],
-    )
-    def test_separators_and_decimal_marks(self, written, options):
-        shown = table()
-        if options.get("quoting"):
-            shown = shown.map(lambda value: f"{value!r}".replace(".", ","))
-        log = read_log(written(shown.to_csv(index=False, **options)))
-        self.same(log, recorded(400))
-        assert log.notes == []
-
-    @pytest.mark.parametrize("form", ["%Y-%m-%dT%H:%M:%S", "%d.%m.%Y %H:%M:%S"])
-    def test_dates(self, written, form):
-        # Over the end of a month; a month that was taken for the day would go backwards.
-        dates = pd.date_range("2026-01-31T23:50:00", periods=400, freq="8s").strftime(form)
-        self.same(read_log(written(time=dates)), recorded(400))
-
-    def test_sampling_interval_in_place_of_times(self, written):
-        path = written(table().drop(columns="time").to_csv(index=False))
-        self.same(read_log(path, Columns(sampling_interval=8.0)), recorded(400))
-        with pytest.raises(ValueError, match=r"no column 'time'.* or give --sampling-interval"):
-            read_log(path)
-
-    def test_units_of_headings_and_options(self, written):
-        plain = table()
-        other = pd.DataFrame(
-            {
-                "Time (min)": plain["time"] / 60.0,
-                "Flow [kg/s]": plain["flow"] / 3.6,
-                "temperature": plain["temperature"] * 1.8 + 32.0,
-            }
-        )
-        path = written(other.to_csv(index=False))
-        log = read_log(path, Columns(temperature_unit="degF"))
-        np.testing.assert_allclose(log.flow, plain["flow"])
-        np.testing.assert_allclose(log.temperature, plain["temperature"], atol=1e-9)
-        assert log.sampling_interval == pytest.approx(8.0)
+    @pytest.mark.parametrize("way", WAYS)
+    def test_ways_to_write_the_same_log(self, written, way):
+        text, columns = WAYS[way]
+        log, expected = read_log(written(text), Columns(**columns)), recorded(400)
+        np.testing.assert_allclose(log.flow, expected.flow, rtol=1e-9)
+        np.testing.assert_allclose(log.temperature, expected.temperature, 1e-9, 1e-9)
+        assert (log.sampling_interval, log.notes) == (8.0, [])
 
     def test_percent_is_said(self, written):
-        path = written(table().rename(columns={"flow": "flow [%]"}).to_csv(index=False))
+        path = written(csv().replace("flow", "flow [%]"))
         assert read_log(path).notes == ["The flow is in %: read % wherever t/h is said."]
 
     def test_missing_rows_and_numbers_are_gaps(self, written):
         gappy = table().drop(index=[100, 101, 102])
         gappy.loc[50, "temperature"] = np.nan
-        log = read_log(written(gappy.to_csv(index=False)))
+        log = read_log(written(csv(gappy)))
         assert len(log.flow) == 400
         assert np.isnan(log.temperature[[50, 100, 101, 102]]).all()
         assert any("3 rows are missing" in note for note in log.notes)
@@ -521,7 +550,7 @@ class TestLog:
         assert np.isfinite(log.flow[[100, 101, 102]]).all() == held
 
     def test_pieces_make_no_difference(self, written, monkeypatch):
-        path = written(table().drop(index=[70, 100]).to_csv(index=False))
+        path = written(csv(table().drop(index=[70, 100])))
         whole = read_log(path)
         monkeypatch.setattr(log_module, "CHUNK", 10)
         for rows in (20_000, 57):
@@ -529,13 +558,11 @@ class TestLog:
             np.testing.assert_array_equal(log.flow, whole.flow[-rows:])
             np.testing.assert_array_equal(log.temperature, whole.temperature[-rows:])
 
-    def test_long_log_is_read_in_bounded_memory(self, tmp_path, monkeypatch, capsys):
+    def test_long_log_is_read_in_bounded_memory(self, written, monkeypatch, capsys):
         rows = 400_000
         flow = np.repeat(np.arange(rows // 100) % 7, 100)
-        path = tmp_path / "long.csv"
-        pd.DataFrame({"time": 8 * np.arange(rows), "flow": flow, "temperature": flow}).to_csv(
-            path, index=False
-        )
+        long = {"time": 8 * np.arange(rows), "flow": flow, "temperature": flow}
+        path = written(csv(pd.DataFrame(long)))
         monkeypatch.setattr(log_module, "CHUNK", 10_000)
         monkeypatch.setattr(log_module, "PROGRESS_AFTER", 0.0)
         tracemalloc.start()
@@ -547,73 +574,21 @@ class TestLog:
         assert peak < 4e6  # two columns of all rows take 6.4 MB
         assert "400k" in capsys.readouterr().err
 
-    @pytest.mark.parametrize(
-        ("line", "complaint"),
-        [
-            ("16,broken,1.0", "line 4: flow must be a number, got 'broken'"),
-            ("16,1.0,inf", "line 4: temperature must be a number, got 'inf'"),
-            ("16,1.0,4e300", "line 4: temperature must be a number, got '4e.300'"),
-            ("16,1.0,1.2.3", "line 4: temperature must be a number, got '1.2.3'"),
-            ("soon,1.0,1.0", "line 4: time must be a number, or a date"),
-            (",1.0,1.0", "line 4: time must be a number, or a date"),
-            ("4,1.0,1.0", "line 4: the time must increase, and goes from 8 s by -4 s"),
-            ("8,1.0,1.0", "line 4: the time must increase"),
-            ("19,1.0,1.0", "line 4: the time steps are unequal, 11 s here where most are 8 s"),
-            ("16,1,0,1,5", "Expected 3 fields in line 4, saw 5. With decimal commas"),
-        ],
-    )
-    def test_bad_line_is_named(self, written, line, complaint):
-        lines = ["time,flow,temperature", "0,1.0,1.0", "8,1.0,1.0", line]
-        lines += [f"{8 * k},1.0,1.0" for k in range(3, 50)]
+    @pytest.mark.parametrize("complaint", FAULTS)
+    def test_what_cannot_be_read_is_named(self, written, complaint):
+        text, columns = FAULTS[complaint]
         with pytest.raises(ValueError, match=complaint):
-            read_log(written("\n".join(lines)))
+            read_log(written(text), Columns(**columns))
 
-    def test_bad_line_among_decimal_commas_is_named(self, written):
-        rows = "".join(f"{k};1,5;{'1,0' if k != 3 else 'broken'}\n" for k in range(20))
-        with pytest.raises(ValueError, match=r"line 5: temperature .* got 'broken'"):
-            read_log(written(f"time;flow;temperature\n{rows}"))
-
-    @pytest.mark.parametrize(
-        ("heading", "columns", "complaint"),
-        [
-            (None, {"flow_unit": "gpm"}, r"unit of 'flow' must be one of .* got 'gpm'"),
-            ("flow (furlongs)", {}, r"unit of .* got 'furlongs'"),
-            ("flown", {}, "no column 'flow'; it has 'time', 'flown', 'temperature'"),
-            (None, {"temperature": "flow"}, "one thing only"),
-            (None, {"sampling_interval": 0.0}, "sampling_interval must be above 0"),
-        ],
-    )
-    def test_column_that_does_not_fit_is_named(self, written, heading, columns, complaint):
-        renamed = table().rename(columns={"flow": heading or "flow"})
-        with pytest.raises(ValueError, match=complaint):
-            read_log(written(renamed.to_csv(index=False)), Columns(**columns))
-
-    def test_fields_beyond_the_heading(self, written):
-        heading, *lines = table().to_csv(index=False).split()
-        empty, long = (
-            "\n".join([heading, *(line + end for line in lines)]) for end in (",", ",0")
-        )
-        self.same(read_log(written(empty)), recorded(400))
-        with pytest.raises(ValueError, match="lines longer than the heading"):
-            read_log(written(long))
-
-    def test_other_faults_are_named(self, written, tmp_path):
-        with pytest.raises(ValueError, match="is empty"):
-            read_log(written(""))
-        heading = written("time,flow,temperature\n")
-        for columns in (Columns(), Columns(sampling_interval=8.0)):
-            with pytest.raises(ValueError, match="too short: 0 rows"):
-                read_log(heading, columns)
+    def test_file_that_is_not_there_is_named(self, tmp_path):
         with pytest.raises(ValueError, match="cannot be read: No such file"):
             read_log(tmp_path / "none.csv")
-        with pytest.raises(ValueError, match="rows have no flow: too many are missing"):
-            read_log(written(flow=np.where(np.arange(400) < 250, np.nan, np.arange(400))))
 
 
 class TestCommand:
     def test_everything_is_written(self, written, tmp_path, capsys):
         out = tmp_path / "out"
-        path = written(table(1200).to_csv(index=False))
+        path = written(csv(table(1200)))
         assert main([str(path), "--out", str(out), "--longest-delay", "30"]) == 0
         plant = json.loads((out / "plant.json").read_text())
         gymnasium.make("MiddlePoint-v0", **plant).reset(seed=0)
@@ -632,7 +607,7 @@ class TestCommand:
         assert "time constant" in capsys.readouterr().out
 
     def test_reason_is_said(self, written, tmp_path, refused):
-        path = written(flow=np.full(400, 3.0))
+        path = written(csv(table().assign(flow=3.0)))
         said = refused(main, [path, "--out", tmp_path / "out"])
         assert "the flow is constant" in said
         assert not (tmp_path / "out" / "plant.json").exists()
@@ -649,13 +624,6 @@ class TestStudy:
         assert found["gain_true"] == pytest.approx(-0.6825, rel=1e-4)
         assert found["time_constant_true"] == pytest.approx(160.9, rel=1e-3)
         assert found["seconds"] < 10.0
-
-    def test_plants_do_not_drift_and_have_noise(self):
-        plants = study.synthetic_plants(20, 706, 1200)
-        assert not any("gain_drift" in plant for plant in plants)
-        noise = [plant["noise_variance"] for plant in plants]
-        assert 0.02 <= min(noise) < 0.1
-        assert 0.4 < max(noise) <= 0.5
 
     def test_tables_count_by_hand(self):
         columns = [
@@ -679,9 +647,13 @@ class TestStudy:
         assert list(beside["explained, median"]) == ["90.0 %", "50.0 %", "70.0 %"]
 
     @pytest.mark.parametrize("kind", study.KINDS)
-    def test_logs_of_each_kind_are_made_as_they_say(self, kind):
-        plant = study.synthetic_plants(3, 708, 600, kind)[2]
-        log = study.synthetic_log(plant, 600, 709, kind)
+    def test_plants_and_logs_are_made_as_they_say(self, kind):
+        plants = study.synthetic_plants(20, 706, 600, kind)
+        assert not any("gain_drift" in plant for plant in plants)
+        assert all(("a" in plant) == (kind == "second order") for plant in plants)
+        noise = [plant["noise_variance"] for plant in plants]
+        assert 0.02 <= min(noise) < 0.1
+        assert 0.4 < max(noise) <= 0.5
+        log = study.synthetic_log(plants[2], 600, 709, kind)
         still = np.mean(np.diff(log.flow) == 0.0)
         assert still > 0.9 if kind in ("steps", "drift", "second order") else still < 0.5
-        assert ("a" in plant) == (kind == "second order")

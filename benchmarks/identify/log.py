@@ -32,30 +32,15 @@ LEAST_TEMPERATURES = 100
 
 @dataclass(frozen=True)
 class Log:
-    """What was recorded, one row a sample. NaN is what is not known.
+    """What was recorded, one row a sample. NaN is what is not known."""
 
-    Attributes
-    ----------
-    flow
-        From the time of its row on, t/h.
-    temperature
-        At the time of its row, degC.
-    sampling_interval
-        s.
-    notes
-        What the user should know about the log.
-    disturbances
-        Other inputs that were measured, from the times of their rows on, by their columns.
-    flow_error
-        Standard error of the flow, t/h.
-    """
-
-    flow: Array
-    temperature: Array
-    sampling_interval: float
-    notes: list[str] = field(default_factory=list)
+    flow: Array  # from the time of its row on, t/h
+    temperature: Array  # at the time of its row, degC
+    sampling_interval: float  # s
+    notes: list[str] = field(default_factory=list)  # what the user should know about the log
+    # Other inputs that were measured, by their columns, from the times of their rows on.
     disturbances: dict[str, Array] = field(default_factory=dict)
-    flow_error: float = 0.0
+    flow_error: float = 0.0  # standard error of the flow, t/h
 
     def mended(self, note: str, **changes: Any) -> Log:
         """Return the log with something changed, and a note that says what."""
@@ -63,20 +48,10 @@ class Log:
 
 
 def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) -> Log:
-    """Read a log.
+    """Read a table with a heading, of which the latest rows are kept.
 
     The separator (comma, semicolon or tab) and the decimal mark are found out. The file is read
-    in pieces, so that it may be larger than the memory; of a long one, the latest rows are
-    kept, and all are checked.
-
-    Parameters
-    ----------
-    path
-        A table with a heading.
-    columns
-        Where what is.
-    rows
-        How many rows to keep.
+    in pieces, so that it may be larger than the memory, and all rows are checked.
 
     Raises
     ------
