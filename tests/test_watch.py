@@ -81,30 +81,38 @@ def test_where_there_is_no_screen_it_says_so_and_writes_a_film(tmp_path, capsys)
 
 
 @pytest.fixture
-def screen(monkeypatch):
-    """Offer a screen, and count what is drawn on it."""
+def window(monkeypatch):
+    """Return a function that watches on a screen, and returns what was drawn.
+
+    After picture k it does what it is given as {k: function}.
+    """
     monkeypatch.setattr(watch, "_has_screen", lambda: True)
-    drawn = []
-    show = drawing.show
 
-    def counted(record, fps):
-        show(record, fps)
-        drawn.append((record.samples[-1], fps))
+    def watched(*arguments, moves=None, speed=1000):
+        drawn, show = [], drawing.show
 
-    monkeypatch.setattr(drawing, "show", counted)
-    return drawn
+        def shown(record, fps):
+            show(record, fps)
+            drawn.append((record.samples[-1], fps))
+            (moves or {}).get(len(drawn) - 1, lambda: None)()
+
+        monkeypatch.setattr(drawing, "show", shown)
+        assert main([*arguments, "--speed", str(speed)]) == 0
+        assert not pygame.display.get_init()
+        return drawn
+
+    return watched
 
 
-def test_a_window_shows_the_run(screen, tmp_path):
+def test_a_window_shows_the_run(window, tmp_path):
     arguments = ["--agent", "pi", "--scenario", "constant-noise", "--seed", "3"]
-    assert main([*arguments, "--speed", "500"]) == 0
+    screen = window(*arguments, speed=500)
     noise = {"noise_variance": 0.5, "setpoint": 5.0}
     # The first 18 outputs are those of noise alone.
     outputs = run(MiddlePointEnv(**noise), np.zeros(18), seed=3)["output"]
     assert [sample[1] for sample, _ in screen[:19]] == list(outputs)
     assert len(screen) == SAMPLES + 1
     assert [fps for _, fps in screen[1:]] == [500] * SAMPLES
-    assert not pygame.display.get_init()
     assert not list(tmp_path.iterdir())
 
 
@@ -139,27 +147,8 @@ def press(key, unicode=""):
     post(pygame.KEYDOWN, key=key, unicode=unicode, mod=0)
 
 
-@pytest.fixture
-def hands_on(screen, monkeypatch):
-    """Do something at samples, given as {k: function}; k counts the pictures drawn."""
-    show = drawing.show
-
-    def install(moves):
-        def shown(record, fps):
-            show(record, fps)
-            moves.get(len(screen) - 1, lambda: None)()
-
-        monkeypatch.setattr(drawing, "show", shown)
-        return screen
-
-    return install
-
-
-def test_closing_the_window_ends_it(hands_on):
-    screen = hands_on({4: lambda: post(pygame.QUIT)})
-    assert main(["--speed", "500"]) == 0
-    assert len(screen) == 5
-    assert not pygame.display.get_init()
+def test_closing_the_window_ends_it(window):
+    assert len(window(moves={4: lambda: post(pygame.QUIT)})) == 5
 
 
 # A bound takes seconds, and is tested where it is made.
@@ -180,9 +169,10 @@ def window_point(flow):
     return 400, round(421 - flow * 75 / 12.4)
 
 
-def test_your_hands_are_on_the_valve(hands_on, quick_bound, capsys):
-    screen = hands_on(
-        {
+def test_your_hands_are_on_the_valve(window, quick_bound, capsys):
+    screen = window(
+        *("--agent", "you"),
+        moves={
             3: lambda: [press(pygame.K_UP) for _ in range(12)],
             10: lambda: post(pygame.MOUSEBUTTONDOWN, button=1, pos=window_point(-8.0)),
             15: lambda: post(
@@ -191,9 +181,8 @@ def test_your_hands_are_on_the_valve(hands_on, quick_bound, capsys):
             20: lambda: post(pygame.MOUSEBUTTONDOWN, button=1, pos=(400, 100)),  # no flow
             25: lambda: press(pygame.K_HOME),
             30: lambda: press(pygame.K_DOWN),
-        }
+        },
     )
-    assert main(["--agent", "you", "--speed", "1000"]) == 0
     commands = [sample[2] for sample, _ in screen[1:]]
     assert commands[:3] == [0.0] * 3
     assert commands[3:10] == pytest.approx([6.0] * 7, abs=1e-6)
@@ -219,14 +208,14 @@ def test_your_hands_are_on_the_valve(hands_on, quick_bound, capsys):
     assert "setpoint" not in quick_bound[0]
 
 
-def test_keys_move_set_point_and_load_under_any_controller(hands_on, quick_bound, capsys):
-    screen = hands_on(
-        {
+def test_keys_move_set_point_and_load_under_any_controller(window, quick_bound, capsys):
+    screen = window(
+        *("--agent", "pi", "--scenario", "constant"),
+        moves={
             5: lambda: [press(pygame.K_PAGEUP), press(pygame.K_PAGEUP)],
             12: lambda: press(pygame.K_PAGEDOWN),
-        }
+        },
     )
-    assert main(["--agent", "pi", "--scenario", "constant", "--speed", "1000"]) == 0
     setpoints = [sample[0] for sample, _ in screen]
     assert setpoints == [5.0] * 6 + [7.0] * 7 + [6.0] * (SAMPLES - 12)
     # The controller saw it: it does what it does on a plant with these set points.
@@ -236,10 +225,9 @@ def test_keys_move_set_point_and_load_under_any_controller(hands_on, quick_bound
     assert "Smith" in capsys.readouterr().out
 
 
-def test_a_load_step_shows_as_in_the_plant_s_equation(hands_on, quick_bound, capsys):
-    screen = hands_on({4: lambda: [press(pygame.K_l), press(pygame.K_l), press(pygame.K_k)]})
-    arguments = ["--agent", "nothing", "--scenario", "constant-noise"]
-    assert main([*arguments, "--speed", "1000"]) == 0
+def test_a_load_step_shows_as_in_the_plant_s_equation(window, quick_bound, capsys):
+    pressed = {4: lambda: [press(pygame.K_l), press(pygame.K_l), press(pygame.K_k)]}
+    screen = window("--agent", "nothing", "--scenario", "constant-noise", moves=pressed)
     untouched = run(MiddlePointEnv(noise_variance=0.5), np.zeros(SAMPLES))["output"]
     added = np.array([sample[1] for sample, _ in screen]) - untouched
     a = [1.0, -0.45181, -0.47546]  # (28): w adds A(1) w to the right-hand side
@@ -249,15 +237,7 @@ def test_a_load_step_shows_as_in_the_plant_s_equation(hands_on, quick_bound, cap
     assert "least possible" not in capsys.readouterr().out
 
 
-def test_speed_pause_and_escape(hands_on, monkeypatch):
-    screen = hands_on(
-        {
-            2: lambda: press(pygame.K_PLUS, "+"),
-            4: lambda: press(pygame.K_MINUS, "-"),
-            6: lambda: press(pygame.K_SPACE),
-            9: lambda: press(pygame.K_ESCAPE),
-        }
-    )
+def test_speed_pause_and_escape(window, monkeypatch):
     waited = []
 
     def wait(milliseconds):
@@ -266,7 +246,13 @@ def test_speed_pause_and_escape(hands_on, monkeypatch):
             press(pygame.K_SPACE)
 
     monkeypatch.setattr(pygame.time, "wait", wait)
-    assert main(["--agent", "you", "--speed", "400"]) == 0
+    moves = {
+        2: lambda: press(pygame.K_PLUS, "+"),
+        4: lambda: press(pygame.K_MINUS, "-"),
+        6: lambda: press(pygame.K_SPACE),
+        9: lambda: press(pygame.K_ESCAPE),
+    }
+    screen = window("--agent", "you", moves=moves, speed=400)
     assert [fps for _, fps in screen[3:7]] == [800.0, 800.0, 400.0, 400.0]
     assert len(waited) == 5  # it stood still, and went on
     assert len(screen) == 10

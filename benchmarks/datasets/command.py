@@ -39,14 +39,9 @@ DESCRIPTION = (
 def execute(options: Options, console: Console) -> str:
     """Write data sets and list them."""
     ids = known("ID", options.ids or list(IDS), list(IDS))
-    import minari  # the first thing that needs it, which not everyone has
+    import minari  # noqa: F401 (here: the first thing that needs it, which not everyone has)
 
-    try:
-        root = minari.storage.get_dataset_path()
-    except OSError as error:
-        raise UsageError(
-            f"{VARIABLE}: {error.filename} cannot be written to: {error.strerror}"
-        ) from error
+    root = Path(os.environ.setdefault(VARIABLE, str(Path.home() / ".minari" / "datasets")))
     out_folder(root, VARIABLE)
     for name in ids:
         needed, given = len(BEHAVIOURS[IDS[name][1]]), options.episodes
@@ -56,7 +51,7 @@ def execute(options: Options, console: Console) -> str:
     rows = []
     for name in ids:
         history, judged_by = record(*IDS[name], options.episodes), scale(IDS[name][0])
-        write(name, history, judged_by)
+        write(root, name, history, judged_by)
         rows.append(
             {
                 "data set": name,
@@ -72,14 +67,11 @@ def execute(options: Options, console: Console) -> str:
     return f"The data sets are in {root}"
 
 
-def write(name: str, history: History, judged_by: Evaluation) -> None:
+def write(root: Path, name: str, history: History, judged_by: Evaluation) -> None:
     """Write a data set, whole or not at all, in place of one that has its name.
 
     The name is its id, `namespace/name-v0`. What it is judged by goes into its metadata.
     """
-    from minari.storage import get_dataset_path
-
-    root, place = get_dataset_path(), get_dataset_path(name)
     # Minari does not list what is in a hidden folder.
     with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as partial:
         os.environ[VARIABLE] = partial  # it takes no folder as an argument
@@ -87,8 +79,8 @@ def write(name: str, history: History, judged_by: Evaluation) -> None:
             _create(name, history, judged_by)
         finally:
             os.environ[VARIABLE] = str(root)
-        if place.exists():
-            shutil.rmtree(place)
+        place = root / name
+        shutil.rmtree(place, ignore_errors=True)
         place.parent.mkdir(parents=True, exist_ok=True)
         (Path(partial) / name).replace(place)
 
@@ -103,16 +95,14 @@ def _create(name: str, history: History, judged_by: Evaluation) -> None:
     episodes = [
         EpisodeBuffer(
             seed=seed,
-            observations=observations,
-            actions=actions,
-            rewards=rewards,
+            observations=history.observations[i],
+            actions=history.actions[i],
+            rewards=history.rewards[i],
             terminations=[False] * SAMPLES,
             truncations=[False] * (SAMPLES - 1) + [True],
             infos={},
         )
-        for seed, observations, actions, rewards in zip(
-            history.seeds, history.observations, history.actions, history.rewards, strict=True
-        )
+        for i, seed in enumerate(history.seeds)
     ]
     controllers = ", ".join(dict.fromkeys(history.controllers))
     with warnings.catch_warnings():

@@ -124,11 +124,8 @@ def in_film(
 
 @contextmanager
 def _mp4(path: Path, fps: float) -> Iterator[Put]:
-    writer = FFMPEG_VideoWriter(str(path), SIZE, fps)
-    try:
+    with FFMPEG_VideoWriter(str(path), SIZE, fps) as writer:
         yield writer.write_frame
-    finally:
-        writer.close()
 
 
 @contextmanager
