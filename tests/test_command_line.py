@@ -26,25 +26,13 @@ HEAVY = {
 }  # fmt: skip
 
 
-WITHOUT = """
-import sys
-
-class Missing:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] == {package!r}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
-
-sys.meta_path.insert(0, Missing())
-from benchmarks.{command}.__main__ import main
-main({given})
-"""
-
-
 def run_without(package, command, given, folder=ROOT):
-    return python(
-        "-c", WITHOUT.format(package=package, command=command, given=given), cwd=folder,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(folder)])},
-    )  # fmt: skip
+    program = (
+        f"import sys; sys.modules[{package!r}] = None; "
+        f"from benchmarks.{command}.__main__ import main; main({given})"
+    )
+    path = os.pathsep.join([str(ROOT), str(folder)])
+    return python("-c", program, cwd=folder, env={**os.environ, "PYTHONPATH": path})
 
 
 def main_of(name):

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,12 @@ import pandas as pd
 import pytest
 
 from agents import LawNetwork
-from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.fan_out import FanOut, TasksFailedError
 from benchmarks.sweep.__main__ import main as sweep
 from benchmarks.train.command import trained
+from benchmarks.train.through_plant import Training
+from tests import tasks
 from tests.conftest import ROOT, python
-from tests.nodes.train import TRAININGS
 from tests.test_fan_out import counted, until, work
 
 NODES = ROOT / "tests" / "nodes"
@@ -29,6 +31,7 @@ DESIGN = (
     *("--design", "random", "--plants", "8", "--runs", "2", "--samples", "1200"),
     *("--agents", "ppo"),
 )
+TRAININGS = [Training(seed=1, steps=3, plants=4, samples=60, choosing=4, adding=3)]
 
 pytestmark = [
     pytest.mark.skipif(
@@ -118,24 +121,49 @@ def test_a_sweep_loses_a_node(cluster, results):
     )
 
 
-def test_trainings_give_the_networks_that_they_give_here(cluster, results):
-    there, here = results / "trained there", results / "trained here"
-    done = python("-m", "tests.nodes.train", str(there), env=cluster.environment)
+def there(cluster, function, folder):
+    """Call a function of this file in a process that is a user of the cluster."""
+    program = f"from tests.test_ray_cluster import {function.__name__} as run; run(r'{folder}')"
+    done = python("-c", program, env=cluster.environment)
     assert done.returncode == 0, done.stderr
+
+
+def train(folder):
+    trained(TRAININGS, Path(folder), FanOut(backend="ray"), here=False)
+
+
+def test_trainings_give_the_networks_that_they_give_here(cluster, results):
+    away, here = results / "trained there", results / "trained here"
+    there(cluster, train, away)
     networks = trained(TRAININGS, here, FanOut(1))
-    assert len(networks) == len(list(there.glob("*/network.npz"))) == len(TRAININGS)
+    assert len(networks) == len(list(away.glob("*/network.npz"))) == len(TRAININGS)
     for network in networks:
         key = network.provenance["code"]
-        other = LawNetwork.load(there / key / "network.npz")
+        other = LawNetwork.load(away / key / "network.npz")
         for layer, same in zip(network.choosing, other.choosing, strict=True):
             assert all(map(np.array_equal, layer, same))
         assert other.provenance["commit"] == network.provenance["commit"]
 
 
+def lose_a_worker(folder):
+    """Run tasks, one of which kills its worker, and one more, which fails."""
+    from ray import cloudpickle
+
+    cloudpickle.register_pickle_by_value(tasks)  # the tests do not travel
+    scratch = Path(folder)
+    given = work(24, scratch / "calls", 0.05)
+    given["plant 9"] = partial(tasks.die_once, 9, scratch / "died", scratch / "calls")
+    fan_out = FanOut(backend="ray")
+    out = {"results": fan_out.run(given), **fan_out.run({"there": os.listdir})}
+    with pytest.raises(TasksFailedError) as failed:
+        fan_out.run({"the fault": partial(tasks.fail, 1)})
+    out["errors"] = failed.value.errors
+    (scratch / "out.json").write_text(json.dumps(out))
+
+
 def test_a_lost_worker_loses_nothing(cluster, tmp_path):
     (tmp_path / "calls").mkdir()
-    done = python("-m", "tests.ray_run", str(tmp_path), env=cluster.environment)
-    assert done.returncode == 0, done.stderr
+    there(cluster, lose_a_worker, tmp_path)
     out = json.loads((tmp_path / "out.json").read_text())
     assert (tmp_path / "died").exists()
     assert out["results"] == FanOut(1).run(work(24))

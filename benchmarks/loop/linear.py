@@ -131,16 +131,11 @@ class Coefficients:
         """
         order = max(self.alpha.shape[-1], 1)
         size = order + len(c) - 1
-        F = np.zeros((*self.load.shape, size, size))
+        F = np.zeros((*self.load.shape, size, size)) + np.eye(size, k=-1)
+        F[..., order : order + 1, :] = 0.0  # xi(k) is new
         F[..., 0, : self.alpha.shape[-1]] = self.alpha
         F[..., 0, order:] = c[1:]
-        for i in range(1, size):
-            if i != order:
-                F[..., i, i - 1] = 1.0
-        g = np.zeros(size)
-        g[0] = 1.0
-        g[order : order + 1] = 1.0
-        return F, g
+        return F, np.isin(np.arange(size), (0, order)).astype(float)
 
 
 def coefficients(
