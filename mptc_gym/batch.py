@@ -50,6 +50,7 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
         self._factors = FACTORS if self.parameters.drifts else ()
         load = ("disturbance",) if self.parameters.is_disturbed else ()
         self._names = (*INFO, *load, *self._factors)  # of what infos hold
+        self._masks = tuple(f"_{name}" for name in self._names)
         # Each plant's k is the clock less where it started.
         self._clock = 0
         self._starts = np.zeros(num_envs, np.int64)
@@ -147,7 +148,7 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
         flags = self._flags(ended)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
             final = {name: self._where(flags, infos[name], 0) for name in self._names}
-            final |= {f"_{name}": flags for name in self._names}
+            final |= dict.fromkeys(self._masks, flags)
             infos |= {"final_info": final, "final_obs": self._final(ended, observations)}
             infos |= {"_final_info": flags, "_final_obs": flags}
             self._restart(ended, infos)

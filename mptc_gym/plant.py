@@ -212,25 +212,24 @@ class PlantBatch:
         self._outputs = deque(np.zeros((order, num_envs)), maxlen=order)
 
         # Because of the delay d, the response to the inputs of d + 1 samples can be worked out
-        # at once, d being the shortest that can be drawn. Inputs lie here with the oldest
-        # first; before those of the d + 1 samples come the older ones that B also needs.
-        shortest, longest = map(int, parameters.range_of("delay"))
-        self._beta = tuple(parameters.b)
-        self._older = len(self._beta) - 1
+        # at once, d being the shortest that can be drawn. Inputs lie in a window of these rows,
+        # the oldest first; before those of the d + 1 samples come the older ones that B and
+        # plants with a longer delay also need.
+        shortest, self._longest = map(int, parameters.range_of("delay"))
         self._samples = shortest + 1
-        self._inputs = np.zeros((self._older + self._samples, num_envs))
+        self._beta = tuple(parameters.b)
+        self._own_delays = self._longest > shortest
+        self._older = len(self._beta) - 1 + self._longest - shortest
+        # With delays of their own the window moves on with the samples, so that the older rows
+        # have to be copied back only where it has come to the end of the rows.
+        spare = max(self._older, self._samples) if self._own_delays else 0
+        self._inputs = np.zeros((self._older + self._samples + spare, num_envs))
+        self._first_row = 0  # of the window
+        rows = len(self._beta) - 1 + self._samples  # of inputs, as each plant's delay has them
+        self._taken = np.zeros((rows, num_envs) if self._own_delays else 0, np.intp)
+        self._delayed = np.zeros(self._taken.shape)
         self._response = np.zeros((self._samples, num_envs))
         self._place = self._samples - 1  # of the next input among the d + 1
-        # Plants with a longer delay take their response from rows of earlier responses.
-        self._shortest, self._longer = shortest, longest - shortest
-        if self._longer:
-            # They lie in a window of these rows. It moves on with the samples, so that the rows
-            # have to be copied back only where the window has come to the end of them.
-            self._window_rows = self._longer + self._samples
-            self._first_row = 0
-            rows = self._window_rows + max(self._longer, self._samples)
-            self._earlier = np.zeros((rows, num_envs))
-            self._taken = np.zeros(self._response.shape, np.intp)  # places within the window
 
     def reset(self, which: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
         """Bring some of the plants to rest, with new numbers: if drawn, one for each."""
@@ -242,11 +241,10 @@ class PlantBatch:
             getattr(self._numbers, name)[which] = values
         if {"dead_zone", "u_min", "u_max"}.intersection(self._drawn):
             self._update_actuator()
-        if self._longer:
-            self._window()[:, which] = 0.0
-            rows = np.arange(self._samples)[:, np.newaxis] + self._longer + self._shortest
-            rows = rows - numbers.delay.astype(np.intp)
-            self._taken[:, which] = rows * self._inputs.shape[1] + which
+        if self._own_delays:
+            first = self._longest - numbers.delay.astype(np.intp)
+            rows = np.arange(len(self._taken))[:, np.newaxis] + first
+            self._taken[:, which] = rows * self._num_envs + which
         if self._changes_dynamics:
             if self._drifts:
                 self._starts[which] = self._clock
@@ -274,7 +272,7 @@ class PlantBatch:
         applied *= np.abs(command) >= edge
         applied += zero
         place = self._place
-        self._inputs[self._older + place] = applied
+        self._inputs[self._first_row + self._older + place] = applied
         place += 1
         if place == self._samples:
             self._respond()
@@ -295,24 +293,19 @@ class PlantBatch:
 
     def _respond(self) -> None:
         """Work out the response to the inputs of d + 1 samples."""
-        inputs, older, samples = self._inputs, self._older, self._samples
+        first, older, samples = self._first_row, self._older, self._samples
+        inputs = self._inputs[first : first + older + samples]
+        if self._own_delays:
+            inputs = inputs.take(self._taken, out=self._delayed, mode="clip")
         self._response[:] = 0.0
         for lag, beta in enumerate(self._beta):  # B of (28)
-            self._response += beta * inputs[older - lag : older - lag + samples]
-        inputs[:older] = inputs[samples:].copy()
-        if self._longer:
-            first = self._first_row + samples
-            if first + self._window_rows > len(self._earlier):
-                self._earlier[: self._longer] = self._earlier[first : first + self._longer]
-                first = 0
-            self._first_row = first
-            window = self._window()
-            window[self._longer :] = self._response
-            window.take(self._taken, out=self._response, mode="clip")
-
-    def _window(self) -> NDArray[np.float64]:
-        """Return the earlier responses that are still to be taken, the oldest first."""
-        return self._earlier[self._first_row : self._first_row + self._window_rows]
+            newest = len(self._beta) - 1 - lag
+            self._response += beta * inputs[newest : newest + samples]
+        first += samples
+        if first + older + samples > len(self._inputs):
+            self._inputs[:older] = self._inputs[first : first + older]
+            first = 0
+        self._first_row = first
 
     def _update_actuator(self) -> None:
         """Work out what commands and (29) take from the plant numbers."""

@@ -228,7 +228,7 @@ class MiddlePointTorchEnv(BatchEnv):
         if self._factors:
             rows += zip(*factors, strict=True)
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        masks = {f"_{name}": everyone for name in self._names}
+        masks = dict.fromkeys(self._masks, everyone)
         names = (*infos, *self._factors)
         flags = self._zeros.new_zeros(2 * samples, self.num_envs, dtype=torch.bool).unbind()
         self._ahead = [
