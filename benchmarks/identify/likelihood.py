@@ -14,13 +14,14 @@ import pandas as pd
 from scipy import ndimage
 
 from benchmarks.identify.armax import Array, Flags, Orders, Rows
-from benchmarks.identify.excitation import LEAST_SAMPLES, check_excitation
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError
 from benchmarks.identify.options import Knowledge
 from benchmarks.identify.simulation import from_rest
 from benchmarks.loop.linear import LinearModel
 
+LEAST_SAMPLES = 100  # beside those that the longest delay takes
+FOLLOWS = 0.98  # share of the flow's moves that, explained by the temperature, is feedback
 COARSE = 40  # dead zones that are tried first
 FINEST = 1e-6  # of the temperature's deviation, what its numbers tell
 BRIDGE = 10  # missing temperatures in a row that are filled in, for the noise to go on
@@ -95,7 +96,7 @@ class Likelihood:
         self.u_min, self.u_max = _limits(command, knowledge)
         # u(k), y(k) and the known disturbances, as deviations; NaN where they are not known.
         self.command = np.clip(command, self.u_min, self.u_max)
-        check_excitation(self.command, log.temperature)
+        _check_excitation(self.command, log.temperature)
         self.output = log.temperature - float(np.nanmean(log.temperature))
         self.known = [each - each[np.isfinite(each)][0] for each in log.disturbances.values()]
         self.lags = [0] * len(self.known)  # samples
@@ -328,6 +329,48 @@ def _limits(command: Array, knowledge: Knowledge) -> tuple[float, float]:
     if not low < high and len(known) and np.ptp(known):
         raise ValueError(f"u_min must be below u_max, got {low:g} and {high:g}")
     return low, high
+
+
+def _check_excitation(command: Array, output: Array) -> None:
+    """Refuse a log in which nothing moves, or nothing but the feedback."""
+    flows, temperatures = command[np.isfinite(command)], output[np.isfinite(output)]
+    if len(flows) < LEAST_SAMPLES:
+        raise CannotTellError(
+            f"the log is too short: {len(flows)} rows with a flow, and at least "
+            f"{LEAST_SAMPLES} are needed"
+        )
+    if np.ptp(flows) == 0.0:
+        raise CannotTellError(
+            f"the flow is constant, {flows[0]:g} t/h from its operating point: nothing moves "
+            "that the temperature could answer. Record it while the flow is moved in steps"
+        )
+    if not len(temperatures) or np.ptp(temperatures) == 0.0:
+        raise CannotTellError(
+            "the temperature is constant: it answers nothing. See whether the sensor works, or "
+            "name another column"
+        )
+    share = _explained_by_feedback(pd.Series(command), pd.Series(output))
+    if share > FOLLOWS:
+        raise CannotTellError(
+            f"the flow follows from the temperature alone ({100 * share:.1f} % of its moves): "
+            "the loop is closed and nothing else moves, so that the plant cannot be told from "
+            "its controller. Change the set point in steps, or move the flow by hand"
+        )
+
+
+def _explained_by_feedback(u: pd.Series[float], y: pd.Series[float]) -> float:
+    """Return which share of the flow's moves, beyond its past, the temperature explains."""
+    past, answered = (u.shift(1), u.shift(2), u.notna()), (y, y.shift(1), y.shift(2))
+    table = np.column_stack([*past, *answered, u.diff()])
+    # Where a limit holds the flow, it does not follow anything.
+    table = table[np.isfinite(table).all(axis=1) & (u > u.min()) & (u < u.max())]
+    if len(table) < LEAST_SAMPLES:
+        return 0.0
+    # What each column adds, and in the end what none explains: squares of the moves.
+    squares = np.asarray(np.linalg.qr(table, mode="r"))[:, -1] ** 2
+    alone = float(squares[len(past) :].sum())
+    # Some flows go on as they have gone, whatever the temperature does.
+    return 1.0 - float(squares[-1]) / alone if alone > 1e-9 * squares.sum() else 0.0
 
 
 def _all_of_last(flags: Flags, count: int) -> Flags:

@@ -64,11 +64,8 @@ def of_impulse_response(
     left, sizes, right = np.linalg.svd(table[known] - centre, full_matrices=False)
     target = output[known] - level
     shares = left.T @ target
-    least, best = np.inf, np.zeros(table.shape[1])
-    for ridge in RIDGES:
-        kept = sizes**2 / (sizes**2 + (ridge * sizes[0]) ** 2 + 1e-300)
-        error = target - left @ (kept * shares)
-        score = float(error @ error) / (1.0 - kept.sum() / len(target)) ** 2
-        if score < least:
-            least, best = score, right.T @ (kept * shares / np.maximum(sizes, 1e-300))
+    kept = sizes**2 / (sizes**2 + (np.outer(RIDGES, sizes[0])) ** 2 + 1e-300)
+    squares = np.sum((target - (kept * shares) @ left.T) ** 2, axis=1)
+    scores = squares / (1.0 - kept.sum(axis=1) / len(target)) ** 2
+    best = right.T @ (kept[np.argmin(scores)] * shares / np.maximum(sizes, 1e-300))
     return (table - centre) @ best + level, float(best[: LAGS + len(TAILS)].sum())
