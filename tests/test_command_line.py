@@ -174,10 +174,19 @@ def test_a_missing_package_is_named_with_its_extra(name, package, extra):
     assert "Traceback" not in done.stderr
 
 
+def test_the_map_shows_questions_and_commands_as_text(capsys):
+    assert show_map() == 0
+    shown = capsys.readouterr().out
+    assert "Which gains are best?" in shown
+    assert {name for name in COMMANDS if f"benchmarks.{name} " in shown} >= {"tune", "limits"}
+    assert "`" not in shown
+    assert "](" not in shown
+
+
 def test_the_map_names_a_missing_package(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "pandas", None)
+    monkeypatch.setitem(sys.modules, "rich.markdown", None)
     assert show_map() == 2
-    assert capsys.readouterr().err.startswith("python -m benchmarks: error: pandas is not inst")
+    assert capsys.readouterr().err.startswith("python -m benchmarks: error: rich is not inst")
 
 
 def test_a_controller_that_lacks_a_package_names_its_extra(tmp_path):

@@ -19,8 +19,8 @@ from typing import Any
 
 from benchmarks.lib.storage import ROOT, versions
 
-# What does not travel of the checkout, as in a .gitignore: all but its code, and the modules
-# beside it, such as those of controllers of one's own.
+# What stays here, as in a .gitignore: all of the checkout but the packages and the modules
+# beside them, such as those of controllers of one's own.
 STAYS = [
     *("/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py"),
     *("__pycache__", "published", "*.md"),
@@ -59,8 +59,8 @@ def answers(
 ) -> Iterator[Answer]:
     """Run tasks on the cluster that is connected, and yield their answers as they come.
 
-    So many `jobs` run at once; None stands for as many as the cluster has cores. A task is
-    begun at most `tries` times, if its worker or node is lost.
+    `jobs` tasks run at once; None means as many as the cluster has cores. A task whose worker
+    or node is lost is begun again, `tries` times in all.
     """
     import ray
 

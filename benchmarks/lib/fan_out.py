@@ -198,7 +198,8 @@ def _answer(key: str, task: Callable[[], Any], parent: int) -> tuple[str, Any, s
 def _end_with(parent: int) -> None:
     """See to it that this process ends when its parent does, even if that was killed.
 
-    A worker would wait for more for some minutes, as it does on Windows, where nobody can tell.
+    Otherwise a worker would wait for work for some minutes, as it does on Windows, where it
+    cannot tell.
     """
 
     def watch() -> None:

@@ -16,7 +16,7 @@ from benchmarks.lib.storage import replacing
 
 PERCENTILES = {"median": 50, "p10": 10, "p90": 90}
 _NAMES = ("scenario", "agent", "controller", "case")
-_TEXTS = (*_NAMES, "claim", "verdict", "question", "command", "page", "writes", "what")
+_TEXTS = (*_NAMES, "claim", "verdict")
 
 
 def write_csv(path: Path, table: pd.DataFrame) -> None:

@@ -30,7 +30,7 @@ LONGEST = 1_000_000  # samples; a plant that needs more has no steady state to w
 
 
 def check_linear(parameters: Parameters) -> None:
-    """Refuse a plant that is more than (28) and (29) by a ValueError that names why."""
+    """Refuse a plant that is more than (28) and (29): a ValueError names the argument."""
     for name, argument in ARGUMENTS.items():
         value = getattr(parameters, name)
         if not argument.linear and value != argument.default:
@@ -141,7 +141,7 @@ class Coefficients:
 def coefficients(
     parameters: Parameters, numbers: PlantNumbers[Any], k: int | NDArray[np.int64]
 ) -> Coefficients:
-    """Return the coefficients of the step to sample k; ValueError as `check_linear`.
+    """Return the coefficients of the step to sample k; see `check_linear` for its ValueError.
 
     The plant numbers of an episode are those of one plant, or arrays for many; k is one sample,
     or for one plant an array of samples.
@@ -161,7 +161,7 @@ def coefficients(
 def nominal(parameters: Parameters) -> LinearModel:
     """Return the model of a plant: ranges at their middle, drifts at k = 0, nothing added.
 
-    ValueError as `check_linear`.
+    See `check_linear` for its ValueError.
     """
     middle = {name: sum(parameters.range_of(name)) / 2 for name in PLANT_NUMBERS}
     at_start = coefficients(parameters, PlantNumbers(**middle), 0)
@@ -214,7 +214,7 @@ class Course(Coefficients):
 
 
 def course(parameters: Parameters, numbers: PlantNumbers[float], samples: int) -> Course:
-    """Return the course of an episode with these numbers; ValueError as `check_linear`."""
+    """Return the course of an episode, given its plant numbers; see also `check_linear`."""
     flows = [numbers.u_min, numbers.u_max]
     if numbers.dead_zone > 0.0:
         flows.append(0.0)
