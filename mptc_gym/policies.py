@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import json
+import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
@@ -81,14 +84,29 @@ def trained_on(policy: Any) -> EnvSpec | None:
     """Return the spec of the environment that a policy was trained on, if that is known.
 
     `mptc_gym.sb3` notes it in the observation space; models of Stable-Baselines3 that were not
-    loaded from a file still have their environments.
+    loaded from a file still have their environments. A path is that of a saved model.
     """
+    if isinstance(policy, str | Path):
+        return _saved_spec(policy)
     text = getattr(getattr(policy, "observation_space", None), "trained_on", None)
     if text is not None:
         return EnvSpec.from_json(text)
     with suppress(AttributeError):  # no model, or no environments, or they have no spec
         return cast("EnvSpec | None", policy.get_env().get_attr("spec")[0])
     return None
+
+
+def _saved_spec(path: str | Path) -> EnvSpec | None:
+    """Return what a zip of Stable-Baselines3 says of the training; no code of it is run."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            data = json.loads(archive.read("data"))
+        text = data["observation_space"].get("trained_on")
+        return None if text is None else EnvSpec.from_json(text)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    except (zipfile.BadZipFile, KeyError, ValueError, AttributeError, TypeError) as error:
+        raise ValueError(f"{path} must be a model that Stable-Baselines3 saved") from error
 
 
 def action_wrappers(spec: EnvSpec) -> list[WrapperSpec]:

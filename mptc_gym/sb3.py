@@ -13,10 +13,8 @@ It needs `pip install "mptc_gym[sb3]"`.
 from __future__ import annotations
 
 import copy
-import json
 import os
 import time
-import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
@@ -301,32 +299,19 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
     ValueError
         If it is not known how the policy was trained.
     """
-    in_file = isinstance(policy, str | Path)
-    trained = _saved_spec(policy) if in_file else trained_on(policy)
+    trained = trained_on(policy)
     if trained is None:
         allowed = (
             "one that knows how it was trained: train it on mptc_gym.sb3.make_vec_env, or save "
             "it by mptc_gym.sb3.save"
         )
+        in_file = isinstance(policy, str | Path)
         reject("policy", str(policy) if in_file else type(policy).__name__, allowed)
     windows: dict[str, Any] = {n: trained.kwargs[n] for n in WINDOWS if n in trained.kwargs}
     with closing(make_one(env, {**windows, **arguments})) as single:
         spec = cast("EnvSpec", single.spec)
     spec.additional_wrappers = tuple(action_wrappers(trained))
     return spec
-
-
-def _saved_spec(path: str | Path) -> EnvSpec | None:
-    """Return what a zip says of the training of its model."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            data = json.loads(archive.read("data"))
-        text = data["observation_space"].get("trained_on")
-        return None if text is None else EnvSpec.from_json(text)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    except (zipfile.BadZipFile, KeyError, ValueError, AttributeError, TypeError) as error:
-        raise ValueError(f"{path} must be a model that Stable-Baselines3 saved") from error
 
 
 class ScoreCallback(BaseCallback):

@@ -39,9 +39,7 @@ class TestSB3:
         )
         done = python("-c", quick)
         assert done.returncode == 0, done.stderr
-        found = re.fullmatch(
-            r"seed 3, \d+ s: MiddlePoint-v0: mean error ([\d.]+) degC.*\n", done.stdout
-        )
+        found = re.match(r"seed 3, \d+ s: MiddlePoint-v0: mean error ([\d.]+)", done.stdout)
         kept = PPO.load(tmp_path / "ppo-3.zip", device="cpu")
         assert f"{evaluate(kept, spec_of(kept)).mean_error:.3f}" == found[1]
 

@@ -178,7 +178,7 @@ def _vector(n: int) -> Iterable[Case]:
         envs.reset(seed=0)
         envs.action_space.seed(0)
         actions = [envs.action_space.sample() for _ in range(20)]
-        yield Case(name + special, _stepper(envs, actions, EPISODE + 1), n * (EPISODE + 1))
+        yield _stepping(name + special, envs, actions, EPISODE + 1)
     yield from _in_torch(n, "cpu", EPISODE + 1)
     for peer in filter(importlib.util.find_spec, PEERS):
         yield from PEERS[peer](n)
@@ -191,8 +191,7 @@ def _envpool(n: int) -> Iterable[Case]:
     envs = envpool.make_gymnasium(REFERENCE, num_envs=n, num_threads=1, seed=0)
     envs.reset()
     actions = list(np.random.default_rng(0).integers(0, 2, (20, n), dtype=np.int32))
-    step = _stepper(envs, actions, PEER_STEPS)
-    yield Case(f"{REFERENCE} of envpool", step, n * PEER_STEPS)
+    yield _stepping(f"{REFERENCE} of envpool", envs, actions, PEER_STEPS)
 
 
 def _gymnax(n: int) -> Iterable[Case]:
@@ -241,8 +240,8 @@ def _in_torch(n: int, device: str, steps: int) -> Iterable[Case]:
         envs = MiddlePointTorchEnv(n, device=device, **arguments)
         envs.reset(seed=0)
         actions = [2.0 * torch.rand(n, 1, device=device) - 1.0 for _ in range(20)]
-        wait = torch.accelerator.synchronize if device != "cpu" else None
-        yield Case(f"in PyTorch{special}", _stepper(envs, actions, steps, wait), n * steps)
+        wait = (lambda: None) if device == "cpu" else torch.accelerator.synchronize
+        yield _stepping(f"in PyTorch{special}", envs, actions, steps, wait)
 
 
 def on_device(device: str, rounds: int) -> pd.DataFrame:
@@ -277,18 +276,21 @@ def _through_the_plant(n: int) -> Case:
     return Case(f"gradient through {n:,} plants and {BACKWARD} samples", train, n * BACKWARD)
 
 
-def _stepper(
-    envs: Any, actions: list[Any], steps: int, wait: Callable[[], object] | None = None
-) -> Callable[[], None]:
-    """Return a function that takes the actions in turn, and waits for a device then."""
+def _stepping(
+    name: str,
+    envs: Any,
+    actions: list[Any],
+    steps: int,
+    wait: Callable[[], object] = lambda: None,
+) -> Case:
+    """Return a batch that takes the actions in turn, and waits for its device then."""
 
-    def step() -> None:
+    def run() -> None:
         for k in range(steps):
             envs.step(actions[k % len(actions)])
-        if wait is not None:
-            wait()
+        wait()
 
-    return step
+    return Case(name, run, steps * len(actions[0]))
 
 
 def _alone() -> Case:
