@@ -368,28 +368,6 @@ def test_signals_end_with_an_error_and_with_a_reset_without():
     assert env.step(torch.zeros(2, 1))[-1]["noise"].tolist() != [1.0, 1.0]
 
 
-@pytest.mark.parametrize("ask", ["medium", "autocast"])
-def test_quick_matrix_products_are_not_used(ask):
-    """Users who ask for them mean their networks."""
-
-    def outputs():
-        env = MiddlePointTorchEnv(3, noise_variance=0.5)
-        env.reset(seed=0)
-        return outputs_of(env, 60).numpy()
-
-    expected = outputs()
-    if ask == "autocast":
-        with torch.autocast("cpu", torch.bfloat16):
-            found = outputs()
-    else:
-        torch.set_float32_matmul_precision("medium")
-        try:
-            found = outputs()
-        finally:
-            torch.set_float32_matmul_precision("highest")
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
-
-
 def test_without_torch_the_import_says_what_to_install():
     program = """
 import sys
