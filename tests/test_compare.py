@@ -175,6 +175,8 @@ class TestEstimates:
             r"Not to be told apart, at 95 %: (b and c|c and b)\.",
             standing(runs, scales, scores),
         )
+        apart = runs.assign(scenario=runs["agent"].map({"a": "x", "b": "y", "c": "z"}))
+        assert standing(apart, scales, scores).count(" and ") == 2  # not run in the same case
         del scores["c"]
         assert standing(runs, scales, scores).endswith(
             "The runs tell all of them apart, at 95 %."
@@ -455,25 +457,26 @@ class TestCompare:
         )
 
     @staticmethod
-    def the_first_is_kept(out):
-        assert list(pd.read_csv(out / "runs.csv")["scenario"]) == ["constant", "square"]
+    def the_first_are_kept(out, count=2):
+        kept = ["constant", "square", "constant"][:count]
+        assert list(pd.read_csv(out / "runs.csv")["scenario"]) == kept
         return json.loads((out / "provenance.json").read_text())["complete"] is False
 
     @pytest.mark.parametrize(
-        ("error", "status", "said"),
+        ("error", "after", "status", "said"),
         [
-            (KeyboardInterrupt, 130, ["Interrupted"]),
-            (ZeroDivisionError, 1, [f"nn, {s}: ZeroDivision" for s in ("constant", "square")]),
+            (KeyboardInterrupt, 3, 130, ["Interrupted"]),
+            (ZeroDivisionError, 2, 1, ["nn, constant: ZeroDiv", "nn, square: ZeroDiv"]),
         ],
     )
     def test_a_run_that_is_stopped_and_one_that_fails_keep_what_they_have(
-        self, error, status, said, tmp_path, monkeypatch, capsys
+        self, error, after, status, said, tmp_path, monkeypatch, capsys
     ):
         out = tmp_path / "out"
-        assert self.run_and_stop(out, monkeypatch, error, after=2) == status
+        assert self.run_and_stop(out, monkeypatch, error, after) == status
         shown = capsys.readouterr().out
         assert all(words in shown for words in said)
-        assert self.the_first_is_kept(out)
+        assert self.the_first_are_kept(out, after)
         assert (out / "report.md").exists()
         assert (out / "square.png").exists()
 
@@ -502,7 +505,7 @@ class TestCompare:
         monkeypatch.setattr(report, "write_report", interrupted)
         assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=2) == 130
         assert "Interrupted" in capsys.readouterr().out
-        assert self.the_first_is_kept(out)
+        assert self.the_first_are_kept(out)
 
     def test_a_folder_that_cannot_be_written_to(self, tmp_path, monkeypatch, refused):
         (tmp_path / "file").write_text("in the way")

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
+from benchmarks.compare.comparison import run_case
 from benchmarks.controllers import pretrained
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.own import own_factory
@@ -12,7 +13,6 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import UsageError
 from benchmarks.limits.verify import errors
 from benchmarks.loop.metrics import mean_error
-from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import Scenario
 from benchmarks.sweep.tasks import agent_task
 from benchmarks.train.ppo import PolicyRequest
@@ -46,7 +46,7 @@ def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, mo
     monkeypatch.setattr(type(entry), "members", lambda *_: [factory])
     scenario = Scenario("other", "", 900, plant)
     ways = {
-        "compare": errors(factory, 2, 900, **plant),
+        "compare": run_case(scenario, entry.name, [factory], 2).runs["mae"],
         "sweep": agent_task(factory, plant, plant, 900, 2)["mae"],
         "watch": mean_error(rivals.replay(factory, scenario, 0)),
     }
@@ -66,13 +66,11 @@ def run(factory):
     def run(runs, seed, sign=1.0, again=False):
         limits = {"u_min": -6.0, "u_max": 10.0} if sign > 0 else {"u_min": -10.0, "u_max": 6.0}
         plant = {**limits, "b": [sign * b for b in Parameters().b], "noise_variance": 0.1}
-        plants = make_plants(
-            runs, 700, **factory.arguments({**plant, "setpoint_amplitude": 6.0})
-        )
         controller = factory(plant, runs, seed)
+        plant["setpoint_amplitude"] = 6.0
         if again:
-            rollout(plants, controller, 700, seed + 50)
-        return rollout(plants, controller, 700, seed)
+            factory.run(plant, 700, runs, seed + 50, controller)
+        return factory.run(plant, 700, runs, seed, controller)
 
     return run
 
@@ -109,7 +107,7 @@ def test_it_asks_for_its_own_windows(factory, windows):
     assert errors(factory, 1, 60, **windows) == errors(factory, 1, 60)
 
 
-def test_its_cost_is_known(entry, factory):
+def test_its_cost_is_known(factory):
     assert factory.cost.prior_knowledge
 
 
@@ -158,7 +156,6 @@ class TestOwnControllers:
         [
             ("act = lambda self, o: [[0.0]] * len(o)", "reset"),
             ("observation = 3", "observation of .* must be a dict"),
-            ("observation = 'window'", "observation of .* must be a dict"),
             ("observation = ['error_window']", "observation of .* must be a dict"),
             ("observation = {'dead_zone': 0.0}", "out of .* got {'dead_zone': 0.0}"),
             ("reset = dict; act = lambda self, o: 0.0", r"shape \(2, 6\).*got \(\)"),
@@ -204,8 +201,9 @@ class TestSavedPolicies:
         expected = evaluate(model, spec_of(file, IDS[preset]), episodes=3)
         np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-12)
         # What it remembers, the flow, is forgotten at the beginning of an episode.
-        plants = make_plants(3, 50, **factory.arguments(PRESETS[preset]))
-        first, again = (rollout(plants, controller, 50, SEED).applied for _ in range(2))
+        first, again = (
+            factory.run(PRESETS[preset], 50, 3, SEED, controller).applied for _ in range(2)
+        )
         np.testing.assert_array_equal(first, again)
 
     def test_several_trainings_are_members_of_one(self, zips):

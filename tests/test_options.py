@@ -143,12 +143,6 @@ class TestRanges:
         assert first.reset()[1] == second.reset()[1]
         assert first.reset(seed=5)[1] != first.reset(seed=6)[1]
 
-    def test_a_range_of_one_value_is_that_value(self, rng):
-        actions = rng.uniform(-1, 1, 100)
-        ours = run(MiddlePointEnv(dead_zone=[7, 7], delay=[5, 5]), actions)
-        theirs = run(MiddlePointEnv(dead_zone=7, delay=5), actions)
-        np.testing.assert_array_equal(ours["output"], theirs["output"])
-
 
 @pytest.mark.parametrize(
     ("arguments", "message"),

@@ -18,6 +18,7 @@ from benchmarks.sweep import command, report, tasks
 from benchmarks.sweep.__main__ import main
 from benchmarks.sweep.tasks import agent_task, limit_task
 from mptc_gym import Parameters
+from tests.conftest import trajectory
 
 NOMINAL = {"delay": 18}
 
@@ -79,11 +80,12 @@ class TestCells:
         assert task["mae"] == task["late"] == [5.0, 5.0]
         assert task["swing"] == [0.0, 0.0]
 
-    def test_swing_is_the_deviation_within_stretches_by_hand(self):
-        # Two stretches, of 1, 3 and of 10, 10, 10, 16: variances 1 and 6.75.
-        error = np.array([[9.0], [1.0], [3.0], [9.0], [10.0], [10.0], [10.0], [16.0], [9.0]])
-        steady = np.array([0, 1, 1, 0, 1, 1, 1, 1, 0], dtype=bool)
-        assert tasks.swing(error, steady) == pytest.approx([np.sqrt(7.75 / 2)])
+    def test_swing_is_the_deviation_in_second_halves_by_hand(self):
+        # Two of them, of 1, 3 and of 10, 10, 10, 16: variances 1 and 6.75.
+        setpoint = np.repeat([5.0, -5.0], [4, 8])
+        error = [9, 9, 1, 3, 9, 9, 9, 9, 10, 10, 10, 16]
+        found = tasks.swing(trajectory(setpoint, setpoint - error))
+        assert found == pytest.approx([np.sqrt(7.75 / 2)])
 
     def test_the_limit_is_that_of_the_plant(self):
         nominal = limit_task(NOMINAL, 1200)
@@ -185,19 +187,14 @@ class TestSweep:
     def test_a_failed_task_is_named_and_the_others_are_kept(
         self, tmp_path, capsys, monkeypatch
     ):
-        monkeypatch.setattr(command, "agent_task", _fails_on_pi)
+        def fails(plant, runs, seed):
+            raise RuntimeError("no luck")
+
+        failing = replace(ROSTER["pi-simc"], made_by=Factory(fails))
+        monkeypatch.setitem(ROSTER, "pi-simc", failing)
         assert run_sweep(tmp_path, "--design", "random", "--plants", 2) == 1
         assert "pi-simc 0" in capsys.readouterr().out
         assert len(list((tmp_path / "tasks").rglob("nn *.json"))) == 2
-
-
-def _fails_on_pi(factory, *arguments, **others):
-    if factory.make is simc_pi:
-        raise RuntimeError("no luck")
-    return agent_task(factory, *arguments, **others)
-
-
-_fails_on_pi.__module__ = agent_task.__module__
 
 
 class TestFindings:

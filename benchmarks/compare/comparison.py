@@ -21,7 +21,7 @@ from mptc_gym.evaluation import SEED
 
 TWICE = "square"  # who learns runs this scenario a second time, with what was learnt
 # What takes long begins first, so that no core waits at the end.
-LONG = ("mpc", "nn-self-tuning", "ppo", "self-tuning", "nn-smith")
+LONG = {"mpc", "nn-self-tuning", "ppo", "self-tuning", "nn-smith"}
 
 
 @dataclass(frozen=True)
@@ -82,21 +82,15 @@ class Comparison:
     """What the errors of a scenario are measured against."""
 
     def run(self, fan_out: FanOut) -> Iterator[Case]:
-        """Run all, and yield each case when it has finished.
-
-        Raises
-        ------
-        TasksFailedError
-            At the end, if a controller raised an exception; all others have finished.
-        """
+        """Run all, and yield each case when it has finished; raise at the end if any failed."""
+        scenarios = self.scenarios.values()
         # The bounds of drawn plants are the longest tasks of all.
-        scenarios = sorted(self.scenarios.values(), key=lambda each: not each.parameters.ranges)
         tasks: dict[str, Callable[[], Case | Scale]] = {
-            f"{each.name}: bounds": partial(bounds, each, self.count) for each in scenarios
+            f"{each.name}: bounds": partial(bounds, each, self.count)
+            for each in sorted(scenarios, key=lambda each: not each.parameters.ranges)
         }
-        long = [agent for agent in LONG if agent in self.controllers]
-        agents = dict.fromkeys([*long, *self.controllers])
-        for agent, each in itertools.product(agents, self.scenarios.values()):
+        agents = sorted(self.controllers, key=lambda agent: agent not in LONG)
+        for agent, each in itertools.product(agents, scenarios):
             case = partial(run_case, each, agent, self.controllers[agent], self.count)
             tasks[f"{agent}, {each.name}"] = case
         for _, result in fan_out.stream(tasks, "compare"):

@@ -89,17 +89,11 @@ def bounds(scenario: Scenario, runs: int) -> Scale:
 def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
     """Return one row for each agent in a scenario: estimates with 95 % intervals.
 
-    There is one row a run, with `agent`, `policy`, `seed` and `mae`. The reference is the agent
-    that the others are compared with, run by run.
-
-    Returns
-    -------
-    DataFrame
-        `mean` and `interquartile_mean` of |e|, degC; `limit`, the least possible error that
-        applies, and `preview`, that of any controller; `ratio`, the mean as a multiple of
-        `limit`; `difference`, the mean one to the reference; `improvement`, the probability of
-        doing better than it; and `student_high`, the upper end of Student's interval of the
-        mean. Ends are infinite where runs differ and there is only one.
+    They are `mean` and `interquartile_mean` of |e|, degC; `ratio`, the mean as a multiple of
+    `limit`, the least possible error that applies; `difference`, the mean one to the reference
+    agent, run by run; `improvement`, the probability of doing better than it; and
+    `student_high`, the upper end of Student's interval of the mean. `preview` is the least
+    possible error of any controller. Ends are infinite where runs differ and there is only one.
     """
     rows = []
     limit = scale.least.value

@@ -58,20 +58,16 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
 
 def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
     """Draw the mean errors as points with 95 % intervals; each axis begins at the limit."""
-    shades = colours(list(estimates["agent"].unique()))
-    with _scenario_panels(path, estimates) as found:
+    with _scenario_panels(path, estimates) as (found, shades):
         for axes, rows in found:
-            worst = rows["mean"].map(lambda mean: mean.value).max()
-            for place, (agent, mean) in enumerate(
-                zip(rows["agent"], rows["mean"], strict=True)
-            ):
-                ends = None
+            worst = max(mean.value for mean in rows["mean"])
+            for place, row in enumerate(rows.to_dict("records")):
+                mean, ends = row["mean"], None
                 if math.isfinite(mean.high):
                     ends = [[mean.value - mean.low], [mean.high - mean.value]]
                     worst = max(worst, mean.high)
-                axes.errorbar(
-                    mean.value, place, xerr=ends, fmt="o", capsize=3, color=shades[agent]
-                )
+                colour = shades[row["agent"]]
+                axes.errorbar(mean.value, place, xerr=ends, fmt="o", capsize=3, color=colour)
             _list_agents(axes, rows, "mean |e| (°C)")
             limit = rows["limit"].iloc[0]
             # A little to the left of it, so that a point on the limit is whole.
@@ -82,8 +78,7 @@ def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
 def plot_runs(runs: pd.DataFrame, path: Path) -> None:
     """Draw the mean error of every single run, so that no failure is averaged away."""
     generator = np.random.default_rng(0)  # scatters points that would hide each other
-    shades = colours(list(runs["agent"].unique()))
-    with _scenario_panels(path, runs) as found:
+    with _scenario_panels(path, runs) as (found, shades):
         for axes, cases in found:
             for place, (agent, rows) in enumerate(groups(cases, "agent")):
                 around = place + generator.uniform(-0.3, 0.3, len(rows))
@@ -104,13 +99,16 @@ def _list_agents(axes: Axes, rows: pd.DataFrame, measure: str) -> None:
 @contextmanager
 def _scenario_panels(
     path: Path, table: pd.DataFrame, height: float | None = None
-) -> Iterator[list[tuple[Axes, pd.DataFrame]]]:
-    """Give a panel for each scenario, with its rows; a legend has what is labelled in any."""
-    height = height or 1.2 + 0.28 * table["agent"].nunique()
-    names = list(table["scenario"].unique())
-    with panels(path, names, (4.2, height), 3) as (figure, found):
-        by_scenario = (rows for _, rows in groups(table, "scenario"))
-        yield list(zip(found, by_scenario, strict=True))
+) -> Iterator[tuple[list[tuple[Axes, pd.DataFrame]], dict[str, str]]]:
+    """Give a panel and the rows of each scenario, and a colour for each agent.
+
+    A legend has what is labelled in any panel.
+    """
+    shades = colours(list(table["agent"].unique()))
+    by_scenario = dict(groups(table, "scenario"))
+    height = height or 1.2 + 0.28 * len(shades)
+    with panels(path, list(by_scenario), (4.2, height), 3) as (figure, found):
+        yield list(zip(found, by_scenario.values(), strict=True)), shades
         shown = [axes.get_legend_handles_labels() for axes in found]
         entries = {name: handle for pair in shown for handle, name in zip(*pair, strict=True)}
         if entries:
@@ -125,11 +123,9 @@ def plot_travel(summary: pd.DataFrame, scales: Mapping[str, Scale], path: Path) 
     medians = summary.pivot_table(
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
-    agents = list(medians["agent"].unique())
-    shades = colours(agents)
-    # Not as many as hues, so that two of like colour have other marks.
-    marks = dict(zip(agents, itertools.cycle("osD^v"), strict=False))
-    with _scenario_panels(path, medians, 3.0) as found:
+    with _scenario_panels(path, medians, 3.0) as (found, shades):
+        # Not as many as hues, so that two of like colour have other marks.
+        marks = dict(zip(shades, itertools.cycle("osD^v"), strict=False))
         for axes, rows in found:
             # A valve that never moves has no place on this axis.
             moving = rows[rows["total_variation"] > 0.0]

@@ -20,7 +20,6 @@ from benchmarks.lib.statistics import student
 from benchmarks.limits.bounds import LeastPossible, least_possible, theorem
 from benchmarks.loop.linear import nominal
 from benchmarks.loop.metrics import mean_error
-from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.evaluation import SEED
 from mptc_gym.plant import action_from_command
@@ -81,10 +80,7 @@ def controllers() -> dict[str, Factory]:
 
 def errors(factory: Factory, runs: int, samples: int, **arguments: Any) -> Array:
     """Return mean |e| of runs with seeds from `SEED` on, degC, shape (runs,)."""
-    plants = make_plants(runs, samples, **factory.arguments(arguments))
-    trajectory = rollout(plants, factory(arguments, runs, SEED), samples, SEED)
-    plants.close()
-    return mean_error(trajectory)
+    return mean_error(factory.run(arguments, samples, runs, SEED))
 
 
 def beats(found: Array, least: LeastPossible) -> bool:

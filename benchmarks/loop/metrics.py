@@ -95,14 +95,6 @@ def held(setpoint: Array) -> list[tuple[int, int]]:
     return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
 
 
-def steady_stretches(setpoint: Array) -> NDArray[np.bool_]:
-    """Return which samples lie in the second half of the time that a set point is held."""
-    steady = np.zeros(len(setpoint), dtype=bool)
-    for start, stop in held(setpoint):
-        steady[(start + stop) // 2 : stop] = True
-    return steady
-
-
 def mean_error(trajectory: Trajectory) -> Array:
     """Return the mean of |e(k)| over k = 1 to N of each run, degC, shape (runs,)."""
     return np.asarray(np.abs(trajectory.error).mean(axis=0))

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from benchmarks.controllers.records import Factory
 from benchmarks.limits import least_possible
 from benchmarks.loop.designs import Arguments
-from benchmarks.loop.metrics import measure, steady_stretches
+from benchmarks.loop.metrics import held, measure
+from benchmarks.loop.rollout import Trajectory
 from mptc_gym import Parameters
 
 SETPOINT: Arguments = {"setpoint": "square", "setpoint_period": 600}
@@ -38,30 +39,29 @@ def agent_task(
     Returns
     -------
     dict of list
-        Of each run, every measure of `METRICS`; `late`, the mean |e| of its second half; and
-        `swing`, the standard deviation of the error on the steady stretches, both in degC.
+        Of each run, every measure of `METRICS`; `late`, the mean |e| of its second half, degC;
+        and `swing`.
     """
     controller = factory.in_service({**told, **SETPOINT}, runs, SEED)
     case = {**plant, **SETPOINT}
     trajectory = factory.run(case, samples, runs, SEED, controller)
-    steady = steady_stretches(trajectory.setpoint[:, 0])
     measures = {
         **measure(trajectory, Parameters(**case)),
         "late": np.abs(trajectory.error[samples // 2 :]).mean(axis=0),
-        "swing": swing(trajectory.setpoint - trajectory.output, steady),
+        "swing": swing(trajectory),
     }
     return {name: values.tolist() for name, values in measures.items()}
 
 
-def swing(error: NDArray[np.float64], steady: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the deviation of the error within each stretch, in the mean square of all.
+def swing(trajectory: Trajectory) -> NDArray[np.float64]:
+    """Return how far the error swings while a set point is held, degC, shape (runs,).
 
-    The error has the shape (samples, runs), `steady` the shape (samples,).
+    It is the standard deviation in the second half of each stretch, in the mean square of all.
     """
-    edges = np.flatnonzero(np.diff(steady, prepend=False, append=False))
+    error = trajectory.setpoint - trajectory.output
     variances = [
-        error[start:stop].var(axis=0)
-        for start, stop in zip(edges[::2], edges[1::2], strict=True)
+        error[(start + stop) // 2 : stop].var(axis=0)
+        for start, stop in held(trajectory.setpoint[:, 0])
     ]
     deviation: NDArray[np.float64] = np.sqrt(np.mean(variances, axis=0))
     return deviation

@@ -9,7 +9,6 @@ import numpy as np
 
 from benchmarks.controllers.records import Factory
 from benchmarks.loop.metrics import mean_error, settled, split
-from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import Scenario
 
 
@@ -51,9 +50,7 @@ def score(
     for i, (scenario, first_sample) in enumerate(SCENARIOS):
         seed = first_run + i * 100_000
         arguments = {**plant, **scenario.arguments}
-        controller = factory(arguments, runs, seed)
-        plants = make_plants(runs, scenario.samples, **factory.arguments(arguments))
-        trajectory = rollout(plants, controller, scenario.samples, seed)
+        trajectory = factory.run(arguments, scenario.samples, runs, seed)
         _, counted = split(trajectory, first_sample)
         medians[scenario.name] = float(np.median(mean_error(counted)))
         if scenario.name == "constant":
