@@ -80,7 +80,7 @@ def _read(file: _File, interval: float | None, rows: int) -> Log:
         for table in file.pieces():
             times = table.pop(file.time) if file.time else None
             spread = table if times is None else clock.spread(times, table)
-            kept = pd.concat([kept, spread])[-rows:] if read else spread[-rows:]
+            kept = pd.concat([kept, spread[-rows:]])[-rows:] if read else spread[-rows:]
             read += len(table)
             progress.update(len(table))
     if clock.interval is None or not read:

@@ -37,7 +37,7 @@ class Touched(MiddlePointEnv):
 
     def step(self, action: Any) -> Any:
         """Step the plant, with what the hand adds."""
-        if not self._ahead:
+        if not self._ahead:  # what comes from outside, the next sample last
             self._look_ahead()
         setpoint, noise, load, transmitter_noise = self._ahead[-1]
         self._ahead[-1] = setpoint + self.setpoint, noise, load + self.load, transmitter_noise
