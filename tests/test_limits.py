@@ -13,7 +13,7 @@ from benchmarks.lib.fan_out import FanOut
 from benchmarks.limits import bounds, command, frontier, least_possible, programme, verify
 from benchmarks.limits.__main__ import main
 from benchmarks.limits.news import News
-from benchmarks.limits.programme import TAIL, plan, reference
+from benchmarks.limits.programme import plan, reference
 from benchmarks.limits.unknown import noise_variance, unknown
 from benchmarks.limits.verify import beats, controllers, errors
 from benchmarks.loop.linear import course
@@ -54,7 +54,7 @@ def change(before, after, samples, **arguments):
     """Return the least sum of |e| over a change that finds the plant settled."""
     settling = 200 if before else 0
     setpoint = np.repeat([before, after], [settling, samples]).astype(np.float64)
-    of_plant = course_of(len(setpoint) + TAIL + 50, **arguments)
+    of_plant = course_of(len(setpoint) + 110, **arguments)
     return reference(of_plant, unknown(of_plant), setpoint).error[settling:].sum()
 
 
@@ -76,23 +76,11 @@ class Plan:
 ODD = [
     {"delay": 30, "u_min": -12.0, "u_max": 6.0, "dead_zone": 4.0},
     {"delay": 0, "a": (1.0, -0.9), "b": (0.2,), "dead_zone": 0.0, "u_min": -1.0, "u_max": 3.0},
-    {
-        "a": tuple(np.poly([0.97, 0.9, 0.6])),
-        "b": (0.01, 0.004),
-        "delay": 5,
-        "u_min": -6.0,
-    },
-    {  # a zero of B far outside the unit circle, and a fast A
-        "a": tuple(np.poly([0.3, -0.2])),
-        "b": (0.1, -0.9, 0.3),
-        "delay": 2,
-        "u_min": -5.0,
-        "u_max": 7.0,
-        "dead_zone": 0.0,
-    },
-]
-
-
+    {"a": tuple(np.poly([0.97, 0.9, 0.6])), "b": (0.01, 0.004), "delay": 5, "u_min": -6.0},
+    # A zero of B far outside the unit circle, and a fast A.
+    {"a": tuple(np.poly([0.3, -0.2])), "b": (0.1, -0.9, 0.3), "delay": 2, "u_min": -5.0,
+     "u_max": 7.0, "dead_zone": 0.0},
+]  # fmt: skip
 FIRST_ORDER = {
     "a": (1.0, -0.5), "b": (1.0,), "c": (1.0,), "delay": 0, "dead_zone": 0.0,
     "u_min": -1.0, "u_max": 1.0,
@@ -300,14 +288,11 @@ class TestNews:
         plants = make_plants(runs, samples, **RANDOM)
         setpoints = rollout(plants, PIController(0.0, 0.0), samples, seed=1).setpoint
         penalties = np.array([law.penalty(s) for s in setpoints.T])
-        starts = [np.r_[0, np.flatnonzero(np.diff(s)) + 1] for s in setpoints.T]
-        ages = [np.arange(samples) - np.repeat(b, np.diff([*b, samples])) for b in starts]
+        # Whether the level has been held for longer than 30 samples.
+        old = np.array([[k > 30 and np.ptp(s[k - 30 : k + 1]) == 0.0 for k in range(samples)]
+                        for s in setpoints.T])  # fmt: skip
         assert np.abs(penalties).mean() > 0.05
-        for known in (
-            np.ones_like(penalties),
-            setpoints.T,
-            np.sign(setpoints.T) * (np.array(ages) > 30),
-        ):
+        for known in (np.ones_like(penalties), setpoints.T, np.sign(setpoints.T) * old):
             sums = (penalties * known).sum(axis=1)
             assert abs(sums.mean()) < 4 * sums.std() / np.sqrt(runs)
             assert sums.std() > 1.0
@@ -345,16 +330,6 @@ class TestLeastPossible:
         least = least_possible(kind="preview", folder=None, **case)
         assert not beats(errors(controllers()[controller], 1, **case), least)
         assert least.value < 0.95 * least.idle
-
-    def test_one_who_counts_samples_beats_the_reference_alone(self):
-        found = errors(COUNTING, 1, 1200)[0]
-        assert least_possible(samples=1200, kind="preview", folder=None).value < found
-        assert found < 0.7 * least_possible(samples=1200).value
-
-    def test_with_load_and_transmitter_noise_mpc_comes_within_a_tenth(self):
-        least = least_possible(samples=1200, kind="reference", **PRESETS["disturbed"])
-        found = errors(MPC, 40, 1200, **PRESETS["disturbed"])
-        assert 1.0 < found.mean() / least.value < 1.1
 
     def test_they_hold_for_those_who_read_the_transmitter(self):
         noisy = {"setpoint": 5.0, "noise_variance": 0.5, "delay": 2}
@@ -449,14 +424,20 @@ class TestPredictiveController:
         (found,) = mean_error(run_mpc(1, **case))
         assert limit * (1 - 1e-4) <= found <= 1.02 * limit
 
-    @pytest.mark.parametrize("name", ["square-noise", "constant-noise"])
-    def test_it_comes_near_the_limit_with_noise_and_does_not_beat_it(self, name):
-        scenario, runs = SCENARIOS[name], 60
-        case = {"samples": scenario.samples, **scenario.arguments}
+    @pytest.mark.parametrize(
+        ("case", "most"),
+        [
+            ({"samples": 1200, "noise_variance": 0.5}, 1.01),
+            ({"samples": 600, "noise_variance": 0.5, "setpoint": 5.0}, 1.01),
+            ({"samples": 1200, **PRESETS["disturbed"]}, 1.07),
+        ],
+    )
+    def test_it_comes_near_the_limit_with_noise_and_does_not_beat_it(self, case, most):
+        runs = 60
         least = least_possible(kind="reference", **case).value
         found = mean_error(run_mpc(runs, seed=77, **case))
         error = found.std() / np.sqrt(runs)
-        assert least - 3 * error < found.mean() < 1.01 * least + 3 * error
+        assert least - 3 * error < found.mean() < most * least + 3 * error
 
     def test_it_foresees_the_plant_exactly(self):
         # Without a dead zone and far from the limits the output comes to the set point at the

@@ -77,20 +77,19 @@ class News:
 
     def penalty(self, setpoint: Array) -> Array:
         """Return pi, degC times samples for each t/h, for one draw of y_d(k): (samples,)."""
-        samples = len(setpoint)
-        starts, ends = np.transpose(held(setpoint))
-        levels = setpoint[starts]
+        samples, holds = len(setpoint), held(setpoint)
         stays = []  # g of each level by its age, were it held for ever
         changed = []  # what a change adds to the mean of g, by age, summed up
-        for i, level in enumerate(levels):
-            before = levels[i - 1] if i else 0.0
+        guess = np.zeros(samples)
+        before = 0.0
+        for start, end in holds:
+            level = setpoint[start]
             changed.append(np.cumsum(self._mean_slope(level) * self._left))
             stays.append(self._slope(before, level) + self._lean(changed[-1]))
-        guess = np.concatenate(
-            [stay[: end - start] for stay, start, end in zip(stays, starts, ends, strict=True)]
-        )
+            guess[start:end] = stays[-1][: end - start]
+            before = level
         surprise = np.zeros((samples, samples))  # [k, j]: g(k) - E[g(k) | up to j]
-        for stay, change, start, end in zip(stays, changed, starts, ends, strict=True):
+        for (start, end), stay, change in zip(holds, stays, changed, strict=True):
             for j in range(start, end):
                 ages = np.arange(j + 1 - start, samples - start)
                 expected = self._expected(ages, j - start, stay, change)
@@ -138,8 +137,7 @@ class News:
         """
         lean = np.zeros(len(change))
         lag = self._course.lag
-        first_response = self._impulse[lag : lag + 1]
-        if not first_response.any():
+        if not self._impulse[lag : lag + 1].any():
             return lean
         for age in range(min(self._longest, len(change)) - 1, self._settled - 1, -1):
             now = age - lag
@@ -148,7 +146,5 @@ class News:
             worth = float(self._impulse[lag : lag + len(ages)] @ mean)
             count = self._longest - max(self._shortest, now + 1) + 1
             still = min(1.0, (self._longest - age) / count)
-            if still > 0.0:
-                needed = -worth / (float(first_response[0]) * still)
-                lean[age] = np.clip(needed, -1.0, 1.0)
+            lean[age] = np.clip(-worth / (self._impulse[lag] * still), -1.0, 1.0)
         return lean
