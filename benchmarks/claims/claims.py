@@ -92,10 +92,9 @@ def dead_zone(batch: Batch, claim: Claim) -> None:
         large = batch.run_nn(samples, **arguments, dead_zone=7.0)
         quantity = f"settled when the run ends, dead zone 7 t/h, {name}"
         claim.ask_share(quantity, settled(large), often=True)
-        claim.ask(
-            f"mean error at dead zone 7 t/h, as a multiple of that at 5 t/h, {name}",
-            ratio(mean_error(large), mean_error(small)), at_least=1 + MUCH,
-        )  # fmt: skip
+        cost = ratio(mean_error(large), mean_error(small))
+        quantity = f"mean error at dead zone 7 t/h, as a multiple of that at 5 t/h, {name}"
+        claim.ask(quantity, cost, at_least=1 + MUCH)
         for zone, runs in ((5, small), (7, large)):
             claim.ask(f"mean error, dead zone {zone} t/h, {name}", mean_error(runs), "°C")
 
@@ -112,10 +111,8 @@ def noise(batch: Batch, claim: Claim) -> None:
     runs = batch.run_nn(samples, **CONSTANT, **NOISY)
     error = (runs.setpoint - runs.output)[steady]
     alone = idle.output[steady].std(axis=0)
-    claim.ask(
-        "mean of e over the last 600 of 1,200 samples, its size, constant set point",
-        np.abs(error.mean(axis=0)), "°C", at_most=0.05 * 5.0,
-    )  # fmt: skip
+    quantity = "mean of e over the last 600 of 1,200 samples, its size, constant set point"
+    claim.ask(quantity, np.abs(error.mean(axis=0)), "°C", at_most=0.05 * 5.0)
     claim.ask(
         "standard deviation of y over these samples, as a multiple of that without control",
         ratio(error.std(axis=0), alone), at_most=1 + MUCH,
@@ -159,14 +156,11 @@ def pi_gains(batch: Batch, claim: Claim) -> None:
             ratio(errors[best], errors[gains[-1]]), at_least=1 - NOTABLE,
         )  # fmt: skip
     doubled = batch.run_pi(2 * KP, KI, samples, **CONSTANT)
-    claim.ask(
-        f"samples of the last 300 with the flow at a limit, Kp = {2 * KP:g}",
-        100 * np.mean(np.abs(doubled.applied[-300:]) == Parameters().u_max), "%", at_least=50,
-    )  # fmt: skip
-    claim.ask(
-        f"largest pole without dead zone and limits, Kp = {2 * KP:g}: unstable above 1",
-        largest_pole(2 * KP, KI), at_least=1,
-    )  # fmt: skip
+    limited = 100 * np.mean(np.abs(doubled.applied[-300:]) == Parameters().u_max)
+    quantity = f"samples of the last 300 with the flow at a limit, Kp = {2 * KP:g}"
+    claim.ask(quantity, limited, "%", at_least=50)
+    quantity = f"largest pole without dead zone and limits, Kp = {2 * KP:g}: unstable above 1"
+    claim.ask(quantity, largest_pole(2 * KP, KI), at_least=1)
     claim.ask("the same, Kp = 2.2", largest_pole(KP, KI))
     smallest = min(largest_pole(gain, KI) for gain in gains)
     claim.ask("the same, the best Kp of 0.1 to 2.2", smallest)
