@@ -70,8 +70,7 @@ class Rows:
 
     def lagged(self, values: Array, lags: Sequence[int]) -> Array:
         """Return a column for each lag, shape (rows, lags)."""
-        known = np.nan_to_num(values)  # what is not known is in no row
-        return known[self.index[:, np.newaxis] - np.array(lags, dtype=np.intp)]
+        return values[self.index[:, np.newaxis] - np.array(lags, dtype=np.intp)]
 
     def levels(self, orders: Orders) -> Array:
         """Return the columns of what is constant: one, or with a walk one a stretch."""
