@@ -1,6 +1,6 @@
 """Control the middle-point temperature of a once-through boiler: a Gymnasium environment.
 
-Importing this package registers `MiddlePoint-v0`, and each of `PRESETS` under an id of its own.
+Importing this package registers `MiddlePoint-v0`, and each of `PRESETS` under its own id.
 """
 
 import gymnasium
@@ -29,6 +29,6 @@ for _name, _id in IDS.items():
         entry_point="mptc_gym.env:MiddlePointEnv",
         vector_entry_point="mptc_gym.vector_env:MiddlePointVectorEnv",
         max_episode_steps=1200,
-        order_enforce=False,  # the environments themselves ask for a reset
+        order_enforce=False,  # the environments check this themselves
         kwargs=PRESETS[_name],
     )

@@ -1,4 +1,4 @@
-"""Score any policy on fixed episodes: `evaluate`."""
+"""Score any policy on fixed episodes."""
 
 from __future__ import annotations
 
@@ -28,31 +28,31 @@ from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
-Values = NDArray[np.float64]  # one an episode, shape (episodes,)
+Values = NDArray[np.float64]  # one per episode, shape (episodes,)
 Env = gymnasium.Env[Any, Any]
 Batch = Callable[..., VectorEnv[Any, Any, Any]]  # makes n environments
 
 SEED: Final = 7_000_000
-"""Of the first of the fixed episodes; episode i has the seed `SEED + i`. Train on others."""
+"""Seed of the first fixed episode; episode i has the seed `SEED + i`. Train on other seeds."""
 EPISODES: Final = 100
-"""How many of them a score is the mean of, unless told otherwise."""
+"""Default number of episodes per score."""
 SAMPLES: Final = 1200
-"""Of an episode whose environment has no limit."""
+"""Length of an episode if its environment has no time limit, samples."""
 
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
-# Arguments that change what an agent sees or is paid, and not what it can come to.
+# Arguments that change observations or rewards, but not the least possible error.
 _NO_MATTER: Final = *WINDOWS, "reward", "error_scale", "move_weight"
-_BATCH: Final = 100  # episodes that run side by side
-_RESAMPLES: Final = 2000  # of the bootstrap
+_BATCH: Final = 100  # episodes run side by side
+_RESAMPLES: Final = 2000  # bootstrap resamples
 _INCREMENTAL: Final = f"{IncrementalAction.__module__}:{IncrementalAction.__name__}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
-    """What `evaluate` found. `str` gives a line to read.
+    """Result of `evaluate`; `str` gives a one-line summary.
 
-    What compares with the least possible error is None where the package has no bound, as for
-    arguments that are no preset's. Arrays have an element for each episode.
+    Fields that depend on the least possible error are None where the package has no bound, as
+    for arguments of no preset. Arrays have one element per episode.
     """
 
     env: str
@@ -64,24 +64,24 @@ class Evaluation:
     errors: Values
     """Mean of |e(k)| over k = 1 to N, degC."""
     travels: Values
-    """How far the valve moves, t/h."""
+    """Distance that the valve moves, t/h."""
     seeds: range
-    """Of the episodes."""
+    """Seeds of the episodes."""
     least_possible: float | None = None
-    """The least possible mean error of these episodes, degC: see `benchmarks/limits`."""
+    """Least possible mean error of these episodes, degC: see `benchmarks/limits`."""
     multiple: float | None = None
     """`mean_error / least_possible`."""
     score: float | None = None
     """0 for a valve that is left alone, 1 for the least possible error."""
     interval: tuple[float, float] | None = None
-    """The ends of the score's 95 % interval, from drawing episodes."""
+    """95 % bootstrap interval of the score, from resampled episodes."""
     least: Values | None = None
-    """The least possible errors, degC. Where nothing but noise and load is drawn they are all
-    the same: an expectation over these."""
+    """Least possible error, degC. Where only noise and load are drawn, all elements equal its
+    expectation over these."""
     scores: Values | None = None
-    """Of each episode against its own bound."""
+    """Score of each episode against its own bound."""
     missing: str = ""
-    """Where there is no bound: what to do about it."""
+    """How to compute the bound if there is none; otherwise empty."""
 
     def __str__(self) -> str:
         parts = [f"{self.env}: mean error {self.mean_error:.3f} degC"]
@@ -107,45 +107,45 @@ def evaluate(
     seed: int = SEED,
     **arguments: Any,
 ) -> Evaluation:
-    """Run a policy on fixed episodes, and score it.
+    """Run a policy on fixed episodes and score it.
 
     Parameters
     ----------
     policy
-        One of three, which gets observations of shape (n, size), float32, one row an episode,
-        and returns actions of shape (n, 1). A batch has up to 100 episodes.
+        One of three kinds. It receives observations of shape (n, size), float32, one row per
+        episode, and returns actions of shape (n, 1). A batch has up to 100 episodes.
 
         - an object with `predict(observations, state, episode_start, deterministic)`, such as
-          a model of Stable-Baselines3. It acts without exploration; a recurrent state begins
-          anew with every batch.
-        - an object with `act(observations)` and `reset()`, such as the controllers of `agents`.
+          a Stable-Baselines3 model. It acts without exploration; a recurrent state is reset
+          before every batch.
+        - an object with `act(observations)` and `reset()`, such as the controllers in `agents`.
           `reset` is called before every batch.
-        - a function of observations.
+        - a function of the observations.
     env
-        An id, `IDS` has seven; an `EnvSpec`, which may name wrappers; or a function that makes
-        an environment. A policy whose action is read by a wrapper, such as
-        `IncrementalAction`, has to be judged with the wrapper: by one of the latter two.
+        An id, such as one of `IDS`; an `EnvSpec`, which may include wrappers; or a function
+        that makes an environment. A policy trained with a wrapper that changes its actions,
+        such as `IncrementalAction`, needs that wrapper here, from a spec or a function.
     episodes
-        How many, at least 2.
+        Number of episodes, at least 2.
     seed
-        Of the first episode. The default is that of all published scores. There are bounds for
-        the 120 episodes from there on: take others than the first 100 to choose a policy by.
+        Seed of the first episode. The default is that of all published scores. Bounds exist for
+        the 120 episodes from there on: to select a policy, use others than the first 100.
     **arguments
-        More arguments for the id or the `EnvSpec`, as of `gymnasium.make`: those of the
+        Further arguments for the id or the `EnvSpec`, as in `gymnasium.make`: those of the
         environment and `max_episode_steps`.
 
     Raises
     ------
     ValueError
-        If there is no such environment, it is not one of this package, the policy does not fit
-        it, or it returns actions of another shape or that are not finite.
+        If the environment does not exist or is not one of this package, if the policy does not
+        fit it, or if the policy's actions have the wrong shape or are not finite.
     TypeError
         If an argument of the environment is unknown.
 
     Warns
     -----
     UserWarning
-        If the policy is a model that does not say how it was trained, and `env` is an id.
+        If the policy is a model that does not record how it was trained, and `env` is an id.
 
     Examples
     --------
@@ -196,10 +196,10 @@ valve travel 0 t/h; 100 episodes, all alike
 
 
 def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values | None:
-    """Return the least possible mean error of episodes, degC, as the package keeps it.
+    """Return the least possible mean error of each episode, degC, from the package's bounds.
 
-    None if the package does not have it for N = `samples` and these seeds. Where noise and load
-    alone are drawn, it is the same for all episodes, and there for any seeds.
+    Return None if there is no bound for N = `samples` and these seeds. Where only noise and
+    load are drawn, one bound holds for all episodes and any seeds.
     """
     least = _kept().get(_case(parameters))
     if least is None or samples != SAMPLES:
@@ -212,20 +212,20 @@ def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values |
 
 @cache
 def _kept() -> dict[Parameters, Values]:
-    """Return the bounds that `python -m benchmarks.limits --package` has written, by case."""
+    """Return the bounds written by `python -m benchmarks.limits --package`, by case."""
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
     cases = json.loads(text)["cases"].values()
     return {_case(Parameters(**case["arguments"])): np.array(case["least"]) for case in cases}
 
 
 def _case(parameters: Parameters) -> Parameters:
-    """Return the arguments without those that do not change what is possible."""
+    """Return the arguments, with those that do not affect the bound at their defaults."""
     defaults = {name: ARGUMENTS[name].default for name in _NO_MATTER}
     return dataclasses.replace(parameters, **defaults)
 
 
 def _missing(parameters: Parameters) -> str:
-    """Return how to come by a bound that the package does not have."""
+    """Return a message that says how to compute a missing bound."""
     case = dataclasses.asdict(_case(parameters))
     options = "".join(
         f" --set {name}={value if isinstance(value, str) else json.dumps(value)}"
@@ -236,7 +236,7 @@ def _missing(parameters: Parameters) -> str:
 
 
 def _interval(gained: Values, possible: Values) -> tuple[float, float]:
-    """Return the 95 % interval of a quotient of means, by drawing episodes with replacement."""
+    """Return the 95 % bootstrap interval of a quotient of means over episodes."""
     generator, n = np.random.default_rng(0), len(gained)
     drawn = (generator.integers(n, size=n) for _ in range(_RESAMPLES))
     quotients = [gained[which].mean() / possible[which].mean() for which in drawn]
@@ -268,7 +268,7 @@ def make_one(env: str | EnvSpec, arguments: dict[str, Any]) -> Env:
 def _parameters(single: Env) -> Parameters:
     """Return the arguments of an environment of this package.
 
-    An environment whose observations would be scaled otherwise than in training is refused.
+    An environment that would scale observations differently than in training is refused.
     """
     inner = getattr(single, "unwrapped", None)
     if not isinstance(inner, MiddlePointEnv):
@@ -282,11 +282,11 @@ def _parameters(single: Env) -> Parameters:
 
 
 def native_batch(single: Env) -> Batch | None:
-    """Return how to make many of an environment that step at once.
+    """Return a function that makes many of an environment, to be stepped at once.
 
-    It is called with their number, and with an `autoreset_mode` and a `render_mode` if need be.
-    It is None if there is no such batch: for another environment, one without a spec, and in
-    other wrappers than `IncrementalAction`.
+    It takes their number and, optionally, an `autoreset_mode` and a `render_mode`. Return None
+    if there is no such batch: for another environment, one without a spec, or one in wrappers
+    other than `IncrementalAction`.
     """
     inner, spec = single.unwrapped, single.spec
     if type(inner) is not MiddlePointEnv or spec is None:
@@ -305,10 +305,10 @@ def native_batch(single: Env) -> Batch | None:
 
 
 def _run(batch: Batch, policy: Any, seeds: range, samples: int) -> tuple[Values, Values, int]:
-    """Run one episode a seed, of N = `samples`, or less if the environments truncate before.
+    """Run one episode per seed, of N = `samples`, or fewer if the environments end earlier.
 
-    Returned are the mean |e(k)| over k = 1 to N, degC, and how far the valve moves, t/h, both
-    of each episode, and N. `batch` makes so many environments.
+    Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each episode;
+    and N. `batch(n)` makes n environments.
     """
     errors, travels = np.empty(len(seeds)), np.empty(len(seeds))
     for first in range(0, len(seeds), _BATCH):
@@ -335,11 +335,11 @@ def _run(batch: Batch, policy: Any, seeds: range, samples: int) -> tuple[Values,
 
 
 def _checked(actions: Any, n: int, k: int) -> NDArray[Any]:
-    """Return what a policy returned at sample k, if the environments can take it."""
+    """Return a policy's actions at sample k as an array, if the environments can take them."""
     try:
         checked = np.asarray(actions)
         finite = np.isfinite(checked)
-    except (TypeError, ValueError, RuntimeError):  # the last one: of tensors
+    except (TypeError, ValueError, RuntimeError):  # the last: from tensors
         reject("actions of policy", actions, "an array of numbers")
     if checked.shape != (n, 1):
         raise ValueError(f"policy must return actions of shape {(n, 1)}, got {checked.shape}")

@@ -1,4 +1,4 @@
-"""Read what a policy says of itself: how it acts, and what it was trained on."""
+"""Find out how a policy acts and what it was trained on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Act = Callable[[NDArray[np.float32]], Any]  # observations, shape (n, size), to 
 
 
 def acting(policy: Any) -> Act:
-    """Bring a policy to the start of a batch of episodes, and return how it acts in it."""
+    """Reset a policy for a batch of episodes, and return its function of observations."""
     predicts, acts = (callable(getattr(policy, name, None)) for name in ("predict", "act"))
     if isinstance(policy, type) or not (predicts or acts or callable(policy)):
         reject(
@@ -37,7 +37,7 @@ def acting(policy: Any) -> Act:
 
 
 def _predicting(policy: Any) -> Act:
-    """Return how a policy in the form of Stable-Baselines3 acts, from the start of episodes."""
+    """Return the function of observations of a policy in the form of Stable-Baselines3."""
     known = inspect.signature(policy.predict).parameters
     normalise = normaliser_of(policy)
     state, begins = None, True
@@ -57,9 +57,9 @@ def _predicting(policy: Any) -> Act:
 
 
 def normaliser_of(policy: Any) -> Callable[[NDArray[Any]], NDArray[Any]]:
-    """Return what normalises the observations of a policy as in its training.
+    """Return the function that normalises a policy's observations as in its training.
 
-    It is a ValueError if the statistics of a `VecNormalize` are lost.
+    Raise ValueError if the statistics of its `VecNormalize` are lost.
     """
     live = getattr(policy, "get_vec_normalize_env", lambda: None)()
     if live is not None:
@@ -70,7 +70,7 @@ def normaliser_of(policy: Any) -> Callable[[NDArray[Any]], NDArray[Any]]:
         mean, most = np.array(kept["mean"]), kept["clip_obs"]
         deviation = np.sqrt(np.array(kept["var"]) + kept["epsilon"])
         return lambda seen: np.clip((seen - mean) / deviation, -most, most).astype(np.float32)
-    # A model that learns on policy has these where, and only where, it is normalised.
+    # An on-policy model keeps original observations if and only if it is normalised.
     normalised = getattr(policy, "_last_original_obs", None) is not None
     if normalised and hasattr(policy, "rollout_buffer") and not hasattr(space, "trained_on"):
         raise ValueError(
@@ -81,23 +81,23 @@ def normaliser_of(policy: Any) -> Callable[[NDArray[Any]], NDArray[Any]]:
 
 
 def trained_on(policy: Any) -> EnvSpec | None:
-    """Return the spec of the environment that a policy was trained on, if that is known.
+    """Return the spec of the environment that a policy was trained on, or None if unknown.
 
-    `mptc_gym.sb3` notes it in the observation space; models of Stable-Baselines3 that were not
-    loaded from a file still have their environments. A path is that of a saved model.
+    `mptc_gym.sb3` stores it in the observation space; a Stable-Baselines3 model that was not
+    loaded from a file still has its environments. A path is that of a saved model.
     """
     if isinstance(policy, str | Path):
         return _saved_spec(policy)
     text = getattr(getattr(policy, "observation_space", None), "trained_on", None)
     if text is not None:
         return EnvSpec.from_json(text)
-    with suppress(AttributeError):  # no model, or no environments, or they have no spec
+    with suppress(AttributeError):  # not a model, no environments, or no spec
         return cast("EnvSpec | None", policy.get_env().get_attr("spec")[0])
     return None
 
 
 def _saved_spec(path: str | Path) -> EnvSpec | None:
-    """Return what a zip of Stable-Baselines3 says of the training; no code of it is run."""
+    """Return the training spec in a Stable-Baselines3 zip, without running code from it."""
     try:
         with zipfile.ZipFile(path) as archive:
             data = json.loads(archive.read("data"))
@@ -110,13 +110,13 @@ def _saved_spec(path: str | Path) -> EnvSpec | None:
 
 
 def action_wrappers(spec: EnvSpec) -> list[WrapperSpec]:
-    """Return the wrappers of a spec but those that only look on."""
+    """Return the wrappers of a spec, except those that only observe."""
     watching = "Monitor", "RecordEpisodeStatistics", "RecordVideo"
     return [each for each in spec.additional_wrappers if each.name not in watching]
 
 
 def check_fit(policy: Any, env: gymnasium.Env[Any, Any], parameters: Parameters) -> None:
-    """Refuse an environment that does not show what a policy reads, or reads what it means."""
+    """Refuse an environment whose observations or wrappers do not fit a policy."""
     normaliser_of(policy)
     shape, own = env.observation_space.shape, getattr(policy, "observation_space", None)
     if own is not None and own.shape != shape:

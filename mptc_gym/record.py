@@ -1,7 +1,7 @@
-"""Record the last samples of an episode for a picture, and choose the axes for them.
+"""Record the latest samples of an episode for a picture, and choose its axes.
 
-Environments hand in plain numbers, one call a sample. A record holds numbers alone, so that it
-can be copied.
+Environments add plain numbers, one call per sample. A record holds only numbers, so that it can
+be copied.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from mptc_gym.parameters import PlantNumbers
 
 Sample = tuple[float, float, float, float]  # y_d(k), y(k), u(k-1), u_a(k-1)
 
-SPAN = 200  # samples that a picture shows at least
-LONGEST = 2000  # samples that a picture shows at most, even if the delay is long
-FARTHEST = 1e12  # degC; what is beyond, or not a number, is drawn at the edge
+SPAN = 200  # fewest samples that a picture spans
+LONGEST = 2000  # most samples that a picture spans, even with a long delay
+FARTHEST = 1e12  # degC; values beyond it, or NaN, are drawn at the edge
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Axis:
 
     low: float
     high: float
-    step: float  # from tick to tick
+    step: float  # between ticks
 
     def ticks(self) -> Iterator[float]:
         """Return the round numbers within the range."""
@@ -35,12 +35,12 @@ class Axis:
         return (i * self.step for i in range(first, last + 1))
 
     def share(self, value: float) -> float:
-        """Return how far up the range a value lies, from 0 to 1; its ends stand for more."""
+        """Return where a value lies in the range, from 0 to 1; values beyond are clipped."""
         return min(1.0, max(0.0, (value - self.low) / (self.high - self.low)))
 
 
 class Record:
-    """The last samples of an episode that begins at rest with the set point y_d(0), degC."""
+    """The latest samples of an episode that starts at rest with the set point y_d(0), degC."""
 
     def __init__(
         self, plant: PlantNumbers[float], sampling_interval: float, setpoint: float
@@ -50,7 +50,7 @@ class Record:
         self.span = min(max(SPAN, 4 * self.delay), LONGEST)
         self.k = 0
         self.samples: deque[Sample] = deque([(setpoint, 0.0, 0.0, 0.0)], maxlen=self.span + 1)
-        # Of the whole episode, so that the axis need not move again and again.
+        # Extremes of the whole episode, so that the axis rarely changes.
         self._lowest, self._highest = min(0.0, setpoint), max(0.0, setpoint)
 
     def add(self, setpoint: float, output: float, command: float, applied: float) -> None:
@@ -64,12 +64,12 @@ class Record:
 
     @property
     def first(self) -> int:
-        """The sample at the left end of the picture; the right end is `span` later."""
+        """The sample at the left edge of the picture; the right edge is `span` later."""
         return max(0, self.k - self.span)
 
     @property
     def in_transit(self) -> int:
-        """How many of the latest inputs do not show in the temperature yet."""
+        """Number of latest inputs that do not yet show in the temperature."""
         return min(self.delay, self.k)
 
     @property
@@ -81,7 +81,7 @@ class Record:
 
     @property
     def temperatures(self) -> Axis:
-        """The axis of the temperatures, degC: all of the episode so far."""
+        """The temperature axis, degC: it covers the episode so far."""
         margin = max(0.05 * (self._highest - self._lowest), 0.5)
         low, high = self._lowest - margin, self._highest + margin
         room = _round_step((high - low) / 20)
@@ -90,17 +90,17 @@ class Record:
 
     @property
     def flows(self) -> Axis:
-        """The axis of the flows, t/h: what the actuator lets through, and some room."""
+        """The flow axis, t/h: the range of the actuator, with a margin."""
         low, high = min(self.plant.u_min, 0.0), max(self.plant.u_max, 0.0)
         margin = 0.12 * (high - low)
         return Axis(low - margin, high + margin, _round_step((high - low) / 4))
 
     @property
     def readings(self) -> dict[str, str]:
-        """The present values as text, by name."""
+        """The current values as text, by name."""
         setpoint, output, command, applied = self.samples[-1]
         seconds = self.sampling_interval
-        digits = 1 if seconds >= 6.0 else 2 if seconds >= 0.6 else 3  # that a sample shows
+        digits = 1 if seconds >= 6.0 else 2 if seconds >= 0.6 else 3  # so that a sample shows
         return {
             "time": f"{self.k * seconds / 60.0:.{digits}f} min",
             "set point": f"{_short(setpoint)} °C",
@@ -112,7 +112,7 @@ class Record:
 
 
 def _round_step(least: float) -> float:
-    """Return the smallest of 1, 2 or 5 times a power of ten that is not below `least`."""
+    """Return the smallest 1, 2 or 5 times a power of ten that is at least `least`."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= least)
 

@@ -1,6 +1,6 @@
-"""Render an episode in the mode that was asked for; draw the picture in text.
+"""Render an episode in the requested mode; draw the text picture.
 
-Pictures in pixels are made by `mptc_gym.drawing`, which is loaded with the first of them.
+`mptc_gym.drawing` makes pictures in pixels, and is imported for the first of them.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from mptc_gym.checks import reject
 from mptc_gym.record import Axis, Record
 
 Frame = NDArray[np.uint8]
-_COLUMNS = 72  # of a picture in text
+_COLUMNS = 72  # width of the text picture
 
 
 def check_mode(mode: str | None, modes: Sequence[str]) -> None:
-    """Refuse a render mode that is not None or one of `modes`, with a ValueError."""
+    """Raise ValueError if a render mode is neither None nor one of `modes`."""
     if mode is not None and not (isinstance(mode, str) and mode in modes):
         reject("render_mode", mode, " or ".join(["None", *map(repr, modes)]))
 
 
 def warn_no_mode() -> None:
-    """Warn that there is nothing to draw."""
+    """Warn that `render` does nothing without a mode."""
     logger.warn(
         "render does nothing without a render mode: give one to gymnasium.make, as in "
         'make("MiddlePoint-v0", render_mode="rgb_array")'
@@ -36,7 +36,7 @@ def warn_no_mode() -> None:
 
 
 def render(mode: str | None, record: Record | None, fps: float) -> Frame | str | None:
-    """Make a picture in a mode: return it, or show it in a window, at most `fps` a second.
+    """Return a picture, or show it in a window at up to `fps` frames per second.
 
     See `MiddlePointEnv.render`.
     """
@@ -65,7 +65,7 @@ def close_window() -> None:
 
 def _drawing() -> ModuleType:
     try:
-        import pygame  # noqa: F401 (alone, so that no other fault is taken for its absence)
+        import pygame  # noqa: F401 (alone: another failed import must not look like this)
     except ImportError as error:
         raise DependencyNotInstalled(
             'pygame is not installed, run `pip install "mptc_gym[render]"`'
@@ -76,7 +76,7 @@ def _drawing() -> ModuleType:
 
 
 def text(record: Record) -> str:
-    """Return a picture in text: set point -, temperature *; command +, applied #."""
+    """Return the text picture: set point -, temperature *; command +, applied #."""
     places = np.round(np.arange(_COLUMNS) * record.span / (_COLUMNS - 1)).astype(int)
     places = places[record.first + places <= record.k]
     setpoints, outputs, commands, applied = np.array(record.samples)[places].T
@@ -103,7 +103,7 @@ def text(record: Record) -> str:
 def _panel(
     axis: Axis, rows: int, lines: dict[str, NDArray[np.float64]], dead_zone: float = 0.0
 ) -> Iterator[str]:
-    """Yield rows of characters, the top one first: lines, over the shade of a dead zone."""
+    """Yield rows of characters from the top: lines over the shaded dead zone."""
 
     def row_of(value: float) -> int:
         return round((1.0 - axis.share(value)) * (rows - 1))

@@ -1,4 +1,4 @@
-"""Train with Stable-Baselines3 on a batch of plants, and keep how a policy was trained.
+"""Train with Stable-Baselines3 on a batch of plants, and record how a policy was trained.
 
     from stable_baselines3 import PPO
     from mptc_gym.sb3 import ScoreCallback, make_vec_env
@@ -7,7 +7,7 @@
                           action_window=20, setpoint="random")
     model = PPO("MlpPolicy", plants, n_steps=64).learn(200_000, ScoreCallback(path="best.zip"))
 
-It needs `pip install "mptc_gym[sb3]"`.
+Requires `pip install "mptc_gym[sb3]"`.
 """
 
 from __future__ import annotations
@@ -53,34 +53,34 @@ def make_vec_env(
     wrapper: Mapping[str, Any] | Callable[..., Any] | None = None,
     **arguments: Any,
 ) -> GymnasiumVecEnv:
-    """Make plants that are stepped at once, for the algorithms of Stable-Baselines3.
+    """Make plants that are stepped together, for the algorithms of Stable-Baselines3.
 
-    A model that is trained on them knows how, and `model.save` saves it: `spec_of` reads it.
-    The infos of an episode's end have its return, as `Monitor` has it.
+    A model trained on them records how it was trained: `model.save` saves this, and `spec_of`
+    reads it. At the end of an episode, its infos hold the return, as with `Monitor`.
 
     Parameters
     ----------
     env
         An id or an `EnvSpec`.
     n_envs
-        How many plants.
+        Number of plants.
     seed
-        Of the first plant at the first reset; plant i has `seed + i`. A model with a seed sets
-        it, too.
+        Seed of the first plant at the first reset; plant i has `seed + i`. The seed of a model,
+        if it has one, replaces it.
     wrapper
-        Asks for `IncrementalAction`: its arguments, or the class for its defaults.
+        Adds `IncrementalAction`: its arguments, or the class itself for its defaults.
     **arguments
-        More arguments for the id, as of `gymnasium.make`; `render_mode` may be "rgb_array".
+        Further arguments for the id, as in `gymnasium.make`; `render_mode` may be "rgb_array".
 
     Raises
     ------
     ValueError
-        If an argument is out of range, or there is another wrapper, which does not take a
-        batch; `stable_baselines3.common.env_util.make_vec_env` is for those.
+        If an argument is out of range, or the wrapper is another, which cannot take a batch:
+        for those, use `stable_baselines3.common.env_util.make_vec_env`.
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     arguments = {name: plain(value) for name, value in arguments.items()}
-    render_mode = arguments.pop("render_mode", None)  # no part of how a policy is trained
+    render_mode = arguments.pop("render_mode", None)  # not part of a policy's training
     single = make_one(env, arguments)
     if getattr(wrapper, "func", wrapper) is VectorIncrementalAction:
         wrapper = getattr(wrapper, "keywords", {})
@@ -102,31 +102,31 @@ def make_vec_env(
 
 
 class GymnasiumVecEnv(VecEnv):
-    """Steps a whole batch at once where `DummyVecEnv` goes from one environment to the next.
+    """Step whole batches at once, where `DummyVecEnv` steps one environment after another.
 
-    Observations, rewards, ends and terminal observations are, to the bit, those of
+    Observations, rewards, episode ends and terminal observations are bit for bit those of
     `DummyVecEnv` with the same environments.
 
     Parameters
     ----------
     batches
-        One or more, of autoreset mode "SameStep" and with the same spaces; their environments
-        are numbered one batch after the other.
+        One or more vector environments of autoreset mode "SameStep" and with the same spaces;
+        their environments are numbered one batch after another.
     spec
-        Of one of the environments with its wrappers, if they are all alike: what a model that
-        is trained on them remembers.
+        Spec of one environment with its wrappers, if all are alike: a model trained on them
+        records it.
 
     Attributes
     ----------
     infos : dict
-        The last infos as Gymnasium gives them, in arrays; those that all batches have. The list
+        The latest infos in Gymnasium's form, as arrays; those that all batches have. The list
         that `step` returns holds only what Stable-Baselines3 itself reads at the end of an
-        episode, as dicts for each environment and step would take longer than the step.
+        episode, as a dict for each environment and step would take longer than the step.
 
     Raises
     ------
     ValueError
-        If an autoreset mode is another one, or spaces differ.
+        If a batch has another autoreset mode, or spaces differ.
     """
 
     def __init__(self, *batches: VectorEnv, spec: EnvSpec | None = None) -> None:
@@ -149,11 +149,11 @@ class GymnasiumVecEnv(VecEnv):
         self._lengths = np.zeros(self.num_envs, np.int64)
 
     def reset(self) -> NDArray[Any]:
-        """Reset all environments, with the seeds that were set by `seed`."""
+        """Reset all environments, with the seeds set by `seed`."""
         if any(self._options):
             raise ValueError(f"options must be empty, got {self._options!r}")
         resets = [
-            # It takes a seed for each environment, whatever its annotation says.
+            # It takes one seed per environment, despite its annotation.
             batch.reset(seed=cast("int", list(self._seeds[part])))
             for batch, part in self._parts
         ]
@@ -162,11 +162,11 @@ class GymnasiumVecEnv(VecEnv):
         return self._joined(resets)[0]
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take note of the actions, shape (num_envs, action size)."""
+        """Store the actions, shape (num_envs, action size)."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step with them."""
+        """Step with the stored actions."""
         steps = [batch.step(self._actions[part]) for batch, part in self._parts]
         observations, rewards, terminated, truncated = self._joined(steps)
         ended = terminated | truncated
@@ -189,7 +189,7 @@ class GymnasiumVecEnv(VecEnv):
         return observations, rewards.astype(np.float32), ended, infos
 
     def _joined(self, returned: list[tuple[Any, ...]]) -> list[NDArray[Any]]:
-        """Put what the batches returned one after the other, the infos in `infos`."""
+        """Concatenate what the batches returned, and store the infos in `infos`."""
         *arrays, infos = zip(*returned, strict=True)
         self.infos = {
             name: np.concatenate([each[name] for each in infos])
@@ -210,8 +210,8 @@ class GymnasiumVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of each environment's batch."""
         if attr_name == "render_mode":
-            # Asked by a wrapper that is put around these: a model may see something else then,
-            # so that it does not know how it was trained from its space, but by `save` alone.
+            # Asked by an outer wrapper, which may change what a model sees: the space then no
+            # longer tells how the model was trained, and only `save` records it.
             vars(self.observation_space).pop("trained_on", None)
         if attr_name == "spec" and self.spec is not None:
             return [self.spec for _ in self._get_indices(indices)]
@@ -236,29 +236,29 @@ class GymnasiumVecEnv(VecEnv):
 
 
 def save(model: BaseAlgorithm, path: str | Path) -> None:
-    """Save a model with the spec of what it was trained on, whole or not at all.
+    """Save a model atomically, with the spec of its training environment.
 
-    A model that was trained on `make_vec_env`, in no other wrapper, does so by its own `save`.
-    This one also saves the statistics of `VecNormalize`.
+    For a model trained on `make_vec_env` without further wrappers, `model.save` keeps the spec,
+    too. This function also saves the statistics of `VecNormalize`.
 
     Parameters
     ----------
     model
-        Has its training environment.
+        A model with its training environment.
     path
-        Of the zip.
+        Path of the zip.
 
     Raises
     ------
     ValueError
-        If it is not known how the model was trained, or a zip could not hold it.
+        If it is unknown how the model was trained, or its spec cannot be written as JSON.
     """
     spec = trained_on(model)
     if spec is None:
         reject("model", model, "trained on make_vec_env or on environments that have a spec")
     path = Path(path)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.zip")
-    # Models save their space with all its attributes.
+    # A model saves its space with all attributes.
     space: Any = model.observation_space
     kept: Any = copy.deepcopy(space)
     kept.trained_on = spec.to_json()
@@ -281,23 +281,23 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
 
 
 def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any) -> EnvSpec:
-    """Return an environment as a policy sees it: with the windows and wrappers of its training.
+    """Return the spec of an environment with the windows and wrappers of a policy's training.
 
         evaluate(model, spec_of(model, "MiddlePointHard-v0"))
 
     Parameters
     ----------
     policy
-        A model, or the path of a zip. No code of the zip is run.
+        A model, or the path of a zip. No code from the zip is run.
     env
-        The environment to judge it on, an id or an `EnvSpec`.
+        The environment to evaluate on: an id or an `EnvSpec`.
     **arguments
-        More arguments for it.
+        Further arguments for the environment.
 
     Raises
     ------
     ValueError
-        If it is not known how the policy was trained.
+        If it is unknown how the policy was trained.
     """
     trained = trained_on(policy)
     if trained is None:
@@ -315,24 +315,24 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
 
 
 class ScoreCallback(BaseCallback):
-    """Scores the policy while it is trained, without exploration, and keeps the best.
+    """Score the policy during training, without exploration, and keep the best.
 
-    The episodes are others than those of `mptc_gym.evaluate`, so that they may choose the
-    policy. Where nothing is drawn, as in `MiddlePoint-v0`, all episodes are the same: choose by
+    The default episodes of `mptc_gym.evaluate` are not used, so they stay free for the final
+    score. Where nothing is drawn, as in `MiddlePoint-v0`, all episodes are the same: select by
     another set point, such as `setpoint_period=500`. The log gets `score/mean_error` and, where
     there is a bound, `score/score`.
 
     Parameters
     ----------
     env
-        What to score it on: an id, or an `EnvSpec`. Windows and wrappers are those of the
-        training.
+        The environment to score on: an id or an `EnvSpec`. Windows and wrappers are those of
+        the training.
     every
-        Samples of experience from one score to the next; there is one at the end, too.
+        Samples of experience between scores; the end of training is scored, too.
     episodes
-        How many a score is the mean of, up to 20 where episodes have bounds of their own.
+        Number of episodes per score. Where bounds differ by episode, there are only 20 of them.
     path
-        Where the best policy is kept, by mean error, if anywhere: a zip.
+        Zip in which to keep the policy with the least mean error, if any.
     verbose
         1 prints each score, 0 does not.
     **arguments
@@ -341,9 +341,9 @@ class ScoreCallback(BaseCallback):
     Attributes
     ----------
     scores : list of (int, Evaluation)
-        What was found, after how many samples.
+        Samples of experience and result of each score.
     best : Evaluation or None
-        The best of them.
+        The result with the least mean error.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
-"""Wrap one environment: the action of `IncrementalAction` changes the flow.
+"""Wrap an environment so that the action changes the flow instead of setting it.
 
-`mptc_gym.wrappers.vector` has the same for vector environments.
+`mptc_gym.wrappers.vector` does so for vector environments.
 """
 
 from __future__ import annotations
@@ -23,53 +23,53 @@ from mptc_gym.plant import action_from_command, float32_action
 
 __all__ = ["IncrementalAction"]
 
-NUMBERS = "dead_zone", "u_min", "u_max"  # that describe an actuator
+NUMBERS = "dead_zone", "u_min", "u_max"  # parameters of an actuator
 
 
 class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructorArgs):
-    """The action changes the flow, instead of setting it: the velocity form of process control.
+    """The action changes the flow instead of setting it: the velocity form of process control.
 
-    The wrapper holds a wanted flow v, in t/h, which is 0 after `reset`. An action w moves it::
+    The wrapper keeps a wanted flow v, in t/h, which is 0 after `reset`. An action w moves it::
 
         v(k) = v(k-1) + w(k) max_move (u_max - u_min) / 2,   limited to [u_min, u_max]
 
-    and the command is u(k) = v(k). That is kind to the valve, and it lets a policy explore, as
-    what it changes lasts.
+    and the command is u(k) = v(k). This spares the valve, and makes exploration effective, as
+    changes last.
 
-    With `undo_dead_zone`, the command leaves out the dead zone, of half width z::
+    With `undo_dead_zone`, the command skips the dead zone, of half width z::
 
         v > 0:   u =  z + (u_max - z) v / u_max
         v = 0:   u =  0
         v < 0:   u = -z + (u_min + z) v / u_min
 
-    Then every change of v has an effect, and all flows that the actuator can apply are still
-    there. Above and below 0 the flow moves 1 - z / u_max and 1 + z / u_min times as much as v,
-    and where v changes its sign it jumps from -z to z or back. No flow at all is commanded
-    from `reset` until the first action that is not 0.
+    Then every change of v has an effect, and every flow that the actuator can apply can still
+    be reached. The flow moves 1 - z / u_max times as much as v above 0, and 1 + z / u_min times
+    as much below. Where v changes sign, it jumps between -z and z. The command stays 0 from
+    `reset` until the first nonzero action.
 
-    The action space is `Box(-1, 1, (1,), float32)`; an action beyond it counts as one on its
-    edge. Observation, reward (`move_weight`, too) and info are those of the environment, which
-    gets absolute actions. A policy has to know v, which the newest action of `action_window`
-    tells: with the nominal delay, `action_window=20` makes the noise-free problem Markov while
-    the set point holds.
+    The action space is `Box(-1, 1, (1,), float32)`; actions beyond it are clipped. Observation,
+    reward (with `move_weight`) and info are those of the environment, which receives absolute
+    actions. A policy must know v, which the newest action in `action_window` shows: with the
+    nominal delay, `action_window=20` makes the noise-free problem Markov while the set point
+    holds.
 
     Parameters
     ----------
     env
-        A `MiddlePointEnv`, in other wrappers or not.
+        A `MiddlePointEnv`, wrapped or not.
     max_move
-        How far an action of 1 moves the wanted flow, as a share of half the range: above 0, up
+        Change of the wanted flow by an action of 1, as a share of half the range: above 0, up
         to 2.
     undo_dead_zone
         False leaves the dead zone as it is. True undoes the plant's own; if that is a range,
-        the one of the episode, which the info of `reset` tells. A number undoes as many t/h,
-        whatever the plant's are. Limits that are ranges are those of the episode, too.
+        the one drawn for the episode, from the info of `reset`. A number undoes a dead zone of
+        that half width in t/h, whatever the plant's. Drawn limits are also the episode's.
 
     Raises
     ------
     ValueError
         From the constructor, if an argument is out of range. From `step`, if the action is not
-        one finite number; nothing has changed then.
+        one finite number; the wrapper and the environment are then unchanged.
     ResetNeeded
         From `step`, if the environment has never been reset.
 
@@ -105,7 +105,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment, and the wanted flow to 0."""
+        """Reset the environment, and set the wanted flow to 0."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._numbers |= {name: info[name] for name in NUMBERS if name in info}
         self._actuator = Actuator(self._numbers, *self._arguments)
@@ -126,7 +126,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
 
 
 class Actuator:
-    """What the wrappers know of an actuator, and how they make it apply a flow.
+    """An actuator as the wrappers know it, and the actions that make it apply a flow.
 
     `numbers` are its `dead_zone`, `u_min` and `u_max`, t/h: floats, or arrays for many plants.
     The other arguments are those of the wrappers; ValueError if one is out of range.
@@ -143,10 +143,10 @@ class Actuator:
             reject("undo_dead_zone", undo_dead_zone, "True, False or a number from 0 to 1e9")
         own, self.u_min, self.u_max = (numbers[name] for name in NUMBERS)
         half_range = (self.u_max - self.u_min) / 2.0
-        self.move = max_move * half_range  # of the wanted flow by an action of 1, t/h
+        self.move = max_move * half_range  # change of the wanted flow by an action of 1, t/h
         self._undoes = undo_dead_zone is not False
         self._zone = z = own if undo_dead_zone is True else undo_dead_zone
-        # A limit within the dead zone is reached by a command on its edge, which (29) limits.
+        # A limit inside the dead zone is reached by commanding the edge, which (29) limits.
         self._above, self._below = (
             np.maximum(limit - z, 0.0) / np.where(limit > 0.0, limit, 1.0)
             for limit in (self.u_max, -self.u_min)

@@ -1,4 +1,4 @@
-"""Wrap many environments side by side: the action of `IncrementalAction` changes the flow."""
+"""Wrap many environments at once so that actions change the flow instead of setting it."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ __all__ = ["IncrementalAction"]
 class IncrementalAction(VectorActionWrapper):
     """The action changes the flow: `mptc_gym.wrappers.IncrementalAction` for many plants.
 
-    Every plant has a wanted flow of its own. All that `reset` and `step` return equals what the
-    same number of wrapped environments return.
+    Every plant has its own wanted flow. Everything that `reset` and `step` return equals what
+    the same number of single wrapped environments return.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class IncrementalAction(VectorActionWrapper):
     Raises
     ------
     ValueError, ResetNeeded
-        As of one environment; from `step` also if the actions have another shape than
+        As for one environment; from `step` also if the shape of the actions is not
         (num_envs, 1).
     """
 
@@ -63,11 +63,11 @@ class IncrementalAction(VectorActionWrapper):
         self._actuator = Actuator(self._numbers, *self._arguments)
         self._mode = AutoresetMode(env.metadata["autoreset_mode"])
         self._flows: NDArray[np.float64] | None = None
-        self._ended = np.zeros(self.num_envs, np.bool_)  # and will be reset by the next step
+        self._ended = np.zeros(self.num_envs, np.bool_)  # to be reset by the next step
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
         """Reset all environments, or those of `reset_mask`, and their wanted flows to 0."""
-        # Looked at first, as Gymnasium's own environments take it out of the options.
+        # Read first, as Gymnasium's own environments remove it from the options.
         mask = options.get("reset_mask") if isinstance(options, Mapping) else None
         observations, infos = self.env.reset(seed=seed, options=options)
         self._restart(np.ones(self.num_envs, np.bool_) if mask is None else mask, infos)
@@ -91,7 +91,7 @@ class IncrementalAction(VectorActionWrapper):
         return returned
 
     def _restart(self, begun: NDArray[np.bool_], infos: dict[str, Any]) -> None:
-        """Want no flow where an episode has begun, and note what was drawn for it."""
+        """Set the wanted flow to 0 where an episode has begun, and store what was drawn."""
         for name in NUMBERS:
             if name in infos:
                 self._numbers[name][begun] = infos[name][begun]
@@ -107,7 +107,7 @@ def _parameters(env: VectorEnv[Any, Any, Any]) -> list[Parameters]:
     if isinstance(inner, MiddlePointVectorEnv):
         return [inner.parameters] * env.num_envs
     plants: list[Any] = []
-    with suppress(AttributeError):  # of environments that are no plants
+    with suppress(AttributeError):  # from environments that are not plants
         plants = list(inner.get_attr("parameters"))  # type: ignore[attr-defined]
     if not plants or not all(isinstance(plant, Parameters) for plant in plants):
         reject("env", env, "a vector environment of MiddlePointEnv in NumPy")
