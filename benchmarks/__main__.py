@@ -1,4 +1,4 @@
-"""List the questions, and the command that answers each: `python -m benchmarks`."""
+"""List the questions and the command that answers each: `python -m benchmarks`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAP = Path(__file__).with_name("README.md")
 
 
 def main() -> int:
-    """Print the map: the table of questions at the top of the page beside this file."""
+    """Print the table of questions from README.md in this folder."""
     try:
         from rich.console import Console
         from rich.markdown import Markdown

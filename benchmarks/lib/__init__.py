@@ -1,1 +1,1 @@
-"""What the commands share."""
+"""Shared infrastructure of the commands."""

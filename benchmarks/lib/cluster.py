@@ -1,7 +1,7 @@
-"""Tasks on a Ray cluster: the code travels with the job, results come back as objects.
+"""Run tasks on a Ray cluster: the code travels with the job, results come back as objects.
 
-The nodes need Ray and the packages that a task imports. They share no folder, and no checkout
-is on them: Ray unpacks the code where its workers run.
+The nodes need Ray and the packages that a task imports. They need no shared folder and no
+checkout: Ray unpacks the code where its workers run.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from typing import Any
 
 from benchmarks.lib.storage import ROOT, versions
 
-# What stays here, as in a .gitignore: all of the checkout but the packages and the modules
-# beside them, such as those of controllers of one's own.
+# Files that are not uploaded, in .gitignore syntax: the whole checkout except its packages and
+# the modules beside them, such as a user's own controllers.
 STAYS = [
     *("/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py"),
     *("__pycache__", "published", "*.md"),
 ]
-QUEUED = 4  # tasks a core that are handed out; also for nodes that come later
+QUEUED = 4  # tasks submitted per core, enough to occupy nodes that join later
 
-# The name of a task, its result, what went wrong, and whether its worker is lost.
+# The name of a task, its result, its error message, and whether its worker was lost.
 Answer = tuple[str, Any, str, bool]
 
 
 def connect() -> None:
-    """Connect to the cluster of RAY_ADDRESS or of this machine; ValueError if there is none."""
-    import ray  # here: an extra, which takes a second to load
+    """Connect to the cluster at RAY_ADDRESS or on this machine; ValueError if there is none."""
+    import ray  # here: an optional package that takes a second to import
 
     if ray.is_initialized():
         return
-    # Code that `ray job submit` has brought there is the same.
+    # `ray job submit` has uploaded the same code.
     os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
     try:
         _knock()
@@ -57,10 +57,10 @@ def connect() -> None:
 def answers(
     tasks: Mapping[str, Callable[[], Any]], jobs: int | None, tries: int
 ) -> Iterator[Answer]:
-    """Run tasks on the cluster that is connected, and yield their answers as they come.
+    """Run tasks on the connected cluster, and yield their answers as they arrive.
 
-    `jobs` tasks run at once; None means as many as the cluster has cores. A task whose worker
-    or node is lost is begun again, `tries` times in all.
+    `jobs` tasks run at once; None means one per core of the cluster. A task whose worker or
+    node is lost is restarted, up to `tries` attempts in all.
     """
     import ray
 
@@ -88,7 +88,7 @@ def answers(
 
 
 def _answer(task: Callable[[], Any], here: dict[str, str]) -> tuple[Any, str, bool]:
-    """Run a task; return its result, what went wrong, and whether that was the node's fault."""
+    """Run a task; return its result, its error message, and whether the node is to blame."""
     there = _versions()
     if there != here:
         has, wanted = dict(there.items() - here.items()), dict(here.items() - there.items())
@@ -100,18 +100,18 @@ _versions = cache(versions)
 
 
 def attempt(task: Callable[[], Any]) -> tuple[Any, str]:
-    """Run a task; return its result, and what went wrong, if anything."""
+    """Run a task; return its result and its traceback, "" if it succeeded."""
     try:
         return task(), ""
     except Exception:
-        # As text, since not every exception survives the way to another process.
+        # As text, since not every exception can be pickled.
         return None, traceback.format_exc()
 
 
 def _knock() -> None:
-    """Raise OSError if nobody listens where Ray would: it would wait for many minutes."""
+    """Raise OSError if nothing listens at Ray's address: Ray itself would wait for minutes."""
     folder = os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
-    latest = Path(folder, "ray", "ray_current_cluster")  # of `ray start`; it may be gone
+    latest = Path(folder, "ray", "ray_current_cluster")  # of `ray start`; may be stale
     found = latest.read_text().strip() if latest.exists() else ""
     address = os.environ.get("RAY_ADDRESS") or found
     host, _, port = address.removeprefix("ray://").rpartition(":")

@@ -1,6 +1,6 @@
-"""Turn options that do not fit into sentences, and check what several commands take.
+"""Report invalid options in a sentence, and check options that several commands share.
 
-Nothing but the standard library is imported here.
+Only the standard library is imported here.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from pathlib import Path
 
 
 class UsageError(ValueError):
-    """An option that does not fit. The message names it."""
+    """An invalid option, named by the message."""
 
 
 @contextmanager
 def blame(option: str) -> Iterator[None]:
-    """Turn a ValueError into a `UsageError` that names an option."""
+    """Turn a ValueError into a `UsageError` that names the option."""
     try:
         yield
     except UsageError:
@@ -27,7 +27,7 @@ def blame(option: str) -> Iterator[None]:
 
 
 def out_folder(folder: Path, option: str = "--out") -> Path:
-    """Return the folder of an option, which is made; `UsageError` if it is not writable."""
+    """Create and return the folder of an option; `UsageError` if it is not writable."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as probe:
@@ -39,9 +39,9 @@ def out_folder(folder: Path, option: str = "--out") -> Path:
 
 
 def known(option: str, given: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the names that an option lists, with spaces or commas between them, each once.
+    """Return the names that an option lists, separated by spaces or commas, each once.
 
-    A name that is not among `names` is a `UsageError`.
+    A name that is not in `names` raises `UsageError`.
     """
     chosen = [name for text in given for name in text.split(",") if name]
     for name in chosen:

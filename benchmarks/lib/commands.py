@@ -1,7 +1,7 @@
-"""Run the commands `python -m benchmarks.NAME`, and end them with a sentence and a status.
+"""Run the commands `python -m benchmarks.NAME`; each ends with a sentence and an exit status.
 
 Only the standard library is imported before `main` is called, so that Ctrl-C and a missing
-package are answered in a sentence, too.
+package also end in a sentence.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ def command(
 ) -> Callable[[Sequence[str] | None], int]:
     """Return the `main` of `python -m benchmarks.<name>`.
 
-    Its package has two modules: `options`, with a dataclass `Options`, whose docstring is the
-    description in the help; and `command`, which is imported after the options were read. Its
-    function `execute` is called with the options and a `rich` console, does the work and
+    The command is a package of two modules. `options` has a dataclass `Options`, whose
+    docstring is the description in the help. `command` is imported once the options are read;
+    its function `execute(options, console)` does the work, prints on the `rich` console and
     returns the closing line.
 
-    The main function takes the command line without the program's name and returns the exit
-    status: 0; 1 if tasks failed or a file could not be written; 130 after Ctrl-C. An option
-    that does not fit, or a package that is missing, ends the program with status 2.
+    `main` takes the command line without the program's name and returns the exit status: 0 for
+    success; 1 if tasks failed, a file could not be written or memory ran out; 130 after Ctrl-C.
+    An invalid option or a missing package ends the program with status 2.
 
     Parameters
     ----------
     name
-        Of the command.
+        Name of the command.
     width
-        Columns of the console where nothing says how wide it is.
+        Width of the console, in columns, if the output is not a terminal.
     interrupted
-        What the user is told after Ctrl-C.
+        Message after Ctrl-C.
     """
 
     def main(arguments: Sequence[str] | None = None) -> int:
-        os.environ["MPLBACKEND"] = "agg"  # pictures go to files, whatever the user's shell says
+        os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever the shell has set
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
-                stream.reconfigure(errors="replace")  # "°C" where there is ASCII alone
+                stream.reconfigure(errors="replace")  # for "°C" on an ASCII terminal
         try:
             given = sys.argv[1:] if arguments is None else arguments
             return _main(f"benchmarks.{name}", given, width)
@@ -95,7 +95,7 @@ def _main(package: str, given: Sequence[str], width: int) -> int:
 
 
 def sentence(error: BaseException) -> str:
-    """Return the message of an error, with the extra that has what could not be imported."""
+    """Return an error's message or, if a package is missing, the extra that installs it."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, ImportError):
         cause = cause.__cause__
@@ -105,5 +105,5 @@ def sentence(error: BaseException) -> str:
             for module in words.intersection(modules.split()):
                 return f'{module} is not installed: pip install -e ".[{extra}]" ({cause})'
         if cause is error:
-            raise error  # a fault of ours
+            raise error  # a bug, not a missing extra
     return str(error)

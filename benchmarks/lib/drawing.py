@@ -1,4 +1,4 @@
-"""The look of all plots: colours, style, and how a figure is made and saved."""
+"""Make and save all figures in one style and one palette."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.lib.storage import replacing
 
-# Okabe and Ito's colours, which colour-blind readers can tell apart; then darker ones of them.
+# Okabe and Ito's palette for colour-blind readers, then darker shades of it.
 COLOURS = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000",
     "#004B77", "#8A3D00", "#00664B", "#8F4A72",
@@ -31,13 +31,13 @@ STYLE: Any = {
 
 
 def colours(names: Sequence[str]) -> dict[str, str]:
-    """Give each name a colour; the same names in the same order get the same ones."""
+    """Return a colour for each name; the same names in the same order get the same colours."""
     return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
 
 
 @contextmanager
 def drawn(path: Path, width: float, height: float, *, grid: bool = True) -> Iterator[Figure]:
-    """Give a figure of this size, inches, to draw on, and write it, whole or not at all."""
+    """Yield a figure of this size, in inches, and save it, completely or not at all."""
     with mpl.rc_context(STYLE | {"axes.grid": grid}):
         figure = Figure(figsize=(width, height))
         yield figure
@@ -55,9 +55,9 @@ def panels(
     *,
     grid: bool = True,
 ) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Give a figure with a panel for each name, and write it.
+    """Yield a figure with one panel per name, and save it.
 
-    A panel is of this size, inches; the margin, right and below, has room for what is common.
+    The size of a panel is in inches, as is the margin at the right and below for shared items.
     """
     columns = min(columns, len(names))
     rows = math.ceil(len(names) / columns)
@@ -72,9 +72,9 @@ def panels(
 
 
 def draw_actuator(axes: Axes, parameters: Any) -> None:
-    """Shade the dead zone, and mark the limits, of a plant's `Parameters`, t/h.
+    """Shade the dead zone and mark the limits of a plant's `Parameters`, t/h.
 
-    Of drawn actuators, what none of them lets pass, and what none of them exceeds.
+    Where they are drawn from ranges, these are the smallest dead zone and the widest limits.
     """
     zone, _ = parameters.range_of("dead_zone")
     axes.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0, label="dead zone")

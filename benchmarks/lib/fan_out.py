@@ -1,8 +1,8 @@
-"""Independent pieces of work, called tasks, side by side: on this machine or on a Ray cluster.
+"""Run independent tasks in parallel, on this machine or on a Ray cluster.
 
-joblib hands them out here, Ray on a cluster. A task's result is saved as soon as it is known,
-so that a run that was stopped goes on with what is missing. Which process runs a task, and
-when, does not matter to its result as long as all its randomness comes from its arguments.
+joblib schedules them on this machine, Ray on a cluster. Each result is saved as soon as it
+arrives, so an interrupted run resumes with the missing tasks. A result does not depend on which
+process runs the task, or when, as long as all its randomness comes from its arguments.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from urllib.parse import quote
 from benchmarks.lib import cluster
 from benchmarks.lib.storage import seal, unseal, write_text
 
-LOSSES = 3  # a task that saw so many workers vanish runs alone, to see whether it is to blame
-GIVE_UP = 10  # when so many tasks were to blame, there is another fault
-NAMED = 10  # failed tasks in a message
-PATIENCE = 0.5  # s between two looks at whether the parent is still there
+LOSSES = 3  # lost workers before a task is run alone, to see whether it is to blame
+GIVE_UP = 10  # tasks to blame before all stop, as the cause must lie elsewhere
+NAMED = 10  # failed tasks listed in a message
+PATIENCE = 0.5  # s between checks that the parent is still running
 
 Tasks = Mapping[str, Callable[[], Any]]
 
 
 class TasksFailedError(RuntimeError):
-    """Some of `tasks` tasks have no result; those of all others are kept.
+    """Some of `tasks` tasks failed; the results of the others are kept.
 
-    `errors` says what went wrong, by the name of the task: a traceback, or a sentence.
+    `errors` maps the name of each failed task to a traceback or a sentence.
     """
 
     def __init__(self, errors: Mapping[str, str], tasks: int) -> None:
@@ -47,15 +47,15 @@ class TasksFailedError(RuntimeError):
 
 
 class FanOut:
-    """Runs tasks on the cores of this machine, or on those of a Ray cluster.
+    """Run tasks on the cores of this machine or of a Ray cluster.
 
     Parameters
     ----------
     jobs
-        How many tasks run at once; None means as many as there are cores. With 1 they run in
-        this process, if not on a cluster, which runs no more at once than it has cores.
+        Number of tasks run at once; None means one per core. On this machine, 1 runs them in
+        this process. A cluster never runs more at once than it has cores.
     backend
-        "loky", processes on this machine; or "ray", a Ray cluster that is running already.
+        "loky" for processes on this machine, "ray" for a Ray cluster that is already running.
 
     Raises
     ------
@@ -71,24 +71,24 @@ class FanOut:
             cluster.connect()
 
     def run(self, tasks: Tasks, folder: Path | None = None, title: str = "") -> dict[str, Any]:
-        """Run the tasks that have no result yet; return the results of all, in their order.
+        """Run the tasks that have no saved result; return all results, in the order of `tasks`.
 
         Parameters
         ----------
         tasks
-            What to run, by name: functions that return what JSON can hold, such as
-            `functools.partial` of a function of a module. Results are as JSON gives them back.
+            Functions without arguments, by name, such as a `functools.partial` of a function of
+            a module. They return JSON values; the results are as read back from JSON.
         folder
-            Where results are saved, a file a task. What lies there under a task's name is taken
-            for its result: tasks with other arguments or code need a folder of their own. A
-            file that is not what was written is no result. None: they are not saved.
+            Folder for the results, one file per task; None saves nothing. A file named after a
+            task counts as its result, so tasks with other arguments or code need a folder of
+            their own. A damaged file is ignored.
         title
-            Stands before a progress bar; "" for none.
+            Label of the progress bar; "" for no bar.
 
         Raises
         ------
         TasksFailedError
-            At the end, if tasks raised an exception or lost their worker again and again.
+            At the end, if tasks raised an exception or lost their worker repeatedly.
         """
         results: dict[str, Any] = {}
         files = {key: folder / f"{quote(key, safe=' ,=+')}.json" for key in tasks if folder}
@@ -104,10 +104,10 @@ class FanOut:
         return {key: results[key] for key in tasks}
 
     def stream(self, tasks: Tasks, title: str = "", done: int = 0) -> Iterator[tuple[str, Any]]:
-        """Run tasks, and yield each name and result as they come.
+        """Run tasks, and yield the name and result of each as it finishes.
 
-        As `run`, but tasks may return whatever can be pickled, and those that cannot be pickled
-        themselves run in this process, after the others. `done` tasks have been done before.
+        Like `run`, but a task may return anything that can be pickled. On this machine, tasks
+        that cannot be pickled run in this process, last. `done` tasks have finished before.
         """
         from tqdm import tqdm
 
@@ -134,8 +134,8 @@ class FanOut:
 
 
 def _local(tasks: Tasks, jobs: int | None) -> Iterator[cluster.Answer]:
-    """Run tasks on this machine, those again whose worker is lost."""
-    import joblib  # here: it takes a while to load
+    """Run tasks on this machine, and rerun those that lose their worker."""
+    import joblib  # here: slow to import
 
     jobs = jobs or joblib.cpu_count()
     away = {key: task for key, task in tasks.items() if jobs > 1 and _travels(task)}
@@ -150,7 +150,7 @@ def _local(tasks: Tasks, jobs: int | None) -> Iterator[cluster.Answer]:
                 del away[key]
                 yield key, result, error, False
         except BrokenExecutor as lost:
-            # Any of those under way may have been the end of the worker.
+            # Any of the tasks under way may have killed the worker.
             losses.update(key for key in started if key in away)
             for key in suspects:
                 del away[key]
@@ -162,7 +162,7 @@ def _local(tasks: Tasks, jobs: int | None) -> Iterator[cluster.Answer]:
 def _in_processes(
     tasks: Tasks, jobs: int, started: list[str]
 ) -> Iterator[tuple[str, Any, str]]:
-    """Run tasks, yield their answers as they come, and note which were handed out."""
+    """Run tasks in other processes, yield their answers, and list in `started` which began."""
     import joblib
 
     def handed_out() -> Iterator[Any]:
@@ -170,16 +170,16 @@ def _in_processes(
             started.append(key)
             yield joblib.delayed(_answer)(key, task, os.getpid())
 
-    # With one process joblib would use this one, which no task is to bring down.
+    # With one process joblib would use this one, which no task may bring down.
     processes = max(2, min(jobs, len(tasks)))
     with joblib.parallel_config("loky", inner_max_num_threads=1):
-        # One by one: a lost worker takes along no more than it must.
+        # Batches of one, so that a lost worker takes as few tasks with it as possible.
         parallel = joblib.Parallel(processes, return_as="generator_unordered", batch_size=1)
     yield from parallel(handed_out())
 
 
 def _travels(task: Callable[[], Any]) -> bool:
-    """Whether a task can be sent to another process: a user's controller may not be such."""
+    """Return whether a task can be pickled: one with a user's own controller may not be."""
     from joblib.externals.loky.backend.reduction import dumps
 
     try:
@@ -196,10 +196,10 @@ def _answer(key: str, task: Callable[[], Any], parent: int) -> tuple[str, Any, s
 
 @cache
 def _end_with(parent: int) -> None:
-    """See to it that this process ends when its parent does, even if that was killed.
+    """End this process when its parent ends, even if the parent was killed.
 
-    Otherwise a worker would wait for work for some minutes, as it does on Windows, where it
-    cannot tell.
+    An orphaned worker would otherwise wait for work for some minutes. On Windows it still does,
+    since it cannot tell.
     """
 
     def watch() -> None:

@@ -1,9 +1,9 @@
-"""Name a kept result after all that shapes it, and nothing else.
+"""Name a saved result after everything that shapes it, and nothing else.
 
-Three things shape a trained policy or a swept task: its arguments, the code that runs, and the
-environment. Code is every module of the checkout that the code imports, directly or not,
-without comments and docstrings. Of the environment it is what it does: trajectories. So an
-edited comment keeps a result, and a moved function cannot leave a stale one in use.
+A trained policy or a swept task is shaped by its arguments, its code and the environment. The
+code is every module of the checkout that is imported, directly or not, without comments and
+docstrings. The environment is represented by its behaviour, a set of trajectories. An edited
+comment thus keeps a result valid, and a moved function cannot leave a stale one in use.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ import numpy as np
 import mptc_gym
 from benchmarks.lib.storage import ROOT, versions
 
-SAMPLES = 60  # of each trajectory
+SAMPLES = 60  # length of each trajectory
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def fingerprint(*modules: str, **shaped_by: Any) -> str:
-    """Return sixteen hexadecimal digits that name what modules compute.
+    """Return sixteen hexadecimal digits that identify the result of modules.
 
-    What they import counts, too, and all else that shapes the result, in a form for JSON.
+    Their imports count too. `shaped_by` holds everything else that matters, as JSON values.
     """
     everything = {
         **shaped_by,
@@ -42,7 +42,7 @@ def fingerprint(*modules: str, **shaped_by: Any) -> str:
 
 @cache
 def behaviour() -> str:
-    """Return a hash of what the environment does: of a trajectory of each preset."""
+    """Return a hash of the environment's behaviour: a trajectory of each preset."""
     digest = hashlib.sha256()
     for name, arguments in sorted(mptc_gym.PRESETS.items()):
         windowed: dict[str, Any] = {**arguments, "output_window": 2, "action_window": 3}
@@ -60,16 +60,16 @@ def behaviour() -> str:
 
 @cache
 def imported(module: str) -> set[str]:
-    """Return a module's name and those that it imports of the checkout, directly or not."""
+    """Return the names of a module and of all modules of the checkout that it depends on."""
     finder: Any = ModuleFinder([str(ROOT)], excludes=["mptc_gym"])
-    with suppress(ImportError):  # a controller of one's own may lie elsewhere
+    with suppress(ImportError):  # a user's own controller may be elsewhere
         finder.import_hook(module)
     return {name for name, found in finder.modules.items() if found.__file__}
 
 
 @cache
 def code(module: str) -> str:
-    """Return a hash of a module's code without comments, docstrings and layout."""
+    """Return a hash of a module's code, which ignores comments, docstrings and layout."""
     path = ROOT.joinpath(*module.split("."))
     file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     tree = ast.parse(file.read_text(encoding="utf-8"))

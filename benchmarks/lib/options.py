@@ -1,4 +1,4 @@
-"""Read command lines into dataclasses: types of options, and groups that commands share."""
+"""Read command lines into dataclasses, with types and groups of options for all commands."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from benchmarks.lib.storage import ROOT
 
 Group = TypeVar("Group")
 
-# A dataclass whose fields are options, also of a dataclass that holds it.
+# Decorates a dataclass whose fields are options, also when it is nested in another dataclass.
 options: Callable[[type[Group]], type[Group]] = Parameter(name="*")
 
 
 def _typed(default: object) -> str | None:
-    """Return a default as one would type it; None for one that tells nothing."""
+    """Return a default as a user would type it; None if it is not worth showing."""
     if isinstance(default, tuple):
         default = " ".join(map(str, default))
     elif isinstance(default, Path) and default.is_relative_to(ROOT):
@@ -32,7 +32,7 @@ def _typed(default: object) -> str | None:
 
 
 def flat(group: Any) -> dict[str, Any]:
-    """Return the options of a group and of the groups in it, as JSON can hold them."""
+    """Return the options of a group and its nested groups, as JSON values."""
     found: dict[str, Any] = {}
     for name, value in vars(group).items():
         if is_dataclass(value):
@@ -43,13 +43,13 @@ def flat(group: Any) -> dict[str, Any]:
 
 
 def _latest(_type: object, tokens: Sequence[Token]) -> tuple[str, ...]:
-    """Return the names of the last of equal options, as of any other option."""
+    """Return the names of the last occurrence of an option, which overrides earlier ones."""
     begins = [i for i, token in enumerate(tokens) if token.keyword and token.index == 0]
     return tuple(token.value for token in tokens[max(begins, default=0) :] if token.value)
 
 
 def _integers(_type: object, tokens: Sequence[Token]) -> Any:
-    """Read integers, and refuse 2.5, which cyclopts would round."""
+    """Read integers, and reject 2.5, which cyclopts would round."""
     try:
         found = [int(token.value) for token in tokens]
     except ValueError as error:
@@ -59,13 +59,13 @@ def _integers(_type: object, tokens: Sequence[Token]) -> Any:
 
 
 def integer(least: int, most: int, *, many: int = 1) -> Parameter:
-    """Return how to read an integer within limits, or `many` of them."""
+    """Return a parameter for an integer within limits, or for `many` of them."""
     limits = Number(gte=least, lte=most)
     return Parameter(converter=_integers, validator=limits, n_tokens=many)
 
 
 def choice(names: Collection[str], text: str) -> Parameter:
-    """Return how to read one of the names that a help text lists."""
+    """Return a parameter for one of `names`, which its help text lists."""
     listed = ", ".join(names)
 
     def convert(_: object, tokens: Sequence[Token]) -> str:
@@ -90,24 +90,24 @@ Folder = Annotated[Path, Parameter(help="Folder to write to.")]
 @options
 @dataclass(frozen=True, kw_only=True)
 class FanOutOptions:
-    """Where independent tasks run, and how many at once."""
+    """Options for running independent tasks in parallel."""
 
     jobs: Count | None = None
-    """How many tasks run at once (default: as many as there are cores)."""
+    """Number of tasks run at once (default: one per core)."""
     backend: Literal["loky", "ray"] = "loky"
-    """Where tasks run: loky, on this machine; ray, on a Ray cluster."""
+    """Where tasks run: loky for this machine, ray for a Ray cluster."""
 
     def open(self) -> FanOut:
-        """Return the fan-out that is asked for."""
+        """Return the fan-out with these options."""
         with blame("--backend"):
             return FanOut(self.jobs, self.backend)
 
 
 def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | None:
-    """Read what was given to a program into a dataclass of options.
+    """Read a program's command line into a dataclass of options.
 
-    The docstring of the dataclass is the description in the help. If that was asked for, it is
-    printed, and None comes back. An option that does not fit is a `UsageError`.
+    The docstring of the dataclass is the description in the help. With --help, the help is
+    printed and None is returned. An invalid option raises `UsageError`.
     """
     app = App(
         name=program,

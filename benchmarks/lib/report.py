@@ -1,4 +1,4 @@
-"""What a comparison found, as one page: Markdown, and HTML with the pictures inside."""
+"""Write a report as Markdown, and as one HTML page with the pictures embedded."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ th:first-child, td:first-child { text-align: left; }
 img { max-width: 100%; margin-top: 1.5rem; }
 .made { color: #666; font-size: 0.85rem; overflow-wrap: anywhere; }
 """
-_INTERVAL = re.compile(r" (\([^()]* to [^()]*\))")  # small, and below its number
+_INTERVAL = re.compile(r" (\([^()]* to [^()]*\))")  # shown small, below its number
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report."""
+    """A section of a report."""
 
     title: str
-    """Its heading; "" for none."""
+    """Heading; "" for none."""
     text: Sequence[str] = ()
-    """What there is to say, in paragraphs."""
+    """Paragraphs."""
     table: pd.DataFrame | None = None
-    """All cells are text."""
+    """Table of text cells."""
     pictures: Sequence[str] = ()
     """Names of PNG files in the report's folder."""
 
 
 def provenance_line(command: str, origin: Mapping[str, Any]) -> str:
-    """Return when, from which commit and by which command of `benchmarks` a report was made."""
+    """Return the time, the commit and the command of `benchmarks` that made a report."""
     called = sys.argv[1:] if command in sys.argv[0] else []
-    commit = origin["commit"]  # a hash of 40 digits, and "-dirty" perhaps
+    commit = origin["commit"]  # a hash of 40 digits, possibly with "-dirty"
     line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])
     return f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}"
 
@@ -63,13 +63,13 @@ def show(sections: Sequence[Section], console: Console) -> None:
 
 
 def write_report(folder: Path, title: str, sections: Sequence[Section], made: str) -> None:
-    """Write `report.md` and `report.html`, whole or not at all; `made` says how it was made."""
+    """Write `report.md` and `report.html`; `made` is their provenance line."""
     write_text(folder / "report.md", _markdown(title, sections, made))
     write_text(folder / "report.html", _html(folder, title, sections, made))
 
 
 def _plain(text: str) -> str:
-    """Return a text that Markdown does not take for HTML."""
+    """Escape text that Markdown would read as HTML."""
     return text.replace("&", "&amp;").replace("<", "&lt;")
 
 

@@ -1,4 +1,4 @@
-"""Estimates from a number of runs, with 95 % confidence intervals."""
+"""Estimate quantities from several runs, with 95 % confidence intervals."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import scipy  # its modules are loaded when they are used
+import scipy  # loads its modules on first use
 from numpy.typing import ArrayLike, NDArray
 
 CONFIDENCE = 0.95
-ENDS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)  # quantiles where an interval ends
-RESAMPLES = 2000  # of a bootstrap
+ENDS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)  # quantiles at the ends of an interval
+RESAMPLES = 2000  # bootstrap resamples
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its confidence interval, from a number of runs."""
+    """A value with its confidence interval, estimated from `runs` runs."""
 
     value: float
     low: float
@@ -28,7 +28,7 @@ class Estimate:
     def __format__(self, form: str) -> str:
         """Return `value (low to high)`; the value alone if nothing was random.
 
-        An interval that reaches to infinity is that of a single run.
+        If the interval extends to infinity, "(one run)" takes its place.
         """
         value, low, high = (format(end, form) for end in (self.value, self.low, self.high))
         if math.isinf(self.high):
@@ -37,14 +37,14 @@ class Estimate:
 
 
 def exact(value: float) -> Estimate:
-    """Return the estimate of a value that is not random: one run, an interval of no width."""
+    """Return the estimate of a value that is not random: one run, an interval of zero width."""
     return Estimate(float(value), float(value), float(value), 1)
 
 
 def student(values: ArrayLike) -> Estimate:
-    """Estimate a mean over runs, shape (runs,), with Student's interval.
+    """Estimate the mean over runs, shape (runs,), with Student's t interval.
 
-    It has no width where there is one run, or all are the same.
+    A single run, or equal values, give an interval of zero width.
     """
     numbers = np.asarray(values, dtype=np.float64)
     mean, runs = float(numbers.mean()), len(numbers)
@@ -59,14 +59,14 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
     """Estimate a quantile over runs, shape (runs,), none of them NaN.
 
     The interval lies between two of the ordered values (Conover, "Practical Nonparametric
-    Statistics", 3rd edition, 1999, section 3.2; see `scipy.stats.quantile_test`). It assumes
-    nothing about the distribution, accepts infinite values ("never"), and is infinite where
-    there are too few runs to tell.
+    Statistics", 3rd edition, 1999, section 3.2; see `scipy.stats.quantile_test`). It makes no
+    assumption about the distribution, accepts infinite values ("never"), and is infinite where
+    there are too few runs.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     if ordered.ndim != 1 or not len(ordered) or np.isnan(ordered).any():
         raise ValueError(f"values must be numbers, one for each run, got {values!r}")
-    # Infinite values cannot be interpolated; the next higher value is taken instead.
+    # Infinite values cannot be interpolated; the next higher value is used instead.
     finite = bool(np.isfinite(ordered).all())
     method: Literal["linear", "higher"] = "linear" if finite else "higher"
     interval = scipy.stats.quantile_test(ordered, p=probability).confidence_interval(CONFIDENCE)
@@ -82,41 +82,41 @@ def median(values: ArrayLike) -> Estimate:
 
 
 def share(happened: NDArray[np.bool_]) -> Estimate:
-    """Estimate how often something happens, from 0 to 1, with Wilson's interval."""
+    """Estimate the share of runs in which something happens, with Wilson's interval."""
     count, runs = int(happened.sum()), len(happened)
     interval = scipy.stats.binomtest(count, runs).proportion_ci(CONFIDENCE, method="wilson")
     return Estimate(count / runs, float(interval.low), float(interval.high), runs)
 
 
 def interquartile_mean(values: ArrayLike, axis: int | None = None) -> Any:
-    """Return the mean of the middle half, which outliers move less than the mean of all."""
+    """Return the mean of the middle half of the values, which is robust to outliers."""
     return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
 def bootstrap(
     *tasks: NDArray[np.float64], seed: int, statistic: Callable[..., Any] = np.mean
 ) -> Estimate:
-    """Estimate a statistic over runs of one task or several, by a percentile bootstrap.
+    """Estimate a statistic over runs of one or more tasks, by a percentile bootstrap.
 
     Parameters
     ----------
     *tasks
-        The values of each, all of the same shape: (runs,), or (members, runs) for several
-        trained controllers in the same runs. Then members and runs are drawn independently, and
-        a sample holds every cell where they cross. Members of the same run meet the same noise,
-        so they do not count as runs of their own, and the interval also covers other trainings
+        Values of each task, all of the same shape: (runs,), or (members, runs) for several
+        trained controllers in the same runs. Members and runs are then resampled independently,
+        and a resample takes every crossing of the two. Members share the noise of a run, so
+        they do not count as separate runs, and the interval also covers training variability
         (A. B. Owen, "The pigeonhole bootstrap", Annals of Applied Statistics 1, 2007, 386-411).
-        With five members that differ far more than runs do, it holds the true value in 82 % of
-        the cases: five are few to draw from. The tasks themselves are not drawn.
+        With only five members that differ far more than runs do, its coverage is 82 %. The
+        tasks themselves are not resampled.
     seed
-        Of the draws.
+        Seed of the resampling.
     statistic
-        Called with an array of all values of all tasks together and `axis`, the last.
+        Called with an array of the values of all tasks and `axis=-1`.
 
     Raises
     ------
     ValueError
-        If there is no value, the shapes differ, or a value is not finite.
+        If there are no values, the shapes differ, or a value is not finite.
     """
     tables = [np.atleast_2d(np.asarray(task, dtype=np.float64)) for task in tasks]
     of_one_shape = len({table.shape for table in tables}) == 1 and tables[0].ndim == 2
@@ -142,9 +142,9 @@ def bootstrap(
 def improvement(
     errors: NDArray[np.float64], reference: NDArray[np.float64], seed: int
 ) -> Estimate:
-    """Estimate how probable it is that one controller does better than another in the same run.
+    """Estimate the probability that a controller beats the reference in the same run.
 
-    Runs in which both do the same count as half. Shapes are as of `bootstrap`.
+    Ties count as half. See `bootstrap` for the shapes.
     """
     better = (errors < reference) + 0.5 * (errors == reference)
     return bootstrap(better, seed=seed)

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there, and where results come from."""
+"""Write files completely or not at all, and record the provenance of results."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from typing import Any
 
 PACKAGES = ("gymnasium", "numpy", "stable_baselines3", "torch")
 ROOT = Path(__file__).parent.parent.parent  # the checkout
-WAITS = (0.01, 0.05, 0.2, 0.5)  # s until a file is put in place once more
+WAITS = (0.01, 0.05, 0.2, 0.5)  # s between attempts to put a file in place
 
 
 class NotWrittenError(RuntimeError):
-    """A file could not be written; the message names it and says why."""
+    """A file could not be written; the message gives its name and the reason."""
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a path to write to, and put what was written in place of `path` at the end.
+    """Yield a temporary path to write to, and move the file to `path` at the end.
 
-    `path` is what it was before if there is an error, or if the process is killed.
+    `path` is left as it was if there is an error or the process is killed.
     """
-    # The suffix stays the last, as some writers choose a format by it or append it.
+    # The suffix stays last, since some writers choose the format by it or append it.
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -45,7 +45,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _move(partial: Path, path: Path) -> None:
-    """Put a file in place of another: Windows refuses while that is open elsewhere."""
+    """Replace a file, with retries: Windows refuses while it is open elsewhere."""
     for wait in WAITS:
         with suppress(PermissionError):
             partial.replace(path)
@@ -55,25 +55,25 @@ def _move(partial: Path, path: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file, completely or not at all."""
     with replacing(path) as partial:
-        # Windows would end lines otherwise, and the bytes would not be those of other systems.
+        # The same line ends, and so the same bytes, on Windows as elsewhere.
         partial.write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file, whole or not at all."""
+    """Write a JSON file, completely or not at all."""
     write_text(path, json.dumps(value, indent=2) + "\n")
 
 
 def seal(value: Any) -> str:
-    """Return a value as JSON, with a checksum that tells whether it is what was written."""
+    """Return a value as JSON with a checksum, by which `unseal` detects damage."""
     checksum = hashlib.sha256(json.dumps(value).encode()).hexdigest()
     return json.dumps({"sha256": checksum, "value": value})
 
 
 def unseal(text: str) -> Any:
-    """Return the value of a text that `seal` has made; ValueError if it is damaged."""
+    """Return the value in a text made by `seal`; ValueError if it is damaged."""
     sealed = json.loads(text)
     if not isinstance(sealed, dict) or text != seal(sealed.get("value")):
         raise ValueError("the checksum of a kept result does not fit")
@@ -81,8 +81,8 @@ def unseal(text: str) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of those packages that shape a result."""
-    import mptc_gym  # here, as gymnasium and NumPy take their time to load
+    """Return the versions of Python and of the packages that affect a result."""
+    import mptc_gym  # here: Gymnasium and NumPy are slow to import
 
     found = {"python": platform.python_version(), "mptc_gym": mptc_gym.__version__}
     for package in PACKAGES:
@@ -92,13 +92,13 @@ def versions() -> dict[str, str]:
 
 
 def origin() -> dict[str, Any]:
-    """Return where results come from that are made now."""
+    """Return the provenance of results made now: time, versions and commit."""
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     return {"started": started, "versions": versions(), "commit": commit()}
 
 
 def commit() -> str:
-    """Return the commit of this checkout, "-dirty" if files differ, "unknown" without git."""
+    """Return the checkout's commit, with "-dirty" if files differ; "unknown" without git."""
     describe = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
     try:
         done = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True, check=True)

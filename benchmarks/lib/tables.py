@@ -1,4 +1,4 @@
-"""Tables on the screen and in files, and percentiles over runs."""
+"""Write tables to files and to the terminal, and take percentiles over runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _TEXTS = (*_NAMES, "claim", "verdict")
 
 
 def write_csv(path: Path, table: pd.DataFrame) -> None:
-    """Write a table without its index, whole or not at all, the same on every system."""
+    """Write a table without its index, completely or not at all, the same on every system."""
     with replacing(path) as partial:
         table.to_csv(partial, index=False, lineterminator="\n")
 
@@ -28,10 +28,10 @@ def write_csv(path: Path, table: pd.DataFrame) -> None:
 def percentiles(
     values: NDArray[np.float64], method: Literal["linear", "nearest", "higher"] = "linear"
 ) -> dict[str, Any]:
-    """Return median, 10th and 90th percentile along the last axis.
+    """Return the median, 10th and 90th percentiles along the last axis.
 
-    Infinite values ("not settled") cannot be interpolated. Where there is one, the next higher
-    value is taken.
+    Infinite values ("not settled") cannot be interpolated. If there are any, the next higher
+    value is used.
     """
     method = method if np.isfinite(values).all() else "higher"
     return {
@@ -41,7 +41,7 @@ def percentiles(
 
 
 def groups(table: pd.DataFrame, column: str) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield each name in a column and its rows, in the order in which the names appear."""
+    """Yield each name in a column with its rows, in order of first appearance."""
     for name, rows in table.groupby(column, sort=False):
         yield str(name), rows
 

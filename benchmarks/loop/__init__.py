@@ -1,1 +1,1 @@
-"""The control loop: the plant, the cases, the one rollout loop and what is measured of it."""
+"""The control loop: the plant, the cases, the rollout loop and its performance measures."""

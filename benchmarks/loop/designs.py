@@ -1,4 +1,4 @@
-"""Plants that are not the paper's: a grid over delay and gain, or a random design."""
+"""Generate plants that differ from the paper's: a grid over delay and gain, a random design."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-Arguments = dict[str, Any]  # of the environment
+Arguments = dict[str, Any]  # arguments of the environment
 
-# What drawn plants differ in, to sweep over or to train on. A gain below 0.74 puts 5 degC
-# beyond the limits.
+# Ranges of the plants drawn for sweeps and for training. With a gain factor below 0.74, 5 degC
+# is beyond the limits.
 SPANS = {
     "delay": (6, 36),
     "dead_zone": (0.0, 8.0),
@@ -18,7 +18,7 @@ SPANS = {
     "gain_factor": (0.75, 1.6),
     "time_constant_factor": (0.5, 2.0),
 }
-# Nineteen of twenty such plants lie beyond `SPANS`, which are those of the self-tuning bank.
+# 95 % of these plants lie outside `SPANS`, the ranges covered by the self-tuning bank.
 WIDE = {
     "delay": (0, 60),
     "dead_zone": (0.0, 10.0),
@@ -30,7 +30,7 @@ GRID = {"delay": range(2, 42, 2), "gain_factor": np.linspace(0.75, 1.65, 10)}
 
 
 def grid() -> list[Arguments]:
-    """Return the paper's plant with other delays and other gains, without noise."""
+    """Return the paper's plant with other delays and gains, without noise."""
     return [
         {"delay": delay, "gain_factor": round(float(gain), 6)}
         for gain in GRID["gain_factor"]
@@ -41,12 +41,12 @@ def grid() -> list[Arguments]:
 def random_design(
     count: int, seed: int, samples: int, spans: Mapping[str, tuple[float, float]] = SPANS
 ) -> list[Arguments]:
-    """Return plants that differ in everything, spread evenly over spans.
+    """Return `count` plants from a Latin hypercube over `spans`.
 
-    The second half of them drift: in the course of `samples` samples, gain and time constant
-    go to another place in their spans. The design is a Latin hypercube.
+    The second half of them drift: over `samples` samples, their gain and time constant move to
+    other values within the spans.
     """
-    from scipy.stats import qmc  # here: it takes long to import
+    from scipy.stats import qmc  # here: slow to import
 
     drawn = qmc.LatinHypercube(len(spans) + 2, rng=np.random.default_rng(seed)).random(count)
     drifting = ("gain_factor", "time_constant_factor")

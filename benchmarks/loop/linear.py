@@ -1,12 +1,12 @@
-"""Describe the plant as a linear system: every analysis takes its coefficients from here.
+"""Describe the plant as a linear system, from which every analysis takes its coefficients.
 
 Between the limits of the actuator (29) the plant is
 
     (28)  y(k) = sum_i alpha_i y(k-1-i) + sum_i beta_i u_a(k-d-1-i) + C xi(k) + A(1) w(k),
 
-w being the load. Gain and time-constant factors, and drifts, are worked into alpha and beta.
-An argument that makes more of the plant than this is refused by name; `mptc_gym.parameters`
-declares, for each argument, what it does.
+where w is the load. Gain and time-constant factors and their drifts are part of alpha and beta.
+Arguments that take the plant beyond this model are rejected by name; `mptc_gym.parameters`
+declares which arguments do.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
 
 Array = NDArray[np.float64]
 
-SETTLED = 1e-5  # share of a transient that is left where a step response ends
-LONGEST = 1_000_000  # samples; a plant that needs more has no steady state to wait for
+SETTLED = 1e-5  # fraction of a transient that remains at the end of a step response
+LONGEST = 1_000_000  # samples; a plant that needs more is treated as never settling
 
 
 def check_linear(parameters: Parameters) -> None:
-    """Refuse a plant that is more than (28) and (29): a ValueError names the argument."""
+    """Raise ValueError for a plant that is more than (28) and (29), naming the argument."""
     for name, argument in ARGUMENTS.items():
         value = getattr(parameters, name)
         if not argument.linear and value != argument.default:
@@ -42,7 +42,7 @@ def check_linear(parameters: Parameters) -> None:
 
 @dataclass(frozen=True)
 class LinearModel:
-    """(28) with coefficients that do not change."""
+    """(28) with constant coefficients."""
 
     a: Sequence[float]
     """Coefficients of A, from z^0 on."""
@@ -67,12 +67,12 @@ class LinearModel:
         return np.asarray(np.roots(self.a), np.complex128)
 
     def transfer(self) -> tuple[Array, Array]:
-        """Return numerator and denominator, in powers of z^-1, from u_a to y."""
+        """Return the numerator and denominator from u_a to y, in powers of z^-1."""
         return np.array([*[0.0] * (self.delay + 1), *self.b]), np.array(self.a)
 
     def response(self, flow: ArrayLike) -> Array:
-        """Return y(0), y(1), ..., degC, from rest, for u_a(0), u_a(1), ..., t/h."""
-        from scipy import signal  # here: it takes long to import
+        """Return y(0), y(1), ..., degC, from rest, given u_a(0), u_a(1), ..., t/h."""
+        from scipy import signal  # here: slow to import
 
         response: Array = signal.lfilter(*self.transfer(), np.asarray(flow, np.float64))
         return response
@@ -80,12 +80,12 @@ class LinearModel:
     def step_response(self, samples: int | None = None) -> Array:
         """Return y(0), y(1), ... after a step of u_a from 0 to 1 t/h at k = 0, degC per t/h.
 
-        None stands for as many samples as the response takes to settle.
+        By default, it is as long as the response takes to settle.
 
         Raises
         ------
         ValueError
-            If it never settles, or settles at 0, and `samples` is None.
+            If `samples` is None and the response never settles, or settles at 0.
         """
         if samples is None:
             slowest = float(np.max(np.abs(self.poles), initial=0.0))
@@ -94,14 +94,14 @@ class LinearModel:
             settling = math.log(SETTLED) / math.log(slowest) if 0.0 < slowest < 1.0 else 0.0
             if slowest >= 1.0 or settling > LONGEST:
                 raise ValueError(f"a must be of a stable plant for a step test, got {self.a}")
-            # Some more for poles that are repeated, whose transients last longer.
+            # Twice as long, since the transients of repeated poles last longer.
             samples = self.delay + len(self.b) + 2 * math.ceil(settling) + 2
         return self.response(np.ones(samples))
 
 
 @dataclass(frozen=True)
 class Coefficients:
-    """What (28) has for one plant, for many, or at each sample of an episode."""
+    """Coefficients of (28) for one plant, for many plants, or for each sample of an episode."""
 
     alpha: Array
     """Shape (..., order of A)."""
@@ -111,9 +111,9 @@ class Coefficients:
     """A(1), shape (...)."""
 
     def impulse_response(self, samples: int) -> Array:
-        """Return what 1 t/h at j does to y(j + d + 1) and on, degC per t/h, (..., samples).
+        """Return the effect of 1 t/h at j on y(j + d + 1), ..., degC per t/h, (..., samples).
 
-        The coefficients do not change meanwhile.
+        The coefficients are held constant.
         """
         response = np.zeros((*self.load.shape, samples))
         for k in range(samples):
@@ -126,8 +126,8 @@ class Coefficients:
     def state_space(self, c: Sequence[float]) -> tuple[Array, Array]:
         """Return F, shape (..., size, size), and g, shape (size,): x(k) = F x(k-1) + g xi(k).
 
-        The state x is y(k), y(k-1), ..., xi(k), xi(k-1), ..., and noise alone acts on it. C has
-        the coefficients `c`, from z^0 on.
+        The state x is y(k), y(k-1), ..., xi(k), xi(k-1), ..., driven by noise alone. C has the
+        coefficients `c`, from z^0 on.
         """
         order = max(self.alpha.shape[-1], 1)
         size = order + len(c) - 1
@@ -143,8 +143,8 @@ def coefficients(
 ) -> Coefficients:
     """Return the coefficients of the step to sample k; see `check_linear` for its ValueError.
 
-    The plant numbers of an episode are those of one plant, or arrays for many; k is one sample,
-    or for one plant an array of samples.
+    The plant numbers are floats for one plant, or arrays for many; k is a single sample or, for
+    one plant, an array of samples.
     """
     check_linear(parameters)
     dynamics = Dynamics(parameters)
@@ -159,7 +159,7 @@ def coefficients(
 
 
 def nominal(parameters: Parameters) -> LinearModel:
-    """Return the model of a plant: ranges at their middle, drifts at k = 0, nothing added.
+    """Return the model of a plant: ranges at their midpoints, drifts at k = 0.
 
     See `check_linear` for its ValueError.
     """
@@ -176,32 +176,32 @@ def nominal(parameters: Parameters) -> LinearModel:
 
 @dataclass(frozen=True)
 class Course(Coefficients):
-    """What (28) and (29) are at each sample of an episode: coefficients, one row a sample."""
+    """(28) and (29) over an episode: the coefficients have one row per sample."""
 
     c: tuple[float, ...]
     """Coefficients of C, from z^0 on."""
     delay: int
     """d, samples."""
     low: float
-    """The least flow that the actuator can apply, t/h; 0 can be, if there is a dead zone."""
+    """Lowest flow that the actuator can apply, t/h, counting 0 if there is a dead zone."""
     high: float
-    """The greatest, likewise."""
+    """Highest flow that the actuator can apply, t/h, counting 0 if there is a dead zone."""
     numbers: PlantNumbers[float]
-    """The plant numbers of the episode."""
+    """Plant numbers of the episode."""
 
     @property
     def lag(self) -> int:
-        """Samples from a flow to the first output that it can show in."""
+        """Samples from a flow to the first output that it can affect."""
         shows = np.flatnonzero(self.beta.any(axis=0))
         return self.delay + 1 + int(shows[0]) if len(shows) else len(self.beta)
 
     def first(self, samples: int) -> Course:
-        """Return the same for the first samples."""
+        """Return the course of the first `samples` samples."""
         cut = slice(samples)
         return replace(self, alpha=self.alpha[cut], beta=self.beta[cut], load=self.load[cut])
 
     def flow_response(self) -> Array:
-        """Return G, shape (samples, samples): what 1 t/h at j adds to y(k) is G[k, j]."""
+        """Return G, shape (samples, samples): 1 t/h at j adds G[k, j] to y(k)."""
         samples, order = self.alpha.shape
         G = np.zeros((samples, samples))
         for k in range(1, samples):
@@ -214,7 +214,7 @@ class Course(Coefficients):
 
 
 def course(parameters: Parameters, numbers: PlantNumbers[float], samples: int) -> Course:
-    """Return the course of an episode, given its plant numbers; see also `check_linear`."""
+    """Return the course of an episode; see `check_linear` for its ValueError."""
     flows = [numbers.u_min, numbers.u_max]
     if numbers.dead_zone > 0.0:
         flows.append(0.0)

@@ -1,4 +1,4 @@
-"""Measures of how well a run went."""
+"""Compute performance measures of runs."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
 
-SETTLING_BAND = 0.05  # of the set-point change, or of the set point
-LAST = 50  # samples at the end of a run, which tell whether it has settled
+SETTLING_BAND = 0.05  # fraction of the set-point change, or of the set point
+LAST = 50  # samples at the end of a run that decide whether it has settled
 
-# Name in tables and CSV files: heading.
+# Names in CSV files, and headings.
 METRICS: dict[str, str] = {
     "mae": "mean |e| (°C)",
     "ise": "ISE (°C² min)",
@@ -31,21 +31,21 @@ METRICS: dict[str, str] = {
 
 
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
-    """Compute every measure of `METRICS` for every run, each of shape (runs,).
+    """Compute the measures in `METRICS` for each run, each of shape (runs,).
 
-    - `mae`: mean of |e(k)| over k = 1 to N, as the rewards have it;
-    - `ise`: integral of e^2, likewise;
-    - `itae`: integral of t |e|, t counted from the latest set-point change;
-    - `total_variation`: of the applied input; see `travel`;
-    - `overshoot`: how far the output goes beyond the new set point, as a percentage of the
-      set-point change; the largest of all changes;
-    - `settling_time`: from a set-point change until the error stays within `SETTLING_BAND` of
-      the change; the longest of all changes, infinite if one of them is not settled when the
-      next comes or the run ends;
-    - `dead_zone_share`: samples whose command lies inside the dead zone;
-    - `saturation_share`: samples whose command lies at or beyond a limit.
+    - `mae`: mean of |e(k)| over k = 1 to N, the errors in the rewards;
+    - `ise`: integral of e^2 over the same samples;
+    - `itae`: integral of t |e|, with t counted from the latest set-point change;
+    - `total_variation`: total variation of the applied input; see `travel`;
+    - `overshoot`: excursion of the output beyond the new set point, as a percentage of the
+      set-point change; the largest over all changes;
+    - `settling_time`: time from a set-point change until the error stays within `SETTLING_BAND`
+      of the change; the longest over all changes, infinite if the output has not settled by the
+      next change or the end of the run;
+    - `dead_zone_share`: share of samples with the command inside the dead zone;
+    - `saturation_share`: share of samples with the command at or beyond a limit.
 
-    The last two are NaN where the actuator's numbers are drawn from ranges.
+    The last two are NaN if the actuator's numbers are drawn from ranges.
     """
     interval = parameters.sampling_interval / 60.0  # min
     command = trajectory.command
@@ -72,7 +72,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
 
 
 def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]:
-    """ITAE (degC samples^2), overshoot (share) and settling time (samples) of one run."""
+    """Return one run's ITAE (degC samples^2), overshoot (share), settling time (samples)."""
     itae, overshoot, settling = 0.0, 0.0, 0.0
     before = 0.0  # the set point before k = 0
     for start, stop in held(setpoint):
@@ -90,7 +90,7 @@ def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]
 
 
 def held(setpoint: Array) -> list[tuple[int, int]]:
-    """Return the first sample of each stretch of constant set point, and the one after it."""
+    """Return the start and stop sample of each stretch of constant set point."""
     changes = np.flatnonzero(np.diff(setpoint)) + 1
     return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
 
@@ -101,35 +101,35 @@ def mean_error(trajectory: Trajectory) -> Array:
 
 
 def travel(trajectory: Trajectory) -> Array:
-    """Return how far the valve moves in each run, from rest at 0, t/h, shape (runs,)."""
+    """Return the valve travel of each run, from rest at 0, t/h, shape (runs,)."""
     moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
     return np.asarray(np.abs(moves).sum(axis=0))
 
 
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
-    """Return for each run whether its last `LAST` errors are within `SETTLING_BAND`."""
+    """Return whether the last `LAST` errors of each run are all within `SETTLING_BAND`."""
     setpoint, output = trajectory.setpoint[-LAST:], trajectory.output[-LAST:]
     within = np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint)
     return np.asarray(within.all(axis=0))
 
 
 def split(trajectory: Trajectory, sample: int) -> tuple[Trajectory, Trajectory]:
-    """Return what was before a sample, and what came from there on."""
+    """Return the trajectory before a sample, and the rest from that sample on."""
     arrays = vars(trajectory).values()
     return Trajectory(*(a[:sample] for a in arrays)), Trajectory(*(a[sample:] for a in arrays))
 
 
 def join(trajectories: Sequence[Trajectory]) -> Trajectory:
-    """Return the runs of several batches as one."""
+    """Join the runs of several batches into one trajectory."""
     arrays = zip(*(vars(trajectory).values() for trajectory in trajectories), strict=True)
     return Trajectory(*(np.hstack(parts) for parts in arrays))
 
 
 def reversals(applied: Array, sampling_interval: float) -> Array:
-    """Return how often a minute the valve turns round, shape (runs,).
+    """Return the number of valve reversals per minute, shape (runs,).
 
-    It turns where it moves against the direction of its last move, however long it stood still
-    in between. `applied` is u_a(k), t/h, shape (samples, runs); the sampling interval is in s.
+    A reversal is a move in the opposite direction to the last one, after any length of rest.
+    `applied` is u_a(k), t/h, shape (samples, runs); the sampling interval is in s.
     """
     moves = np.sign(np.diff(applied, axis=0, prepend=0.0))
     counts = [np.count_nonzero(np.diff(run[run != 0.0])) for run in moves.T]

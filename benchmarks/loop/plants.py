@@ -1,4 +1,4 @@
-"""Which plant a command runs on: one of a file, a preset, or single arguments."""
+"""Choose the plant of a command: from a file, a preset or single arguments."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from mptc_gym.parameters import slowest_pole
 
 @dataclass(frozen=True)
 class ChosenPlant:
-    """A plant that was asked for."""
+    """The plant that the user chose."""
 
     name: str
-    """What was asked for, in a few words; "the paper's plant" if nothing was."""
+    """Short description of the choice; "the paper's plant" by default."""
     arguments: dict[str, Any]
-    """Arguments of the environment that are not its defaults."""
+    """Arguments of the environment that differ from the defaults."""
 
 
 @options
 @dataclass(frozen=True, kw_only=True)
 class PlantOptions:
-    """Which plant to run on: one of a file, a preset, or single arguments."""
+    """Options that choose the plant: from a file, a preset or single arguments."""
 
     plant: Path | None = None
     """JSON file with arguments of the environment, such as the plant.json that
@@ -35,11 +35,11 @@ class PlantOptions:
         str | None, choice(PRESETS, "A plant that comes with the environment")
     ] = None
     set: Repeated = ()
-    """An argument of the environment, such as delay=30 or delay=[12,24] (repeatable; it
-    overrides those of --plant, and these override --preset)."""
+    """An argument of the environment, such as delay=30 or delay=[12,24] (repeatable;
+    overrides --plant, which overrides --preset)."""
 
     def chosen(self) -> ChosenPlant:
-        """Return the plant that is asked for; `UsageError` if something does not fit."""
+        """Return the chosen plant; `UsageError` if an option is invalid."""
         names: list[str] = []
         arguments: dict[str, Any] = {}
         if self.preset:
@@ -57,7 +57,7 @@ class PlantOptions:
             try:
                 arguments[name] = json.loads(value)
             except ValueError:
-                arguments[name] = value  # such as random
+                arguments[name] = value  # a bare word, such as random
         given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
         try:
             parameters = Parameters.of_environment(arguments)
@@ -72,7 +72,7 @@ class PlantOptions:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return the object that a JSON file holds, such as `plant.json`."""
+    """Return the arguments in a JSON file such as `plant.json`."""
     try:
         arguments = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

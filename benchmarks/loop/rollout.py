@@ -1,4 +1,4 @@
-"""The one rollout loop: a controller on a batch of plants."""
+"""Roll out a controller on a batch of plants, in the loop that all comparisons share."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Array = NDArray[np.float64]
 
 
 class Agent(Protocol):
-    """What a controller must offer to be rolled out."""
+    """The interface of a controller in a rollout."""
 
     def reset(self) -> None:
-        """Forget the episode."""
+        """Prepare for a new episode."""
 
     def act(self, observation: Any) -> Any:
         """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
@@ -29,7 +29,7 @@ class Agent(Protocol):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What happened in a batch of runs; every array has shape (samples, runs)."""
+    """The signals of a batch of runs; every array has shape (samples, runs)."""
 
     setpoint: Array
     """y_d(k), degC."""
@@ -42,18 +42,18 @@ class Trajectory:
     noise: Array
     """n(k), degC."""
     error: Array
-    """e(k + 1), degC: that of the reward of sample k. Every mean error is over k = 1 to N."""
+    """e(k + 1), degC: the error in the reward of sample k. Mean errors are over k = 1 to N."""
 
 
 def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vector.VectorEnv:
-    """Make a batch of plants whose episodes last `samples` samples."""
+    """Make a batch of plants with episodes of `samples` samples."""
     return gymnasium.make_vec(
         "MiddlePoint-v0", num_envs=num_envs, max_episode_steps=samples, **arguments
     )
 
 
 def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[Array]:
-    """Return the plant numbers of each run, as the environment draws them: shape (runs,)."""
+    """Return the plant numbers that the environment draws for each run, shape (runs,)."""
     numbers = Ranges(parameters).given_arrays.chosen(tuple(PLANT_NUMBERS))
     if parameters.ranges:
         plants = make_plants(runs, 1, **asdict(parameters))
@@ -77,13 +77,13 @@ def rollout(
     Parameters
     ----------
     plants, agent
-        The batch, and its controller, which is reset first.
+        Batch of plants and its controller. Both are reset first.
     samples
-        k = 0 to samples - 1. Not more than an episode lasts.
+        Number of samples, k = 0 to samples - 1, at most the length of an episode.
     seed
-        Run i meets the noise and the set point of seed `seed + i`.
+        Run i has the noise and the set point of seed `seed + i`.
     before
-        Called with k before the controller acts at sample k: to watch it, or to damage it.
+        Called with k before the controller acts at sample k, to observe or to damage it.
     """
     shape = samples, plants.num_envs
     trajectory = Trajectory(*(np.empty(shape) for _ in fields(Trajectory)))
@@ -101,7 +101,7 @@ def rollout(
                 f"act must return actions of shape {(plants.num_envs, 1)}, got {actions.shape}"
             )
         observation, _, _, _, info = plants.step(actions)
-        # A step reports the command and the applied input of the sample that it starts from.
+        # A step reports the command and the applied input of the sample that it starts at.
         trajectory.command[k] = info["command"]
         trajectory.applied[k] = info["applied"]
         trajectory.error[k] = info["error"]

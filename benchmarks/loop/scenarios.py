@@ -1,4 +1,4 @@
-"""The cases that controllers are compared on, each with a name, in one place."""
+"""Define the cases on which controllers are compared."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from mptc_gym import PRESETS, Parameters
 
 @dataclass(frozen=True)
 class Scenario:
-    """A plant, a set point and a length."""
+    """A plant, a set point and the length of a run."""
 
     name: str
-    """For options and file names."""
+    """Name in options and file names."""
     title: str
-    """For headings."""
+    """Title in headings."""
     samples: int
-    """Length of a run."""
+    """Length of a run, samples."""
     arguments: dict[str, Any] = field(default_factory=dict)
-    """Arguments of the environment that are not its defaults."""
+    """Arguments of the environment that differ from the defaults."""
 
     @property
     def parameters(self) -> Parameters:
@@ -28,9 +28,9 @@ class Scenario:
         return Parameters(**self.arguments)
 
 
-# The text of the paper gives the plants and not the set point, which only its figures show. Two
-# are used here: the environment's square wave between +5 and -5 degC, 300 samples each, over
-# two periods; and a step to 5 degC that is held.
+# The text of the paper describes the plants; only its figures show the set point. Two set
+# points are used here: the environment's square wave between +5 and -5 degC, 300 samples each,
+# over two periods; and a step to 5 degC.
 _PLANTS = (
     ("", "paper", "dead zone 5 t/h, no noise (Figs 5 and 10)"),
     ("-dead-zone-7", "dead-zone-7", "dead zone 7 t/h, no noise (Figs 6 and 7)"),
@@ -51,7 +51,7 @@ SCENARIOS: dict[str, Scenario] = {
     for setpoint, setpoint_title, samples, arguments in SETPOINTS
     for suffix, preset, plant_title in _PLANTS
 } | {
-    # What a boiler does all day. At 5 degC the flow that is needed stays outside the dead zone.
+    # A boiler's daily duty. At 5 degC the required flow stays outside the dead zone.
     "load": Scenario(
         "load",
         "load steps within ±1.5 °C at a held set point, dead zone 5 t/h, no noise",
@@ -68,10 +68,10 @@ PRESET_SCENARIOS: dict[str, Scenario] = {
 
 
 def scenarios_of(name: str, arguments: Mapping[str, Any]) -> dict[str, Scenario]:
-    """Return the cases of a plant that is not the paper's, given its name and arguments.
+    """Return the cases for another plant, given its name and arguments.
 
-    They are the set points of the paper's cases on this plant; or, if the arguments say what
-    the set point is, one case with theirs.
+    They use the set points of the paper's cases, unless the arguments define a set point: then
+    there is one case, with that set point.
     """
     own = {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments)
     cases = [("run", "its own set point", 1200, {})] if own else SETPOINTS
