@@ -1,7 +1,7 @@
-"""Try one reinforcement-learning library on the environment, with its lines of clients.md.
+"""Test the environment with one reinforcement-learning library, by its lines in clients.md.
 
-Each line is taken from the page, word for word, and used to train or to step. Commands get the
-options that make them short.
+Each line is taken from the page verbatim and used to train or to step. Options are added to the
+commands to keep them short.
 """
 
 import re
@@ -20,7 +20,7 @@ PAGE = ROOT / "benchmarks/examples/clients.md"
 
 
 def lines(library: str) -> list[str]:
-    """Return what the page's table gives as the lines that work with a library."""
+    """Return a library's lines from the page's table."""
     rows = [line.split(" | ") for line in PAGE.read_text(encoding="utf-8").splitlines()]
     found = [row[2] for row in rows if re.fullmatch(rf"\| {library}(,.*)?", row[0])]
     assert found, f"the page has no line of {library}"
@@ -28,7 +28,7 @@ def lines(library: str) -> list[str]:
 
 
 def run(line: str, *options: str, folder: Path | None = None) -> subprocess.CompletedProcess:
-    """Run a command of the page with the Python that runs this."""
+    """Run a command from the page with the current Python."""
     program, *words = line.split()
     assert program == "python", line
     return subprocess.run(
@@ -37,7 +37,7 @@ def run(line: str, *options: str, folder: Path | None = None) -> subprocess.Comp
 
 
 def torchrl() -> None:
-    """GymEnv, and GymWrapper on the vector environment; check_env_specs on both."""
+    """Check GymEnv, and GymWrapper on the vector environment, with check_env_specs."""
     from torchrl.envs import GymEnv, GymWrapper
     from torchrl.envs.utils import check_env_specs
 
@@ -58,7 +58,7 @@ def torchrl() -> None:
 
 
 def skrl() -> None:
-    """PPO on the vector environment, for a moment."""
+    """Train PPO briefly on the vector environment."""
     from skrl.agents.torch.ppo import PPO, PPO_CFG
     from skrl.envs.wrappers.torch import wrap_env
     from skrl.memories.torch import RandomMemory
@@ -86,11 +86,11 @@ def skrl() -> None:
     )
     trainer = SequentialTrainer(env=env, agents=agent, cfg={"timesteps": 64, "headless": True})
     trainer.train()
-    assert policy.log_std_parameter.item() != 0.0  # where it began
+    assert policy.log_std_parameter.item() != 0.0  # the initial value
 
 
 def tianshou() -> None:
-    """PPO on Tianshou's own batch of plants, for two episodes of each."""
+    """Train PPO on plants in Tianshou's own vector environment, for two episodes of each."""
     import torch
     from tianshou.algorithm import PPO
     from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
@@ -137,7 +137,7 @@ def tianshou() -> None:
 
 
 def rl_zoo3() -> None:
-    """Train, then look at what was trained, as two commands."""
+    """Train a policy and run it, by two commands."""
     train, enjoy = lines("RL Baselines3 Zoo")
     done = run(train, "-n", "2048")
     assert done.returncode == 0, done.stderr
@@ -157,7 +157,7 @@ def rllib() -> None:
 
 
 def cleanrl() -> None:
-    """CleanRL's file, which lies in its wheel: as it is, and with the page's one change."""
+    """Run CleanRL's file from its wheel, unchanged and with the one change on the page."""
     (line,) = lines("CleanRL")
     (wheel,) = Path().glob("cleanrl-*.whl")
     file = Path("ppo_continuous_action.py")
@@ -166,7 +166,7 @@ def cleanrl() -> None:
 
     file.write_text(text, encoding="utf-8")
     done = run(line, *options)
-    # Once this passes, the page need not speak of a change any more.
+    # If the file runs unchanged, the page no longer needs to mention the change.
     assert done.returncode, "the file runs unchanged"
     assert "TransformObservation.__init__() missing" in done.stderr, done.stderr
 
@@ -180,7 +180,7 @@ def cleanrl() -> None:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(ROOT))  # for what the examples import
+    sys.path.insert(0, str(ROOT))  # for imports by the examples
     name = sys.argv[1]
     locals()[name]()
     packages = {"rllib": "ray", "cleanrl": "torch"}.get(name, name), "gymnasium", "torch"

@@ -1,7 +1,7 @@
-"""The README as the long description of the package, where its relative links lead nowhere.
+"""Make the package's long description from the README, whose relative links would break there.
 
 With an address under `Repository` in `[project.urls]` of pyproject.toml, links and pictures
-become absolute. Without one the description is the README as it is.
+become absolute. Without one, the README is used unchanged.
 """
 
 import re
@@ -13,10 +13,10 @@ LINK = re.compile(r"(?P<picture>!?)(?P<text>\[[^]]*\])\((?!https?:|#)(?P<target>
 
 
 class Description(MetadataHookInterface):
-    """Sets `readme` when the package is built."""
+    """Set `readme` when the package is built."""
 
     def update(self, metadata: dict) -> None:
-        """Add the text to the metadata of the project."""
+        """Add the description to the project's metadata."""
         text = (Path(self.root) / "README.md").read_text(encoding="utf-8")
         address = metadata.get("urls", {}).get("Repository", "").rstrip("/")
         if address:
@@ -25,10 +25,10 @@ class Description(MetadataHookInterface):
 
 
 def absolute(text: str, address: str) -> str:
-    """Return a page of the repository's top level with its relative links made absolute."""
+    """Make the relative links of a page at the repository's top level absolute."""
 
     def whole(link: re.Match[str]) -> str:
-        # A picture has to be the file itself, not the page that shows it.
+        # A picture must be the raw file, not the page that shows it.
         kind = "raw" if link["picture"] else "blob"
         return f"{link['picture']}{link['text']}({address}/{kind}/HEAD/{link['target']})"
 

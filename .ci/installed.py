@@ -1,4 +1,4 @@
-"""Check an installed mptc_gym: what came with it, what did not, and that it runs."""
+"""Check that an installed mptc_gym is complete, brings nothing else and runs."""
 
 import re
 import sys
@@ -10,7 +10,7 @@ from pathlib import Path
 import gymnasium
 from gymnasium.utils.env_checker import check_env
 
-# Those of a checkout and of the extras: none comes with the package.
+# Packages of the checkout and the extras, none of which may come with mptc_gym.
 ABSENT = (
     "agents", "benchmarks", "tests", "torch", "stable_baselines3", "matplotlib", "scipy",
     "pandas", "pygame",
@@ -32,7 +32,7 @@ assert about["License-Expression"] == "MIT"
 assert about["Description-Content-Type"] == "text/markdown"
 readme = str(about.get_payload())
 assert "MiddlePoint-v0" in readme
-# Pictures and pages are not in the package; with an address, its README has them from there.
+# The package has no pictures or pages; its README links to those at the repository, if known.
 links = re.findall(r"(!?)\[[^]]*\]\(([^)]*)\)", readme)
 relative = [target for _, target in links if not target.startswith("https:")]
 pictures = [target for picture, target in links if picture]
@@ -48,7 +48,7 @@ needed = [each for each in installed.requires or () if "extra ==" not in each]
 assert sorted(each.partition(">=")[0] for each in needed) == ["gymnasium", "numpy"], needed
 
 env = gymnasium.make("mptc_gym:MiddlePoint-v0", noise_variance=0.5)
-check_env(env.unwrapped, skip_render_check=True)  # pictures need an extra
+check_env(env.unwrapped, skip_render_check=True)  # rendering needs an extra
 env.action_space.seed(0)
 env.reset(seed=0)
 for _ in range(1000):

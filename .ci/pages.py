@@ -1,6 +1,6 @@
-"""Adds the repository's pages, pictures and tables to the site, and its source files as pages.
+"""Add the repository's pages, pictures and tables to the site, and its source files as pages.
 
-MkDocs looks for pages in one folder, and those of this project lie beside the code.
+MkDocs expects all pages in one folder, but those of this project are beside the code.
 """
 
 import re
@@ -17,9 +17,9 @@ PICTURE = re.compile(r'(<img [^>]*src="([^"]+)"[^>]*>)')
 TO_SOURCE = re.compile(r"(\]\((?!https?:)[^)#]+\.py)\)")
 
 
-@event_priority(100)  # before the plugins that look for files of theirs, such as notebooks
+@event_priority(100)  # before plugins that look for their own files, such as notebooks
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add what git tracks: pages and what they show, and a page for each source file."""
+    """Add the tracked pages and the files that they show, and a page for each source file."""
     tracked = subprocess.run(
         ["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True
     )
@@ -38,13 +38,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Lead links to source files to their pages."""
+    """Point links to source files at their pages."""
     return TO_SOURCE.sub(r"\1.md)", markdown)
 
 
 def on_page_content(html: str, **_: object) -> str:
-    """Lead each picture to its full size, for small screens.
+    """Link each picture to its full-size version, for small screens.
 
-    The mark before literal blocks in docstrings goes, which Markdown does not know.
+    Remove the `::` before literal blocks in docstrings, which Markdown does not know.
     """
     return PICTURE.sub(r'<a href="\2">\1</a>', html.replace("<p>::</p>\n", ""))

@@ -1,1 +1,1 @@
-"""Short programs that use the environment with what people use."""
+"""Short programs that use the environment with popular libraries."""

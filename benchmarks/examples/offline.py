@@ -1,7 +1,7 @@
-"""Offline learning on one page, in PyTorch alone: behaviour cloning and TD3+BC.
+"""Learn from logged data on one page, in PyTorch alone: behaviour cloning and TD3+BC.
 
-`python -m benchmarks.datasets` writes the data first. `python -m benchmarks.examples.offline`
-then learns from one data set, without a plant, and runs what it has learnt on episodes that are
+First, `python -m benchmarks.datasets` writes the data. `python -m benchmarks.examples.offline`
+then learns from one data set, without a plant, and evaluates the policies on episodes that are
 not in the data. A score of 1 is the least possible mean error, 0 that of an idle valve.
 """
 
@@ -21,21 +21,21 @@ from torch.utils.data import TensorDataset
 
 import mptc_gym
 
-BATCH = 256  # transitions a step
-WIDTH = 64  # nodes of each of two hidden layers
-LEARNING_RATE = 1e-3  # at the start; it falls linearly to a tenth
-GAMMA = 0.97  # discount a sample
-TAU = 0.01  # share by which target networks follow in a step
-ALPHA = 0.05  # weight of the value against that of staying near the data
-SMOOTHING, CLIP = 0.1, 0.25  # spread of the noise on target actions, and its limit
-DELAY = 2  # steps of the critics for each of the actor
-LAST_ACTION = 6  # its place in an observation: after three set points and three errors
+BATCH = 256  # transitions per gradient step
+WIDTH = 64  # units in each of the two hidden layers
+LEARNING_RATE = 1e-3  # initial value; falls linearly to a tenth
+GAMMA = 0.97  # discount per sample
+TAU = 0.01  # update rate of the target networks
+ALPHA = 0.05  # weight of the value relative to staying near the data
+SMOOTHING, CLIP = 0.1, 0.25  # standard deviation and limit of the noise on target actions
+DELAY = 2  # critic steps per actor step
+LAST_ACTION = 6  # index in an observation, after three set points and three errors
 
 
 def transitions_of(episodes: Iterable[Any]) -> TensorDataset:
-    """Return observations, actions, rewards and next observations of a Minari data set.
+    """Return the observations, actions, rewards and next observations of a Minari data set.
 
-    No episode terminates, so that all transitions have a future.
+    No episode terminates, so every transition is bootstrapped.
     """
     rows = [
         (each.observations[:-1], each.actions, each.rewards[:, None], each.observations[1:])
@@ -46,25 +46,25 @@ def transitions_of(episodes: Iterable[Any]) -> TensorDataset:
 
 
 class Network(nn.Module):
-    """Two hidden layers over temperatures in units of 5 degC and actions as they are."""
+    """A network with two hidden layers; its inputs are temperatures over 5 degC and actions."""
 
     scale: Tensor
 
     def __init__(self, high: np.ndarray) -> None:
         super().__init__()
-        # Fixed factors are the same in training and in use.
+        # Fixed factors are the same in training and evaluation.
         self.register_buffer("scale", torch.where(torch.as_tensor(high) > 1.0, 0.2, 1.0))
         layers = nn.Linear(len(high), WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU()
         self.layers = nn.Sequential(*layers, nn.Linear(WIDTH, 1))
 
     def forward(self, values: Tensor) -> Tensor:
-        """Return one number a row, shape (n, 1)."""
+        """Return one number per row, shape (n, 1)."""
         result: Tensor = self.layers(values * self.scale)
         return result
 
 
 class Actor(Network):
-    """A policy that changes the last action, as a valve's position is changed."""
+    """A policy whose output is an increment to the last action, like a valve's move."""
 
     def act(self, observations: Tensor) -> Tensor:
         """Return actions within [-1, 1], shape (n, 1)."""
@@ -75,20 +75,20 @@ class Actor(Network):
 def learn(
     data: TensorDataset, high: np.ndarray, *, alpha: float, steps: int, seed: int
 ) -> Actor:
-    """Return an actor: TD3+BC (Fujimoto & Gu 2021), or behaviour cloning if alpha is 0.
+    """Train an actor by TD3+BC (Fujimoto & Gu 2021), or by behaviour cloning if alpha is 0.
 
     Parameters
     ----------
     data
-        All that it sees.
+        Transitions to learn from.
     high
         Upper bounds of the observation, shape (n_obs,).
     alpha
-        Weight of the value against that of staying near the data.
+        Weight of the value relative to staying near the data.
     steps
-        Gradient steps.
+        Number of gradient steps.
     seed
-        Of the weights, the batches and the noise.
+        Seed of the weights, the batches and the noise.
     """
     torch.manual_seed(seed)
     actor = Actor(high)
@@ -132,23 +132,23 @@ def _descend(optimizer: torch.optim.Optimizer, loss: Any) -> None:
 
 
 def policy_of(actor: Actor) -> Any:
-    """Return an actor as a function of observations, for `mptc_gym.evaluate`."""
+    """Return the policy of an actor, a function of observations, for `mptc_gym.evaluate`."""
     return lambda observations: actor.act(torch.as_tensor(observations)).detach().numpy()
 
 
 def main(
     *, data: str = "middlepoint/paper/smith-v0", steps: int = 3000, seeds: int = 5
 ) -> None:
-    """Learn offline from a data set, and score what was learnt.
+    """Learn offline from a data set, and score the policies.
 
     Parameters
     ----------
     data
-        Data set.
+        Name of the data set.
     steps
-        Gradient steps.
+        Number of gradient steps.
     seeds
-        How many runs of each learner.
+        Number of runs of each learner.
     """
     try:
         import minari

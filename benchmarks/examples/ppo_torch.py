@@ -1,7 +1,7 @@
-"""PPO on one page, in PyTorch alone, on a batch of plants on any device.
+"""Train PPO on one page, in PyTorch alone, on a batch of plants on any device.
 
 `python -m benchmarks.examples.ppo_torch --device cuda` trains a policy and prints its score on
-the noise-free square wave, without exploration. The plants are stepped on the device, so
+the noise-free square wave, without exploration. The plants are stepped on the device, so the
 experience never leaves it. The policy is not saved.
 """
 
@@ -26,48 +26,48 @@ from mptc_gym.torch_env import MiddlePointTorchEnv
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Settings of a training."""
+    """Training settings."""
 
     steps: int = 1_000_000
-    """Samples of experience, all plants together."""
+    """Total number of samples, over all plants."""
     seed: int = 0
     """Seed of the policy, the exploration and the set points."""
     device: str = "cpu"
-    """Where the plants and the policy are computed: cpu or cuda."""
+    """Device of the plants and the policy: cpu or cuda."""
     num_envs: int = 64
-    """Plants that are stepped at once."""
+    """Number of plants stepped at once."""
     num_steps: int = 64
     """Samples of each plant between two updates."""
     epochs: int = 5
-    """Passes of an update through its samples."""
+    """Passes through the samples in an update."""
     minibatches: int = 16
-    """Gradient steps of a pass."""
+    """Gradient steps in a pass."""
     learning_rate: float = 1e-3
-    """Learning rate at the start; it falls linearly to a twentieth."""
+    """Initial learning rate; it falls linearly to a twentieth."""
     gamma: float = 0.95
-    """Discount a sample."""
+    """Discount per sample."""
     gae_lambda: float = 1.0
-    """Below 1, advantages rely on the value function."""
+    """Lambda of the advantage estimates; below 1, they rely on the value function."""
     clip: float = 0.2
-    """How far an update may change the probability of an action."""
+    """Limit on the relative change of an action's probability in an update."""
     value_weight: float = 0.5
     """Weight of the value function's loss."""
     max_gradient: float = 0.5
     """Norm to which gradients are clipped."""
     first_log_std: float = -0.5
-    """Logarithm of the exploration's spread at the start; actions are within -1 and 1."""
+    """Initial log standard deviation of the exploration; actions are within -1 and 1."""
     last_log_std: float = -2.0
-    """The same at the end; it falls linearly."""
+    """Final log standard deviation; it falls linearly."""
     evaluations: int = 10
-    """How often the policy is measured."""
+    """Number of evaluations during training."""
 
 
 DEFAULTS = Arguments()
-# With delay + 2 past actions the problem is Markov while the set point holds.
+# With delay + 2 past actions the problem is Markov while the set point is constant.
 OBSERVATION: dict[str, Any] = {"action_window": 20, "output_window": 2}
-# Returns of about 1 in size: the gradient of larger ones would crowd out that of the policy.
+# Returns are of order 1: the gradient of larger ones would swamp that of the policy.
 TRAINING = {"setpoint": "random", "reward": "absolute", "error_scale": 50.0, **OBSERVATION}
-DEGREES = 5.0  # what temperatures are divided by before they enter a network
+DEGREES = 5.0  # divisor of temperatures at the inputs of the networks
 app = App(help=__doc__, version_flags=(), result_action="return_value")
 
 
@@ -78,7 +78,7 @@ class Agent(nn.Module):
 
     def __init__(self, space: gymnasium.spaces.Box) -> None:
         super().__init__()
-        # Fixed factors are the same in training and in use, which running averages are not.
+        # Unlike running averages, fixed factors are the same in training and evaluation.
         temperatures = torch.as_tensor(space.high) > 1.0  # the others are past actions
         self.register_buffer("scale", torch.where(temperatures, 1.0 / DEGREES, 1.0))
         size = len(space.high)
@@ -97,7 +97,7 @@ class Agent(nn.Module):
 
 
 def network(size: int, last_gain: float) -> nn.Sequential:
-    """Return two hidden layers and one output; a small gain makes the first outputs small."""
+    """Return two hidden layers and one output; a small gain makes the initial outputs small."""
     layers = nn.Linear(size, 64), nn.Linear(64, 64), nn.Linear(64, 1)
     for layer, gain in zip(layers, (2**0.5, 2**0.5, last_gain), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
@@ -109,12 +109,12 @@ def network(size: int, last_gain: float) -> nn.Sequential:
 def estimate(
     rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, arguments: Arguments
 ) -> Tensor:
-    """Return generalised advantage estimates; all have the shape (num_steps, num_envs)."""
+    """Return generalised advantage estimates; all arrays have shape (num_steps, num_envs)."""
     advantages = torch.zeros_like(rewards)
     advantage = torch.zeros_like(rewards[0])
     for t in reversed(range(len(rewards))):
         surprise = rewards[t] + arguments.gamma * next_values[t] - values[t]
-        # What is found later belongs to another episode if one has ended here.
+        # After the end of an episode, later advantages belong to the next one.
         decay = arguments.gamma * arguments.gae_lambda * (1.0 - ends[t])
         advantages[t] = advantage = surprise + decay * advantage
     return advantages
@@ -127,8 +127,8 @@ def train(arguments: Annotated[Arguments, Parameter(name="*")] = DEFAULTS) -> Ag
     device = arguments.device
     if device == "cpu":
         torch.set_num_threads(1)  # the networks are too small for more
-    # In mode "SameStep" every step is one of the plant. In "NextStep" each episode would bring
-    # one that only resets, whose action and reward mean nothing and would have to be masked.
+    # In mode "SameStep" every step is a step of the plant. "NextStep" would add one per episode
+    # that only resets, whose action and reward are meaningless and would have to be masked.
     plants = MiddlePointTorchEnv(
         arguments.num_envs, device=device, autoreset_mode="SameStep", **TRAINING
     )
@@ -158,8 +158,8 @@ def train(arguments: Annotated[Arguments, Parameter(name="*")] = DEFAULTS) -> Ag
                 log_probs[t] = policy.log_prob(actions[t]).squeeze(-1)
                 now, rewards[t], terminated, truncated, infos = plants.step(actions[t])
                 ends[t] = terminated | truncated
-                # What follows is worth what it is worth from the last observation of the
-                # episode; the one returned at an end is already the first of the next.
+                # Bootstrap from the last observation of an episode: the observation returned at
+                # its end is already the first of the next episode.
                 following = now
                 if "final_obs" in infos:
                     following = torch.where(ends[t, :, None] > 0, infos["final_obs"], now)

@@ -1,14 +1,14 @@
-"""PPO of Stable-Baselines3 learns to control the plant in a quarter of a minute, on one core.
+"""Train PPO of Stable-Baselines3 to control the plant, in a quarter of a minute on one core.
 
-`python benchmarks/examples/sb3.py` trains, keeps the policy in `ppo-0.zip`, and prints its
-score on a square wave that it has not met: 0 is a valve left alone, 1 the least possible error.
+`python benchmarks/examples/sb3.py` trains a policy, saves it in `ppo-0.zip`, and prints its
+score on an unseen square wave: 0 is a valve left alone, 1 the least possible error.
 
-This is one file to copy. What makes it work:
+Copy this one file. It works for these reasons:
 
 - 64 plants are stepped at once, with random set points; the reward is the absolute error.
-- The action changes the flow (`IncrementalAction`), and the dead zone is undone on the way.
-- The policy sees errors and the moves of the flow, not their levels, and has no biases. So it
-  rests where the error is 0 and nothing moves, and nowhere else: no offset has to be unlearnt.
+- The action changes the flow (`IncrementalAction`), which also compensates the dead zone.
+- The policy sees errors and changes of the flow, not its level, and has no biases. It is thus
+  at rest only where the error is 0 and nothing moves, and has no offset to unlearn.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from torch import Tensor, nn
 from mptc_gym import evaluate
 from mptc_gym.sb3 import make_vec_env, spec_of
 
-SETPOINTS, ERRORS, ACTIONS = 3, 3, 20  # in the observation: two actions more than the delay
+SETPOINTS, ERRORS, ACTIONS = 3, 3, 20  # windows of the observation; actions: the delay plus two
 
 
 class Moves(BaseFeaturesExtractor):
-    """Shows the error, how it has changed, and how the flow has moved, newest first."""
+    """Extract the error, its changes and the moves of the flow, newest first."""
 
     def __init__(self, space: Box) -> None:
         super().__init__(space, features_dim=ERRORS + ACTIONS - 1)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Return the inputs of the networks, of about 1 in size."""
+        """Return the inputs of the networks, of order 1."""
         _, errors, actions = observations.split([SETPOINTS, ERRORS, ACTIONS], dim=1)
         return torch.cat([errors[:, :1], -0.5 * errors.diff(), -2.0 * actions.diff()], dim=1)
 
 
 def make_model(seed: int) -> PPO:
-    """Return a model that has learnt nothing yet."""
+    """Return an untrained model."""
     plants = make_vec_env(
         "MiddlePoint-v0",
         64,
@@ -53,7 +53,7 @@ def make_model(seed: int) -> PPO:
         setpoint="random",
         setpoint_amplitude=6.0,
         reward="absolute",
-        error_scale=50.0,  # returns of about 1, which are soon learnt
+        error_scale=50.0,  # for returns of order 1, which are learnt quickly
     )
     model = PPO(
         "MlpPolicy",
@@ -75,7 +75,7 @@ def make_model(seed: int) -> PPO:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Train, keep the policy, and print how good it is."""
+    """Train a policy, save it and print its score."""
     parser = argparse.ArgumentParser(description="PPO of Stable-Baselines3 on 64 plants.")
     parser.add_argument("--steps", type=int, default=200_000, help="samples of experience")
     parser.add_argument("--seed", type=int, default=0, help="of policy, exploration and plants")

@@ -1,8 +1,8 @@
-"""Train a network of your own through the plant: `python -m benchmarks.examples.through_plant`.
+"""Train your own network through the plant: `python -m benchmarks.examples.through_plant`.
 
-The environment in PyTorch is differentiable, so the error of a whole run has a gradient with
-respect to the weights of the policy: no value function, no exploration. It takes half a minute
-on one core. Then the policy meets the paper's square wave, which it was not trained on.
+The PyTorch environment is differentiable, so the error of a whole run has a gradient with
+respect to the policy's weights: no value function, no exploration. Training takes half a minute
+on one core. The policy is then tested on the paper's square wave, which it was not trained on.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ SETPOINTS: dict[str, Any] = {
     "setpoint_amplitude": 6.0,
     "setpoint_period": 400,
 }
-HOLDS = -0.1465  # action that holds the plant, per degC: its gain is -0.6825 degC per t/h
+HOLDS = -0.1465  # steady-state action per degC: the plant's gain is -0.6825 degC per t/h
 
 
 def act(network: nn.Module, seen: Tensor) -> Tensor:
-    """Return actions, shape (n, 1). Where the plant is held, all that the network sees is 0."""
+    """Return actions, shape (n, 1). In steady state at the set point all inputs are 0."""
     setpoint, outputs, actions = seen[:, :1], seen[:, 1:25], seen[:, 25:]
     steady = torch.cat([0.5 * (setpoint - outputs), actions - HOLDS * setpoint], dim=1)
     action: Tensor = HOLDS * setpoint + network(steady)
@@ -48,7 +48,7 @@ def run(network: nn.Module, plants: MiddlePointTorchEnv, samples: int, seed: int
 
 
 def main(steps: int = 100, plants: int = 64, samples: int = 300) -> float:
-    """Train, and return the mean |e| on the square wave, degC."""
+    """Train a policy, and return its mean |e| on the square wave, degC."""
     torch.manual_seed(0)
     network = nn.Sequential(
         nn.Linear(48, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 1)

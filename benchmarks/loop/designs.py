@@ -18,7 +18,7 @@ SPANS = {
     "gain_factor": (0.75, 1.6),
     "time_constant_factor": (0.5, 2.0),
 }
-# 95 % of these plants lie outside `SPANS`, the ranges covered by the self-tuning bank.
+# About 95 % of these plants lie outside `SPANS`, the ranges covered by the self-tuning bank.
 WIDE = {
     "delay": (0, 60),
     "dead_zone": (0.0, 10.0),

@@ -1,7 +1,7 @@
-"""Measures environment steps a second beside other environments: `python -m benchmarks.speed`.
+"""Compare the steps a second of this and other environments: `python -m benchmarks.speed`.
 
-What is compared takes turns in one run and is reported as a ratio, with its spread. EnvPool and
-gymnax are measured where they are installed.
+The compared cases are timed in turns within one run and reported as ratios with their spread.
+EnvPool and gymnax are included if they are installed.
 """
 
 from __future__ import annotations
@@ -35,34 +35,34 @@ from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
 SINGLE_STEPS = 20_000
-FRAMES = 400  # with a chart that is full for half of them
+FRAMES = 400  # the chart is full for half of them
 EPISODE = 1200
 BATCHES = (8, 64, 1024, 16384)
 LOOPS = (64, 1000)
 MEMORY_PLANTS = 100
 DEVICE_BATCHES = tuple(4**power for power in range(5, 12))  # 1,024 to 4,194,304 plants
 DEVICE_STEPS = 200
-GRADIENTS, BACKWARD = 1024, 300  # plants, and samples
-PEER_STEPS = 100  # of each environment of EnvPool and gymnax
+GRADIENTS, BACKWARD = 1024, 300  # plants and samples of the gradient
+PEER_STEPS = 100  # steps of each environment of EnvPool and gymnax
 INSTALL_PEERS = "pip install envpool gymnax six"
 REFERENCE = "CartPole-v1"
-# Arguments of a plant, by what is special about it.
+# Arguments of the plants, by the suffix of their names.
 NOISE: dict[str, Any] = {"noise_variance": 0.5}
 PLANTS: dict[str, dict[str, Any]] = {"": {}, ", R = 0.5": NOISE, ", hard": PRESETS["hard"]}
 
 
 @dataclass(frozen=True)
 class Case:
-    """Something to be timed."""
+    """A piece of code to time."""
 
     name: str
     run: Callable[[], object]
     steps: int
-    """Environment steps of a call."""
+    """Environment steps per call."""
 
 
 def execute(options: Options, console: Console) -> str:
-    """Measure and print."""
+    """Measure, print the tables and return the closing lines."""
     rounds = options.rounds
     torch.set_num_threads(1)  # one core, as for the others
 
@@ -112,9 +112,9 @@ def execute(options: Options, console: Console) -> str:
 
 
 def compare(cases: list[Case], rounds: int) -> pd.DataFrame:
-    """Time cases alternately, so many rounds, and return a row a case.
+    """Time cases in turns for some rounds, and return one row per case.
 
-    The ratio is that of its steps a second to those of the first case in the same round.
+    The ratio compares a case's steps a second with those of the first case in the same round.
     """
     seconds = _alternately(cases, rounds)
     rates = seconds.rdiv([case.steps for case in cases], axis="columns")
@@ -129,7 +129,7 @@ def compare(cases: list[Case], rounds: int) -> pd.DataFrame:
 
 
 def memory() -> pd.DataFrame:
-    """Measure the memory of a plant, in a batch and alone."""
+    """Measure the memory per plant, in a batch and alone."""
     rows = []
     random = {**NOISE, "setpoint": "random"}
     for name, given in {"R = 0": {}, "R = 0.5, random set point": random}.items():
@@ -141,7 +141,7 @@ def memory() -> pd.DataFrame:
 
 
 def _memory(env: Any) -> int:
-    """Return the bytes that an environment uses after a step."""
+    """Return the memory of an environment after a step, in bytes."""
     tracemalloc.start()
     env = copy.deepcopy(env)
     env.reset(seed=0)
@@ -152,7 +152,7 @@ def _memory(env: Any) -> int:
 
 
 def _single(name: str, special: str = "", **arguments: Any) -> Case:
-    """Return one environment, with a picture of each step if it has a render mode."""
+    """Return the case of one environment, rendered at each step if it has a render mode."""
     env = gymnasium.make(name, **arguments)
     env.action_space.seed(0)
     draws = env.render_mode is not None
@@ -171,7 +171,7 @@ def _single(name: str, special: str = "", **arguments: Any) -> Case:
 
 
 def _vector(n: int) -> Iterable[Case]:
-    """Yield vector environments; a call is one of our episodes, with its reset."""
+    """Yield the cases of vector environments; a call is one plant episode and its reset."""
     kinds = [(REFERENCE, "", {}), *(("MiddlePoint-v0", *plant) for plant in PLANTS.items())]
     for name, special, arguments in kinds:
         envs = gymnasium.make_vec(name, n, vectorization_mode="vector_entry_point", **arguments)
@@ -185,7 +185,7 @@ def _vector(n: int) -> Iterable[Case]:
 
 
 def _envpool(n: int) -> Iterable[Case]:
-    """Yield CartPole in C++, on one thread."""
+    """Yield the case of CartPole in C++, on one thread."""
     import envpool
 
     envs = envpool.make_gymnasium(REFERENCE, num_envs=n, num_threads=1, seed=0)
@@ -195,9 +195,9 @@ def _envpool(n: int) -> Iterable[Case]:
 
 
 def _gymnax(n: int) -> Iterable[Case]:
-    """Yield CartPole in JAX on one thread of the CPU: step by step, and all steps compiled."""
+    """Yield CartPole in JAX on one CPU thread, step by step and as one compiled loop."""
     flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    os.environ.setdefault("XLA_FLAGS", flags)  # read when JAX is first used
+    os.environ.setdefault("XLA_FLAGS", flags)  # read on the first use of JAX
     import gymnax
     import jax
 
@@ -227,7 +227,7 @@ def _gymnax(n: int) -> Iterable[Case]:
         jax.block_until_ready(scan(start))
 
     for name, run in {"": stepped, ", one compiled loop": compiled}.items():
-        run()  # compiled the first time
+        run()  # the first call compiles
         yield Case(f"{REFERENCE} of gymnax{name}", run, n * PEER_STEPS)
 
 
@@ -235,7 +235,7 @@ PEERS: dict[str, Callable[[int], Iterable[Case]]] = {"envpool": _envpool, "gymna
 
 
 def _in_torch(n: int, device: str, steps: int) -> Iterable[Case]:
-    """Yield environments in PyTorch; a call ends when the device is done."""
+    """Yield the cases of the PyTorch environment; a call waits for the device to finish."""
     for special, arguments in PLANTS.items():
         envs = MiddlePointTorchEnv(n, device=device, **arguments)
         envs.reset(seed=0)
@@ -245,12 +245,12 @@ def _in_torch(n: int, device: str, steps: int) -> Iterable[Case]:
 
 
 def on_device(device: str, rounds: int) -> pd.DataFrame:
-    """Return steps a second of the environment in PyTorch on a device, a row a batch."""
+    """Return the PyTorch environment's steps a second on a device, one row per batch size."""
     rows = []
     for n in DEVICE_BATCHES:
         row = {"n": f"{n:,}"}
         for case in _in_torch(n, device, DEVICE_STEPS):
-            case.run()  # what is done once, the first time
+            case.run()  # warm-up
             rates = case.steps / _alternately([case], rounds)[case.name]
             row[case.name] = f"{rates.median():.3g}"
         rows.append(row)
@@ -258,7 +258,7 @@ def on_device(device: str, rounds: int) -> pd.DataFrame:
 
 
 def _through_the_plant(n: int) -> Case:
-    """Return forward and backward through plants and a policy."""
+    """Return the case of a forward and backward pass through plants and a policy."""
     envs = MiddlePointTorchEnv(n, max_episode_steps=None, differentiable=True)
     size = envs.parameters.observation_size
     policy = nn.Sequential(
@@ -283,7 +283,7 @@ def _stepping(
     steps: int,
     wait: Callable[[], object] = lambda: None,
 ) -> Case:
-    """Return a batch that takes the actions in turn, and waits for its device then."""
+    """Return the case of a batch that cycles through the actions, then waits for its device."""
 
     def run() -> None:
         for k in range(steps):
@@ -294,7 +294,7 @@ def _stepping(
 
 
 def _alone() -> Case:
-    """Return one plant and its network, without a batch."""
+    """Return the case of one plant and its network, without a batch."""
     env = gymnasium.make("MiddlePoint-v0", **NOISE)
     controller = DirectNNController()
 
@@ -308,14 +308,14 @@ def _alone() -> Case:
 
 
 def _closed_loop(n: int) -> Case:
-    """Return a batch of plants and their networks."""
+    """Return the case of a batch of plants and their networks."""
     plants, controller = make_plants(n, EPISODE, **NOISE), DirectNNController(num_envs=n)
     run = partial(rollout, plants, controller, EPISODE, seed=0)
     return Case(f"batch of {n:,}", run, n * EPISODE)
 
 
 def _alternately(cases: list[Case], rounds: int) -> pd.DataFrame:
-    """Time each in turn, and return seconds: a row a round, a column a case."""
+    """Time the cases in turns, and return seconds: one row per round, one column per case."""
     rows = []
     for _ in tqdm(range(rounds), leave=False):
         row = {}

@@ -10,13 +10,13 @@ from benchmarks.lib.options import Runs, options
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Measure environment steps a second beside other environments.
+    """Compare the steps a second of this and other environments.
 
-    What is compared takes turns in one run and is reported as a ratio, with its spread. EnvPool
-    and gymnax are measured where they are installed.
+    The compared cases are timed in turns within one run and reported as ratios with their
+    spread. EnvPool and gymnax are included if they are installed.
     """
 
     rounds: Runs = 15
-    """Measurements of each."""
+    """Number of measurements of each case."""
     device: str | None = None
-    """Measure the environment in PyTorch there (cuda), and nothing else."""
+    """Measure only the PyTorch environment, on this device, such as cuda."""
