@@ -1,4 +1,4 @@
-"""Compare controllers, all of them on the same noise: `python -m benchmarks.compare --help`."""
+"""Compare controllers in the same noise: `python -m benchmarks.compare --help`."""
 
 from benchmarks.lib.commands import command
 

@@ -1,4 +1,4 @@
-"""Run a comparison as its options say, and write what it finds."""
+"""Run a comparison from its options, and write its results."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, sce
 from mptc_gym.evaluation import SEED
 
 OUT = Path("results/compare")
-LONGEST = 60  # characters of a folder's name
-PAUSE = 2.0  # s between two times that the runs so far are written
+LONGEST = 60  # characters at which a folder's name is cut
+PAUSE = 2.0  # s between saves of the runs so far
 
 
 def execute(options: Options, console: Console) -> str:
-    """Run the comparison and write what it finds."""
+    """Run the comparison and write its results."""
     controllers = chosen(options.agents, options.controllers.agent)
     plant = options.plant.chosen()
     if options.presets and plant.arguments:
@@ -82,7 +82,7 @@ def execute(options: Options, console: Console) -> str:
             if time.perf_counter() - saved >= PAUSE:
                 save()
                 saved = time.perf_counter()
-    except BaseException:  # Ctrl-C, too
+    except BaseException:  # including Ctrl-C
         if comparison.cases:
             write(FanOut(jobs=1))
         raise
@@ -95,7 +95,7 @@ def execute(options: Options, console: Console) -> str:
 def _try_out(
     members: Mapping[str, list[Factory]], scenarios: Collection[Scenario], runs: int
 ) -> None:
-    """Refuse a plant that has no score, or that a controller cannot be set up for."""
+    """Reject a plant that has no score, or that a controller cannot be set up for."""
     for scenario in scenarios:
         with blame(scenario.title):
             scale_of(scenario, runs).least.score(0.0)
@@ -105,7 +105,7 @@ def _try_out(
 
 
 def _folder(*differences: list[str]) -> Path:
-    """Return a folder that says what was run, where that is not what is run by default."""
+    """Return a folder named after the differences from the default comparison."""
     name = "-".join(part for difference in differences for part in difference)
     if not name:
         return OUT

@@ -1,4 +1,4 @@
-"""Run controllers on scenarios, side by side on the cores, and keep what has finished."""
+"""Run controllers on scenarios in parallel, and keep the cases that have finished."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from benchmarks.loop.metrics import join, mean_error, measure
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import SEED
 
-TWICE = "square"  # who learns runs this scenario a second time, with what was learnt
-# What takes long begins first, so that no core waits at the end.
+TWICE = "square"  # controllers that learn run this scenario again, keeping what they learnt
+# Slow controllers start first, so that no core is idle at the end.
 LONG = {"mpc", "nn-self-tuning", "ppo", "self-tuning", "nn-smith"}
 
 
 @dataclass(frozen=True)
 class Case:
-    """What a controller did in a scenario."""
+    """The results of a controller in a scenario."""
 
     scenario: str
     agent: str
     runs: pd.DataFrame
-    """One row for each run of each member."""
+    """Measures, one row for each run of each member."""
     responses: pd.DataFrame
     """Percentiles over the runs, one row for each sample."""
     again: float | None
-    """Mean |e| in a second run with what was learnt, degC, if there was one."""
+    """Mean |e| of a second run that keeps what was learnt, degC, if there was one."""
     seconds: float
-    """How long the runs took."""
+    """Duration of the runs."""
 
 
 def run_case(scenario: Scenario, agent: str, members: Sequence[Factory], runs: int) -> Case:
@@ -49,7 +49,7 @@ def run_case(scenario: Scenario, agent: str, members: Sequence[Factory], runs: i
         given = scenario.arguments, scenario.samples, runs, SEED, controller
         trajectory = member.run(*given)
         if scenario.name == TWICE:
-            # Who does not learn does the same again; of a user's own that is not known.
+            # Without learning a second run is the same; a user's own controller may learn.
             learns = member.learns or agent not in ROSTER
             second = member.run(*given) if learns else trajectory
             again.append(float(mean_error(second).mean()))
@@ -69,20 +69,20 @@ def run_case(scenario: Scenario, agent: str, members: Sequence[Factory], runs: i
 
 @dataclass
 class Comparison:
-    """Controllers, scenarios, and what is known of them so far."""
+    """Controllers, scenarios, and their results so far."""
 
     scenarios: Mapping[str, Scenario]
     controllers: Mapping[str, Sequence[Factory]]
-    """The members of each."""
+    """The members of each controller."""
     count: int
-    """How many runs of each there are: the first episodes of `mptc_gym.evaluate`."""
+    """Number of runs of each member: the first episodes of `mptc_gym.evaluate`."""
     cases: dict[tuple[str, str], Case] = field(default_factory=dict)
-    """What has finished, by controller and scenario."""
+    """Finished cases, by controller and scenario."""
     scales: dict[str, Scale] = field(default_factory=dict)
-    """What the errors of a scenario are measured against."""
+    """The bounds that errors are measured against, by scenario."""
 
     def run(self, fan_out: FanOut) -> Iterator[Case]:
-        """Run all, and yield each case when it has finished; raise at the end if any failed."""
+        """Run everything and yield each case as it finishes; raise at the end if any failed."""
         scenarios = self.scenarios.values()
         # The bounds of drawn plants are the longest tasks of all.
         tasks: dict[str, Callable[[], Case | Scale]] = {
@@ -102,22 +102,22 @@ class Comparison:
 
     @property
     def finished(self) -> list[Case]:
-        """The cases that have finished, in order, whatever finished first."""
+        """Finished cases, in the order of controllers and scenarios."""
         order = itertools.product(self.controllers, self.scenarios)
         return [self.cases[key] for key in order if key in self.cases]
 
     @property
     def agents(self) -> list[str]:
-        """The controllers that have run on a scenario, in order."""
+        """Controllers with a finished case, in order."""
         return list(dict.fromkeys(case.agent for case in self.finished))
 
     @property
     def names(self) -> list[str]:
-        """The scenarios that a controller has run on, in order."""
+        """Scenarios with a finished case, in order."""
         run = {name for _, name in self.cases}
         return [name for name in self.scenarios if name in run]
 
     @property
     def runs(self) -> pd.DataFrame:
-        """One row for each run."""
+        """Measures, one row for each run."""
         return pd.concat([case.runs for case in self.finished], ignore_index=True)

@@ -1,4 +1,4 @@
-"""Estimates from runs: the distance to the least possible error, and paired differences."""
+"""Estimate distances to the least possible error, and paired differences, from runs."""
 
 from __future__ import annotations
 
@@ -27,34 +27,34 @@ from mptc_gym.evaluation import EPISODES
 if TYPE_CHECKING:
     from benchmarks.limits import LeastPossible
 
-Score = tuple[Estimate, dict[str, float]]  # overall, and in each scenario
+Score = tuple[Estimate, dict[str, float]]  # overall, and by scenario
 
 BOOTSTRAP = 0  # seed of the bootstraps
-TOLERANCE = 1e-4  # relative error that a bound may have
+TOLERANCE = 1e-4  # relative error allowed in a bound
 
 
 @dataclass(frozen=True)
 class Scale:
-    """What the errors of a scenario are measured against."""
+    """The bounds that the errors of a scenario are measured against."""
 
     scenario: str
     least: LeastPossible
-    """The least possible error that applies, of the kind "reference" or "news" where the set
-    point changes, or "preview"; see `benchmarks.limits`."""
+    """The least possible error that applies: of the kind "news", "reference" or "preview", as
+    `benchmarks.limits.least_possible` chooses."""
     preview: LeastPossible
-    """The least possible error of any controller at all."""
+    """The least possible error of any controller, even with preview."""
     drawn: bool
-    """Whether runs differ: whether anything is random."""
+    """Whether anything is random, so that runs differ."""
     frontier: tuple[tuple[float, float], ...] = ()
-    """The least error for a given travel of the valve, t/h and degC, if known; see `bounds`."""
+    """Points of valve travel, t/h, and least error for it, degC, if known; see `bounds`."""
 
 
 def scale_of(scenario: Scenario, runs: int) -> Scale:
-    """Return what the errors of a scenario are measured against, but for the frontier.
+    """Return the bounds on the errors of a scenario, without the frontier.
 
-    The bounds of drawn plants and set points are the means over the episodes that are run.
+    Bounds of drawn plants and set points are means over the episodes that are run.
     """
-    from benchmarks.limits import is_random, least_possible  # here: SciPy takes long to load
+    from benchmarks.limits import is_random, least_possible  # here, as SciPy is slow to load
 
     case: dict[str, Any] = {
         "samples": scenario.samples,
@@ -66,11 +66,11 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
 
 
 def bounds(scenario: Scenario, runs: int) -> Scale:
-    """Return what the errors of a scenario are measured against.
+    """Return the bounds on the errors of a scenario, with the frontier.
 
-    Between two points of the frontier, which comes by descending travel, the bound is the
-    straight line. Drawn plants and set points have none: it would take as many programmes as
-    there are episodes, more than a picture is worth.
+    The frontier is sorted by descending travel; between two of its points the bound is the
+    straight line. Drawn plants and set points have no frontier: it would take linear programmes
+    for every episode, more than a picture is worth.
     """
     from benchmarks.limits import frontier
 
@@ -80,20 +80,20 @@ def bounds(scenario: Scenario, runs: int) -> Scale:
     case: dict[str, Any] = {"samples": scenario.samples, **scenario.arguments}
     try:
         points = frontier(kind="reference", **case)
-    except ValueError:  # it does not settle between changes
+    except ValueError:  # the plant does not settle between changes
         points = frontier(**case)
     travels = tuple((travel * scenario.samples, error) for travel, error in points)
     return replace(scale, frontier=travels)
 
 
 def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
-    """Return one row for each agent in a scenario: estimates with 95 % intervals.
+    """Return estimates for a scenario with 95 % intervals, one row for each agent.
 
     They are `mean` and `interquartile_mean` of |e|, degC; `ratio`, the mean as a multiple of
-    `limit`, the least possible error that applies; `difference`, the mean one to the reference
-    agent, run by run; `improvement`, the probability of doing better than it; and
+    `limit`, the least possible error that applies; `difference`, the mean paired difference
+    from the reference agent; `improvement`, the probability of a smaller error than its; and
     `student_high`, the upper end of Student's interval of the mean. `preview` is the least
-    possible error of any controller. Ends are infinite where runs differ and there is only one.
+    possible error of any controller. Ends are infinite if runs differ but there is only one.
     """
     rows = []
     limit = scale.least.value
@@ -127,12 +127,12 @@ def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
 
 
 def score(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> Score:
-    """Return how much of what is possible an agent achieves, in all and in each scenario.
+    """Return an agent's score, overall and in each scenario.
 
-    The score of a run is 0 for the mean error of a valve that is left alone and 1 for the least
-    possible error. The first is the interquartile mean over the runs of all scenarios, which
-    weigh the same however hard they are, with a 95 % interval from drawing policies and runs
-    within each. The others are means.
+    A run scores 0 for the mean error of a valve that is left alone and 1 for the least possible
+    error. The overall score is the interquartile mean over the runs of all scenarios, which
+    weigh the same however hard they are, with a 95 % interval from resampling policies and runs
+    within each scenario. The scores by scenario are means.
     """
     tables = {
         scenario: scales[scenario].least.score(_errors(group))
@@ -150,7 +150,7 @@ def _errors(runs: pd.DataFrame) -> NDArray[np.float64]:
 def standing(
     runs: pd.DataFrame, scales: Mapping[str, Scale], scores: Mapping[str, Score]
 ) -> str:
-    """Say in two sentences who is best at what valve travel, and who cannot be told apart."""
+    """Say which agent is best, at what valve travel, and which do not differ significantly."""
     overall = {agent: found.value for agent, (found, _) in scores.items()}
     agents = sorted(overall, key=lambda agent: -overall[agent])
     travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
@@ -171,13 +171,13 @@ def standing(
 
 
 def _alike(runs: pd.DataFrame, scales: Mapping[str, Scale], one: str, other: str) -> bool:
-    """Whether the mean scores of two controllers do not differ beyond their interval."""
+    """Return whether the mean scores of two controllers do not differ significantly."""
     tables = []
     for scenario, cases in groups(runs, "scenario"):
         errors = [_errors(cases[cases["agent"] == agent]) for agent in (one, other)]
         if not all(each.size for each in errors):
-            continue  # after an interruption not all have run
-        # Policies are drawn of the one that has more of them.
+            continue  # after an interruption, not all have run
+        # Policies are resampled for the controller that has more of them.
         many, few = sorted(map(scales[scenario].least.score, errors), key=len, reverse=True)
         tables.append(many - few.mean(axis=0))
     if not tables:
@@ -187,7 +187,7 @@ def _alike(runs: pd.DataFrame, scales: Mapping[str, Scale], one: str, other: str
 
 
 def verdict(estimates: pd.DataFrame) -> str:
-    """Say in a sentence whether a controller came below a bound, and what that means."""
+    """Say whether a controller came below a bound, and what that means."""
     if impossible := _below(estimates, "preview"):
         return (
             f"Below the bound of every controller, beyond the interval: {impossible}. "
@@ -202,10 +202,10 @@ def verdict(estimates: pd.DataFrame) -> str:
 
 
 def _below(estimates: pd.DataFrame, bound: str) -> str:
-    """Name those whose mean error lies below a bound by more than chance.
+    """Name the controllers whose mean error is significantly below a bound.
 
-    The whole interval lies below. Where there are few runs a bootstrap makes it too narrow, so
-    that Student's interval must lie below, too.
+    The whole interval must lie below it. As the bootstrap makes it too narrow where runs are
+    few, Student's interval must lie below, too.
     """
     return ", ".join(
         f"{row['agent']} in {row['scenario']}"

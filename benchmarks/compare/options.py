@@ -27,7 +27,7 @@ _CASES = (
 class Options:
     """Run controllers on the same cases in the same noise, and write a report.
 
-    It has tables, data and pictures.
+    The report has tables, data and pictures.
     """
 
     agents: AgentNames = COMPARED
@@ -35,9 +35,9 @@ class Options:
     scenarios: Annotated[Names | None, Parameter(help=_CASES)] = None
     plant: PlantOptions = field(default_factory=PlantOptions)
     presets: bool = False
-    """Run all presets of the environment in place of the paper's cases."""
+    """Run the environment's presets instead of the paper's cases."""
     runs: Runs = RUNS
     """Runs of each controller in each case."""
     out: Path | None = None
-    """Folder to write to (default: results/compare, and a name of its own beside that for a
-    comparison of other controllers or cases)."""
+    """Folder to write to (default: results/compare, or for other controllers or cases a folder
+    beside it that is named after them)."""

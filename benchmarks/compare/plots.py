@@ -1,4 +1,4 @@
-"""Pictures of a comparison, drawn from the tables that it writes."""
+"""Draw the pictures of a comparison from the tables that it writes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from benchmarks.loop.scenarios import Scenario
 def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> None:
     """Draw set point, output and applied input of every agent over time.
 
-    The rows are those that `tables.summarise_responses` makes, of all agents.
+    `responses` holds the rows of `tables.summarise_responses` for all agents.
     """
     palette = colours(list(responses["agent"].unique()))
     with drawn(path, 9, 6) as figure:
@@ -57,7 +57,7 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
 
 
 def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
-    """Draw the mean errors as points with 95 % intervals; each axis begins at the limit."""
+    """Draw mean errors with 95 % intervals; each axis begins at the least possible error."""
     with _scenario_panels(path, estimates) as (found, shades):
         for axes, rows in found:
             worst = max(mean.value for mean in rows["mean"])
@@ -70,14 +70,14 @@ def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
                 axes.errorbar(mean.value, place, xerr=ends, fmt="o", capsize=3, color=colour)
             _list_agents(axes, rows, "mean |e| (°C)")
             limit = rows["limit"].iloc[0]
-            # A little to the left of it, so that a point on the limit is whole.
+            # Begin slightly to the left of the limit, so that a point on it is whole.
             axes.axvline(limit, color="0.4", linewidth=1)
             axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
 
 
 def plot_runs(runs: pd.DataFrame, path: Path) -> None:
-    """Draw the mean error of every single run, so that no failure is averaged away."""
-    generator = np.random.default_rng(0)  # scatters points that would hide each other
+    """Draw the mean error of every run, so that no failure is averaged away."""
+    generator = np.random.default_rng(0)  # jitters points that would overlap
     with _scenario_panels(path, runs) as (found, shades):
         for axes, cases in found:
             for place, (agent, rows) in enumerate(groups(cases, "agent")):
@@ -100,9 +100,9 @@ def _list_agents(axes: Axes, rows: pd.DataFrame, measure: str) -> None:
 def _scenario_panels(
     path: Path, table: pd.DataFrame, height: float | None = None
 ) -> Iterator[tuple[list[tuple[Axes, pd.DataFrame]], dict[str, str]]]:
-    """Give a panel and the rows of each scenario, and a colour for each agent.
+    """Yield a panel and the rows of each scenario, and a colour for each agent.
 
-    A legend has what is labelled in any panel.
+    The legend holds the labels of all panels.
     """
     shades = colours(list(table["agent"].unique()))
     by_scenario = dict(groups(table, "scenario"))
@@ -124,10 +124,10 @@ def plot_travel(summary: pd.DataFrame, scales: Mapping[str, Scale], path: Path) 
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
     with _scenario_panels(path, medians, 3.0) as (found, shades):
-        # Not as many as hues, so that two of like colour have other marks.
+        # Fewer marks than hues, so that agents of similar colour have different marks.
         marks = dict(zip(shades, itertools.cycle("osD^v"), strict=False))
         for axes, rows in found:
-            # A valve that never moves has no place on this axis.
+            # A valve that never moves has no place on a logarithmic axis.
             moving = rows[rows["total_variation"] > 0.0]
             for row in moving.to_dict("records"):
                 agent = row["agent"]
@@ -159,7 +159,7 @@ def plot_travel(summary: pd.DataFrame, scales: Mapping[str, Scale], path: Path) 
 
 
 def plot_learning(curves: pd.DataFrame, path: Path) -> None:
-    """Draw learning curves: mean |e| over samples of experience, a panel for each agent."""
+    """Draw mean |e| against samples of experience, a panel for each agent."""
     shown = {
         "training_mae": "training: random set points, exploring",
         "validation_mae": "validation: set points of its own",

@@ -1,4 +1,4 @@
-"""The report of a comparison: its tables and pictures, those of most interest first."""
+"""Write the report of a comparison, with the most interesting tables and pictures first."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from benchmarks.lib.storage import NotWrittenError
 
 
 def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -> list[Section]:
-    """Write the report of all that has finished, with its tables and pictures, and return it.
+    """Write the report of all finished cases, with tables and pictures, and return it.
 
-    The fan-out makes the estimates and draws the pictures; one that cannot be drawn is a
-    sentence in the report.
+    The fan-out computes the estimates and draws the pictures. A picture that cannot be drawn
+    becomes a sentence in the report.
     """
     runs, names, agents = comparison.runs, comparison.names, comparison.agents
-    scales = {  # after an interruption not all may be known
+    scales = {  # after an interruption, some may be missing
         name: comparison.scales.get(name)
         or scale_of(comparison.scenarios[name], comparison.count)
         for name in names
@@ -96,8 +96,8 @@ def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -
 
 
 def _draw(kind: str, *arguments: Any) -> str:
-    """Draw a picture, and return what went wrong: it costs no report."""
-    from benchmarks.compare import plots  # here: Matplotlib is loaded where pictures are drawn
+    """Draw a picture, and return an error's message, so that the report is still written."""
+    from benchmarks.compare import plots  # here, so that only drawing loads Matplotlib
 
     try:
         getattr(plots, f"plot_{kind}")(*arguments)
@@ -115,7 +115,7 @@ def _sections(
     estimates: pd.DataFrame,
     scores: Mapping[str, Score],
 ) -> list[Section]:
-    """Return the report, the parts of most interest first."""
+    """Return the sections of the report, the most interesting ones first."""
     names = comparison.names
     titles = [(name, comparison.scenarios[name].title) for name in names]
     sections = [

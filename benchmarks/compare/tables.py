@@ -1,4 +1,4 @@
-"""From runs to tables: percentiles over runs, and how they are written."""
+"""Summarise runs in tables, and format and write them."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from benchmarks.loop.scenarios import Scenario
 
 NOT_SETTLED = "not settled"
 NO_MEASURE = "not measured"
-STEP_METRICS = ("overshoot", "settling_time")  # which mean nothing in noise
+STEP_METRICS = ("overshoot", "settling_time")  # meaningless in noise
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return one row for each scenario, agent and metric: percentiles over the runs."""
+    """Return percentiles over the runs, one row for each scenario, agent and metric."""
     return pd.DataFrame(
         [
             {"scenario": scenario, "agent": agent, "metric": metric, "runs": len(group)}
@@ -36,9 +36,9 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) -> pd.DataFrame:
-    """Return the set point and the percentiles of y and u_a over the runs, row by sample.
+    """Return the set point and percentiles of y and u_a over the runs, one row per sample.
 
-    Where every run has a set point of its own, the first run stands for all.
+    If the runs differ in their set points, the first run stands for all.
     """
     if (trajectory.setpoint != trajectory.setpoint[:, :1]).any():
         trajectory = Trajectory(*(values[:, :1] for values in vars(trajectory).values()))
@@ -50,7 +50,7 @@ def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) 
         "setpoint": trajectory.setpoint[:, 0],
     }
     for signal in ("output", "applied"):
-        # Values that occurred: between those of the applied input may lie the dead zone.
+        # Values that occurred: an interpolated applied input could lie in the dead zone.
         for name, values in percentiles(getattr(trajectory, signal), "nearest").items():
             columns[f"{signal}_{name}"] = values
     return pd.DataFrame(columns)
@@ -59,8 +59,8 @@ def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) 
 def write(path: Path, table: pd.DataFrame) -> None:
     """Write a table of numbers, texts and estimates as CSV.
 
-    An estimate becomes three columns, its value and the ends of its interval; infinite values,
-    which apart from such ends only a settling time can have, are written in words.
+    An estimate becomes three columns: its value and the ends of its interval. Infinite values,
+    which apart from these ends are settling times, are written in words.
     """
     columns: dict[Any, Any] = {}
     for name, cells in table.items():
@@ -73,7 +73,7 @@ def write(path: Path, table: pd.DataFrame) -> None:
 
 
 def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
-    """Return the mean errors as multiples of the least possible error, and what that is."""
+    """Return the least possible errors, and the mean errors as multiples of them."""
     bounds = [{"agent": "least possible (°C)"}, {"agent": "with preview (°C)"}]
     for name, scale in scales.items():
         mark = "*" * (scale.least.kind == "reference")
@@ -84,17 +84,17 @@ def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.Data
 
 
 def score_table(scores: Mapping[str, Score]) -> pd.DataFrame:
-    """Return the scores by agent: a row for each, the overall score first."""
+    """Return the scores, one row for each agent, the overall score first."""
     rows = [
         {"agent": label(agent), "score": f"{overall:.3f}"}
         | {scenario: f"{mean:.2f}" for scenario, mean in means.items()}
         for agent, (overall, means) in scores.items()
     ]
-    return pd.DataFrame(rows).fillna("")  # after an interruption not all have run
+    return pd.DataFrame(rows).fillna("")  # after an interruption, not all have run
 
 
 def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
-    """Return differences to the reference: a row for each other agent."""
+    """Return differences from the reference, one row for each other agent."""
     others = estimates.dropna(subset=["difference"])
     pairs = zip(others["difference"], others["improvement"], strict=True)
     return _by_agent(
@@ -110,7 +110,7 @@ def _by_agent(rows: pd.DataFrame, cells: Any) -> pd.DataFrame:
 
 
 def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> pd.DataFrame:
-    """Return all metrics: a row for each scenario and agent, a column for each metric."""
+    """Return all metrics, one row for each scenario and agent, one column for each metric."""
     rows = []
     for name, scenario in scenarios.items():
         noisy = scenario.parameters.range_of("noise_variance")[1] > 0.0
@@ -126,7 +126,7 @@ def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> p
 
 
 def _median(row: Mapping[Any, Any]) -> str:
-    """Write the median and, where they differ, the 10th and 90th percentile."""
+    """Format the median and, where they differ, the 10th and 90th percentiles."""
     form = ".3f" if row["metric"] == "mae" else ",.0f"
     words = {math.inf: NOT_SETTLED}
     median, p10, p90 = (
