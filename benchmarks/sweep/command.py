@@ -1,4 +1,4 @@
-"""Run a sweep as its options say, and write what it finds."""
+"""Run a sweep from its options, and write its results."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from benchmarks.sweep.report import report, table
 from benchmarks.sweep.tasks import agent_task, limit_task
 from mptc_gym import Parameters
 
-NOTHING = "nothing"  # the controller that sets the scale
+NOTHING = "nothing"  # the idle controller, which sets the scale
 
 
 def execute(options: Options, console: Console) -> str:
-    """Run the sweep and write what it finds."""
+    """Run the sweep and write its results."""
     controllers = chosen(options.agents, options.controllers.agent)
     nominal = options.plant.chosen().arguments
     if options.design == "grid":
@@ -53,7 +53,7 @@ def execute(options: Options, console: Console) -> str:
     def run(
         name: str, tasks: Iterable[Callable[[], Any]], *modules: str, **shaped_by: Any
     ) -> list[Any]:
-        """Run a task for each plant, or take what is kept of the very same task."""
+        """Run a task for each plant, or load the kept result of exactly this task."""
         numbers = {"plants": plants, "samples": options.samples, **shaped_by}
         kept = out / "tasks" / fingerprint(limit_task.__module__, *modules, **numbers)
         named = {f"{name} {i}": task for i, task in enumerate(tasks)}
@@ -62,7 +62,7 @@ def execute(options: Options, console: Console) -> str:
     limits = run("limit", (partial(limit_task, plant, options.samples) for plant in plants))
     results = {}
     for name, factories in members.items():
-        # Every plant has a member, in turn: how much they differ shows in the maps.
+        # The plants take the members in turn, so that the maps show how much they differ.
         tasks = (
             partial(agent_task, *given, options.samples, options.runs)
             for given in zip(cycle(factories), told, plants, strict=False)

@@ -1,4 +1,4 @@
-"""Maps of where controllers work, drawn from the runs of a sweep."""
+"""Draw maps of where controllers work, from the runs of a sweep."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from benchmarks.lib.tables import groups
 from mptc_gym import Parameters
 
 _COLOURS: dict[str, Any] = {"cmap": "cividis_r", "norm": LogNorm(1.0, 4.0)}
-_OFTEN = 0.5  # a plant is marked from this share of its runs on
+_OFTEN = 0.5  # share of a plant's runs from which it is marked
 _MARKS: dict[str, dict[str, Any]] = {
     "oscillates": {
         "marker": "o", "markersize": 3.5, "color": "white", "markeredgecolor": "black",
@@ -46,10 +46,10 @@ _OF_PLANTS: tuple[dict[str, Any], ...] = (
 
 
 def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
-    """Draw how well each controller does over delay and gain, a map for each.
+    """Draw a map of each controller's errors over delay and gain.
 
-    On a grid, where delay and gain alone differ, that is the ratio to the limit; on plants that
-    differ in everything it is the mean error.
+    On a grid, where only delay and gain differ, it shows the ratio to the limit; on plants that
+    differ in everything, the mean error.
     """
     drift = runs.get("gain_drift", pd.Series(np.nan, runs.index))
     largest = runs["gain_factor"] * drift.fillna(1.0).clip(1.0)
@@ -73,7 +73,7 @@ def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
 
 
 def _by_plant(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return one row for each controller and plant: medians, and shares of runs."""
+    """Return medians and shares of runs, one row for each controller and plant."""
     runs = runs.assign(**{name: runs[name].astype(float) for name in _MARKS})
     measures = dict.fromkeys(("mae", "ratio"), "median") | dict.fromkeys(_MARKS, "mean")
     firsts = dict.fromkeys(("delay", "gain", "drifts"), "first")
@@ -87,7 +87,7 @@ def _draw_grid(axes: Axes, rows: pd.DataFrame) -> Any:
     dead_zone, _ = nominal.range_of("dead_zone")
     table = rows.pivot_table(index="gain", columns="delay", values="ratio")
     axes.plot(18, 1.0, "+", color="black", markersize=12, markeredgewidth=2)
-    # From here on, the flow that 5 degC needs lies in the dead zone.
+    # Above this gain, the flow that 5 degC needs lies in the dead zone.
     axes.axhline(5.0 / (gain * dead_zone), color="black", linestyle=":")
     return axes.pcolormesh(table.columns, table.index, table, shading="nearest", **_COLOURS)
 
@@ -102,7 +102,7 @@ def _draw_plants(axes: Axes, rows: pd.DataFrame) -> Any:
 
 
 def plot_drift(runs: pd.DataFrame, pair: tuple[str, str], path: Path) -> None:
-    """Draw by how much the errors of two controllers differ, over the drift of the gain."""
+    """Draw the difference of two controllers' errors over the drift of the gain."""
     drifting = runs[runs["gain_drift"].notna()]
     late = drifting.pivot_table(index=["plant", "run"], columns="agent", values="late")
     if not set(pair) <= set(late.columns):

@@ -19,20 +19,20 @@ SWEPT = tuple(name for name, controller in ROSTER.items() if controller.swept)
 class Options:
     """Run controllers on plants that they were not made for.
 
-    The plant that they were made for is the paper's, or that of --plant, --preset or --set; the
-    others differ from it in what the design says.
+    They were made for the paper's plant, or that of --plant, --preset or --set; the design says
+    how the other plants differ from it.
     """
 
     design: Literal["grid", "random", "wide"] = "grid"
     """grid: 20 delays by 10 gains; random: plants that differ in everything, half of which
-    drift; wide: the same, most of them beyond what random draws from."""
+    drift; wide: the same, most of them outside the ranges of random."""
     plants: Runs = 200
     """Plants of a random or wide design."""
     design_seed: Seed = 0
-    """Seed that the plants of a random or wide design are drawn with."""
+    """Seed for the plants of a random or wide design."""
     told: Literal["nominal", "each"] = "nominal"
-    """nominal: every controller is made for the one plant above; each: for the very plant that
-    it runs on, as it is at the start if it drifts."""
+    """nominal: every controller is made for the one plant above; each: for the plant that it
+    runs on, as that is at the start if it drifts."""
     runs: Runs = 20
     """Runs of a controller on a plant."""
     samples: Runs = 1200

@@ -1,4 +1,4 @@
-"""The results of a sweep: one row for each run, and the sections of the report."""
+"""Tabulate the runs of a sweep, and make the sections of its report."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from benchmarks.lib.tables import groups
 from benchmarks.loop.designs import Arguments
 from benchmarks.sweep import maps
 
-SEED = 0  # of the bootstraps
-OSCILLATES = 1.0  # degC by which the swing on steady stretches exceeds that without control
-GROUPS = (  # of the plants that drift, with half-open intervals; each has a row of its own
+SEED = 0  # seed of the bootstraps
+OSCILLATES = 1.0  # degC of swing at a held set point beyond that without control
+GROUPS = (  # groups of drifting plants, by half-open intervals; each has a row of its own
     ("gain falls to less than 0.8 times", "gain_drift", 0.0, 0.8),
     ("gain stays within 0.8 to 1.25 times", "gain_drift", 0.8, 1.25),
     ("gain rises to more than 1.25 times", "gain_drift", 1.25, np.inf),
@@ -26,7 +26,7 @@ GROUPS = (  # of the plants that drift, with half-open intervals; each has a row
     ("delay above 22 samples", "delay", 23, np.inf),
 )
 MEASURES = {"mae": "over a whole run", "late": "over the second half of a run"}
-# What is asked of two controllers at a time: whether the first makes the smaller error.
+# Questions about pairs of controllers: does the first make the smaller error?
 QUESTIONS = (
     (
         "Does online learning help when the plant drifts?",
@@ -70,10 +70,10 @@ def table(
     limits: Sequence[float | None],
     results: Mapping[str, Sequence[dict[str, list[float]]]],
 ) -> pd.DataFrame:
-    """Return one row for each run: the plant, the measures, and how they compare.
+    """Return one row for each run: its plant, its measures, and how they compare.
 
-    A plant is what it differs in from the nominal one. Limits are those of the plants, and
-    results, by name, those of the agents and of "nothing" on each.
+    A plant holds the arguments in which it differs from the nominal one. There is a limit for
+    each plant, and by name a result of each agent and of "nothing" on each plant.
     """
     rows = []
     for i, (plant, limit) in enumerate(zip(plants, limits, strict=True)):
@@ -84,7 +84,7 @@ def table(
             task = pd.DataFrame({"plant": i, "agent": agent, "run": numbers, **measures})
             task["limit"] = np.nan if limit is None else limit
             task["ratio"] = task["mae"] / task["limit"]
-            # The same noise with no control, which sets both scales.
+            # Doing nothing in the same noise sets both scales.
             task["oscillates"] = task["swing"] > nothing["swing"] + OSCILLATES
             task["useless"] = task["mae"] >= nothing["mae"]
             rows.append(task.assign(**plant))
@@ -94,7 +94,7 @@ def table(
 def report(runs: pd.DataFrame, out: Path, design: str, told: str) -> list[Section]:
     """Draw the maps of a "grid", "random" or "wide" design, and return the report.
 
-    What adaptation is good for is asked where controllers are `told` a "nominal" plant.
+    `QUESTIONS` are asked unless the design is a grid or controllers are `told` each plant.
     """
     picture = "map.png" if design == "grid" else "plants.png"
     maps.plot_maps(runs, out / picture, grid=design == "grid")
@@ -140,7 +140,7 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
 def differences(
     runs: pd.DataFrame, pairs: Sequence[tuple[str, str]], measure: str
 ) -> pd.DataFrame:
-    """Return one row for each group of plants, one column for each pair of controllers."""
+    """Return differences, a row for each group of plants, a column for each pair."""
     drifting = runs[runs["gain_drift"].notna()]
     groups = {"no drift": runs[runs["gain_drift"].isna()], "all that drift": drifting}
     for name, column, low, high in GROUPS:

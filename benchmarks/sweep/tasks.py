@@ -1,4 +1,4 @@
-"""What is run on each plant of a sweep: every controller, and the limit."""
+"""Run a controller, or compute the least possible error, on a plant of a sweep."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from benchmarks.loop.rollout import Trajectory
 from mptc_gym import Parameters
 
 SETPOINT: Arguments = {"setpoint": "square", "setpoint_period": 600}
-SEED = 0  # of a plant's first run
+SEED = 0  # seed of a plant's first run
 
 
 def limit_task(plant: Arguments, samples: int) -> float | None:
     """Return the least mean |e| on a plant, degC; None if it does not settle between changes.
 
-    It is the least possible error if each change of the set point finds the plant settled and
-    is not foreseen; see `benchmarks.limits`.
+    This is the least possible error if each change of the set point finds the plant settled
+    and is not foreseen; see `benchmarks.limits`.
     """
     case = {**plant, **SETPOINT}
     try:
@@ -32,14 +32,14 @@ def limit_task(plant: Arguments, samples: int) -> float | None:
 def agent_task(
     factory: Factory, told: Arguments, plant: Arguments, samples: int, runs: int
 ) -> dict[str, list[float]]:
-    """Run a controller that is made for the plant that it is told on another.
+    """Run a controller that is made for the plant it is `told` on another plant.
 
-    Run i has the noise, and the initial weights, of seed `SEED + i`.
+    Run i has the noise and the initial weights of seed `SEED + i`.
 
     Returns
     -------
     dict of list
-        Of each run, every measure of `METRICS`; `late`, the mean |e| of its second half, degC;
+        For each run, all measures of `METRICS`; `late`, the mean |e| of its second half, degC;
         and `swing`.
     """
     controller = factory.in_service({**told, **SETPOINT}, runs, SEED)
@@ -54,9 +54,9 @@ def agent_task(
 
 
 def swing(trajectory: Trajectory) -> NDArray[np.float64]:
-    """Return how far the error swings while a set point is held, degC, shape (runs,).
+    """Return the swing of the error while a set point is held, degC, shape (runs,).
 
-    It is the standard deviation in the second half of each stretch, in the mean square of all.
+    This is the root mean square of the standard deviations in the second half of each hold.
     """
     error = trajectory.setpoint - trajectory.output
     variances = [
