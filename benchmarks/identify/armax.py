@@ -1,4 +1,4 @@
-"""Fits (28) by least squares: prediction errors of an ARMAX model."""
+"""Fit (28), an ARMAX model, by least squares on its prediction errors."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from scipy import linalg, optimize, signal
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# The largest root of C beyond which xi is not to be recovered, and the largest magnitude of
+# Largest positive real root of C with which xi can be recovered, and largest magnitude of the
 # other roots: nearer to the unit circle, they cancel poles that fit a log by chance.
 LARGEST, LARGEST_OTHER = 0.998, 0.8
-MOST_LEVELS = 12  # stretches of a random walk, the longest, that have a level of their own
+MOST_LEVELS = 12  # longest stretches, in which a random walk has a level of its own
 
 
 @dataclass(frozen=True)
 class Orders:
-    """How many coefficients A, B and C have, without the leading 1 of A and C.
+    """Number of coefficients of A, B and C, without the leading 1 of A and C.
 
-    With `walk`, a random walk is added to the noise. As an innovation, the sum of both is
-    C' xi / (1 - z^-1), where C' has one coefficient more than C.
+    With `walk`, a random walk is added to the noise. In innovation form, the sum of both is
+    C' xi / (1 - z^-1), where C' has one more coefficient than C.
     """
 
     a: int
@@ -40,28 +40,27 @@ class Orders:
 
     @property
     def count(self) -> int:
-        """Number of coefficients, with the constant."""
+        """Number of all coefficients, including the constant."""
         return self.a + self.b + self.noise + 1
 
 
 def invertible(c: Array) -> bool:
-    """Return whether the roots of C leave xi to be recovered."""
+    """Return whether the roots of C allow xi to be recovered."""
     roots = np.roots([1.0, *c])
     slow = (np.abs(roots.imag) < 1e-3) & (roots.real > 0.0)
     return bool(np.all(np.abs(roots) <= np.where(slow, LARGEST, LARGEST_OTHER)))
 
 
 class Rows:
-    """The rows k of a log in which everything is known that (28) needs.
+    """The rows k of a log in which everything that (28) needs is known.
 
-    Of those that are `known`, some are not `counted`: bridges, with temperatures that were
-    filled in.
+    Some `known` rows are not `counted`: those that need temperatures that were filled in.
     """
 
     def __init__(self, known: Flags, counted: Flags) -> None:
         self.index = np.flatnonzero(known)
         self.counts = counted[known]
-        # Stretches without a gap: the recursion for xi starts anew in each.
+        # Stretches without a gap: the recursion for xi restarts in each.
         breaks = np.flatnonzero(np.diff(self.index) > 1) + 1
         self._stretches = list(itertools.pairwise([0, *breaks.tolist(), len(self.index)]))
 
@@ -73,10 +72,10 @@ class Rows:
         return values[self.index[:, np.newaxis] - np.array(lags, dtype=np.intp)]
 
     def levels(self, orders: Orders) -> Array:
-        """Return the columns of what is constant: one, or with a walk one a stretch."""
+        """Return the columns for the level: one, or with a walk one per long stretch."""
         if not orders.walk:
             return np.ones((len(self.index), 1))
-        # The walk starts from the first row of a stretch, and from there at an unknown level.
+        # The walk restarts in the first row of a stretch, at an unknown level from the next on.
         longest = sorted(self._stretches, key=lambda ends: ends[0] - ends[1])[:MOST_LEVELS]
         columns = np.zeros((len(self.index), len(longest)))
         for i, (start, stop) in enumerate(longest):
@@ -84,7 +83,7 @@ class Rows:
         return columns
 
     def whitened(self, columns: Array, c: Array, walk: bool = False) -> Array:
-        """Return the columns divided by C, and with a walk differenced, in all rows."""
+        """Return the columns filtered by 1 / C, and differenced with a walk, in all rows."""
         parts = []
         for start, stop in self._stretches:
             part = columns[start:stop]
@@ -94,12 +93,12 @@ class Rows:
         return np.concatenate(parts)
 
     def square(self, errors: Array) -> float:
-        """Return the sum of the squares of errors, in the rows that count."""
+        """Return the sum of squared errors over the counted rows."""
         counted = errors[self.counts]
         return float(counted @ counted)
 
     def _slopes(self, errors: Array, c: Array) -> Array:
-        """Return what each coefficient of C does to the errors, with its sign turned."""
+        """Return the negative derivatives of the errors by the coefficients of C."""
         white, slopes = self.whitened(errors, c), np.zeros((len(errors), len(c)))
         for lag, (start, stop) in itertools.product(range(1, len(c) + 1), self._stretches):
             slopes[start + lag : stop, lag - 1] = white[start : max(stop - lag, start)]
@@ -108,18 +107,18 @@ class Rows:
     def solve(
         self, table: Array, orders: Orders, start: Array | None = None
     ) -> tuple[Array, Array, Array]:
-        """Return coefficients of the regressors, C from z^-1 on, and xi of all rows.
+        """Return the coefficients of the regressors, C from z^-1 on, and xi in all rows.
 
-        They make the squares of xi = (target - regressors @ linear) / C least. For a given C
-        the problem is linear, so that only C is searched: variable projection (G. H. Golub and
-        V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973, 413-432), with L. Kaufman's
+        They minimise the sum of squares of xi = (target - regressors @ linear) / C. For a given
+        C the problem is linear, so only C is searched: variable projection (G. H. Golub and V.
+        Pereyra, SIAM Journal on Numerical Analysis 10, 1973, 413-432), with L. Kaufman's
         approximation of the Jacobian (BIT 15, 1975, 49-57).
 
         The table holds the target and the regressors, shape (rows, 1 + n). The search begins
-        at `start`, with zeros after it.
+        at `start`, padded with zeros.
         """
 
-        @lru_cache(maxsize=1)  # the search asks twice
+        @lru_cache(maxsize=1)  # the search needs each C twice
         def project(c: tuple[float, ...]) -> tuple[Array, Array, Array]:
             white = self.whitened(table, np.array(c), orders.walk)
             basis, triangle = np.linalg.qr(white[self.counts, 1:])
@@ -140,7 +139,7 @@ class Rows:
 
         c = np.zeros(orders.noise)
         if len(c):
-            if start is not None and invertible(start[: len(c)]):  # a part of C need not be
+            if start is not None and invertible(start[: len(c)]):  # part of one may not be
                 c[: len(start)] = start[: len(c)]
             if orders.walk and not c.any():
                 c[0] = -0.7
@@ -155,7 +154,7 @@ class Rows:
         white = self.whitened(table[:, 1:], c, orders.walk)
         jacobian = np.hstack([white, self._slopes(errors, c)])[self.counts]
         scale = np.linalg.norm(jacobian, axis=0)
-        scale[scale == 0.0] = 1.0  # of a flow that never leaves a dead zone
+        scale[scale == 0.0] = 1.0  # a flow that never leaves a dead zone
         information = (jacobian / scale).T @ (jacobian / scale)
         variance = self.square(errors) / max(len(self) - jacobian.shape[1], 1)
         spread: Array = variance * linalg.pinvh(information) / np.outer(scale, scale)

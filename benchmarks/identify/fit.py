@@ -1,4 +1,4 @@
-"""Fits (28) and the dead zone of (29) to a log: the choice of orders, delay and dead zone."""
+"""Fit (28) and the dead zone of (29) to a log: choose the orders, delay and dead zone."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from benchmarks.identify.posterior import posterior
 from benchmarks.identify.simulation import explained, of_impulse_response
 
 OWN_LAGS = 0.6, 0.75, 0.85, 0.92, 0.96  # poles of the plant that are not poles of the noise
-FIRST_ORDERS = Orders(2, 1, 2)  # to look for the delay with, before the orders are known
+FIRST_ORDERS = Orders(2, 1, 2)  # orders of the first search for the delay
 OF_A, OF_B, OF_C = (1, 2, 3), (1, 2, 3, 6, 12), (0, 1, 3)
-LONG = 3  # coefficients of B: more are a response of any form
-WORTH_A_FIT = 7  # orders that are fitted, of those that come out best with a common C
-WORTH_A_TRIAL = 4  # of those, the ones that are tried on the last third
-CLOSE = 12.0  # of criteria: orders that far behind take no part
-WORSE = 1.2  # times the least share that is left open: what is more takes no part
-WEAK = 100.0  # twice the log likelihood, below which a log may be the wrong way round
-CHANCE = 0.01  # that a flow without effect is taken for one with effect
-SLOW = 3.0  # time constants that a log should hold
+LONG = 3  # coefficients of B beyond which the response may have any shape
+WORTH_A_FIT = 7  # orders that are fitted: the best with a common C
+WORTH_A_TRIAL = 4  # fits that are tried on the last third: the best
+CLOSE = 12.0  # difference in the criterion beyond which orders are dropped
+WORSE = 1.2  # multiple of the least unexplained share beyond which orders are dropped
+WEAK = 100.0  # gain in twice the log likelihood below which the columns may be swapped
+CHANCE = 0.01  # probability that a flow without effect is accepted
+SLOW = 3.0  # time constants that a log should cover
 
 
 def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
     """Fit (28), and the dead zone of (29), to a log.
 
-    Orders of A, B and C, with and without a random walk of the base line, are fitted by maximum
-    likelihood. Those with the best information criteria are fitted again to the first two
-    thirds of the log, and simulate the last one; what is clearly worse there is left out. All
-    intervals are quantiles of the posterior over what remains.
+    Models with several orders of A, B and C, with and without a random walk of the base line,
+    are fitted by maximum likelihood. The best by information criteria are refitted to the first
+    two thirds of the log and simulate the last third; clearly worse ones are dropped. The
+    intervals of delay, dead zone, gain and time constant come from the posterior over the rest.
 
     Raises
     ------
     CannotTellError
-        If the log cannot tell; the message says why.
+        If the log does not determine the plant; the message says why.
     ValueError
-        If what is known does not fit to the log.
+        If the knowledge is invalid or does not fit the log.
     """
     knowledge = knowledge or Knowledge()
     given = Orders(*knowledge.orders) if knowledge.orders else None
@@ -85,7 +85,7 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
 
 
 def _fits(likelihood: Likelihood) -> list[Fit]:
-    """Return fits of all orders that are worth it, by their criterion, the best first."""
+    """Return fits of promising orders, the best first, then two with a lag of their own."""
     scanned = []
     for base in likelihood.first_fits([FIRST_ORDERS, replace(FIRST_ORDERS, walk=True)]):
         for a, b in itertools.product(OF_A, OF_B):
@@ -93,7 +93,7 @@ def _fits(likelihood: Likelihood) -> list[Fit]:
             place = likelihood.scan(orders, base.c, [base.place.gap])[0]
             scanned.append((orders, place, base.c))
     scanned.sort(key=lambda each: likelihood.criterion(each[0], each[1].deviance))
-    # Of each kind one at least: a common C is no measure for all.
+    # Keep at least one of each kind: a common C does not suit all of them.
     of_kinds = [
         next(each for each in scanned if (each[0].walk, each[0].b > LONG) == kind)
         for kind in itertools.product((False, True), repeat=2)
@@ -108,7 +108,7 @@ def _fits(likelihood: Likelihood) -> list[Fit]:
             if orders not in fits:
                 fits[orders] = likelihood.best_fit(fit.place, orders, fit.c)
     found = likelihood.ranked(fits.values())
-    # A second time constant of the plant that is not one of the noise has a peak of its own.
+    # A second time constant that the noise does not share has its own peak of the likelihood.
     lags = []
     for orders in (Orders(2, 1, 1), Orders(2, 2, 1)):
         tried = []
@@ -121,7 +121,7 @@ def _fits(likelihood: Likelihood) -> list[Fit]:
 
 
 def _tried(likelihood: Likelihood, fits: list[Fit]) -> tuple[list[Fit], HeldOut]:
-    """Return the fits that simulate the last third well, and how well the best of them does."""
+    """Return the fits that simulate the last third well, and the shares explained there."""
     cut = int(likelihood.rows.index[len(likelihood.rows.index) * 2 // 3])
     last, start = np.arange(len(likelihood.output)) >= cut, likelihood.first(cut)
     mild = likelihood.ranked(fits, mild=True)
@@ -131,7 +131,7 @@ def _tried(likelihood: Likelihood, fits: list[Fit]) -> tuple[list[Fit], HeldOut]
     for fit in dict.fromkeys([*fits[:WORTH_A_TRIAL], *mild[:2], *long[:1], *own_lag]):
         simulated = start.simulated(start.fit(fit.place, fit.orders, fit.c))
         shares[fit] = explained(likelihood.output, simulated, last)
-    # What a better simulation leaves open, and a part of the noise that no one foresees.
+    # The share that the best simulation leaves unexplained, with a margin for the noise.
     left = 1.0 - max(shares.values())
     least = max(WORSE * left, left + 0.005)
     good = [
@@ -139,8 +139,8 @@ def _tried(likelihood: Likelihood, fits: list[Fit]) -> tuple[list[Fit], HeldOut]
         if 1.0 - share <= least * (2.0 if fit.has_own_lag else 1.0)
     ] or list(shares)[:1]  # fmt: skip
     criteria = [likelihood.criterion(fit.orders, fit.place.deviance, mild=True) for fit in good]
-    # One of each kind: without a walk and with it, with a short B and a long one, and with a
-    # time constant of its own.
+    # Keep one of each kind: with and without a walk; with one, few or many coefficients of B;
+    # with and without a time constant that the noise does not share.
     kinds: dict[tuple[bool, ...], Fit] = {}
     for fit, each in zip(good, criteria, strict=True):
         if each < min(criteria) + CLOSE:
@@ -154,7 +154,7 @@ def _tried(likelihood: Likelihood, fits: list[Fit]) -> tuple[list[Fit], HeldOut]
 
 
 def _check_answer(likelihood: Likelihood, best: Fit) -> None:
-    """Refuse a log in which the flow does nothing that can be told from noise."""
+    """Refuse a log in which the effect of the flow cannot be distinguished from noise."""
     gained = likelihood.gained(best)
     if gained < WEAK and _gained_when_swapped(likelihood) > WEAK:
         raise CannotTellError(
@@ -163,7 +163,7 @@ def _check_answer(likelihood: Likelihood, best: Fit) -> None:
             "--flow and --temperature. If they are not, the flow has too little effect to be "
             "told from noise: move it further, or move the set point of a closed loop more"
         )
-    # As many delays and dead zones have been tried, the best of them gains by chance.
+    # Many delays and dead zones have been tried, so the best of them gains by chance.
     tried = len(likelihood.delays) * len(likelihood.gaps())
     least = float(stats.chi2.isf(CHANCE / tried, best.orders.b))
     if gained < least:
@@ -176,7 +176,7 @@ def _check_answer(likelihood: Likelihood, best: Fit) -> None:
 
 
 def _gained_when_swapped(likelihood: Likelihood) -> float:
-    """Return what the temperature adds to the likelihood of the flow."""
+    """Return how much the temperature adds to twice the log likelihood of the flow."""
     log, longest_delay = likelihood.log, likelihood.knowledge.longest_delay
     mirrored = Log(log.temperature, log.flow, log.sampling_interval)
     try:
@@ -187,7 +187,7 @@ def _gained_when_swapped(likelihood: Likelihood) -> float:
 
 
 def _notes(model: Model, likelihood: Likelihood) -> list[str]:
-    """Return what the user should know about the fit."""
+    """Return remarks for the user about the fit."""
     longest, log = likelihood.knowledge.longest_delay, model.log
     gain, constant = model.estimates["gain"], model.estimates["time_constant"]
     walk = model.noise["disturbance_walk_variance"]

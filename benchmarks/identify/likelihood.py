@@ -1,4 +1,4 @@
-"""The likelihood of a log for a delay, a dead zone and orders of A, B and C."""
+"""Compute the likelihood of a log given a delay, a dead zone and orders of A, B and C."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from benchmarks.identify.options import Knowledge
 from benchmarks.identify.simulation import from_rest
 from benchmarks.loop.linear import LinearModel
 
-LEAST_SAMPLES = 100  # beside those that the longest delay takes
-FOLLOWS = 0.98  # share of the flow's moves that, explained by the temperature, is feedback
-COARSE = 40  # dead zones that are tried first
-FINEST = 1e-6  # of the temperature's deviation, what its numbers tell
-BRIDGE = 10  # missing temperatures in a row that are filled in, for the noise to go on
+LEAST_SAMPLES = 100  # without those that the longest delay takes
+FOLLOWS = 0.98  # explained share of the flow's moves above which feedback alone moves it
+COARSE = 40  # edges of the gaps that are tried first
+FINEST = 1e-6  # resolution of the temperature, as a share of its standard deviation
+BRIDGE = 10  # longest run of missing temperatures that is filled in, for xi to go on
 SHORTEST = 30  # rows of a stretch without a gap
-OWN_LAG = -0.3  # the C of first order, below which it cancels a time constant
-STILL = 0.99  # the root of C', above which it cancels the random walk
-OF_KNOWN = 4  # coefficients of a known disturbance
+OWN_LAG = -0.3  # coefficient of a first-order C below which it cancels a time constant
+STILL = 0.99  # root of C' above which it cancels the random walk
+OF_KNOWN = 4  # coefficients of B for a known disturbance
 
 
 class Gap(NamedTuple):
-    """Neighbours among the magnitudes of the commands that are tried, and the zone between."""
+    """Two magnitudes of commands, t/h, between which the dead zone may end."""
 
     low: float
     high: float
 
 
 class Place(NamedTuple):
-    """A delay and a place of the dead zone, with the deviance there.
+    """A delay and a gap in which the dead zone ends, with the deviance there.
 
-    The deviance is twice the negative log likelihood, but for a constant.
+    The deviance is twice the negative log likelihood, up to a constant.
     """
 
     delay: int
@@ -51,7 +51,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What is likeliest for some orders at a place."""
+    """A fit of some orders at a place."""
 
     orders: Orders
     place: Place
@@ -60,33 +60,33 @@ class Fit:
     c: Array
     """C, or C' with a walk, from z^-1 on."""
     errors: Array
-    """The prediction errors xi of the rows that are predicted."""
+    """Prediction errors xi, one for each predicted row."""
     square: float
-    """The sum of their squares, in the rows that count."""
+    """Sum of their squares over the counted rows."""
 
     @property
     def has_own_lag(self) -> bool:
-        """Whether the plant has a second time constant that is not one of the noise."""
+        """Whether the plant has a second time constant that the noise does not share."""
         return self.orders == Orders(2, self.orders.b, 1) and float(self.c[0]) < OWN_LAG
 
     @property
     def walks_nowhere(self) -> bool:
-        """Whether the random walk is one of (nearly) no variance."""
+        """Whether the variance of the random walk is (nearly) 0."""
         roots = np.roots([1.0, *self.c])
         return self.orders.walk and bool(np.max(roots.real, initial=0.0) > STILL)
 
 
 class Likelihood:
-    """A log in deviations from its operating point, and how well models explain it.
+    """The likelihood of a log, in deviations from its operating point.
 
-    `longest` has the longest A and B that are tried.
+    `longest` has the longest A and B to be tried.
 
     Raises
     ------
     CannotTellError
-        If the log is too short, or nothing moves in it.
+        If the log is too short, or does not excite the plant.
     ValueError
-        If what is known does not fit to the log.
+        If the knowledge does not fit the log.
     """
 
     def __init__(self, log: Log, knowledge: Knowledge, longest: Orders) -> None:
@@ -94,14 +94,14 @@ class Likelihood:
         self.operating_flow = _operating_flow(log.flow, knowledge)
         command = log.flow - self.operating_flow
         self.u_min, self.u_max = _limits(command, knowledge)
-        # u(k), y(k) and the known disturbances, as deviations; NaN where they are not known.
+        # u(k), y(k) and the known disturbances, as deviations; NaN where unknown.
         self.command = np.clip(command, self.u_min, self.u_max)
         _check_excitation(self.command, log.temperature)
         self.output = log.temperature - float(np.nanmean(log.temperature))
         self.known = [each - each[np.isfinite(each)][0] for each in log.disturbances.values()]
         self.lags = [0] * len(self.known)  # samples
         self.delays = range(knowledge.longest_delay + 1)
-        # Smaller errors than this are rounding, and no reason for higher orders.
+        # A smaller mean square of the errors is rounding, and no reason for higher orders.
         self.resolution = FINEST**2 * float(np.nanvar(self.output))
         magnitudes = np.unique(np.abs(self.command[np.isfinite(self.command)]))
         self.magnitudes = magnitudes[magnitudes > 0.0]
@@ -115,7 +115,7 @@ class Likelihood:
             )
 
     def _find_rows(self, longest: Orders) -> None:
-        """Find where all is known that (28) takes, for every delay and all orders."""
+        """Find the rows in which (28) is known, for every delay and all orders."""
         reach = self.knowledge.longest_delay + longest.b
         missing = ~np.isfinite(self.output)
         filled = pd.Series(self.output).interpolate(limit_direction="both")
@@ -130,19 +130,19 @@ class Likelihood:
         self.rows = Rows(_runs(self._usable, SHORTEST), self._counted)
 
     def first(self, samples: int) -> Likelihood:
-        """Return the likelihood of the first samples."""
+        """Return the likelihood of the first samples alone."""
         part, usable = copy(self), self._usable & (np.arange(len(self.output)) < samples)
         part.rows = Rows(_runs(usable, SHORTEST), self._counted)
         return part
 
     def applied(self, gap: Gap) -> Array:
-        """Return u_a for a dead zone within a gap."""
+        """Return u_a for a dead zone that ends within a gap."""
         return np.where(np.abs(self.command) <= gap.low, 0.0, self.command)
 
     def table(self, orders: Orders, place: Place | None = None, but: int = -1) -> Array:
-        """Return y(k), and its regressors: -y(k-1) ..., u_a(k-d-1) ..., disturbances, levels.
+        """Return y(k) and its regressors: -y(k-1) ..., u_a(k-d-1) ..., disturbances, levels.
 
-        Without a place, there are none of the flow. One disturbance may be left out.
+        Without a place, the flow is left out. `but` is the index of a disturbance to leave out.
         """
         inputs = [] if place is None else [(self.applied(place.gap), place.delay, orders.b)]
         inputs += [
@@ -158,11 +158,11 @@ class Likelihood:
         ])  # fmt: skip
 
     def white(self, table: Array, c: Array, orders: Orders) -> Array:
-        """Return columns whitened by C, in the rows that count."""
+        """Return the columns whitened by C, in the counted rows."""
         return self.rows.whitened(table, c, orders.walk)[self.rows.counts]
 
     def fit(self, place: Place, orders: Orders, start: Array | None = None) -> Fit:
-        """Return the fit of maximum likelihood."""
+        """Return the maximum-likelihood fit."""
         table = self.table(orders, place)
         return self._fit(place, orders, *self.rows.solve(table, orders, start))
 
@@ -180,14 +180,14 @@ class Likelihood:
         return Fit(orders, there, linear, c, errors, square)
 
     def best_fit(self, place: Place, orders: Orders, start: Array) -> Fit:
-        """Return the better of two fits: there may be a peak with a slow C and one without."""
+        """Return the better of two fits: the likelihood may peak with a slow C and without."""
         slow = np.asarray(np.poly([0.8, 0.95][: 1 + orders.walk]), float)[1 : orders.noise + 1]
         starts = [start, slow] if orders.a > 1 and orders.noise else [start]
         fits = [self.fit(place, orders, each) for each in starts]
         return min(fits, key=lambda fit: fit.place.deviance)
 
     def first_fits(self, tried: list[Orders]) -> list[Fit]:
-        """Return fits of orders, the best first, and find the delays of known disturbances."""
+        """Find the delays of the known disturbances, and return fits of orders, best first."""
         place = self.scan(replace(tried[0], c=0), np.zeros(0), self.gaps())[0]
         if self.known:
             c, orders = self.fit(place, tried[0]).c, replace(tried[0], b=OF_KNOWN)
@@ -202,7 +202,7 @@ class Likelihood:
         return self.ranked(fits)
 
     def deviance(self, squares: Array | float) -> Array:
-        """Return twice the negative log likelihood, but for a constant."""
+        """Return twice the negative log likelihood, up to a constant."""
         count = len(self.rows)
         least = max(count * self.resolution, 1e-300)
         return np.asarray(count * np.log(np.maximum(squares, least)))
@@ -210,20 +210,20 @@ class Likelihood:
     def criterion(self, orders: Orders, deviance: float, *, mild: bool = False) -> float:
         """Return the Bayesian information criterion, or the milder one of Akaike.
 
-        A coefficient of B beyond the first counts twice: it is chosen, as the delay is, from
-        several places, and one before or behind the right ones gains by chance.
+        A coefficient of B beyond the first counts twice: like the delay, its place is chosen
+        among several, and one before or after the right ones gains by chance.
         """
         price = 2.0 if mild else math.log(len(self.rows))
         return deviance + (orders.count + orders.b - 1) * price
 
     def ranked(self, fits: Iterable[Fit], *, mild: bool = False) -> list[Fit]:
-        """Return fits by their criterion, the best first."""
+        """Return fits sorted by their criterion, the best first."""
         return sorted(
             fits, key=lambda fit: self.criterion(fit.orders, fit.place.deviance, mild=mild)
         )
 
     def gaps(self) -> list[Gap]:
-        """Return places of the dead zone to begin with."""
+        """Return the coarse gaps with which the search for the dead zone begins."""
         if self.knowledge.applied:
             return [Gap(0.0, 0.0)]
         edges = np.concatenate([[0.0], self.magnitudes])
@@ -233,7 +233,7 @@ class Likelihood:
     def scan(
         self, orders: Orders, c: Array, gaps: list[Gap], delays: range | None = None
     ) -> list[Place]:
-        """Return the deviance of every delay and gap with a given C, the best first."""
+        """Return every delay and gap with its deviance for a given C, the best first."""
         delays = delays or self.delays
         applied = [self.applied(gap) for gap in gaps]
         found = self._profile(self.table(orders), orders, c, applied, delays)
@@ -249,7 +249,7 @@ class Likelihood:
     def _profile(
         self, table: Array, orders: Orders, c: Array, inputs: list[Array], delays: range
     ) -> Iterator[Array]:
-        """Return the deviances of every delay with one more input, of B's length, for each."""
+        """Yield, for each input added with B's length, the deviances of all delays."""
         white = self.white(table, c, orders)
         basis, _ = np.linalg.qr(white[:, 1:])
 
@@ -279,7 +279,7 @@ class Likelihood:
         )
 
     def models(self, fit: Fit) -> list[LinearModel]:
-        """Return what the flow does by (28), and what each known disturbance does."""
+        """Return the models of the responses to the flow and to each known disturbance."""
         poles, rest = np.split(fit.linear, [fit.orders.a])
         lengths = [fit.orders.b, *[OF_KNOWN] * len(self.known)]
         parts, delays = np.split(rest, np.cumsum(lengths))[:-1], [fit.place.delay, *self.lags]
@@ -290,19 +290,19 @@ class Likelihood:
         ]
 
     def errors(self, fit: Fit, *, bridged: bool = True) -> Array:
-        """Return the prediction errors, one a row of the log, NaN where there is none."""
+        """Return the prediction errors, one per row of the log, NaN where there is none."""
         result, kept = np.full(len(self.output), np.nan), self.rows.counts | bridged
         result[self.rows.index[kept]] = fit.errors[kept]
         return result
 
     def simulated(self, fit: Fit) -> Array:
-        """Return what flow and known disturbances do to the temperature, degC."""
+        """Return the simulated response of the temperature to all inputs, degC."""
         inputs = [self.applied(fit.place.gap), *self.known]
         parts = [from_rest(*each) for each in zip(self.models(fit), inputs, strict=True)]
         return np.asarray(np.sum(parts, axis=0))
 
     def gained(self, best: Fit) -> float:
-        """Return what the flow adds to twice the log likelihood."""
+        """Return how much the flow adds to twice the log likelihood."""
         *_, errors = self.rows.solve(self.table(best.orders), best.orders, best.c)
         return float(self.deviance(self.rows.square(errors))) - best.place.deviance
 
@@ -332,7 +332,7 @@ def _limits(command: Array, knowledge: Knowledge) -> tuple[float, float]:
 
 
 def _check_excitation(command: Array, output: Array) -> None:
-    """Refuse a log in which nothing moves, or nothing but the feedback."""
+    """Refuse a log in which nothing moves, or in which feedback alone moves the flow."""
     flows, temperatures = command[np.isfinite(command)], output[np.isfinite(output)]
     if len(flows) < LEAST_SAMPLES:
         raise CannotTellError(
@@ -359,25 +359,25 @@ def _check_excitation(command: Array, output: Array) -> None:
 
 
 def _explained_by_feedback(u: pd.Series[float], y: pd.Series[float]) -> float:
-    """Return which share of the flow's moves, beyond its past, the temperature explains."""
+    """Return the share of the flow's moves, beyond its past, that the temperature explains."""
     past, answered = (u.shift(1), u.shift(2), u.notna()), (y, y.shift(1), y.shift(2))
     table = np.column_stack([*past, *answered, u.diff()])
-    # Where a limit holds the flow, it does not follow anything.
+    # A flow held at a limit follows nothing.
     table = table[np.isfinite(table).all(axis=1) & (u > u.min()) & (u < u.max())]
     if len(table) < LEAST_SAMPLES:
         return 0.0
-    # What each column adds, and in the end what none explains: squares of the moves.
+    # Sums of squares of the moves: what each column adds, and last what none explains.
     squares = np.asarray(np.linalg.qr(table, mode="r"))[:, -1] ** 2
     alone = float(squares[len(past) :].sum())
-    # Some flows go on as they have gone, whatever the temperature does.
+    # Some flows follow from their own past, whatever the temperature does.
     return 1.0 - float(squares[-1]) / alone if alone > 1e-9 * squares.sum() else 0.0
 
 
 def _all_of_last(flags: Flags, count: int) -> Flags:
-    """Return where the last `count` flags, its own included, are all true."""
+    """Return where the last `count` flags, the current one included, are all true."""
     return np.asarray(pd.Series(flags).rolling(count, min_periods=1).min(), np.bool_)
 
 
 def _runs(flags: Flags, least: int) -> Flags:
-    """Return where flags are true in runs of at least this length."""
+    """Return where flags are true in runs of at least the given length."""
     return np.asarray(ndimage.binary_opening(flags, np.ones(least)))

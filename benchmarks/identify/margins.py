@@ -1,4 +1,4 @@
-"""How far a loop is from instability: margins from its frequency response."""
+"""Compute a loop's stability margins from its frequency response."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
 
-SLOWEST = 1e-5  # lowest frequency, of the Nyquist frequency
-POINTS = 20_000  # of the frequency response
+SLOWEST = 1e-5  # lowest frequency, as a share of the Nyquist frequency
+POINTS = 20_000  # frequencies, of logarithmic and of linear spacing each
 
 
 @dataclass(frozen=True)
 class Margins:
-    """What a loop bears before it is unstable. All are NaN if it is not stable."""
+    """Stability margins of a loop, all NaN if it is not stable."""
 
     gain: float = math.nan
-    """Factor on the gain of the plant; infinite if none makes it unstable."""
+    """Factor on the plant's gain at which the loop becomes unstable; infinite if none does."""
     phase: float = math.nan
-    """Phase shift in either direction, degrees; infinite if the loop gain is below 1."""
+    """Phase shift in either direction, degrees; infinite if the loop gain stays below 1."""
     delay: float = math.nan
-    """Further delay, s; infinite likewise."""
+    """Additional delay, s; infinite if the loop gain stays below 1."""
     sensitivity: float = math.nan
     """Ms, the largest factor by which the loop amplifies a disturbance, 1 or more. 1 / Ms is
-    the least distance of the loop's frequency response from -1."""
+    the smallest distance of the loop's frequency response from -1."""
 
     @property
     def stable(self) -> bool:
@@ -42,20 +42,20 @@ class Margins:
 
 
 class Loop:
-    """A controller and a plant, (28) without the actuator, opened at the error.
+    """The loop of a controller and a plant, (28) without the actuator, opened at the error.
 
-    L is what e comes back as.
+    L is its transfer function from e to y.
 
     Parameters
     ----------
     controller
-        Linear between the limits of the flow: its method `transfer` says how.
+        Linear between the limits of the flow, with the transfer function that `transfer` gives.
     parameters
         The plant's. A range stands for its middle, and a plant that drifts is taken at k = 0.
     """
 
     def __init__(self, controller: PIController, parameters: Parameters) -> None:
-        # u follows e, and y follows u: L = G_u G, in powers of z^-1.
+        # G_u from e to u, and G from u to y: L = G_u G, in powers of z^-1.
         (up, down), (b, a) = controller.transfer(), nominal(parameters).transfer()
         self.numerator, self.denominator = np.convolve(up, b), np.convolve(down, a)
         self._interval = parameters.sampling_interval
@@ -78,13 +78,13 @@ class Loop:
 
     @cached_property
     def margins(self) -> Margins:
-        """The margins, while no limit and no dead zone is met."""
+        """Margins while no limit and no dead zone is met."""
         closed = polyadd(self.denominator, self.numerator)
         if not np.all(np.abs(np.roots(closed)) < 1.0):
             return Margins()
         values = self.response
         at = self.response_at(self._crossings(values.imag)).real
-        at = np.append(at, values[-1].real)  # at Nyquist's frequency L is real, too
+        at = np.append(at, values[-1].real)  # at the Nyquist frequency L is real, too
         gains = -1.0 / at[(at > -1.0) & (at < 0.0)]
         of_one = self._crossings(np.abs(values) - 1.0)
         left = (np.angle(self.response_at(of_one)) + math.pi) % (2.0 * math.pi)
@@ -97,7 +97,7 @@ class Loop:
         )
 
     def _crossings(self, values: Array) -> Array:
-        """Return the frequencies at which values change their sign, by lines in between."""
+        """Return the frequencies at which values change sign, by linear interpolation."""
         i = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
         share = values[i] / (values[i] - values[i + 1])
         result: Array = self.frequency[i] + share * (self.frequency[i + 1] - self.frequency[i])

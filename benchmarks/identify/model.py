@@ -1,4 +1,4 @@
-"""What a log answers: estimates and the model."""
+"""Define what an identification returns: the model and its estimates."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from benchmarks.loop.linear import LinearModel
 
 
 class CannotTellError(ValueError):
-    """The log does not hold what is asked of it; the message says why."""
+    """No usable plant can be identified from the log; the message says why."""
 
 
 class Interval(NamedTuple):
@@ -23,11 +23,11 @@ class Interval(NamedTuple):
 
 
 class HeldOut(NamedTuple):
-    """How much of the last third of a log models explain that were fitted to the rest.
+    """Shares of variance in the last third of a log, explained by models fitted to the rest.
 
-    Shares of the temperature's variance, in simulation: the models are given the flow and the
-    known disturbances, but no temperature. A straight line is taken from their errors, for the
-    slow disturbance that no flow explains.
+    The models simulate the temperature: they are given the flow and the known disturbances, but
+    no temperature. A straight line is removed from their errors to account for the slow
+    disturbance, which no flow explains.
     """
 
     model: float
@@ -36,34 +36,34 @@ class HeldOut(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """A plant that a log has shown, in deviations from the operating point as in (28)."""
+    """A plant identified from a log, in deviations from the operating point as in (28)."""
 
     plant: LinearModel
-    """The likeliest A, B, C and delay."""
+    """The most likely A, B, C and delay."""
     noise: dict[str, float]
     """`noise_variance`, `measurement_noise_variance` and `disturbance_walk_variance` of the
     environment, degC^2."""
     known: dict[str, LinearModel]
-    """What each known disturbance does, by its column of the log."""
+    """Model of the response to each known disturbance, by its column of the log."""
     estimates: dict[str, Interval]
     """`delay` (samples), `dead_zone` (t/h), `gain` (degC per t/h), `time_constant` (s, of the
     slowest pole), `noise_variance` (degC^2, of the prediction errors), and the coefficients
     `a1`, `b1` and so on."""
     possible: list[LinearModel]
-    """Plants drawn from what the log leaves open."""
+    """Plants drawn from the posterior."""
     u_min: float
     u_max: float
     """t/h."""
     operating_flow: float
     operating_temperature: float
-    """t/h and degC: where u and y are 0."""
+    """t/h and degC, where u and y are 0."""
     orders: Orders
     errors: Array
-    """The prediction errors xi, one a row of the log, NaN where they are not known, degC."""
+    """Prediction errors xi, degC, one per row of the log, NaN where unknown."""
     held_out: HeldOut
     log: Log
-    """What was fitted: the log, mended."""
+    """The cleaned log that was fitted."""
     simulated: Array
-    """What the model makes of flow and known disturbances alone, degC."""
+    """Temperature simulated from the flow and the known disturbances alone, degC."""
     notes: list[str]
-    """What the user should know about the fit."""
+    """Remarks for the user about the log and the fit."""

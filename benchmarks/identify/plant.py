@@ -1,4 +1,4 @@
-"""The arguments of the environment that make it the plant that a log has shown."""
+"""Describe an identified plant by the environment's arguments."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from benchmarks.loop.linear import LinearModel
 from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
 
-LARGEST_FACTOR = 10.0  # of gain and time constant in a range, where the log gives no end
-REACH = 0.8  # share of the temperature that the flow can hold, for the set point
-SETTLED = 0.02  # share of a transient that is left when it counts as over
-LONGEST = 100_000  # samples of a step response
-POINTS = 1024  # of the spectra of noise
-MOSTLY = 0.5  # share of the noise that is white in the temperature, to be the transmitter's
-OF_C = 3  # coefficients, of a noise that is parted
+LARGEST_FACTOR = 10.0  # bound of the factors on gain and time constant in a range
+REACH = 0.8  # largest set point, as a share of the temperature that the flow can hold
+SETTLED = 0.02  # share of a transient that is left when it counts as settled
+LONGEST = 100_000  # longest transient, samples
+POINTS = 1024  # length of the Fourier transforms of noise
+MOSTLY = 0.5  # least share of the noise that must be white to be the transmitter's
+OF_C = 3  # coefficients of C after the noise has been split
 
 
 def noise_of(
@@ -29,9 +29,9 @@ def noise_of(
     """Return the variances of the environment's noises, degC^2, by name, and C.
 
     The plant has C, or with a walk C', and `variance` is that of xi. The noise of a log is
-    C' xi / (A (1 - z^-1)) with a walk, C xi / A without. The walk is what is left of it at
-    frequency 0. Of the rest, the white part is the transmitter's noise if it is most of it, as
-    (28) cannot tell the two apart otherwise.
+    C' xi / (A (1 - z^-1)) with a walk, C xi / A without. Its limit at frequency 0 gives the
+    walk. The white part of the rest is the transmitter's noise if it is at least half;
+    otherwise (28) cannot separate the two.
     """
     a, c = np.array(plant.a), np.array(plant.c)
     of_a = np.abs(np.fft.rfft(a, POINTS)) ** 2
@@ -47,7 +47,7 @@ def noise_of(
     if white < MOSTLY * float(np.mean(left / of_a)):
         white = 0.0
     if white or orders.walk:
-        # The rest as C xi: the factor of its spectrum with all zeros inside the unit circle.
+        # The rest is C xi: C is the spectral factor with all zeros inside the unit circle.
         left = np.maximum(left - white * of_a, 1e-4 * left)
         cepstrum = np.fft.irfft(np.log(left))
         variance = float(np.exp(cepstrum[0]))
@@ -60,10 +60,10 @@ def noise_of(
 
 
 def plant_arguments(model: Model) -> dict[str, Any]:
-    """Return `plant.json`: the arguments of `MiddlePoint-v0` for what was found.
+    """Return the content of `plant.json`: the arguments of `MiddlePoint-v0` for the model.
 
-    The set point is the environment's where the plant reaches it and has the time for it;
-    otherwise it is made smaller and slower.
+    The set point stays the environment's default if the plant can reach it in time; otherwise
+    it is made smaller and slower.
     """
     plant, defaults = model.plant, Parameters()
     gain, limits = abs(plant.gain), (abs(model.u_min), abs(model.u_max))
@@ -89,7 +89,7 @@ def plant_arguments(model: Model) -> dict[str, Any]:
 
 
 def plant_ranges(model: Model) -> dict[str, Any]:
-    """Return `ranges.json`: the same with the intervals as ranges, to be drawn from."""
+    """Return the content of `ranges.json`: the same, with intervals as ranges to draw from."""
     arguments, plant = plant_arguments(model), model.plant
     names = "delay", "dead_zone", "noise_variance", "gain", "time_constant"
     delay, zone, noise, gain, constant = (model.estimates[name] for name in names)
@@ -103,7 +103,7 @@ def plant_ranges(model: Model) -> dict[str, Any]:
     }
     pole = complex(slowest_pole(plant.a) or 0.0)
     if pole.imag == 0.0 and 0.0 < pole.real < 1.0:
-        # The environment's time constant is 1 / (1 - pole) samples, and 1 at the least.
+        # The environment's time constant is 1 / (1 - pole) samples, at least 1.
         rate, times = 1.0 - pole.real, np.maximum([constant.low, constant.high], 1e-9)
         fast, slow = np.maximum(-np.expm1(-plant.sampling_interval / times), 1e-12).tolist()
         ranges["time_constant_factor"] = [
@@ -123,7 +123,7 @@ def plant_ranges(model: Model) -> dict[str, Any]:
 
 
 def _rounded(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments with eight digits, which is more than any log tells."""
+    """Return arguments rounded to eight digits, more than any log determines."""
     rounded: dict[str, Any] = json.loads(
         json.dumps(arguments), parse_float=lambda text: float(f"{float(text):.8g}")
     )
@@ -131,7 +131,7 @@ def _rounded(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def settling(plant: LinearModel) -> int:
-    """Return how long a step response takes, samples, to be over but for a fiftieth."""
+    """Return how long a step response takes to settle within 2 %, samples."""
     size = float(np.max(np.abs(plant.poles), initial=0.0))
     own = math.log(SETTLED) / math.log(size) if 0.0 < size < 1.0 else 0.0
     return plant.delay + len(plant.b) + min(math.ceil(own), LONGEST)

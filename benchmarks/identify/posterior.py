@@ -1,4 +1,4 @@
-"""What a log leaves open: orders, delays, dead zones and coefficients by their probability."""
+"""Compute the posterior of orders, delays, dead zones and coefficients, given a log."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from benchmarks.identify.model import Interval
 from benchmarks.lib.statistics import CONFIDENCE, ENDS
 from benchmarks.loop.linear import LinearModel
 
-ENDS_OF_ERRORS = float(stats.norm.ppf(ENDS[1]))  # standard errors
-NEAR = 25.0  # of deviances: what is further off has no probability worth a mention
-AS_GOOD = 8.0  # of Akaike's criterion: orders that are no further behind count the same
-MOST_GAPS = 250  # that are tried in all
-MOST_FITS = 8  # of orders, at as many delays
-WALKS = [0.0, *np.geomspace(0.001, 0.512, 10)]  # of the root of C' from 1, where a walk shows
-PLACES, DRAWS_EACH = 60, 6  # drawn: orders with a delay and a dead zone, and coefficients
+ENDS_OF_ERRORS = float(stats.norm.ppf(ENDS[1]))  # half-width of an interval, standard errors
+NEAR = 25.0  # deviance behind the best beyond which the probability is negligible
+AS_GOOD = 8.0  # difference in Akaike's criterion up to which orders count as equally good
+MOST_GAPS = 250  # gaps beyond which none is split further
+MOST_FITS = 8  # delays, roughly, for which the C of a fit is found anew
+WALKS = [0.0, *np.geomspace(0.001, 0.512, 10)]  # distances of the walk's root of C' from 1
+PLACES, DRAWS_EACH = 60, 6  # entries drawn, and coefficients drawn for each
 
 
 class Entry(NamedTuple):
-    """Orders, as one of the fits that take part has them, with a C, at a place."""
+    """A place with a fit, for its orders and C, and the number of its orders."""
 
     number: int
     fit: Fit
@@ -36,17 +36,17 @@ class Entry(NamedTuple):
 def posterior(
     likelihood: Likelihood, fits: list[Fit]
 ) -> tuple[Fit, list[LinearModel], dict[str, Interval]]:
-    """Return the likeliest fit, plants that are drawn, and the estimates of a `Model`.
+    """Return the most likely fit, plants drawn from the posterior, and a `Model`'s estimates.
 
-    The fits are of the orders that take part, the best first.
+    `fits` has one fit for each of the candidate orders, the best first.
     """
     entries = _entries(likelihood, fits)
-    # The likeliest plant is of the simplest orders that will do. What is possible gives all
-    # orders that are about as good the same weight: a second time constant may stand for a
-    # part of the delay, and a log tells little of it.
+    # The most likely plant has the simplest adequate orders. The set of possible plants weights
+    # all orders that are about as good equally: a second time constant may account for part of
+    # the delay, and a log says little about it.
     likeliest, weights = (_weights(likelihood, entries, possible=p) for p in (False, True))
-    # A B with more coefficients than it need have may begin with some that are nearly 0: its
-    # delay is not when the response begins.
+    # A B with more coefficients than necessary may begin with some close to 0, so that the
+    # response begins later than its delay says.
     lengths = np.array([entry.fit.orders.b for entry in entries])
     short = weights * (lengths <= lengths[np.argmax(likeliest)])
     delay = _of_delay([entry.place.delay for entry in entries], likeliest, short / short.sum())
@@ -55,7 +55,7 @@ def posterior(
     chosen = _choose(likelihood, entries, likeliest, delay.value, dead_zone.value)
     drawn = _draw(likelihood, entries, weights)
     plant, interval = likelihood.models(chosen)[0], likelihood.log.sampling_interval
-    endless = math.copysign(math.inf, plant.gain)  # where nothing settles
+    endless = math.copysign(math.inf, plant.gain)  # gain of a plant that does not settle
     return chosen, drawn, {
         "delay": delay,
         "dead_zone": dead_zone,
@@ -70,7 +70,7 @@ def posterior(
 
 
 def _entries(likelihood: Likelihood, fits: list[Fit]) -> list[Entry]:
-    """Return places for all orders that are near the best."""
+    """Return entries for each fit, over the delays near its best place."""
     found, gaps = [], likelihood.gaps()
     for i, fit in enumerate(fits):
         places = likelihood.scan(fit.orders, fit.c, gaps)
@@ -80,7 +80,7 @@ def _entries(likelihood: Likelihood, fits: list[Fit]) -> list[Entry]:
             gaps = _refined(likelihood, fit, places, delays)
             at_its_own = range(fit.place.delay, fit.place.delay + 1)
             gap = likelihood.scan(fit.orders, fit.c, gaps, at_its_own)[0].gap
-        # Another delay may ask for another C.
+        # The best C depends on the delay.
         stride = max(len(delays) // MOST_FITS, 1)
         for around in (delays[k : k + stride] for k in range(0, len(delays), stride)):
             refit = likelihood.fit(Place(around[len(around) // 2], gap), fit.orders, fit.c)
@@ -92,11 +92,11 @@ def _entries(likelihood: Likelihood, fits: list[Fit]) -> list[Entry]:
 
 
 def _refined(likelihood: Likelihood, fit: Fit, places: list[Place], delays: range) -> list[Gap]:
-    """Return gaps near the best, with all gaps between commands told apart there."""
+    """Return the gaps near the best, split at the commands inside them."""
     magnitudes = likelihood.magnitudes
     best: dict[Gap, float] = {}
     for place in places:
-        best.setdefault(place.gap, place.deviance)  # the best of a gap comes first
+        best.setdefault(place.gap, place.deviance)  # places are sorted, the best first
     while len(best) < MOST_GAPS:
         gaps, limit, middles = sorted(best), min(best.values()) + NEAR, {}
         for gap, above in zip(gaps, [*gaps[1:], gaps[-1]], strict=True):
@@ -105,7 +105,7 @@ def _refined(likelihood: Likelihood, fit: Fit, places: list[Place], delays: rang
                 middles[gap] = float(inside[len(inside) // 2])
         if not middles:
             break
-        # The lower half has the same commands at rest as the whole.
+        # The lower half has the same commands in the dead zone as the whole.
         for gap, middle in middles.items():
             best[Gap(gap.low, middle)] = best.pop(gap)
         upper = [Gap(middle, gap.high) for gap, middle in middles.items()]
@@ -115,19 +115,19 @@ def _refined(likelihood: Likelihood, fit: Fit, places: list[Place], delays: rang
 
 
 def _weights(likelihood: Likelihood, entries: list[Entry], *, possible: bool) -> Array:
-    """Return the probabilities of places."""
+    """Return the probabilities of the entries."""
     deviances = np.array([entry.place.deviance for entry in entries])
     member = np.array([entry.number for entry in entries])
     low, high = np.array([entry.place.gap for entry in entries]).T
-    # Beforehand, the probability is a half that there is no dead zone.
+    # The prior probability of no dead zone is one half.
     weights: Array = 0.5 * (high - low) / likelihood.magnitudes[-1] + 0.5 * (low == 0.0)
     behind = np.zeros(member.max() + 1)
     for number in range(len(behind)):
         own = member == number
         least, fit = deviances[own].min(), entries[int(np.argmax(own))].fit
         behind[number] = likelihood.criterion(fit.orders, least, mild=possible)
-        # How a response with a lag sets in is a matter of few samples, and of chance: the
-        # likelihood of delays is trusted half as far.
+        # The onset of a response with a lag rests on few samples, and so on chance: the
+        # likelihood of delays is trusted half as much.
         trust = 0.5 if possible and fit.has_own_lag else 1.0
         weights[own] *= np.exp(trust * (least - deviances[own]) / 2.0)
         if possible:
@@ -141,7 +141,7 @@ def _weights(likelihood: Likelihood, entries: list[Entry], *, possible: bool) ->
 def _choose(
     likelihood: Likelihood, entries: list[Entry], weights: Array, delay: float, zone: float
 ) -> Fit:
-    """Return the fit of the likeliest orders with the delay and the dead zone."""
+    """Return the fit of the most likely orders with the given delay and dead zone."""
     there = np.array([entry.place.delay == delay for entry in entries])
     number = int(np.argmax(np.bincount([e.number for e in entries], weights * there)))
     best = max(
@@ -152,7 +152,7 @@ def _choose(
 
 
 def _draw(likelihood: Likelihood, entries: list[Entry], weights: Array) -> list[LinearModel]:
-    """Return plants: of systematically drawn places, with drawn walks and coefficients."""
+    """Draw plants: entries by systematic sampling, walks and coefficients at random."""
     generator = np.random.default_rng(0)
     points = (np.arange(PLACES) + generator.random()) / PLACES
     picked = np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
@@ -178,10 +178,10 @@ def _draw(likelihood: Likelihood, entries: list[Entry], weights: Array) -> list[
 def _walks(likelihood: Likelihood, fit: Fit) -> tuple[list[tuple[Orders, Array]], Array]:
     """Return orders and C' for random walks of all sizes, and their probabilities.
 
-    A walk that no criterion asks for may still move the base line, above all where the noise is
-    slow as well. Its size is the root of C' nearest 1: there the walk is none. The probability
-    beforehand is a half for that, and the rest is even over the logarithm of the root's
-    distance from 1. The coefficients of A, B and the levels are integrated over.
+    A walk too small for any criterion to select may still move the base line, above all where
+    the noise is slow too. The root of C' nearest 1 determines its size; at 1 there is no walk.
+    The prior probability of no walk is one half; the rest is uniform over the logarithm of the
+    root's distance from 1. The coefficients of A and B and the levels are integrated out.
     """
     rest = np.roots([1.0, *fit.c])
     if fit.orders.walk:
@@ -204,7 +204,7 @@ def _walks(likelihood: Likelihood, fit: Fit) -> tuple[list[tuple[Orders, Array]]
 
 
 def _of_errors(likelihood: Likelihood, fit: Fit) -> dict[str, Interval]:
-    """Return the variance of the prediction errors, degC^2, and A, B and C, by name."""
+    """Return estimates, by name: the prediction errors' variance, degC^2, and A, B and C."""
     freedom = max(len(likelihood.rows) - fit.orders.count, 1)
     counts = {"a": fit.orders.a, "b": fit.orders.b, "c": fit.orders.noise}
     names = [f"{letter}{i + 1}" for letter, count in counts.items() for i in range(count)]
@@ -221,10 +221,10 @@ def _of_errors(likelihood: Likelihood, fit: Fit) -> dict[str, Interval]:
 
 
 def slowest(a: Sequence[float]) -> float:
-    """Return the time constant that a step response ends with, samples.
+    """Return the time constant with which a step response settles, samples.
 
-    It is that of the largest real pole above 0, if any: poles below 0, whose responses change
-    sign at every sample, tell how the noise is made.
+    It belongs to the largest real pole above 0, if any: poles below 0, whose responses change
+    sign at every sample, describe the noise.
     """
     poles = np.roots(a)
     settling = poles[np.isreal(poles) & (poles.real > 0.0)]
@@ -233,20 +233,20 @@ def slowest(a: Sequence[float]) -> float:
 
 
 def _interval(value: float, drawn: Sequence[float]) -> Interval:
-    """Return a value with the quantiles of draws."""
-    # Without interpolation: between a number and infinity there is none.
+    """Return a value with its interval, from the quantiles of draws."""
+    # Without interpolation, as draws may be infinite.
     low, high = np.quantile(drawn, ENDS, method="nearest").tolist()
     return Interval(value, min(low, value), max(high, value))
 
 
 def _of_delay(delays: list[int], likeliest: Array, weights: Array) -> Interval:
-    """Return the delay that has most probability within one sample, and its interval."""
+    """Return the delay with the most probability within one sample of it, and its interval."""
     tried, member = np.unique(delays, return_inverse=True)
     shares, of_interval = (np.bincount(member, each) for each in (likeliest, weights))
     near = np.abs(tried[:, np.newaxis] - tried) <= 1
-    # Of equal ones, the delay that is itself the likelier.
+    # Ties go to the delay that is itself more likely.
     value = float(tried[np.lexsort((shares, (near @ shares).round(6)))[-1]])
-    # Of whole samples, the fewest in a row that have the probability.
+    # The shortest run of delays that holds the required probability.
     sums = np.concatenate([[0.0], np.cumsum(of_interval)])
     first, last = np.nonzero(sums[1:] - sums[:-1, np.newaxis] >= CONFIDENCE - 1e-9)
     best = np.lexsort((sums[first] - sums[last + 1], tried[last] - tried[first]))[0]
@@ -255,7 +255,7 @@ def _of_delay(delays: list[int], likeliest: Array, weights: Array) -> Interval:
 
 
 def _of_dead_zone(places: list[Gap], weights: Array, slack: float) -> Interval:
-    """Return the dead zone: its posterior is spread evenly within each gap.
+    """Return the dead zone, with a posterior that is uniform within each gap.
 
     The commands at both ends of a gap may be off by `slack`, t/h.
     """

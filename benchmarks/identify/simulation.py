@@ -1,4 +1,4 @@
-"""How much of a log models explain by simulation, and what an impulse response explains."""
+"""Simulate a log with a model or an impulse response, and measure how much this explains."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from scipy import linalg, signal
 from benchmarks.identify.armax import Array, Flags
 from benchmarks.loop.linear import LinearModel
 
-LAGS = 60  # of the impulse response, samples
-TAILS = (30.0, 60.0, 120.0, 240.0)  # time constants of what goes on after them, samples
-RIDGES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the penalty that is chosen from
+LAGS = 60  # length of the impulse response, samples
+TAILS = (30.0, 60.0, 120.0, 240.0)  # time constants of its slow tail, samples
+RIDGES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # shares of the largest singular value
 
 
 def held(values: Array) -> Array:
-    """Return values with the last known one in place of those that are not known."""
+    """Return values with gaps filled from the last known value, or at first from the next."""
     return np.asarray(pd.Series(values).ffill().bfill(), np.float64)
 
 
 def from_rest(model: LinearModel, flow: Array) -> Array:
-    """Return the response to a flow, from rest at its first value; NaN of an unstable plant."""
+    """Return the response to a flow from rest at its first value; NaN for an unstable plant."""
     if np.max(np.abs(model.poles), initial=0.0) >= 1.0:
         return np.full(len(flow), np.nan)
     known = held(flow)
@@ -29,9 +29,9 @@ def from_rest(model: LinearModel, flow: Array) -> Array:
 
 
 def explained(output: Array, simulated: Array, rows: Flags) -> float:
-    """Return the share of the variance in some rows that a simulation explains.
+    """Return the share of the variance in the given rows that a simulation explains.
 
-    The straight line that fits best is taken from its errors: the slow disturbance.
+    The best-fitting straight line is removed from its errors to account for slow disturbances.
     """
     known = rows & np.isfinite(output)
     if not known.any() or not np.isfinite(simulated[known]).all():
@@ -47,9 +47,9 @@ def of_impulse_response(
 ) -> tuple[Array, float]:
     """Return the simulation by a finite impulse response with a slow tail, degC, and its gain.
 
-    It has `LAGS` coefficients and four slow exponentials for each input, and is fitted to some
-    rows by least squares with a ridge, which generalised cross-validation chooses (G. H. Golub,
-    M. Heath and G. Wahba, Technometrics 21, 1979, 215-223). The gain is of the first input.
+    `LAGS` coefficients and four slow exponentials for each input are fitted to the given rows
+    by ridge regression; generalised cross-validation chooses the ridge (G. H. Golub, M. Heath
+    and G. Wahba, Technometrics 21, 1979, 215-223). The gain is that of the first input.
     """
     columns = []
     for each in map(held, inputs):

@@ -1,4 +1,4 @@
-"""Tunes controllers, and de-tunes them until the plants that a log leaves possible bear it."""
+"""Tune controllers, and slow them until they are robust to what a log leaves uncertain."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ from benchmarks.identify.plant import plant_arguments, settling
 from benchmarks.loop.linear import LinearModel
 from mptc_gym import Parameters
 
-MOST_SENSITIVE = 2.0  # Ms of a loop that is recommended
-SHARE = 0.95  # of the plants that the log leaves possible
-SLOWER = 1.25  # by which a closed loop is slowed at a time
-SLOWEST = 60  # times at most
+MOST_SENSITIVE = 2.0  # largest Ms of a recommended loop
+SHARE = 0.95  # share of the possible plants that must stay within it
+SLOWER = 1.25  # factor by which a closed loop is slowed from one attempt to the next
+SLOWEST = 60  # attempts at most
 
 
 @dataclass(frozen=True)
 class Recommended:
-    """A controller that the plants bear which a log leaves possible, and how it came about."""
+    """A controller that is robust to what a log leaves uncertain, and how it was found."""
 
     controller: PIController
     """Linear between the limits."""
     loop: Loop
-    """That with the identified plant."""
+    """The loop with the identified plant."""
     worst: float
-    """Ms that 95 % of the possible plants stay below."""
+    """95th percentile of Ms over the possible plants that are stable."""
     slowed: float
-    """By which factor the closed loop is slower than by the rule."""
+    """Factor by which the closed loop is slower than the rule makes it."""
 
 
 def reduced(plant: LinearModel) -> StepTest:
-    """Return a model of first order with delay that has the whole response of a stable plant.
+    """Return a first-order model with delay, fitted to the whole response of a stable plant.
 
-    By areas (K. J. Astrom and T. Hagglund, "PID Controllers", 2nd edition, 1995, section 2.4):
-    that between the step response and its end is T + L, and that under it up to T + L is T / e.
-    The sample that any input takes to show is part of the delay.
+    The area between the step response and its final value is T + L, and that under it up to
+    T + L is T / e (K. J. Astrom and T. Hagglund, "PID Controllers", 2nd edition, 1995, section
+    2.4). The delay includes the sample that any input takes to show.
     """
     samples, interval = 3 * settling(plant) + 10, plant.sampling_interval
     shape = plant.step_response(samples) / plant.gain
-    total = max(float(np.sum(1.0 - shape)) - 0.5, 0.0)  # samples, with lines between them
+    total = max(float(np.sum(1.0 - shape)) - 0.5, 0.0)  # samples, by the trapezoidal rule
     under = integrate.cumulative_trapezoid(shape, initial=0.0)
     area = float(np.interp(total, np.arange(samples), under))
     constant = min(max(math.e * area, 0.2), max(total, 0.2))
@@ -64,8 +64,8 @@ def reduced(plant: LinearModel) -> StepTest:
 def recommended(model: Model) -> dict[str, Recommended | None]:
     """Return a PI controller by SIMC's rule and a Smith predictor, by name.
 
-    Each is slowed until Ms is at most 2 with the identified plant and with 95 % of those that
-    the log leaves possible. It is None if that is not to be had.
+    Each is slowed until Ms is at most 2 with the identified plant and with 95 % of the stable
+    plants that the log leaves possible. It is None if that fails, or if most are not stable.
     """
     step, parameters = reduced(model.plant), Parameters(**plant_arguments(model))
     limits: dict[str, Any] = {"u_min": model.u_min, "u_max": model.u_max}
@@ -85,7 +85,7 @@ def recommended(model: Model) -> dict[str, Recommended | None]:
         )
 
     stable = [p for p in model.possible if np.max(np.abs(p.poles), initial=0.0) < 1.0]
-    # A plant that settles in the log is stable; if most of what is possible is not, it did not.
+    # A plant that settles in the log is stable; if most possible ones are not, it did not.
     known = len(stable) > len(model.possible) / 2
     sensitivity = _sensitivity([model.plant, *stable])
 
@@ -104,11 +104,11 @@ def recommended(model: Model) -> dict[str, Recommended | None]:
 
 
 def _sensitivity(plants: list[LinearModel]) -> Callable[[PIController], Array]:
-    """Return what gives Ms of stable plants, of which the first says how slow they are.
+    """Return a function from a controller to its Ms with each of several stable plants.
 
-    It takes the controller. Ms is infinite where the loop is not stable: 1 + L begins at -90
-    degrees, for the integrator, and ends real. By Nyquist's criterion the loop is stable if it
-    does so without a turn around 0, and the controller has no poles beyond the unit circle.
+    The first plant sets the lowest frequency. Ms is infinite for an unstable loop: 1 + L begins
+    at -90 degrees, because of the integrator, and ends real. By Nyquist's criterion the loop is
+    stable if 1 + L does not encircle 0 and no controller pole is outside the unit circle.
     """
     slowest = 0.01 / max(settling(plants[0]), 1)
     turns = 8 * (max(plant.delay + len(plant.b) for plant in plants) + 50)
