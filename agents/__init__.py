@@ -1,4 +1,4 @@
-"""Controllers for the middle-point temperature. They know numbers, not the environment."""
+"""Provide controllers for the middle-point temperature, independent of the environment."""
 
 from agents.controller import Controller
 from agents.direct_nn import DirectNNController, Weights

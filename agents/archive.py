@@ -1,4 +1,4 @@
-"""Read `.npz` files that anybody may have written, and say which one is damaged."""
+"""Read `.npz` files from untrusted sources, and name the file that is damaged."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-PRETRAINED: Final = Path(__file__).parent / "pretrained"  # what comes with the project
+PRETRAINED: Final = Path(__file__).parent / "pretrained"  # networks that come with the project
 
 
 @contextmanager
 def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDArray[Any]]]:
-    """Give the arrays of a file by name. Nothing in the file is executed.
+    """Yield the arrays of a file by name. Nothing in the file is executed.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is damaged, or what is made of it meanwhile is refused; the message says
-        what it was to hold.
+        If the file is damaged, or the `with` block rejects its contents; the message says
+        what it should hold.
     """
     with Path(path).open("rb") as raw:
         try:
             with np.load(raw, allow_pickle=False) as file:
                 yield file
-        except Exception as error:  # damage shows in zip, zlib, NumPy, JSON or the checks
+        except Exception as error:  # from zip, zlib, NumPy, JSON or a check
             raise ValueError(f"{path} holds no {holds}, or is damaged: {error}") from error

@@ -1,4 +1,4 @@
-"""Define what every controller is, something that resets and acts, and check its arguments."""
+"""Define the base classes of all controllers, and check their arguments."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Annotated, Any, Final, get_type_hints
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# The windows of an observation that default indices are for: the paper's six inputs.
+# Observation windows that the default indices assume: the paper's six inputs.
 PAPER_WINDOWS: Final[Mapping[str, int]] = {"setpoint_window": 3, "error_window": 3}
-Values = NDArray[np.float64] | np.float64  # one value a loop: shape (), or (batch,)
-MOST = 1_000_000  # nodes, loops, elements or samples: beyond it, a number is a mistake
+Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
+MOST = 1_000_000  # nodes, loops, elements or samples; a larger number is a mistake
 
 
 def action_from_command(
@@ -27,8 +27,8 @@ def action_from_command(
 ) -> NDArray[np.float32]:
     """Scale commands to normalised actions, -1 at `u_min` and 1 at `u_max`.
 
-    An action has the precision of float32. Rounded to it, a command on the edge of the dead
-    zone can fall inside and have no effect. Such an action is moved outwards by one float.
+    Actions are float32. Rounding can move a command from the edge of the dead zone to its
+    inside, where it has no effect. Such an action is moved outwards by one float.
 
     Parameters
     ----------
@@ -37,26 +37,26 @@ def action_from_command(
     u_min, u_max
         The actuator's limits, t/h.
     dead_zone
-        The actuator's, t/h: a command outside of it stays outside. 0 if it is not known.
+        The actuator's dead zone, t/h; a command outside it stays outside. 0 if unknown.
 
     Returns
     -------
     ndarray of float32
-        Actions, with one more axis of length 1 at the end.
+        Actions, with a trailing axis of length 1.
     """
     exact = 2.0 * (command - u_min) / (u_max - u_min) - 1.0
     action = np.asarray(exact, dtype=np.float32)
     if np.any(np.asarray(dead_zone) > 0.0):
         arrives = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0
         lost = (np.abs(command) >= dead_zone) & (np.abs(arrives) < dead_zone)
-        # Below 1, floats are finer than what is left of them once the plant has added 1.
+        # The plant adds 1, which rounds away steps finer than the float spacing at 1.
         outwards = np.copysign(np.spacing(np.maximum(np.abs(action), np.float32(1))), command)
         action = np.where(lost, action + outwards, action).astype(np.float32)
     return action[..., np.newaxis]
 
 
 def check_count(name: str, value: Any, least: int, most: int | None = None) -> int:
-    """Return `value` if it is an integer within bounds; ValueError otherwise."""
+    """Return `value` if it is an integer within bounds; otherwise raise a ValueError."""
     if (
         not isinstance(value, Integral)
         or isinstance(value, bool)
@@ -71,12 +71,12 @@ def check_count(name: str, value: Any, least: int, most: int | None = None) -> i
 def check_number(
     name: str, value: Any, least: float = -math.inf, above: float = -math.inf
 ) -> float:
-    """Return `value` if it is a finite number within bounds; ValueError otherwise."""
+    """Return `value` if it is a finite number within bounds; otherwise raise a ValueError."""
     try:
         number = isinstance(value, Real) and not isinstance(value, bool)
         if number and math.isfinite(value) and value >= least and value > above:
             return float(value)
-    except OverflowError:  # an integer beyond all floats
+    except OverflowError:  # an integer too large for a float
         pass
     bound = "" if least == -math.inf else f" of at least {least:g}"
     bound += "" if above == -math.inf else f" above {above:g}"
@@ -84,26 +84,26 @@ def check_number(
 
 
 def check_gain(name: str, value: Any) -> float:
-    """Return `value` if it is a finite number other than 0; ValueError otherwise."""
+    """Return `value` if it is a finite number other than 0; otherwise raise a ValueError."""
     if check_number(name, value) == 0.0:
         raise ValueError(f"{name} must not be 0, got {value!r}")
     return float(value)
 
 
 def check_flag(name: str, value: Any) -> bool:
-    """Return `value` if it is True or False; ValueError otherwise."""
+    """Return `value` if it is True or False; otherwise raise a ValueError."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {value!r}")
     return bool(value)
 
 
 def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Return `value` in float64 if it is made of real numbers; ValueError otherwise."""
+    """Return `value` as float64 if it holds real numbers; otherwise raise a ValueError."""
     try:
         given = np.asarray(value)
-        if given.dtype.kind in "biufO":  # no text, which NumPy would read, and nothing complex
+        if given.dtype.kind in "biufO":  # neither text, which NumPy would parse, nor complex
             return given.astype(np.float64, copy=False)
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last from tensors
         pass
     raise ValueError(f"{name} must be numbers, got {value!r}")
 
@@ -117,7 +117,7 @@ def check_limits(u_min: Any, u_max: Any) -> None:
         raise ValueError(f"u_min and u_max are too far apart, got {u_min!r}, {u_max!r}")
 
 
-# Arguments of controllers, with what checks them.
+# Types of controller arguments, each with its check.
 Number = Annotated[float, check_number]
 NotNegative = Annotated[float, partial(check_number, least=0.0)]
 Positive = Annotated[float, partial(check_number, above=0.0)]
@@ -136,18 +136,18 @@ def _checks(controller: type[Controller]) -> dict[str, Callable[[str, Any], Any]
 
 @dataclass(eq=False, kw_only=True)
 class Controller(ABC):
-    """A controller of one loop, or of a batch of loops side by side.
+    """A controller of one loop, or of a batch of independent loops.
 
-    Controllers are dataclasses: their fields are the arguments of the constructor. Types such
-    as `Positive` say what is allowed.
+    Controllers are dataclasses: their fields are the arguments of the constructor, and types
+    such as `Positive` state which values are allowed.
 
     Attributes
     ----------
     n_obs : int
-        The least number of elements of an observation.
+        The minimum number of elements in an observation.
     command : float64 or ndarray of float64
-        The last command u before the actuator, t/h: a number after `act` on one observation,
-        shape (batch,) after `act` on a batch.
+        The last command u, before the actuator, t/h: a scalar after `act` on one observation,
+        an array of shape (batch,) after `act` on a batch.
 
     Raises
     ------
@@ -156,25 +156,25 @@ class Controller(ABC):
     """
 
     u_min: Number = -10.0
-    """The actuator's lower limit, t/h."""
+    """Lower limit of the actuator, t/h."""
     u_max: Number = 10.0
-    """Its upper limit, t/h. The limits scale the action; they do not limit the command."""
+    """Upper limit of the actuator, t/h. Limits scale the action; they do not clip commands."""
     n_obs: int = field(init=False, repr=False)
     command: Values = field(init=False, repr=False)
 
-    _advice = ""  # in the error that observations of a wrong shape bring
-    _remembers = True  # what has been; otherwise each batch may be of another size
-    _edge = 0.0  # t/h, of a dead zone: a command on it becomes an action that has an effect
+    _advice = ""  # appended to the error about an observation's shape
+    _remembers = True  # past samples; if not, the batch size may change at any time
+    _edge = 0.0  # of the dead zone, t/h; a command on it keeps its effect as an action
 
     def __post_init__(self) -> None:
         for name, check in _checks(type(self)).items():
             setattr(self, name, check(name, getattr(self, name)))
         check_limits(self.u_min, self.u_max)
         self.command = np.float64(0.0)
-        self._loops_before: tuple[int, ...] | None = None  # () or (batch,), since `reset`
+        self._loops_before: tuple[int, ...] | None = None  # since `reset`, () or (batch,)
 
     def reset(self) -> None:
-        """Forget the episode. What was learnt stays."""
+        """Forget the episode, but keep what was learnt."""
         self.command = np.float64(0.0)
         self._loops_before = None
 
@@ -184,20 +184,20 @@ class Controller(ABC):
         Parameters
         ----------
         observation
-            Shape (n_obs,), or (batch, n_obs) with a row for each loop. Elements beyond those
+            Shape (n_obs,), or (batch, n_obs) with one row per loop. Elements beyond those
             that the controller reads are ignored.
 
         Returns
         -------
         ndarray of float32
-            The normalised action, shape (1,) or (batch, 1), in the precision of the action
-            space. It lies outside [-1, 1] where the command lies outside the actuator's limits.
+            The normalised action, shape (1,) or (batch, 1), with the dtype of the action space.
+            It lies outside [-1, 1] where the command exceeds the actuator's limits.
 
         Raises
         ------
         ValueError
-            If the observation has another shape, or another batch than those before it since
-            `reset`, or a value that is no finite number. The controller is unchanged then.
+            If the observation has the wrong shape, another batch size than before since
+            `reset`, or a value that is not finite. The controller is then unchanged.
         """
         values = check_numbers("observation", observation)
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs or not len(values):
@@ -220,24 +220,24 @@ class Controller(ABC):
 
     @abstractmethod
     def _control(self, observation: NDArray[np.float64]) -> Values:
-        """Return u in t/h for an observation that has been checked."""
+        """Return u, t/h, for a checked observation."""
 
 
 @dataclass(eq=False, kw_only=True)
 class ToldController(Controller):
-    """A controller that is told what a step test shows of the plant, and its actuator."""
+    """A controller that is told the results of a step test and the actuator's numbers."""
 
     gain: Gain
-    """Steady-state gain of the plant, degC per t/h, of either sign."""
+    """Steady-state gain of the plant, degC per t/h; positive or negative."""
     time_constant: Positive
-    """Its time constant, s."""
+    """Time constant of the plant, s."""
     delay: NotNegative
-    """Its delay, s; the sample that any input takes to show is part of it."""
+    """Delay of the plant, s, including the one sample that any input takes to show."""
     dead_zone: NotNegative = 0.0
-    """The actuator's, t/h: commands within it are 0 to the plant, those on its edge have an
-    effect. 0 if it is not known."""
+    """Half width of the actuator's dead zone, t/h; 0 if unknown. Commands inside it reach the
+    plant as 0; those on its edge have an effect."""
     sampling_interval: Positive = 8.0
-    """s."""
+    """Sampling interval, s."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""The paper's neural-network controller, trained online from the output error of the plant."""
+"""Implement the paper's neural controller, trained online from the plant's output error."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)  # arrays have no single truth value
 class Weights:
-    """Weights and thresholds of one network, or with a leading batch axis of many."""
+    """Weights and thresholds of one network, or of many along a leading batch axis."""
 
     W: Array
     """W_ij, from input i to hidden node j; shape (N_1, N)."""
@@ -48,7 +48,7 @@ class Weights:
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Weights:
-        """Read weights that `save` has written.
+        """Read weights written by `save`.
 
         Raises
         ------
@@ -64,16 +64,16 @@ class DirectNNController(Controller):
     """A network of N inputs, N_1 hidden nodes and one output that learns while it controls.
 
     It implements steps A to E of Section 4 of the paper: the forward pass with the weights of
-    sample k, then their update with e(k) and the activations of the same pass. Of the plant it
-    knows the direction D(G) of its response and nothing else. `u_min` and `u_max` are U_min and
-    U_max, the range of the command.
+    sample k, then their update from e(k) and the activations of that pass. All it knows of the
+    plant is the direction D(G) of its response. `u_min` and `u_max` are U_min and U_max, the
+    range of the command.
     """
 
     n_inputs: Size = 6
-    """N, number of inputs: the first N elements of the observation."""
+    """N, number of inputs, which are the first N elements of the observation."""
     n_hidden: Size = 3
     """N_1, number of hidden nodes."""
-    # The gains and both scales: from `python -m benchmarks.tune nn`.
+    # `python -m benchmarks.tune nn` found the gain factors and both scales.
     eta: NotNegative = 5.3
     """eta^y, gain factor of W, the weights from the inputs to the hidden nodes."""
     eta_1: NotNegative = 0.0303
@@ -83,33 +83,33 @@ class DirectNNController(Controller):
     eta_1_theta: NotNegative = 0.0372
     """eta_1theta^y, gain factor of theta_2, the threshold of the output."""
     direction: Number = -1
-    """D(G), -1 for a plant whose output falls when its input rises, 1 for the opposite."""
+    """D(G): -1 for a plant whose output falls when its input rises, 1 for the opposite."""
     input_scale: Number = 0.021
     """Factor from the observation (degC) to the inputs X_i. The paper does not state one."""
     weight_scale: NotNegative = 1.68
-    """Initial weights and thresholds are uniform in [-weight_scale, weight_scale]. The paper
-    says "selected randomly"."""
+    """Initial weights and thresholds are drawn uniformly from [-weight_scale, weight_scale].
+    The paper says "selected randomly"."""
     error_index: Index = 3
-    """Where the observation holds e(k), degC."""
+    """Index of e(k), degC, in the observation."""
     seed: Index = 0
-    """Of the initial weights."""
+    """Seed of the initial weights."""
     num_envs: int | None = None
-    """Number of loops in a batch, each with a network of its own; None for a single loop.
-    Member i is to the bit the single controller with seed `seed + i`."""
+    """Number of loops in a batch, each with its own network; None for a single loop. Member i
+    equals a single controller with seed `seed + i`, bit for bit."""
     learning: Flag = True
-    """Whether the weights are updated. May be changed at any time."""
+    """Whether the weights are updated; it can be changed at any time."""
     update_interval: Count = 1
-    """The weights are updated at every `update_interval`-th sample, the first of an episode
-    included."""
+    """The weights are updated at every `update_interval`-th sample, starting with the first of
+    an episode."""
 
-    observation = PAPER_WINDOWS  # that the default indices are for
+    observation = PAPER_WINDOWS  # for the default indices
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.n_obs = max(self.n_inputs, self.error_index + 1)
         if abs(self.direction) != 1.0:
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
-        if not np.isfinite(2.0 * self.weight_scale):  # how wide the initial weights lie
+        if not np.isfinite(2.0 * self.weight_scale):  # width of the initial range
             raise ValueError(f"weight_scale must be at most 8.9e307, got {self.weight_scale!r}")
         if self.num_envs is not None:
             check_count("num_envs", self.num_envs, 1, MOST)
@@ -135,14 +135,14 @@ class DirectNNController(Controller):
 
     @property
     def weights(self) -> Weights:
-        """The present weights, as a copy; with `num_envs`, each with a leading batch axis.
+        """A copy of the current weights; with `num_envs`, each has a leading batch axis.
 
-        What is set must have the same shapes; in a batch, those of one network set them all.
+        Weights to set must have the same shapes; in a batch, one network's weights set all.
 
         Raises
         ------
         ValueError
-            If a shape does not fit or a value is not finite; nothing is changed then.
+            If a shape does not fit or a value is not finite; the weights are then unchanged.
         """
         arrays = (self._W, self._theta_1, self._W_1, self._theta_2)
         which = 0 if self.num_envs is None else slice(None)
@@ -162,11 +162,11 @@ class DirectNNController(Controller):
                 raise ValueError(f"weights.{name} must be finite")
             every = np.broadcast_to(array, (self.num_envs or 1, *shape))
             arrays.append(np.array(every.T, order="C"))
-        # The batch axis is last, so that sums over nodes add long rows; W as (N, N_1, batch).
+        # The batch axis is last, so that sums over nodes add long rows; W is (N, N_1, batch).
         self._W, self._theta_1, self._W_1, self._theta_2 = arrays
 
     def reset(self) -> None:
-        """Forget the episode. The weights stay."""
+        """Forget the episode, but keep the weights."""
         super().reset()
         self._sample = 0
 
@@ -194,8 +194,8 @@ class DirectNNController(Controller):
 
 
 def _sum_of_rows(terms: Array) -> Array:
-    # One after the other, whatever the shape: np.sum may add in another order for another
-    # batch size, and then a batch would not be to the bit what its members are alone.
+    # One after the other, whatever the shape: the order in which np.sum adds can depend on the
+    # batch size, and then a batch would not equal its single members bit for bit.
     total: Array = np.add.accumulate(terms, axis=0)[-1]
     return total
 

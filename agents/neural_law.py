@@ -1,8 +1,8 @@
-"""From what a model explains of a loop to the flow that it needs: the law of a told network.
+"""Implement the control law of a told network, from the signals of its model to a flow.
 
-It is written once for NumPy and for PyTorch, so that what is trained is what runs. All is in
-multiples: temperatures of what half the actuator's range moves the plant by, the *reach*, flows
-of half that range, times of samples.
+The law is written once for NumPy and PyTorch, so that the law in use is the one trained. All
+quantities are scaled: flows by half the actuator's range, temperatures by the *reach*, the
+steady-state effect of such a flow on the plant, and times by the sampling interval.
 """
 
 from __future__ import annotations
@@ -20,79 +20,79 @@ from agents.archive import PRETRAINED, reading
 
 Array = NDArray[np.float64]
 
-# Exponential means, by the share that the newest sample has: of the load that explains the
-# residual, and of the residual itself. A share of 1 is the newest sample alone.
+# Weights of the newest sample in exponential means, of the load that explains the residual and
+# of the residual itself. A weight of 1 keeps the newest sample alone.
 LOAD_RATES: Final = (1.0, 0.5, 0.2, 0.07, 0.025, 0.008, 0.002)
 RESIDUAL_RATES: Final = (1.0, 0.5, 0.2)
-REFERENCE: Final = 2  # of the loads, the one that news are told from
-NEWS: Final = 7  # samples of news that the network sees
+REFERENCE: Final = 2  # index of the load mean whose innovations are the news
+NEWS: Final = 7  # latest samples of news that the network sees
 LEAST_NOISE: Final = 0.002  # of the reach
-DOUBT: Final = 0.0002  # of the reach, added to noise before its logarithm is taken
-# Misses of the means are remembered for 20 samples and for 100, by which a load is told from
-# noise. Logarithms of their ratios are evidence, weighed so, and more of it counts for less.
-MISS_RATES: Final = (0.05, 0.01)  # a sample
+DOUBT: Final = 0.0002  # of the reach, added to the noise before its logarithm is taken
+# The misses of the means are averaged over 20 and over 100 samples, to distinguish load from
+# noise. The logarithms of their ratios are evidence, weighted by `TRUST` and saturated.
+MISS_RATES: Final = (0.05, 0.01)  # per sample
 TRUST: Final = (5.0, 30.0)
 SATURATION: Final = 0.07
-CLEARANCE: Final = 0.005  # of half the range, that commands pass the dead zone by
+CLEARANCE: Final = 0.005  # of half the range, by which commands clear the dead zone
 MOST_ADDED: Final = 0.45  # of half the range
-MOST_WEIGHT: Final = 40.0  # the logarithm, up or down
-# Weights of the means before the network has a say: logarithms, but for a constant. Unless
-# there is evidence of it, no load is expected to jump. The network tilts those of the loads.
+MOST_WEIGHT: Final = 40.0  # bound on the size of its logarithm
+# Logarithms of the means' prior weights, up to a constant: without evidence, no jump of the
+# load is expected. The network tilts those of the load means.
 PREFERENCE: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.5, 2.5, 0.0, 1.0, 0.0)
 TILT: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
 _LOADS, _MEANS = len(LOAD_RATES), len(LOAD_RATES) + len(RESIDUAL_RATES)
 INPUTS: Final = _MEANS - 2 + NEWS + 1 + 6 + 6 + 2 * _LOADS
 OUTPUTS: Final = 1 + len(RESIDUAL_RATES) + 1
-PARTS: Final = "choosing", "adding"  # of the networks
+PARTS: Final = "choosing", "adding"  # the two networks
 
 
-# What the law asks at each sample, with what is seen and with what there is at rest: returns
-# outputs, shape (n, OUTPUTS), and an addition to the flow, shape (n,), which is 0 where the two
-# are the same.
+# The networks, which the law calls at each sample with the inputs now and those at rest. They
+# return outputs, shape (n, OUTPUTS), and an addition to the flow, shape (n,), which is 0 where
+# both inputs are equal.
 Network = Callable[[Any, Any], tuple[Any, Any]]
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What the law is told of n plants; every field has shape (n,)."""
+    """Prior knowledge of n plants; every field has shape (n,)."""
 
     unit: Any
-    """A(1) of the model: by so much a steady input of 1 moves it from rest in a sample."""
+    """A(1) of the model: how far a steady input of 1 moves it from rest in one sample."""
     fading: Any
-    """What is left of a deviation once the delay and a sample are over."""
+    """Share of a deviation that remains after the delay and one more sample."""
     time_constant: Any
-    """In multiples of the paper's, which has 20.6 samples."""
+    """Time constant, as a multiple of the paper's 20.6 samples."""
     delay: Any
-    """d, samples."""
+    """Delay d, samples."""
     dead_zone: Any
-    """In multiples of half the range."""
+    """Half width of the dead zone, as a multiple of half the range."""
     centre: Any
-    """Of the flows that the limits let pass: they are within 1 of it."""
+    """Centre of the limits: flows within 1 of it pass."""
     uncertainty: Any
-    """By how much, in natural logarithms, the gain may be wrong (a standard deviation); it
-    stands for the other numbers, too."""
+    """Standard deviation of the natural logarithm of the gain; it stands for the uncertainty
+    of the other numbers, too."""
 
 
 class Law:
-    """The law for n loops, with all that it remembers.
+    """The law for n loops, with its memory.
 
-    The residual r is what the model, with the delay, does not explain of the output. A steady
-    load of A(z^-1) r / A(1) would explain it. Means of that load and of the residual are
-    *foreseen*: at the end of the delay, the residual will have gone some way to the load. What
-    each mean of the load has missed of the newest samples speaks against it; the network tilts
-    that to newer samples or to older ones. It also chooses a mean of the residual, the rate at
-    which the model is brought to what is then left of the set point, and a small addition.
+    The residual r is the part of the output that the delayed model does not explain. A steady
+    load of A(z^-1) r / A(1) would explain it. The law predicts the residual at the end of the
+    delay, when it will have moved part of the way to the load, from means of both. The errors
+    of a load mean on the newest samples count against it; the network tilts the weights to
+    means of newer or of older samples. It also chooses a mean of the residual, the rate at
+    which the model approaches the rest of the set point, and a small addition to the flow.
 
     Parameters
     ----------
     prior
-        What is told.
+        What is known of the plants.
     xp
-        NumPy or PyTorch.
+        The array module, NumPy or PyTorch.
     still
-        Returns a number without its gradient.
+        Function that returns an array without its gradient.
     haste
-        How much quicker than the network asks for: it tilts the means of the load to the newer
+        How much quicker the law is than the network asks for: it tilts the load means to newer
         samples, and is added to the logit of the rate.
     """
 
@@ -121,16 +121,16 @@ class Law:
         self._tell(prior)
 
     def retell(self, prior: Prior, ratio: Any, residual: Any) -> None:
-        """Take over other numbers of the plants, and what has been seen in their light.
+        """Adopt new numbers of the plants, and convert the memory to them.
 
         Parameters
         ----------
         prior
-            What is told from now on.
+            What is known of the plants from now on.
         ratio
-            Of the reach before to the reach now.
+            Ratio of the old reach to the new one.
         residual
-            How the last residual changes, in multiples of the reach now.
+            Change of the last residual, as a multiple of the new reach.
         """
         units = ratio * prior.unit / self.prior.unit
         loads = self._means[:, :_LOADS] * units[:, None] + (prior.unit * residual)[:, None]
@@ -155,24 +155,24 @@ class Law:
     def flow(
         self, network: Network, setpoint: Any, residual: Any, load: Any, state: Any
     ) -> Any:
-        """Return the flow that is wanted, before the actuator.
+        """Return the wanted flow, before the actuator.
 
         Parameters
         ----------
         network
-            Is asked.
+            The two networks.
         setpoint, residual
             y_d(k) and r(k).
         load
             A(z^-1) r(k), A(1) times the load.
         state
-            The model's output without delay, the one before, and the last flow that passed.
+            The model's undelayed output, the one before it, and the last flow that passed.
         """
         xp, still = self._xp, self._still
         now, before, last = state
         missed = load[:, None] - self._means[:, :_LOADS]
         news, size = missed[:, REFERENCE], abs(still(missed))
-        size = xp.clip(size, None, 4.0 * self._misses[0] + LEAST_NOISE)  # no outliers
+        size = xp.clip(size, None, 4.0 * self._misses[0] + LEAST_NOISE)  # limits outliers
         self._misses = [
             misses + rate * (size - misses)
             for rate, misses in zip(MISS_RATES, self._misses, strict=True)
@@ -188,7 +188,7 @@ class Law:
         means = self._means = self._means + self._rates * (newest - self._means)
         self._news = xp.concatenate([news[:, None], self._news[:, :-1]], axis=1)
 
-        # What is small beside the noise, or large: limited to 1.
+        # Signals relative to the noise, squashed into (-1, 1).
         foreseen = (
             self._shares[:, REFERENCE] * means[:, REFERENCE] + self.prior.fading * residual
         )
@@ -226,16 +226,16 @@ class Law:
         return target + rate / self.prior.unit * (target - now) + added
 
     def applied(self, flow: Any) -> tuple[Any, Any]:
-        """Move flows within the dead zone to its edge or to 0; return them, and what passes."""
+        """Move flows in the dead zone to its edge or 0; return them, also clipped to limits."""
         xp, zone, hard = self._xp, self.prior.dead_zone, self._still(flow)
         edge = zone + CLEARANCE * (zone > 0.0)
         size = abs(hard)
         moved = xp.where(size < edge, edge * xp.sign(hard) * (size >= edge / 2.0), hard)
-        flow = flow + (moved - hard)  # straight through, for the gradient
+        flow = flow + (moved - hard)  # straight-through gradient
         return flow, xp.clip(flow, self.prior.centre - 1.0, self.prior.centre + 1.0)
 
     def _of_each_mean(self, load: Any, residual: Any) -> Any:
-        """Return a column for each mean: those of the load, then those of the residual."""
+        """Return one column per mean: those of the load, then those of the residual."""
         loads = load[:, None] + 0.0 * self._rates[:_LOADS]
         residuals = residual[:, None] + 0.0 * self._rates[_LOADS:]
         return self._xp.concatenate([loads, residuals], axis=1)
@@ -255,7 +255,7 @@ class LawNetwork:
     choosing, adding
         Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
     provenance
-        Where they come from, in a form for JSON.
+        Origin of the networks, JSON-serialisable.
     """
 
     choosing: Sequence[tuple[Array, Array]]
@@ -270,7 +270,7 @@ class LawNetwork:
 
     @classmethod
     def load(cls, path: str | PathLike[str] = PRETRAINED / "nn-smith.npz") -> LawNetwork:
-        """Read networks that `save` has written. Nothing in the file is executed.
+        """Read networks written by `save`. Nothing in the file is executed.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The told network, behind what a bank of models finds out about the plant."""
+"""Combine the told network with a bank of models that identifies the plant."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from agents.self_tuning import SelfTuningController
 
 Array = NDArray[np.float64]
 
-MOST_UNCERTAIN = 0.3  # the network was trained up to this
+MOST_UNCERTAIN = 0.3  # told to the network, which was trained up to 0.4
 
 
 @dataclass(eq=False, kw_only=True)
 class NeuralSelfTuningController(SelfTuningController):
-    """Identifies the plant as a self-tuning controller does, and controls it by a network.
+    """A self-tuning controller whose control law is a trained network.
 
-    The bank of models takes the place of the model that a `NeuralSmithPredictor` is told, and
-    the bank's spread that of the uncertainty. What is found out is taken over at once: the
-    network was trained on models that are wrong, and is told how wrong they may be.
+    The bank of models replaces the model that a `NeuralSmithPredictor` is told, and the spread
+    of the bank replaces the uncertainty. New estimates are adopted at once: the network was
+    trained on models that are wrong, and is told how wrong they may be.
     """
 
     forgetting: Positive = 0.999
@@ -31,8 +31,8 @@ class NeuralSelfTuningController(SelfTuningController):
     """The weights; by default those that come with the project."""
     haste: NotNegative = 0.75
     """How much quicker the law is than the network asks for, see `agents.neural_law.Law`. The
-    network was trained with models that stay as they are; what a model that changes does not
-    explain is sooner out of date. 0 halves the valve travel in noise."""
+    network was trained with fixed models; the residual of a changing model is sooner out of
+    date. 0 halves the valve travel in noise."""
     closed_loop_time_constant: float = field(init=False, default=0.15)
 
     _every, _share, _caution, _noise = 2, 1.0, 1.0, 0.25
@@ -42,17 +42,17 @@ class NeuralSelfTuningController(SelfTuningController):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._half = (self.u_max - self.u_min) / 2.0
-        self._flow = self._half * np.sign(self.gain)  # t/h, of a flow of 1
+        self._flow = self._half * np.sign(self.gain)  # t/h at a flow of 1
         self._reach: Array  # of the bank's model, degC
         self._rule: Law | None = None
 
     def reset(self) -> None:
-        """Forget the episode and what was learnt: the next plant may be another."""
+        """Forget the episode and what was learnt: the next plant may be different."""
         super().reset()
         self._rule = None
 
     def _informed(self, before: Array) -> Law:
-        """Return the law, which knows what the bank has found out."""
+        """Return the law, updated with the bank's estimates."""
         if self._rule is not None and self._samples % self._every:
             return self._rule
         gain = self._sums.sum(1)
@@ -76,7 +76,7 @@ class NeuralSelfTuningController(SelfTuningController):
         return self._rule
 
     def _spread(self, delay: Array) -> Array:
-        """Return how uncertain the bank is, in natural logarithms of the gain."""
+        """Return the bank's uncertainty, as that of the natural logarithm of the gain."""
         by_mode, by_delay = (self._by_model(self._weights).sum(axis) for axis in (1, 2))
         constants = np.log(self._constants)
         constant = (by_mode * constants).sum(1, keepdims=True)
@@ -90,7 +90,7 @@ class NeuralSelfTuningController(SelfTuningController):
             self._outputs[:, ago] - np.einsum("ij,ij->i", self._gains, self._delayed(ago))
             for ago in range(3)
         ]
-        # Models of first order miss what is quick, which is left out.
+        # First-order models miss fast dynamics, which the average of two samples reduces.
         residual, before = (off[0] + off[1]) / 2.0, (off[1] + off[2]) / 2.0
         rule = self._informed(before)
         load = residual - (1.0 - rule.prior.unit) * before

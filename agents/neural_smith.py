@@ -1,4 +1,4 @@
-"""A network behind a told model of the plant, as a Smith predictor has one."""
+"""Implement a trained network that acts on a told model, as a Smith predictor does."""
 
 from __future__ import annotations
 
@@ -15,38 +15,37 @@ from agents.neural_law import Law, LawNetwork, Prior
 Array = NDArray[np.float64]
 
 NOMINAL = 20.62  # samples, the time constant of the paper's plant
-SLOWEST = 45.0  # samples, of the plants that the network was trained on
+SLOWEST = 45.0  # samples, the largest time constant that the network was trained on
 
 
 @dataclass(eq=False, kw_only=True)
 class NeuralSmithPredictor(ToldController):
     """A trained network that is told the plant.
 
-    As in a Smith predictor, a model of the plant runs beside it, and what the model makes of
-    the flow so far is known before the delay is over. The network sees the model's output, what
-    the model does not explain of the measured one, and the told numbers; see
-    `agents.neural_law`. It was trained once, on many plants, and does not learn while it
-    controls. All that it sees is in multiples of what the plant can reach and of samples, so
-    one set of weights serves plants of either sign, of any limits and any sampling interval.
-    For plants with a time constant of more than 90 samples it acts every second sample or less
-    often.
+    As in a Smith predictor, a model runs in parallel with the plant, so the response to past
+    flows is known before the delay is over. The network sees the model's output, the part of
+    the measured output that the model does not explain, and the told numbers; see
+    `agents.neural_law`. It was trained once, on many plants, and does not learn online. All its
+    inputs are scaled by the plant's reach and by the sampling interval, so one set of weights
+    serves plants of either sign, with any limits and any sampling interval. With a first-order
+    model and a time constant of at least 90 samples, it acts every second sample or less often.
     """
 
     coefficients: tuple[Sequence[float], Sequence[float]] | None = None
-    """A and B of the plant, if more than its first order is known: `a[0]` is 1, and `b` begins
-    with z^-1. Their gain is taken for `gain`."""
+    """A and B of the stable plant, if more than a first-order model is known: `a[0]` is 1, and
+    `b` begins with z^-1. Their gain replaces `gain`."""
     uncertainty: NotNegative = 0.0
-    """By how much the gain may be wrong, a standard deviation as a share of it. It stands for
-    the time constant, which may be wrong by half as much again, and for the delay: 0.1 means
-    two samples. 0 where the numbers are exact."""
+    """Standard deviation of the gain, as a share of it; 0 where the numbers are exact. It also
+    stands for the time constant, which may be wrong by half as much again, and for the delay:
+    0.1 means two samples."""
     setpoint_index: Index = 0
-    """Where the observation holds y_d(k), degC."""
+    """Index of y_d(k), degC, in the observation."""
     error_index: Index = 3
-    """Where it holds e(k), degC."""
+    """Index of e(k), degC, in the observation."""
     network: LawNetwork = field(default_factory=LawNetwork.load, repr=False)
     """The weights; by default those that come with the project."""
 
-    observation = PAPER_WINDOWS  # that the default indices are for
+    observation = PAPER_WINDOWS  # for the default indices
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,7 +62,7 @@ class NeuralSmithPredictor(ToldController):
             self._a, self._b = _checked(self.coefficients)
         gain = self._b.sum() / self._a.sum()
         half = (self.u_max - self.u_min) / 2.0
-        self._flow = math.copysign(half, gain)  # t/h, of a flow of 1
+        self._flow = math.copysign(half, gain)  # t/h at a flow of 1
         self._reach = abs(gain) * half
         self._b = self._b / gain
         self._delay = max(round(self._delay_samples / self._every) - 1, 0)
@@ -79,7 +78,7 @@ class NeuralSmithPredictor(ToldController):
         self._law: Law | None = None
 
     def reset(self) -> None:
-        """Forget the episode, and set the model to rest."""
+        """Forget the episode, and return the model to rest."""
         super().reset()
         self._law = None
 
@@ -88,7 +87,7 @@ class NeuralSmithPredictor(ToldController):
         n = len(rows)
         if self._law is None:
             self._law = Law(Prior(**{name: np.full(n, x) for name, x in self._about.items()}))
-            # Of the model without delay, the residual and the flow that passed; newest first.
+            # Undelayed outputs of the model, residuals and flows that passed; newest first.
             self._model = np.zeros((self._delay + len(self._a) + 1, n))
             self._residual = np.zeros((len(self._a), n))
             self._flows = np.zeros((len(self._b), n))
@@ -106,7 +105,7 @@ class NeuralSmithPredictor(ToldController):
         model, residual, flows = self._model, self._residual, self._flows
         residual[1:] = residual[:-1].copy()
         off = output - model[self._delay]
-        # Models of first order miss what is quick, which is left out.
+        # First-order models miss fast dynamics, which the average of two samples reduces.
         residual[0] = (off + self._off) / 2.0 if self._is_first_order else off
         self._off = off
         state = model[0], model[1], flows[0]
@@ -122,7 +121,7 @@ class NeuralSmithPredictor(ToldController):
 
 
 def _checked(coefficients: tuple[Sequence[float], Sequence[float]]) -> tuple[Array, Array]:
-    """Return A and B if they are of a stable plant with a gain."""
+    """Return A and B if they describe a stable plant with a gain other than 0."""
     a, b = (np.array(each, dtype=np.float64) for each in coefficients)
     stable = a.ndim == b.ndim == 1 and len(a) and a[0] == 1.0 and np.isfinite([*a, *b]).all()
     if not (stable and np.all(np.abs(np.roots(a)) < 1.0) and b.sum() != 0.0):

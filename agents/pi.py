@@ -1,4 +1,4 @@
-"""PI controllers: the one that the paper compares with (Section 5), and better ones."""
+"""Implement PI controllers: the paper's baseline (Section 5) and better-tuned ones."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ SEARCHED_GAINS = {"kp": 1.34, "ki": 0.0456}
 
 @dataclass(eq=False)
 class PIController(Controller):
-    """u(k) = -Kp e(k) - Ki sum_{i<=k} e(i), as printed in Section 5.
+    """PI controller u(k) = -Kp e(k) - Ki sum_{i<=k} e(i), as printed in Section 5.
 
-    The signs are those of a plant whose output falls when its input rises, D(G) = -1. For a
-    plant of the other direction both gains are below zero.
+    The signs suit a plant whose output falls when its input rises, D(G) = -1. For a plant of
+    the opposite direction, both gains are negative.
     """
 
     kp: Number = 2.2
-    """Kp, t/h per degC."""
+    """Proportional gain Kp, t/h per degC."""
     ki: Number = 0.3
-    """Ki, t/h per degC and sample."""
+    """Integral gain Ki, t/h per degC and sample."""
     _: KW_ONLY
     anti_windup: Flag = False
-    """Whether the sum stands still while the command lies beyond a limit and the error would
-    drive it further (conditional integration; Astrom and Hagglund, "PID Controllers", 2nd
-    edition, 1995, section 3.5). The paper's goes on."""
+    """Whether to hold the sum while the command is beyond a limit and the error would drive it
+    further (conditional integration; Astrom and Hagglund, "PID Controllers", 2nd edition, 1995,
+    section 3.5). The paper's controller always integrates."""
     error_index: Index = 3
-    """Where the observation holds e(k), degC."""
+    """Index of e(k), degC, in the observation."""
 
-    observation = PAPER_WINDOWS  # that the default indices are for
+    observation = PAPER_WINDOWS  # for the default indices
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,7 +61,7 @@ class PIController(Controller):
         sampling_interval: float = 8.0,
         **arguments: Any,
     ) -> PIController:
-        """Return a controller tuned by SIMC's rule, with anti-windup.
+        """Return a controller tuned by the SIMC rule, with anti-windup.
 
         S. Skogestad, "Simple analytic rules for model reduction and PID controller tuning",
         Journal of Process Control 13, 2003, 291-309, equations (23) and (24).
@@ -69,13 +69,13 @@ class PIController(Controller):
         Parameters
         ----------
         gain, time_constant, delay
-            k, tau_1 and theta of the plant: degC per t/h, of either sign, s and s.
+            k, tau_1 and theta of the plant: degC per t/h (of either sign), s and s.
         closed_loop_time_constant
             tau_c, s; by default the delay, "tight control with good robustness".
         sampling_interval
-            s.
+            Sampling interval, s.
         arguments
-            Of the controller.
+            Other arguments of the controller.
 
         Raises
         ------
@@ -100,12 +100,12 @@ class PIController(Controller):
         self._sum = None
 
     def transfer(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the transfer function from e to u while no limit is met.
+        """Return the transfer function from e to u, valid between the limits.
 
         Returns
         -------
         numerator, denominator
-            Coefficients of z^0, z^-1 and so on. Kp e + Ki e / (1 - z^-1), with the sign of u.
+            Coefficients of z^0, z^-1 and so on, of -Kp - Ki / (1 - z^-1).
         """
         numerator = np.array([-(self.kp + self.ki), self.kp])
         return numerator, np.array([1.0, -1.0])

@@ -1,4 +1,4 @@
-"""A trained feed-forward policy, run in NumPy alone."""
+"""Run a trained feed-forward policy in NumPy alone."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from agents.controller import (
 Array = NDArray[np.float64]
 
 WINDOWS: Final = ("setpoint_window", "error_window", "output_window", "action_window")
-_FORMAT = 1  # of the file
+_FORMAT = 1  # version of the file format
 
 
 ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
@@ -37,15 +37,15 @@ ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
 
 @dataclass(frozen=True)
 class Increments:
-    """Velocity form: the network's output changes the valve's position, which is kept here."""
+    """Velocity form: the network's output changes the valve's position."""
 
     max_move: float
-    """By how much an output of 1 changes the position in one sample. Positions reach from -1 to
-    1, as actions do."""
+    """Change of the position per sample at an output of 1. Positions range from -1 to 1, as
+    actions do."""
     dead_zone: float = 0.0
-    """t/h. If it is above 0, positions are spread over the flows outside the dead zone: just
-    above 0 stands for its upper edge and just below 0 for its lower one. If it is 0, a position
-    is an action."""
+    """Half width of the dead zone to skip, t/h. If it is above 0, positions are spread over the
+    flows outside the dead zone: just above 0 is its upper edge, just below 0 its lower one. If
+    it is 0, a position is an action."""
 
     def __post_init__(self) -> None:
         check_number("max_move", self.max_move, 0)
@@ -56,26 +56,26 @@ class Increments:
 class PolicyNetwork(Controller):
     """A feed-forward network from the latest observation to an action.
 
-    The observation is multiplied by `input_scale` and goes through the layers. The activation
-    follows each of them but the last, which gives one number, limited to [-1, 1]. It is the
-    action, or with `increments` the velocity of the valve. All is computed in float64.
+    The observation is multiplied by `input_scale` and passed through the layers. The activation
+    follows every layer but the last, whose single output is clipped to [-1, 1]. This output is
+    the action or, with `increments`, the velocity of the valve. All arithmetic is in float64.
     """
 
     layers: Sequence[tuple[Array, Array]] = field(repr=False)
     """Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer."""
     _: KW_ONLY
     observation: Mapping[str, int]
-    """The windows of the observation that the network wants, by the names of the environment's
-    arguments: `setpoint_window`, `error_window`, `output_window`, `action_window`. A window
-    that is not named is 0."""
+    """The windows of the observation that the network expects, by the names of the
+    environment's arguments: `setpoint_window`, `error_window`, `output_window`,
+    `action_window`. A window that is not named is 0."""
     input_scale: Array = field(repr=False)
-    """Factor of each element of the observation; shape (n_obs,)."""
+    """Factor for each element of the observation; shape (n_obs,)."""
     activation: str = "elu"
-    """"elu", "relu" or "tanh"."""
+    """Activation of the hidden layers: "elu", "relu" or "tanh"."""
     increments: Increments | None = None
-    """The velocity form, if the network was trained in it."""
+    """The velocity form, if the network was trained in it; otherwise None."""
     provenance: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    """Where the weights come from; whatever JSON can hold."""
+    """Origin of the weights, JSON-serialisable."""
 
     _advice = "; the environment needs the network's `observation` as arguments"
 
@@ -108,7 +108,7 @@ class PolicyNetwork(Controller):
     def load(
         cls, path: str | PathLike[str], *, u_min: float = -10.0, u_max: float = 10.0
     ) -> PolicyNetwork:
-        """Read a network that `save` has written. Nothing in the file is executed.
+        """Read a network written by `save`. Nothing in the file is executed.
 
         Raises
         ------
@@ -116,9 +116,9 @@ class PolicyNetwork(Controller):
             If there is no such file.
         ValueError
             If the file is damaged or does not hold a network, or if the limits are not finite
-            or not in order.
+            and in order.
         """
-        check_limits(u_min, u_max)  # here, so that they are not taken for damage to the file
+        check_limits(u_min, u_max)  # here: `reading` would report a damaged file
         with reading(path, "policy network") as file:
             about = json.loads(str(file["about"]))
             if about["format"] != _FORMAT:
@@ -152,7 +152,7 @@ class PolicyNetwork(Controller):
             np.savez_compressed(file, **arrays)
 
     def reset(self) -> None:
-        """Forget the episode: in velocity form, the valve's position."""
+        """Forget the episode, which is the valve's position in velocity form."""
         super().reset()
         self._position = None
 

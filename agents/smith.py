@@ -1,4 +1,4 @@
-"""A Smith predictor: a PI controller that reckons with what is still on its way."""
+"""Implement a Smith predictor: a PI controller that accounts for inputs in transit."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ Array = NDArray[np.float64]
 
 @dataclass(eq=False, kw_only=True)
 class SmithPredictor(ToldController, PIController):
-    """A PI controller on the error that a model of the plant, without its delay, foresees.
+    """A PI controller on the error that an undelayed model of the plant predicts.
 
-    The model is of first order with a delay. It runs beside the plant. Its output without the
-    delay less its output with it is the effect of the inputs that are still in transit. The
-    controller acts on the error less this effect. So far as the model is right, it acts as if
-    there were no delay (O. J. M. Smith, "Closer control of loops with dead time", Chemical
-    Engineering Progress 53, 1957, 217-219).
-    Its gains are SIMC's for the plant without delay; it has anti-windup. To the model the
-    command stays within the limits.
+    A first-order model with a delay runs in parallel with the plant. Its undelayed output minus
+    its delayed output is the effect of the inputs that are still in transit. The controller
+    acts on the error minus this effect. As far as the model is right, it acts as if there were
+    no delay (O. J. M. Smith, "Closer control of loops with dead time", Chemical Engineering
+    Progress 53, 1957, 217-219).
+    The gains are SIMC's for the plant without delay, with anti-windup. The model sees the
+    command as the actuator passes it, after the dead zone and the limits.
     """
 
     closed_loop_time_constant: Positive
-    """Of the loop without the delay, s."""
+    """Time constant of the closed loop without the delay, s."""
     kp: Number = field(init=False)
     ki: Number = field(init=False)
     anti_windup: Flag = field(init=False, default=True)
@@ -48,25 +48,25 @@ class SmithPredictor(ToldController, PIController):
         self._pole = math.exp(-self.sampling_interval / self.time_constant)
         self._input_gain = self.gain * (1.0 - self._pole)
         self._delay = max(round(self._delay_samples), 1)
-        self._model: list[Values] = []  # its last outputs without delay, newest last
+        self._model: list[Values] = []  # its last undelayed outputs, newest last
 
     def reset(self) -> None:
-        """Set the integral to zero, and the model to rest."""
+        """Set the integral to zero, and return the model to rest."""
         super().reset()
         self._model = []
 
     def transfer(self) -> tuple[Array, Array]:
-        """Return the transfer function from e to u while no limit and no dead zone is met.
+        """Return the transfer function from e to u, valid away from limits and dead zone.
 
         Returns
         -------
         numerator, denominator
-            Coefficients of z^0, z^-1 and so on: those of the PI controller with the model, with
-            and without its delay, fed back around it.
+            Coefficients of z^0, z^-1 and so on, of the PI controller with the undelayed minus
+            the delayed model fed back around it.
         """
         pi, integral = super().transfer()
         model = np.array([0.0, self._input_gain]), np.array([1.0, -self._pole])
-        ahead = np.zeros(self._delay)  # 1 - z^-(delay - 1): what is on its way
+        ahead = np.zeros(self._delay)  # 1 - z^-(delay - 1): inputs in transit
         ahead[0] += 1.0
         ahead[-1] -= 1.0
         outgoing = np.convolve(integral, model[1])
