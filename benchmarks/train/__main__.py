@@ -1,4 +1,4 @@
-"""Train the networks that control: `python -m benchmarks.train --help`."""
+"""Train the neural controllers: `python -m benchmarks.train --help`."""
 
 from benchmarks.lib.commands import command
 

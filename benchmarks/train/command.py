@@ -1,4 +1,4 @@
-"""Train as the options say, and put the networks where they are kept."""
+"""Train networks as the options say, and save them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from benchmarks.train import kept, ppo
 from benchmarks.train.options import Options
 from benchmarks.train.through_plant import KINDS, Training, train, training_key
 
-# Networks that are put where they are kept, by file; what is shown of all; and what is said.
+# Networks to save, by file name; a table row per trained network; and the closing message.
 Made = tuple[Mapping[str, LawNetwork | PolicyNetwork], list[dict[str, Any]], str]
 
 
 def execute(options: Options, console: Console) -> str:
-    """Train, and say how the networks do in validation."""
+    """Train networks, save them and show their results in validation."""
     out = command_line.out_folder(options.out)
     target = PRETRAINED if options.keep else out
     networks, rows, said = (_ppo if options.network == "ppo" else _told)(options, out)
@@ -47,9 +47,9 @@ def trained(
     retrain: bool = False,
     here: bool = True,
 ) -> list[LawNetwork]:
-    """Train side by side what `out` does not hold yet, and return the networks.
+    """Train in parallel the networks that `out` does not hold yet, and return all of them.
 
-    Where `out` is at hand, `here`, it also keeps how far a training got.
+    If the trainings run `here`, with access to `out`, it also holds their progress.
     """
     runs = {}
     for each in trainings:
@@ -66,9 +66,9 @@ def trained(
 
 
 def _told(options: Options, out: Path) -> Made:
-    """Train told networks, of which validation chooses one.
+    """Train told networks, and choose one by validation.
 
-    What is shown are geometric means of |e|, as shares of the reach.
+    The rows show geometric means of |e|, as shares of the reach.
     """
     first = Training()
     first = replace(first, steps=options.steps or first.steps)
@@ -92,7 +92,7 @@ def _told(options: Options, out: Path) -> Made:
 
 
 def _ppo(options: Options, out: Path) -> Made:
-    """Train PPO's policies, all of which are compared."""
+    """Train PPO policies, and save all of them."""
     asked = ppo.PolicyRequest(
         options.fan_out.open(), out, options.steps, options.networks, options.retrain
     )

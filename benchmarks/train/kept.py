@@ -1,4 +1,4 @@
-"""Runs trainings side by side, and keeps what each has made as soon as it is finished."""
+"""Run trainings in parallel, and save each network as soon as it is finished."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ def trained(
     *,
     retrain: bool = False,
 ) -> dict[Path, Network]:
-    """Return what trainings have made, by the files that keep it.
+    """Return trained networks by file, and train those whose file is missing.
 
-    Trainings run where their file is missing, or all of them to `retrain`: in other processes,
-    on a cluster on other machines. Files are written here.
+    `retrain` trains all of them. Trainings run in other processes or, on a cluster, on other
+    machines; this process writes the files.
 
     Raises
     ------
     TasksFailedError
-        At the end, if some failed; the others are kept.
+        At the end, if some trainings failed; the other networks are saved.
     ValueError
-        If a file is damaged; the message names it, and what to do.
+        If a file is damaged; the message names it and says what to do.
     """
     missing = {
         str(file): run for file, run in trainings.items() if retrain or not file.exists()

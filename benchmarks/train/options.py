@@ -14,20 +14,20 @@ OUT = Path("results/networks")
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Train the networks that control: by the gradient through the plant, or by PPO.
+    """Train the neural controllers: by the gradient through the plant, or by PPO.
 
-    What is finished is kept: the same command trains what is missing.
+    Finished networks are kept: the same command, run again, trains only the missing ones.
     """
 
     network: Annotated[str, choice(("nn-smith", "ppo"), "What to train")] = field(kw_only=False)
     networks: Count | None = None
-    """How many to train, each from a seed of its own (default: 1 of nn-smith, of which
-    validation would choose one, and 5 of PPO, all of which are compared)."""
+    """Number of networks to train, each from its own seed (default: 1 for nn-smith, where
+    validation chooses the best of several; 5 for PPO, which are all compared)."""
     steps: Count | None = None
-    """Steps of the optimiser, for PPO samples of experience (default: as published)."""
+    """Optimiser steps or, for PPO, samples of experience (default: as published)."""
     retrain: bool = False
-    """Train even what is finished."""
+    """Train finished networks again."""
     keep: bool = False
-    """Put the result into agents/pretrained."""
+    """Save the result to agents/pretrained."""
     out: Folder = OUT
     fan_out: FanOutOptions = field(default_factory=FanOutOptions)

@@ -1,8 +1,8 @@
-"""PPO of Stable-Baselines3: how it is trained, and where its policies are kept.
+"""Train PPO of Stable-Baselines3, or load the policies that are trained already.
 
-The policy controls in velocity form: its action changes the flow, and so it can hold it. When
-it is trained it is a `PolicyNetwork`, which needs NumPy alone: PyTorch is imported for training
-only.
+The policy controls in velocity form: its action changes the flow, so it can also hold it. A
+trained policy is a `PolicyNetwork`, which needs NumPy alone; PyTorch is imported only for
+training.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from benchmarks.train import kept
 from benchmarks.train.ppo_arguments import PPOArguments
 
 KEPT = Path("results/policies")
-POLICIES = 5  # are trained and compared, from seeds in sequence
-TUNING_SEED, FINAL_SEED = 1000, 2000  # of policies in a search, others than a comparison uses
+POLICIES = 5  # that are trained and compared, from consecutive seeds
+TUNING_SEED, FINAL_SEED = 1000, 2000  # of policies in a search; no comparison uses them
 
 
 @dataclass(frozen=True)
 class PolicyRequest:
-    """Which trained policies are wanted, and how those that are missing are to be trained."""
+    """A request for trained policies, and how to train those that are missing."""
 
     fan_out: FanOut = field(default_factory=lambda: FanOut(1))
     """Runs the trainings."""
     folder: Path = KEPT
-    """Where trained policies are kept."""
+    """Folder of the trained policies."""
     steps: int | None = None
-    """Samples of experience; None for as many as the training has by default."""
+    """Samples of experience; None for the default of the training."""
     policies: int | None = None
-    """How many policies, which differ in their seeds; None for the default."""
+    """Number of policies, which differ in their seeds; None for the default."""
     retrain: bool = False
-    """Whether to train even where a finished policy is at hand."""
+    """Whether to train finished policies again."""
 
 
 def members(
@@ -45,21 +45,21 @@ def members(
 ) -> dict[Path, PolicyNetwork]:
     """Return policies that differ in their seeds, by file, and train those that are missing.
 
-    Policies that were trained here are taken first, then those that come with the project.
+    Policies in the request's folder take precedence over those that come with the project.
 
     Parameters
     ----------
     request
-        Where they are kept, how many there are, and what trains them.
+        Number of policies, their folder, and what trains them.
     arguments
-        How to train the first; the seeds of the others follow.
+        Arguments of the first policy; the others take the seeds that follow.
     shipped
-        Whether those that come with the project will do.
+        Whether to accept policies that come with the project.
 
     Raises
     ------
     ValueError
-        If a file is damaged; the message names it, and what to do.
+        If a file is damaged; the message names it and says what to do.
     """
     first = arguments or PPOArguments()
     first = replace(first, steps=request.steps or first.steps)
@@ -81,17 +81,17 @@ def train(arguments: PPOArguments) -> PolicyNetwork:
 
 
 def file_name(seed: int) -> str:
-    """Return the name of the policy of this seed, among those that come with the project."""
+    """Return the file name of a seed's policy among those that come with the project."""
     return f"ppo-{seed}.npz"
 
 
 def policy_key(arguments: PPOArguments) -> str:
-    """Return a name made of everything that shapes a policy."""
+    """Return a fingerprint of everything that shapes a policy."""
     return fingerprint(__name__, arguments=asdict(arguments))
 
 
 def _comes(arguments: PPOArguments) -> bool:
-    """Say whether a policy that was trained like this comes with the project."""
+    """Return whether a policy trained with these arguments comes with the project."""
     file = PRETRAINED / file_name(arguments.seed)
     asked = json.loads(json.dumps(asdict(arguments)))
     return file.exists() and bool(PolicyNetwork.load(file).provenance["arguments"] == asked)

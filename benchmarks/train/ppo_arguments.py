@@ -1,4 +1,4 @@
-"""Everything that shapes a policy of PPO: its settings, and the plants it is trained on."""
+"""Declare everything that shapes a PPO policy: its settings and its training plants."""
 
 from __future__ import annotations
 
@@ -15,58 +15,58 @@ class PPOArguments:
     """Everything that shapes a policy, except versions and code."""
 
     seed: int = 10_000
-    """Of the initial policy, the exploration, and what the plants meet in training."""
+    """Seed of the initial policy, the exploration, and the training episodes."""
     steps: int = 1_196_032
-    """Samples of experience, all plants together."""
+    """Samples of experience, summed over all plants."""
     starts: int = 4
-    """How often to begin anew, with other initial weights and an equal share of the samples.
-    Validation chooses the best of all: many a training ends with an offset, and more samples do
-    not mend that."""
+    """Number of starts, each with new initial weights and an equal share of the samples.
+    Validation chooses the best policy of all: many trainings end with an offset, and more
+    samples do not remove it."""
     max_move: float = 1.0
-    """How far an action of 1 moves the flow, as a share of half its range."""
+    """Change of the flow at an action of 1, as a share of half its range."""
     undo_dead_zone: float = DEAD_ZONE
-    """The dead zone that is undone on the way from the policy to the plant, t/h. A comparison
-    takes that of the plant that is run."""
+    """Half width of the dead zone that is undone between policy and plant, t/h. A comparison
+    uses that of the plant it runs."""
     noise_variance: float = 0.5
-    """R of the plants trained on, degC^2. A policy trained with noise steers less nervously,
-    and does better with another dead zone than one trained on that plant."""
+    """R of the noisy training plants, degC^2. A policy trained with noise acts less nervously,
+    and does better on a different dead zone than a policy trained with that one."""
     calm: float = 0.75
-    """Share of the plants that have no noise. In noise, small offsets hardly cost anything."""
+    """Share of the plants without noise. In noise, small offsets cost hardly anything."""
     plant: dict[str, Any] = field(default_factory=dict)
-    """Arguments of the environment trained on, where it is not the nominal plant."""
+    """Arguments of the training environment that differ from the nominal plant's."""
     setpoint_amplitude: float = 6.0
-    """Random set points are uniform within this, degC."""
+    """Random set points are uniform between plus and minus this amplitude, degC."""
     reward: str = "absolute"
-    """The environment's; "absolute" is what the comparison measures."""
+    """Reward of the environment; "absolute" is what the comparison measures."""
     error_scale: float = 50.0
-    """The environment's, degC. It makes returns about 1 in size, which a value function learns
-    much sooner than large ones."""
+    """Error scale of the environment, degC. It brings returns to a size of about 1, which a
+    value function learns much sooner than large ones."""
     error_window: int = 3
     """Errors in the observation."""
     action_window: int = DELAY + 3
-    """Past actions in the observation, the differences of which are the past moves; with
-    delay + 2 moves the noise-free problem is Markov."""
+    """Past actions in the observation, whose differences are the past moves. With delay + 2
+    moves, the noise-free problem is Markov."""
     n_envs: int = 64
-    """Plants that are stepped at once."""
+    """Plants that are stepped in parallel."""
     n_steps: int = 64
-    """Samples of each plant between two updates."""
+    """Samples per plant between updates."""
     batch_size: int = 1024
-    """Samples of a gradient step."""
+    """Samples per gradient step."""
     n_epochs: int = 5
-    """How often an update goes through its samples."""
+    """Passes over the samples per update."""
     learning_rate: float = 2e-3
-    """At the start; it falls linearly, to a twentieth."""
+    """Initial learning rate; it falls linearly to a twentieth."""
     gamma: float = 0.95
-    """Discount a sample."""
+    """Discount factor per sample."""
     gae_lambda: float = 1.0
-    """Below 1, advantages lean on the value function, also for what the delay still hides."""
+    """GAE's lambda; below 1, advantages rely on values, even for effects still in transit."""
     clip_range: float = 0.2
-    """How far an update may move the probability of an action."""
+    """How far an update may move the probability ratio of an action from 1."""
     log_std: tuple[float, float] = (-1.0, -3.0)
-    """Logarithm of the standard deviation of the action, at first and at last. Left to itself
-    it stays high, and a mean that is right with the exploration is wrong without it."""
+    """Logarithm of the action's standard deviation, at the start and at the end. If learnt, it
+    stays high, and a mean that is right with the exploration is wrong without it."""
     hidden: tuple[int, ...] = (64, 64)
-    """Nodes of the hidden layers, of policy and value function alike."""
+    """Nodes of the hidden layers, in both the policy and the value function."""
 
     @property
     def observation(self) -> dict[str, Any]:
@@ -75,7 +75,7 @@ class PPOArguments:
 
     @property
     def training(self) -> dict[str, Any]:
-        """Arguments of the environment trained on."""
+        """Arguments of the training environment."""
         return {
             **self.observation,
             **self.plant,
@@ -88,7 +88,7 @@ class PPOArguments:
 
     @property
     def plants(self) -> list[tuple[int, dict[str, Any]]]:
-        """How many plants to train on, and their arguments: the noisy ones, then the calm."""
+        """Numbers of training plants and their arguments: noisy plants, then calm ones."""
         calm = round(self.calm * self.n_envs)
         groups = [
             (self.n_envs - calm, self.training),
@@ -97,7 +97,7 @@ class PPOArguments:
         return [(count, arguments) for count, arguments in groups if count]
 
 
-# What makes a policy one for many plants, those of a random design.
+# Arguments that make one policy serve many plants, those of a random design.
 RANDOMISED: dict[str, Any] = {
     "plant": {name: list(span) for name, span in SPANS.items() if name != "noise_variance"},
     "action_window": 39,

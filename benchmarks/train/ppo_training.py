@@ -1,4 +1,4 @@
-"""Trains PPO of Stable-Baselines3 to control the plant."""
+"""Train PPO of Stable-Baselines3 to control the plant."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from mptc_gym.wrappers.vector import IncrementalAction
 
 VALIDATION_INTERVAL = 32_768  # samples of experience
 VALIDATION_RUNS = 16
-VALIDATION_SEED = 2_000_000  # met neither in training nor by any comparison
-VALIDATION_DEAD_ZONE = 6.5  # t/h, one that no comparison has
-# Set points that no comparison has, and that can be held with either dead zone: smaller ones
-# need a flow within it. A policy is often worse at them at the end than it was before.
+VALIDATION_SEED = 2_000_000  # used neither in training nor in any comparison
+VALIDATION_DEAD_ZONE = 6.5  # t/h, used in no comparison
+# Set points that no comparison uses and that can be held with either dead zone: smaller ones
+# need a flow within it. At the end of training, a policy is often worse at them than before.
 HELD = [level for level in (4.8, -5.6, 5.3, -4.7, 5.8, -5.1) for _ in range(150)]
-PROBE = SCENARIOS["square"]  # shown in the learning curve, without a part in the training
-PROBE_SEED = 1_000_000  # met by no comparison
-TRAINING_SEEDS = 1 << 32  # and above: what the plants meet in training, and nothing else does
+PROBE = SCENARIOS["square"]  # shown in the learning curve, without effect on the training
+PROBE_SEED = 1_000_000  # used in no comparison
+TRAINING_SEEDS = 1 << 32  # seeds from here on are those of the training plants alone
 
 
 def train(arguments: PPOArguments) -> PolicyNetwork:
     """Train, and return the policy that did best in validation.
 
-    Validation is on set points that are met neither in training nor in a comparison. The
-    policy's provenance holds the arguments and the learning curve.
+    Validation uses set points that occur neither in training nor in a comparison. The policy's
+    provenance holds the arguments and the learning curve.
     """
     keeper = Keeper(arguments)
     for start in range(arguments.starts):
@@ -59,11 +59,11 @@ def train(arguments: PPOArguments) -> PolicyNetwork:
 
 
 def features(parameters: Parameters) -> NDArray[np.float64]:
-    """Return what turns an observation into the inputs of the networks.
+    """Return the matrix that turns an observation into the inputs of the networks.
 
-    They are the error, how set point and error change, the flow and the past moves: what
-    holds the flow is that nothing changes. Factors bring each to about 1. The result has the
-    shape (inputs, observation_size).
+    The inputs are the error, the set point, the flow and their past changes: the flow is to be
+    held when nothing changes. Factors bring each input to about 1. The matrix has the shape
+    (inputs, observation_size).
     """
     size, (error, _, action) = parameters.observation_size, parameters.heads
     one = np.eye(size)
@@ -75,7 +75,7 @@ def features(parameters: Parameters) -> NDArray[np.float64]:
 
 
 class FixedFeatures(BaseFeaturesExtractor):
-    """Multiplies observations with a matrix of `features`: the same in training and in use."""
+    """Multiply observations by a matrix from `features`, the same in training and in use."""
 
     matrix: torch.Tensor
 
@@ -91,7 +91,7 @@ class FixedFeatures(BaseFeaturesExtractor):
 
 
 def begin(arguments: PPOArguments, start: int = 0) -> PPO:
-    """Return a model that has learnt nothing yet; what is random depends on the start, too."""
+    """Return an untrained model; its random numbers depend on the seed and the start."""
     torch.set_num_threads(1)  # the networks are too small for more
     plants = GymnasiumVecEnv(
         *(
@@ -109,7 +109,7 @@ def begin(arguments: PPOArguments, start: int = 0) -> PPO:
     model = PPO(
         "MlpPolicy",
         plants,
-        # The last update comes when no progress remains; it is not to be in vain.
+        # At the last update nothing remains; the lower bound lets it have an effect.
         learning_rate=lambda remaining: arguments.learning_rate * max(remaining, 0.05),
         n_steps=arguments.n_steps,
         batch_size=arguments.batch_size,
@@ -125,8 +125,8 @@ def begin(arguments: PPOArguments, start: int = 0) -> PPO:
         seed=model_seed,
         device="cpu",
     )
-    # Without biases the mean is an odd function, as the plant is the same upside down: what is
-    # learnt at +5 degC is known at -5 degC.
+    # Without biases the mean is an odd function, which suits a symmetric plant: what is learnt
+    # at +5 degC also holds at -5 degC.
     for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net):
         if isinstance(layer, nn.Linear):
             nn.init.zeros_(layer.bias)
@@ -136,8 +136,8 @@ def begin(arguments: PPOArguments, start: int = 0) -> PPO:
 
 
 def exported(state: Mapping[str, torch.Tensor], arguments: PPOArguments) -> PolicyNetwork:
-    """Return the mean of a policy, given by its state in PyTorch, in NumPy alone."""
-    # Stable-Baselines3 has an activation after each hidden layer, which counts as one, too.
+    """Return the mean of a policy as a network in NumPy, given its state in PyTorch."""
+    # Stable-Baselines3 also counts the activation after each hidden layer as a layer.
     names = [f"mlp_extractor.policy_net.{2 * i}" for i in range(len(arguments.hidden))]
     (first, bias), *others = [
         (state[f"{name}.weight"].double().numpy(), state[f"{name}.bias"].double().numpy())
@@ -155,21 +155,21 @@ def exported(state: Mapping[str, torch.Tensor], arguments: PPOArguments) -> Poli
 
 
 class Keeper(BaseCallback):
-    """Lets the exploration fall, and records how far a training gets, start after start."""
+    """Reduce the exploration over each start, and record the progress of the training."""
 
     def __init__(self, arguments: PPOArguments) -> None:
         super().__init__()
-        self.share = arguments.steps // arguments.starts  # samples of a start
-        self.curve: list[dict[str, float]] = []  # the learning curve, a row a point
+        self.share = arguments.steps // arguments.starts  # samples per start
+        self.curve: list[dict[str, float]] = []  # the learning curve, one row per point
         self.best: dict[str, torch.Tensor] = {}  # parameters that did best in validation
         self._arguments = arguments
         self._errors: list[float] = []
-        self._before = -self.share  # samples of the starts before this one
+        self._before = -self.share  # samples of the earlier starts
         self._began = time.process_time()
 
     def _on_training_start(self) -> None:
         self._before += self.share
-        self._recorded = 0  # when, in samples of this start
+        self._recorded = 0  # samples of this start at the last record
 
     def _on_training_end(self) -> None:
         self.record()
@@ -200,7 +200,7 @@ class Keeper(BaseCallback):
         ]
         point = {
             "steps": self._before + self.num_timesteps,
-            "seconds": time.process_time() - self._began,  # of the processor
+            "seconds": time.process_time() - self._began,  # of CPU time
             "training_mae": float(np.mean(self._errors)),
             "validation_mae": float(np.mean(errors)),
             "square_mae": self._mae(square, 1, PROBE.samples, PROBE_SEED),

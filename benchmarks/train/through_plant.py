@@ -1,10 +1,10 @@
-"""Trains the network of `nn-smith` by the gradient through plants of all kinds.
+"""Train the network of `nn-smith` by the gradient through plants of all kinds.
 
-A batch of simulated plants is run under the network, each behind a model that is told its
-numbers, and the error of the whole run is differentiated with respect to the weights, back
-through law, actuator and plant. The literature calls it differentiable predictive control (J.
-Drgona et al., "Differentiable predictive control: deep learning alternative to explicit model
-predictive control for unknown nonlinear systems", Journal of Process Control 116, 2022, 80-92).
+The network controls a batch of simulated plants, each with a model that is told its numbers.
+The error of the whole run is differentiated with respect to the weights, back through plant,
+actuator and law. The literature calls this differentiable predictive control (J. Drgona et al.,
+"Differentiable predictive control: deep learning alternative to explicit model predictive
+control for unknown nonlinear systems", Journal of Process Control 116, 2022, 80-92).
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ NOMINAL = Parameters(time_constant_factor=[0.2, 5.0])  # a range, so that it can
 DYNAMICS = Dynamics(NOMINAL)
 GAIN = abs(sum(NOMINAL.b) / sum(NOMINAL.a))  # degC per t/h
 RATE = 1.0 - float(np.abs(np.roots(NOMINAL.a)).max())  # of the dominant pole
-LONGEST, BLOCK = 44, 4  # samples: the longest delay that is told, the shortest
+LONGEST, BLOCK = 44, 4  # samples: told delays lie from BLOCK to LONGEST - BLOCK
 VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED = 64, 600, 3_000_000
-SAVED_EVERY = 50  # steps of a training of minutes
-# Of plants in validation, and what is drawn for them: from, to, and the power of `small`.
+SAVED_EVERY = 50  # steps; a training takes minutes
+# Kinds of validation plants, with the ranges drawn from: low, high, and the power of `small`.
 KINDS: dict[str, dict[str, tuple[float, float, int]]] = {
     "calm": {},
     "noise": {"noise_variance": (0.1, 1.0, 2)},
@@ -60,29 +60,29 @@ class Training:
     """Everything that shapes the network, except versions and code."""
 
     seed: int = 10_000
-    """Of the initial weights, and of all that the plants meet."""
+    """Seed of the initial weights, the plants and their episodes."""
     steps: int = 600
-    """Of the optimiser."""
+    """Steps of the optimiser."""
     plants: int = 256
-    """Of a step."""
+    """Plants per step."""
     samples: int = 300
-    """That a step looks back on."""
+    """Samples that a step runs and differentiates through."""
     stretches: int = 4
-    """Steps that go on with the same plants, before there are new ones."""
+    """Steps on the same plants before new ones are drawn."""
     choosing: int = 64
-    """Nodes of each hidden layer of the network that chooses."""
+    """Nodes of each hidden layer in the network that chooses."""
     adding: int = 24
-    """The same of the one that adds to the flow."""
+    """Nodes of each hidden layer in the network that adds to the flow."""
     learning_rate: float = 2e-3
-    """Of Adam at the start; it falls linearly, to a hundredth."""
+    """Initial learning rate of Adam; it falls linearly to a hundredth."""
     move_price: float = 0.007
-    """Of what the flow travels a sample, half the range, in multiples of the reach."""
+    """Price of valve travel by half the range per sample, as a multiple of the reach."""
     tolerance: float = 0.003
-    """Below this error, a share of the reach, the loss is quadratic (Huber)."""
+    """Error below which the loss is quadratic (Huber), as a share of the reach."""
     spread: float = 0.4
-    """The largest uncertainty of what is told."""
+    """Largest uncertainty of the told numbers."""
     averaging: float = 0.98
-    """What is kept is the exponential mean of the weights of past steps."""
+    """Factor of the exponential mean of the weights over past steps; the mean is kept."""
 
 
 class Net(nn.Module):
@@ -105,7 +105,7 @@ class Net(nn.Module):
                 last.bias.zero_()
 
     def forward(self, seen: Tensor, at_rest: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the law asks for; see `agents.neural_law.Network`."""
+        """Return the outputs and the addition; see `agents.neural_law.Network`."""
         added = torch.tanh(self.adding(torch.cat([seen, at_rest])))[:, 0]
         n = len(seen)
         return self.choosing(seen), MOST_ADDED * (added[:n] - added[n:])
@@ -124,17 +124,17 @@ class Net(nn.Module):
 
 
 class Draw:
-    """Draws what a batch of plants is, what it meets, and what is told of it."""
+    """Random draws of a batch of plants, their set points and their told numbers."""
 
     def __init__(self, training: Training, n: int, samples: int, *seed: int) -> None:
         self._n, self._samples, self._spread = n, samples, training.spread
         self._generator = torch.Generator()
-        # Hashed, so that the draws of neighbouring seeds have nothing in common.
+        # Hashed, so that neighbouring seeds give unrelated draws.
         state = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
         self._generator.manual_seed(int(state >> np.uint64(1)))
 
     def uniform(self, low: Any, high: Any, *shape: int) -> Tensor:
-        """Draw uniformly, shape (n,) if no other is given."""
+        """Draw uniformly, with shape (n,) by default."""
         drawn = torch.rand(*(shape or (self._n,)), generator=self._generator)
         values: Tensor = low + drawn * (high - low)
         return values
@@ -144,10 +144,10 @@ class Draw:
         return self.uniform(low, high) * (self.uniform(0.0, 1.0) < share)
 
     def plants(self) -> Numbers:
-        """Draw the numbers of the plants, those of `MiddlePointTorchEnv`, and `small`.
+        """Draw the numbers of the plants for `MiddlePointTorchEnv`, and `small`.
 
-        `small` is a factor of set point, dead zone, noise and load: the same problem in a
-        corner of what the plant can reach.
+        `small` is a factor of set point, dead zone, noise and load: the same problem within a
+        fraction of the plant's reach.
         """
         one = torch.ones(self._n)
         gain, constant = (
@@ -196,11 +196,11 @@ class Draw:
         return torch.where(self.uniform(0.0, 1.0) < 0.5, square, held)
 
     def told(self, numbers: Numbers, *, exact: bool = False) -> Numbers:
-        """Draw what is told of plants: half of it by numbers of first order, some wrongly."""
+        """Draw the told numbers: first-order models for 60 % of the plants, some wrong."""
         told = {name: numbers[name] for name in ("u_min", "u_max", "dead_zone")}
         told["first"] = self.uniform(0.0, 1.0) < 0.6
         k = self.some(0.0 if exact else 0.5, 0.0, self._spread)
-        # Some were right once, and nobody knows that they are not any more.
+        # Some numbers are out of date, which their uncertainty does not show.
         aged = self.some(0.0 if exact else 0.1, 0.0, 0.3)
         wrong = torch.randn(3, self._n, generator=self._generator) * k
         wrong[:2] += self.uniform(-1.5, 1.5, 2, self._n) * aged
@@ -216,7 +216,7 @@ class Draw:
 def environment(
     n: int, samples: int, dtype: torch.dtype = torch.float32
 ) -> MiddlePointTorchEnv:
-    """Return plants that take all that differs between them as signals at each reset."""
+    """Return plants that take all numbers that differ between them as signals at each reset."""
     return MiddlePointTorchEnv(
         n,
         max_episode_steps=samples,
@@ -244,7 +244,7 @@ def environment(
 
 
 class Loops:
-    """A batch of plants under the network, from rest on.
+    """A batch of plants controlled by the network, starting from rest.
 
     The law and the told models are those of `NeuralSmithPredictor`.
     """
@@ -285,9 +285,9 @@ class Loops:
         self._observations, _ = plants.reset(seed=seed, options={"signals": signals})
 
     def run(self, net: Net, samples: int) -> tuple[Tensor, Tensor]:
-        """Run on; return e(k + 1) in multiples of the reach, u_a(k) of half the range.
+        """Continue; return e(k + 1) as multiples of the reach, u_a(k) of half the range.
 
-        Both have the shape (samples, n). Gradients end where the call began.
+        Both have the shape (samples, n). Gradients do not reach back beyond this call.
         """
         self._plants.detach()
         for owner in (self, self._law):
@@ -306,7 +306,7 @@ class Loops:
         """Return actions, shape (n, 1)."""
         setpoint, output = (self._observations / self._reach[:, None]).unbind(1)
         k = len(self._new) % BLOCK
-        if k == 0:  # looked up for some samples at once: it costs less
+        if k == 0:  # looked up a block at a time, which is cheaper
             if self._new:
                 self._before = torch.cat([self._before[BLOCK:], torch.stack(self._new)])
                 self._new = []
@@ -324,13 +324,13 @@ class Loops:
         new = self._alpha[0] * self._model + self._alpha[1] * self._last_model
         new = new + self._beta[0] * self._flow + self._beta[1] * self._last_flow
         self._model, self._last_model = new, self._model
-        # The plant answers downwards.
+        # The plant's gain is negative.
         action: Tensor = (-wanted * self._half - self._low) / self._half - 1.0
         return action[:, None]
 
 
 def loss_of(errors: Tensor, applied: Tensor, small: Tensor, training: Training) -> Tensor:
-    """Return the mean logarithm of each plant's error and price of moves."""
+    """Return the mean over the plants of the logarithm of error plus price of moves."""
     tolerance = training.tolerance * small
     size = errors.abs()
     huber = torch.where(size < tolerance, size**2 / (2.0 * tolerance), size - tolerance / 2.0)
@@ -339,9 +339,9 @@ def loss_of(errors: Tensor, applied: Tensor, small: Tensor, training: Training) 
 
 
 def validate(net: Net, training: Training) -> dict[str, float]:
-    """Return the mean logarithm of the mean |e|, and the travel, of each kind of plants.
+    """Return the mean logarithm of the mean |e|, and the travel, for each kind of plants.
 
-    Training does not meet these plants. They are told exactly.
+    These plants do not occur in training. Their told numbers are exact.
     """
     plants = environment(VALIDATION_PLANTS, VALIDATION_SAMPLES)
     found = {}
@@ -362,7 +362,7 @@ def validate(net: Net, training: Training) -> dict[str, float]:
             errors, applied = loops.run(net, VALIDATION_SAMPLES)
         each, first = errors.abs().mean(0).log(), told["first"]
         found[kind] = float(each.mean())
-        found[f"{kind} 1"] = float(each[first].mean())  # told a model of first order
+        found[f"{kind} 1"] = float(each[first].mean())  # told a first-order model
         found[f"{kind} 2"] = float(each[~first].mean())
         found[f"{kind}, travel"] = 10.0 * float(applied.diff(dim=0).abs().mean())
     return found
@@ -374,11 +374,11 @@ def train(training: Training, state: Path | None = None, source: str = "") -> La
     Parameters
     ----------
     training
-        What to do.
+        Arguments of the training.
     state
-        A file that keeps how far the training got, and that it goes on from.
+        File that stores the progress; the training resumes from it if it exists.
     source
-        The commit that this is run from, for the provenance.
+        Commit of the code that runs, for the provenance.
     """
     torch.set_num_threads(1)  # the network is too small for more
     with torch.random.fork_rng(devices=[]):
@@ -420,7 +420,7 @@ def _advance(
     training: Training,
     step: int,
 ) -> None:
-    """Take some steps of the optimiser, on new plants."""
+    """Take up to `stretches` steps of the optimiser on new plants."""
     length = training.stretches * training.samples
     draw = Draw(training, training.plants, length, training.seed, step)
     numbers = draw.plants()
@@ -434,7 +434,7 @@ def _advance(
         loss.backward()
         if math.isfinite(nn.utils.clip_grad_norm_(net.parameters(), 1.0)):
             optimiser.step()
-        # At first the mean forgets faster, so that the initial weights have no part in it.
+        # At first the mean forgets faster, so that the initial weights have no influence.
         share = 1.0 - min(training.averaging, (now + 1) / (now + 11))
         with torch.no_grad():
             for slow, new in zip(mean.parameters(), net.parameters(), strict=True):
@@ -442,5 +442,5 @@ def _advance(
 
 
 def training_key(training: Training) -> str:
-    """Return a name made of everything that shapes a network: arguments, versions and code."""
+    """Return a fingerprint of all that shapes a network: arguments, versions and code."""
     return fingerprint(__name__, training=asdict(training))
