@@ -45,7 +45,7 @@ def execute(options: Options, console: Console) -> str:
     out_folder(root, VARIABLE)
     for name in ids:
         needed, given = len(BEHAVIOURS[IDS[name][1]]), options.episodes
-        if given < needed:  # one for each controller
+        if given < needed:  # each controller needs one
             text = f"episodes must be at least {needed} for {name}, got {given}"
             raise UsageError(f"--episodes: {text}")
     rows = []
@@ -68,13 +68,13 @@ def execute(options: Options, console: Console) -> str:
 
 
 def write(root: Path, name: str, history: History, judged_by: Evaluation) -> None:
-    """Write a data set, whole or not at all, in place of one that has its name.
+    """Write a complete data set or none, replacing one of the same name.
 
-    The name is its id, `namespace/name-v0`. What it is judged by goes into its metadata.
+    The name is its id, `namespace/name-v0`. Its metadata holds the scale of its scores.
     """
-    # Minari does not list what is in a hidden folder.
+    # Minari does not list the contents of hidden folders.
     with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as partial:
-        os.environ[VARIABLE] = partial  # it takes no folder as an argument
+        os.environ[VARIABLE] = partial  # Minari takes no folder as an argument
         try:
             _create(name, history, judged_by)
         finally:
@@ -106,7 +106,7 @@ def _create(name: str, history: History, judged_by: Evaluation) -> None:
     ]
     controllers = ", ".join(dict.fromkeys(history.controllers))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of what it is not told: an address
+        warnings.simplefilter("ignore", UserWarning)  # about missing metadata: an address
         dataset = minari.create_dataset_from_buffers(
             name,
             episodes,

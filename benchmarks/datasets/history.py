@@ -1,4 +1,4 @@
-"""Record the history of a plant under a controller, as a log has it."""
+"""Record the history of a plant under a controller, as a log would."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ PLANTS = ("paper", "disturbed", "fouling")  # presets
 BEHAVIOURS = {
     "pi": ("pi",),
     "smith": ("smith",),
-    "mixed": ("pi", "pi-simc", "smith", "nn"),  # episode i is of the i-th of them, and so on
+    "mixed": ("pi", "pi-simc", "smith", "nn"),  # controllers take turns, episode by episode
 }
-SEED = 9_000_000  # of the first episode; no comparison and no bound uses these
-EVALUATIONS = 50  # episodes to judge learners on; others than those of the data
+SEED = 9_000_000  # of the first episode; no comparison and no bound uses seeds from here on
+EVALUATIONS = 50  # episodes to evaluate learners on; the data holds none of them
 
 # The past actions make the problem Markov. The reward of a step is -|e| in degC.
 ARGUMENTS = {
     "setpoint": "random",
     "reward": "absolute",
     "error_scale": 1.0,
-    "action_window": 20,  # the delay and two
+    "action_window": 20,  # delay + 2
 }
 
 
@@ -41,10 +41,10 @@ class History:
     plant: str
     """A name in `PRESETS`."""
     controllers: list[str]
-    """Of each episode, as the seeds are."""
+    """Name of the controller of each episode, in the order of `seeds`."""
     seeds: list[int]
     observations: NDArray[np.float32]
-    """Shape (episodes, SAMPLES + 1, n_obs); from k = 0 on."""
+    """Shape (episodes, SAMPLES + 1, n_obs), from k = 0 on."""
     actions: NDArray[np.float32]
     """Shape (episodes, SAMPLES, 1), within [-1, 1]."""
     rewards: NDArray[np.float64]
@@ -57,7 +57,7 @@ class History:
 
     @property
     def sha256(self) -> str:
-        """A hash of all that it holds, and of the environment's arguments."""
+        """Hash of all the data and of the environment's arguments."""
         about = [arguments_of(self.plant), self.controllers, self.seeds]
         digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
         for array in (self.observations, self.actions, self.rewards):
@@ -72,10 +72,10 @@ def arguments_of(plant: str) -> dict[str, Any]:
 
 
 def record(plant: str, behaviour: str, episodes: int = EPISODES, seed: int = SEED) -> History:
-    """Log one of `PLANTS` under one or several controllers, as `BEHAVIOURS` name them.
+    """Log one of `PLANTS` under the controllers of one of `BEHAVIOURS`.
 
-    Episode i is the one that the environment draws with seed `seed + i`. There must be one for
-    each controller.
+    The environment draws episode i with seed `seed + i`. Each controller needs at least one
+    episode.
     """
     names, arguments = BEHAVIOURS[behaviour], arguments_of(plant)
     size = Parameters(**arguments).observation_size
@@ -92,7 +92,7 @@ def record(plant: str, behaviour: str, episodes: int = EPISODES, seed: int = SEE
         seeds = history.seeds[own]
         (factory,) = ROSTER[name].members()
         controller = _Recorder(factory.in_service(arguments, len(seeds), seed))
-        # One sample more, for what is observed at the end.
+        # One more sample, for the final observation.
         plants = make_plants(len(seeds), SAMPLES + 1, **arguments)
         trajectory = rollout(plants, controller, SAMPLES + 1, seeds)  # type: ignore[arg-type]
         plants.close()
@@ -103,16 +103,16 @@ def record(plant: str, behaviour: str, episodes: int = EPISODES, seed: int = SEE
 
 
 def scale(plant: str, episodes: int = EVALUATIONS) -> Evaluation:
-    """Return what offline learners are judged by: an idle valve on fixed episodes.
+    """Return the scale for offline learners: an idle valve evaluated on fixed episodes.
 
-    Its `mean_error` scores 0 and its `least_possible` scores 1, as by `mptc_gym.evaluate` of
+    Its `mean_error` scores 0 and its `least_possible` scores 1, as in `mptc_gym.evaluate` of
     any policy on the same environment.
     """
     return evaluate(Nothing(), episodes=episodes, **arguments_of(plant))
 
 
 class _Recorder:
-    """A controller whose observations and actions are kept."""
+    """A controller that records its observations and actions."""
 
     def __init__(self, controller: Agent) -> None:
         self._controller = controller
@@ -122,7 +122,7 @@ class _Recorder:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         self.observations.append(observation)
-        # Beyond +-1 the actuator saturates, so that this changes nothing that the plant does.
+        # Beyond +-1 the actuator saturates, so clipping does not change what the plant does.
         action = np.clip(self._controller.act(observation), -1.0, 1.0)
         self.actions.append(action.astype(np.float32))
         return self.actions[-1]

@@ -6,19 +6,19 @@ from dataclasses import dataclass, field
 
 from benchmarks.lib.options import Count, Names, options
 
-SAMPLES = 1200  # of an episode
-EPISODES = 100  # of a data set
+SAMPLES = 1200  # per episode
+EPISODES = 100  # per data set
 
 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Write offline data sets where Minari keeps its own.
+    """Write offline data sets to Minari's folder.
 
-    Each comes with the least possible error of its plant.
+    Each includes the least possible error of its plant.
     """
 
     ids: Names = field(default=(), kw_only=False)
     """Data sets to write, such as middlepoint/paper/pi-v0 (default: all)."""
     episodes: Count = EPISODES
-    """Episodes of a data set, 1,200 transitions each."""
+    """Episodes per data set, of 1,200 transitions each."""

@@ -31,9 +31,9 @@ from mptc_gym.drawing import SIZE
 from mptc_gym.record import Record
 from mptc_gym.rendering import Frame
 
-COLOURS = 48  # of a GIF: the lines', the areas' and what lies between them
+COLOURS = 48  # of a GIF: lines, areas and the shades between them
 OUT = Path("results/watch")
-Put = Callable[[Frame], object]  # takes the pictures of a film, one after the other
+Put = Callable[[Frame], object]  # takes the frames of a film, one after the other
 
 
 def execute(options: Options, console: Console) -> str:
@@ -77,10 +77,10 @@ def execute(options: Options, console: Console) -> str:
 def in_window(
     factory: Factory | None, scenario: Scenario, seed: int, speed: int
 ) -> tuple[Trajectory, rivals.Moves]:
-    """Run a controller, or the one who watches if there is none, and show it in a window.
+    """Run a controller, or let the viewer control if there is none, and show it in a window.
 
-    What is returned are the one run, and what was done to set point and load. `Closed` is
-    raised if the window is closed before the end.
+    Return the run and the moves of set point and load. Closing the window before the end
+    raises `Closed`.
     """
     arguments = factory.arguments(scenario.arguments) if factory else scenario.arguments
     hands = Hands(**limits(Parameters(**arguments)), speed=speed)
@@ -107,9 +107,9 @@ def in_window(
 def in_film(
     factory: Factory, scenario: Scenario, seed: int, speed: int, path: Path
 ) -> Trajectory:
-    """Run a controller and write what a window would show to a file.
+    """Run a controller and write a film of what a window would show.
 
-    It shows every n-th sample, as its kind of film has only so many pictures a second.
+    The film shows every n-th sample, as its format limits the number of frames per second.
     """
     film, fps = FILMS[path.suffix]
     every = math.ceil(speed / fps)
@@ -130,13 +130,13 @@ def _mp4(path: Path, fps: float) -> Iterator[Put]:
 
 @contextmanager
 def _gif(path: Path, fps: float) -> Iterator[Put]:
-    kept: list[bytes] = []  # compressed: in memory a minute of them takes a gigabyte
+    kept: list[bytes] = []  # compressed: a minute of raw frames takes a gigabyte of memory
     yield lambda frame: kept.append(zlib.compress(frame.tobytes(), 1))
 
     def picture(data: bytes) -> Image.Image:
         return Image.frombytes("RGB", SIZE, zlib.decompress(data))
 
-    # One palette for all, of the last picture, which has something of everything in it.
+    # One palette for all frames, taken from the last, which shows a bit of everything.
     palette = picture(kept[-1]).quantize(COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=1)
     first, *others = (
         picture(data).quantize(palette=palette, dither=Image.Dither.NONE) for data in kept
@@ -144,7 +144,7 @@ def _gif(path: Path, fps: float) -> Iterator[Put]:
     first.save(path, save_all=True, append_images=others, duration=1000 / fps, loop=0)
 
 
-# What opens a file, for a number of pictures a second, and how many of them there are at most.
+# By suffix: the writer, given a file and the frames per second, and the most frames per second.
 FILMS: dict[str, tuple[Callable[[Path, float], AbstractContextManager[Put]], int]] = {
     ".mp4": (_mp4, 30),
     ".gif": (_gif, 10),

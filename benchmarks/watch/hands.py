@@ -1,4 +1,4 @@
-"""A window with the plant in it, in which keys and mouse do what the player asks for."""
+"""Let a player control the plant in a window, with keys and mouse."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class Closed(Exception):  # noqa: N818 (no error)
 
 
 class Hands(Nothing):
-    """A controller whose flow comes from keys and mouse, and the window that it looks at."""
+    """A controller whose flow is set with keys and mouse, and the window it is shown in."""
 
     def __init__(self, u_min: float, u_max: float, speed: float) -> None:
         super().__init__(u_min, u_max)
         self.speed = speed  # samples a second
-        self.setpoint = self.load = 0.0  # what has been added to both by hand, degC
-        self.paused = False  # whether the plant is to stand still
+        self.setpoint = self.load = 0.0  # added to both by hand, degC
+        self.paused = False  # whether the plant stands still
 
     def show(self, record: Record) -> None:
         """Show a record in the window."""
@@ -45,7 +45,7 @@ class Hands(Nothing):
         drawing.show(record, self.speed)
 
     def take(self, events: Iterable[Any]) -> None:
-        """Do what events of pygame ask for; `Closed` if that is the end."""
+        """Handle events of pygame; raise `Closed` if one ends the run."""
         for event in events:
             if event.type == pygame.QUIT:
                 raise Closed

@@ -14,7 +14,7 @@ from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS
 from mptc_gym import MiddlePointEnv
 
-YOU = "you"  # the agent that is no controller
+YOU = "you"  # the viewer as agent, in place of a controller
 _AGENTS = (
     f"Who controls: {', '.join(ROSTER)}, {YOU}, or a controller of your own, "
     "NAME=MODULE:FACTORY or NAME=PPO:FILE.zip."
@@ -36,6 +36,6 @@ class Options:
     seed: Seed = 0
     """Seed of noise and initial weights."""
     speed: Count = MiddlePointEnv.metadata["render_fps"]
-    """Samples a second."""
+    """Samples per second."""
     video: Path | None = None
-    """Write a film to this file, .mp4 or .gif, in place of a window."""
+    """Write a film to this file, .mp4 or .gif, instead of opening a window."""

@@ -1,4 +1,4 @@
-"""Run the controllers on the plant that someone has controlled by hand."""
+"""Run the controllers on a plant that was controlled by hand, for comparison."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from benchmarks.loop.scenarios import Scenario
 from mptc_gym import MiddlePointEnv
 from mptc_gym.record import Record
 
-Moves = dict[int, tuple[float, float]]  # k: what is added to set point and load from k + 1 on
-EPISODES = 20  # of the bound, where a plant is drawn
+Moves = dict[int, tuple[float, float]]  # k: additions to set point and load from k + 1 on
+EPISODES = 20  # for the bound, where plants are drawn
 
 
 class Touched(MiddlePointEnv):
-    """The environment, with a set point and a load that a hand changes while it runs.
+    """The environment, with a set point and a load that can be moved while it runs.
 
     `show`, if given, is called with a record of the last samples at each reset and step.
     """
@@ -33,11 +33,11 @@ class Touched(MiddlePointEnv):
     ) -> None:
         super().__init__(render_mode="rgb_array" if show else None, **arguments)
         self._shown = show
-        self.setpoint = self.load = 0.0  # what is added from the next sample on, degC
+        self.setpoint = self.load = 0.0  # added from the next sample on, degC
 
     def step(self, action: Any) -> Any:
-        """Step the plant, with what the hand adds."""
-        if not self._ahead:  # what comes from outside, the next sample last
+        """Step the plant, with the additions to set point and load."""
+        if not self._ahead:  # external signals, the next sample last
             self._look_ahead()
         setpoint, noise, load, transmitter_noise = self._ahead[-1]
         self._ahead[-1] = setpoint + self.setpoint, noise, load + self.load, transmitter_noise
@@ -62,7 +62,7 @@ def replay(
     moves: Moves | None = None,
     show: Callable[[Record], object] | None = None,
 ) -> Trajectory:
-    """Run a controller, with the noise and the moves of another's run."""
+    """Run a controller with the noise and the moves of another run."""
     arguments = factory.arguments(scenario.arguments)
     plant, moves = Touched(show, **arguments), moves or {}
 
@@ -75,9 +75,9 @@ def replay(
 def table(
     label: str, trajectory: Trajectory, moves: Moves, scenario: Scenario, seed: int
 ) -> pd.DataFrame:
-    """Return mean error and valve travel of a run, and of the controllers; and the bound.
+    """Return mean error and valve travel of a run and of the controllers, and the bound.
 
-    There is no bound where the load was moved by hand.
+    There is no bound if the load was moved by hand.
     """
     runs = {label: trajectory} | {
         controller.label: replay(controller.first(), scenario, seed, moves)
@@ -92,7 +92,7 @@ def table(
     if not any(load for _, load in moves.values()):
         arguments, kind = dict(scenario.arguments), None
         if moves:
-            # Whoever moves the set point knows it beforehand.
+            # The viewer knows the moves of the set point in advance.
             kind, longer = "preview", replace(scenario, samples=scenario.samples + 1)
             idle = replay(ROSTER["nothing"].first(), longer, seed, moves)
             arguments["setpoint"] = idle.setpoint[:, 0].tolist()
