@@ -1,4 +1,4 @@
-"""Find a plant and its controllers from a log: `python -m benchmarks.identify --help`."""
+"""Identify a plant from a log and tune controllers: `python -m benchmarks.identify --help`."""
 
 from benchmarks.lib.commands import command
 

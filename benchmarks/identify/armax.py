@@ -139,7 +139,7 @@ class Rows:
 
         c = np.zeros(orders.noise)
         if len(c):
-            if start is not None and invertible(start[: len(c)]):  # part of one may not be
+            if start is not None and invertible(start[: len(c)]):  # a part of C may not be
                 c[: len(start)] = start[: len(c)]
             if orders.walk and not c.any():
                 c[0] = -0.7

@@ -1,4 +1,4 @@
-"""Mends what recorders do to a log: two rates, noise on a held flow, spikes."""
+"""Repair faults of a log: two rates, a stuck sensor, noise on a held flow, spikes and jumps."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from benchmarks.identify.likelihood import Likelihood
 from benchmarks.identify.log import Log
 from benchmarks.identify.options import Knowledge
 
-SPIKE = 8.0  # robust deviations that a sample must stick out from its neighbours
-STANDSTILL = 20  # samples in a row with the same temperature, of one that else moves
-MOST_SPIKES = 0.03  # share of the rows
-FLOW_JUMP = 8.0  # deviations of its noise, from which a change of a held flow is surely a step
-STEP = 5.0  # standard errors, from which a difference of means is one
+SPIKE = 8.0  # robust deviations from its neighbours beyond which a sample is suspected
+STANDSTILL = 20  # equal temperatures in a row that show a stuck sensor
+MOST_SPIKES = 0.03  # largest share of rows that are suspected
+FLOW_JUMP = 8.0  # deviations of its noise beyond which a change of a held flow is a step
+STEP = 5.0  # standard errors beyond which a difference of means is a step
 SHORTEST_HOLD = 10  # samples
-RATES = range(2, 61)  # rows for each temperature
-TO_FORESEE = Orders(2, 6, 2)  # so that a fast response is not taken for a spike
-OUTLYING = 6.0  # robust deviations of prediction errors, from which a suspect is a spike
-PLAIN = 24.0  # deviations that a suspect without a prediction sticks out, to be a spike
-JUMP, MOST_JUMPS = 24.0, 3  # robust deviations of a jump of the sensor; how many are mended
+RATES = range(2, 61)  # rows per temperature
+TO_FORESEE = Orders(2, 6, 2)  # B is long, so that a fast response does not look like a spike
+OUTLYING = 6.0  # robust deviations of prediction errors beyond which a suspect is a spike
+PLAIN = 24.0  # deviations beyond which a suspect without a prediction is a spike
+JUMP, MOST_JUMPS = 24.0, 3  # least jump of the sensor, robust deviations; most jumps repaired
 
 
 def cleaned(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
-    """Return the log as it can be fitted, with a note of all that was mended.
+    """Return the log ready to be fitted, with a note on each repair.
 
-    `given` are the orders, if they are known.
+    `given` has the orders, if they are known.
     """
     log = without_noise_of_held_flow(_at_one_rate(without_standstill(log)))
     log = _without_spikes(log, knowledge, given or TO_FORESEE)
@@ -49,7 +49,7 @@ def _at_one_rate(log: Log) -> Log:
         return log
 
     def mean(values: Array) -> Array:
-        """Return means from each temperature to the next."""
+        """Return the means from each temperature to the next."""
         means: Array = sliding_window_view(values, rate)[first::rate].mean(axis=1)
         return means
 
@@ -65,16 +65,16 @@ def _at_one_rate(log: Log) -> Log:
 
 
 def deviation(values: Array) -> float:
-    """Return the standard deviation of values around 0 that outliers do not move."""
+    """Return a standard deviation of values around 0 that is robust to outliers."""
     return 1.4826 * float(np.nanmedian(np.abs(values)))
 
 
 def without_noise_of_held_flow(log: Log) -> Log:
-    """Return the log with the means of the flow while it is held, if it is held, but noisy."""
+    """Return the log with a held but noisy flow replaced by its mean over each hold."""
     flow = log.flow
     moves = np.diff(flow)
     spread = deviation(moves) / math.sqrt(2.0) if np.isfinite(moves).any() else 0.0
-    if spread == 0.0:  # it stands still in most samples
+    if spread == 0.0:  # the flow is constant in most samples
         return log
     holds = np.split(flow, _steps(flow, spread))
     long = [len(hold) for hold in holds if len(hold) >= SHORTEST_HOLD]
@@ -83,7 +83,7 @@ def without_noise_of_held_flow(log: Log) -> Log:
     left = left[np.isfinite(left)]
     if len(holds) < 4 or sum(long) < 0.9 * len(flow) or len(left) < 2 or not left.any():
         return log
-    # What a controller or a hand does is not white; what a transmitter adds is.
+    # The moves of a controller or an operator are not white; the noise of a transmitter is.
     together, noise = np.corrcoef(left[1:], left[:-1])[0, 1], float(np.std(left))
     if abs(together) > 0.2 or noise > 0.25 * np.nanstd(flow):
         return log
@@ -96,10 +96,10 @@ def without_noise_of_held_flow(log: Log) -> Log:
 
 
 def _steps(flow: Array, spread: float) -> list[int]:
-    """Return where a flow with white noise steps.
+    """Return the rows at which a flow with white noise steps.
 
-    By binary segmentation (A. J. Scott and M. Knott, Biometrics 30, 1974, 507-512): a stretch
-    is parted where the means before and after differ most for their errors, until none do.
+    Binary segmentation (A. J. Scott and M. Knott, Biometrics 30, 1974, 507-512): a stretch is
+    split where the means before and after differ most in standard errors, until none differ.
     """
     moves = np.diff(flow)
     found = (np.flatnonzero(~(np.abs(moves) < FLOW_JUMP * spread)) + 1).tolist()
@@ -117,15 +117,15 @@ def _steps(flow: Array, spread: float) -> list[int]:
 
 
 def without_standstill(log: Log) -> Log:
-    """Return the log without temperatures of a sensor that was stuck, and moves elsewhere."""
+    """Return the log without the temperatures of a sensor that was stuck for a while."""
     temperature = log.temperature
     ends = np.concatenate([[True], np.diff(temperature) != 0.0])
     run = np.cumsum(ends) - 1
     lengths = np.bincount(run)
     still = lengths >= STANDSTILL
     if not still.any() or still.all() or np.mean(lengths[~still] == 1) < 0.9:
-        return log  # a coarse sensor, or none that stood still
-    stuck = still[run] & ~ends  # the first of each may be right
+        return log  # a coarse sensor, or one that was never stuck
+    stuck = still[run] & ~ends  # the first of each run may be right
     return log.mended(
         f"In {int(stuck.sum())} rows the temperature stands still to the last digit, and moves "
         "elsewhere: they are left out, as those of a sensor that was stuck.",
@@ -134,9 +134,9 @@ def without_standstill(log: Log) -> Log:
 
 
 def _protrusion(log: Log) -> Array:
-    """Return how far temperatures stick out from those before and after, in deviations.
+    """Return how far temperatures stick out from their neighbours, in robust deviations.
 
-    It is 0 for all but the furthest ones, of which `MOST_SPIKES` may be above `SPIKE`.
+    It is 0 for all but the largest, a share of `MOST_SPIKES`, and for those below `SPIKE`.
     """
     series = pd.Series(log.temperature)
     apart = (series - series.rolling(7, center=True, min_periods=3).median()).abs()
@@ -149,15 +149,15 @@ def _protrusion(log: Log) -> Array:
 
 
 def _without_spikes(log: Log, knowledge: Knowledge, orders: Orders) -> Log:
-    """Return the log without its spikes: suspects that no answer to the flow explains."""
+    """Return the log without its spikes: suspects that no response to the flow explains."""
     apart = _protrusion(log)
     found = apart > 0.0
     if not found.any():
         return log
     likelihood = Likelihood(log, knowledge, orders)
     errors = np.abs(likelihood.errors(likelihood.first_fits([orders])[0]))
-    # The first rows have no prediction: they go with the others, if those are spikes all. The
-    # second sample of a spike may follow from the first.
+    # The first rows have no prediction: they count as spikes if all other suspects do. The
+    # second sample of a spike may be predicted from the first.
     outlying, known = errors > OUTLYING * deviation(errors), np.isfinite(errors)
     outlying |= ~known & (apart > PLAIN) & bool(outlying[found & known].all())
     runs = np.cumsum(np.diff(found, prepend=False))
@@ -174,7 +174,7 @@ def _without_spikes(log: Log, knowledge: Knowledge, orders: Orders) -> Log:
 
 
 def _without_jumps(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
-    """Return the log without jumps of its sensor: moves that neither flow nor noise explain."""
+    """Return the log without sensor jumps: moves that neither flow nor noise explains."""
     orders = replace(given or TO_FORESEE, walk=True)
     for _ in range(MOST_JUMPS):
         moves = np.diff(log.temperature, prepend=np.nan)
@@ -189,7 +189,7 @@ def _without_jumps(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
         row = int(np.nanargmax(np.abs(errors)))
         height, least = float(errors[row]), JUMP * deviation(errors)
         large = np.flatnonzero(np.abs(errors) > least)
-        # Many of them are the plant's own: its gain is not the same everywhere.
+        # Many large errors come from the plant: its gain is not the same everywhere.
         many = np.sum(np.diff(large) > TO_FORESEE.b) >= MOST_JUMPS
         if many or not min(abs(height), abs(moves[row])) > least:
             return log

@@ -1,4 +1,4 @@
-"""Identify a plant as the options say, and write what was found."""
+"""Identify a plant from a log, and write the plant, its ranges and a report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from benchmarks.lib.storage import origin, write_json
 
 
 def execute(options: Options, console: Console) -> str:
-    """Identify a plant and write what was found."""
+    """Identify a plant from a log and write the results."""
     made = origin()
     began = time.process_time()
     out = out_folder(options.out)

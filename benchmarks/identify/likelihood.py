@@ -20,7 +20,7 @@ from benchmarks.identify.options import Knowledge
 from benchmarks.identify.simulation import from_rest
 from benchmarks.loop.linear import LinearModel
 
-LEAST_SAMPLES = 100  # without those that the longest delay takes
+LEAST_SAMPLES = 100  # not counting those that the longest delay takes
 FOLLOWS = 0.98  # explained share of the flow's moves above which feedback alone moves it
 COARSE = 40  # edges of the gaps that are tried first
 FINEST = 1e-6  # resolution of the temperature, as a share of its standard deviation
@@ -115,7 +115,7 @@ class Likelihood:
             )
 
     def _find_rows(self, longest: Orders) -> None:
-        """Find the rows in which (28) is known, for every delay and all orders."""
+        """Find the rows in which every term of (28) is known, for all delays and orders."""
         reach = self.knowledge.longest_delay + longest.b
         missing = ~np.isfinite(self.output)
         filled = pd.Series(self.output).interpolate(limit_direction="both")

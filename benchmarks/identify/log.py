@@ -1,4 +1,4 @@
-"""Reads a recorded log, and says what is wrong with it."""
+"""Read a recorded log, and report what is wrong with it."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ from benchmarks.identify.options import UNITS, Columns
 Array = NDArray[np.float64]
 
 DAY_FIRST = r"^(\d\d)\.(\d\d)\.(\d{4})\b"
-CHUNK = 200_000  # rows that are read at once
-MOST_ROWS = 20_000  # that are kept by default, the latest
+CHUNK = 200_000  # rows read at once
+MOST_ROWS = 20_000  # latest rows kept by default
 PROGRESS_AFTER = 1.0  # s
-UNEVEN = 0.1  # of the sampling interval: what a time step may be off
-LONGEST_GAP = 2_000  # rows that a gap is filled with: beyond, what came before is forgotten
-LARGEST = 1e30  # of a number: its square must be one, too
-LEAST_KNOWN = 0.5  # share of the flows
+UNEVEN = 0.1  # tolerance of a time step, as a share of the sampling interval
+LONGEST_GAP = 2_000  # most rows that a gap is filled with: the past is forgotten by then
+LARGEST = 1e30  # bound of a number, so that its square is finite
+LEAST_KNOWN = 0.5  # least share of flows that must be known
 LEAST_TEMPERATURES = 100
 
 
 @dataclass(frozen=True)
 class Log:
-    """What was recorded, one row a sample. NaN is what is not known."""
+    """A recorded log, one row per sample. NaN stands for what is unknown."""
 
     flow: Array  # from the time of its row on, t/h
     temperature: Array  # at the time of its row, degC
     sampling_interval: float  # s
-    notes: list[str] = field(default_factory=list)  # what the user should know about the log
-    # Other inputs that were measured, by their columns, from the times of their rows on.
+    notes: list[str] = field(default_factory=list)  # remarks for the user about the log
+    # Other measured inputs, by column, from the times of their rows on.
     disturbances: dict[str, Array] = field(default_factory=dict)
     flow_error: float = 0.0  # standard error of the flow, t/h
 
     def mended(self, note: str, **changes: Any) -> Log:
-        """Return the log with something changed, and a note that says what."""
+        """Return the log with changes, and a note that describes them."""
         return replace(self, notes=[*self.notes, note], **changes)
 
 
 def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) -> Log:
-    """Read a table with a heading, of which the latest rows are kept.
+    """Read a table with a heading, and keep its latest rows.
 
-    The separator (comma, semicolon or tab) and the decimal mark are found out. The file is read
+    The separator (comma, semicolon or tab) and the decimal mark are detected. The file is read
     in pieces, so that it may be larger than the memory, and all rows are checked.
 
     Raises
@@ -125,7 +125,7 @@ class _File:
             "encoding_errors": "replace",
             "skipinitialspace": True,
             "skip_blank_lines": False,
-            "index_col": False,  # fields beyond the heading are warned of
+            "index_col": False,  # pandas warns of fields beyond the heading
         }
         wanted = [("flow", columns.flow), ("temperature", columns.temperature)]
         wanted += [("disturbance", each) for each in columns.disturbance]
@@ -143,7 +143,7 @@ class _File:
         self.time = found[-1] if wanted[-1][0] == "time" else None
 
     def _find(self, name: str, names: Sequence[str], option: str) -> str:
-        """Return the column of a name: exactly, or but for case and a unit in brackets."""
+        """Return the column with a name; if none matches, ignore case and units in brackets."""
         if name in names:
             return name
         alike = [n for n in names if re.sub(r"[\[(].*", "", n).strip().lower() == name.lower()]
@@ -157,7 +157,7 @@ class _File:
         return alike[0]
 
     def pieces(self) -> Iterator[pd.DataFrame]:
-        """Return the file piece by piece: flow, temperature, disturbances and time, if any."""
+        """Yield the file piece by piece: flow, temperature, disturbances and time, if any."""
         with pd.read_csv(self.path, chunksize=CHUNK, **self._format) as chunks:
             for chunk in chunks:
                 yield pd.DataFrame({name: self._numbers(chunk[name]) for name in self._scales})
@@ -168,10 +168,10 @@ class _File:
         factor, offset = self._scales[column.name]
         texts = column
         if not pd.api.types.is_numeric_dtype(column) and self._format["decimal"] == ",":
-            texts = column.astype(str).str.replace(",", ".")  # pandas has left all as they are
+            texts = column.astype(str).str.replace(",", ".")  # pandas has left it all as text
         values = pd.to_numeric(texts, errors="coerce").astype(np.float64)
         if is_time and values.isna().any():
-            # Where points are between the numbers, the day comes first.
+            # In dates with points, the day comes first.
             iso = column.astype(str).str.replace(DAY_FIRST, r"\3-\2-\1", regex=True)
             dates = pd.to_datetime(iso, errors="coerce", format="ISO8601", utc=True)
             if dates.notna().all():
@@ -190,7 +190,7 @@ class _File:
 
 
 class _Clock:
-    """Turns times into rows at equal distances, with empty ones where there are gaps."""
+    """Spreads rows over equal time steps, with empty rows in the gaps."""
 
     def __init__(self, interval: float | None) -> None:
         self.interval = interval
@@ -198,7 +198,7 @@ class _Clock:
         self._last = pd.Series(dtype=np.float64)
 
     def spread(self, times: pd.Series[float], table: pd.DataFrame) -> pd.DataFrame:
-        """Return the values of a piece, a row a sample."""
+        """Return the values of a piece, one row per sample."""
         known = pd.concat([self._last, times])
         self._last = known.iloc[-1:]
         steps = known.diff().iloc[1:]
@@ -236,7 +236,7 @@ class _Clock:
 
 
 def _unit(name: str, quantity: str, columns: Columns) -> str:
-    """Return the unit that an option or a heading's brackets say."""
+    """Return the unit given by an option or by brackets in the heading."""
     units = UNITS[quantity]
     bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", name)
     said = bracket.group(1) if bracket else next(iter(units))
@@ -250,7 +250,7 @@ def _unit(name: str, quantity: str, columns: Columns) -> str:
 
 
 def _missing(columns: dict[str, Array]) -> list[str]:
-    """Return a note of what is not known; ValueError if that is too much."""
+    """Return a note on missing values; a ValueError is raised if they are too many."""
     counts = {name: int(np.isnan(each).sum()) for name, each in columns.items()}
     rows = len(columns["flow"])
     for name, count in counts.items():
@@ -266,9 +266,9 @@ def _missing(columns: dict[str, Array]) -> list[str]:
 
 
 def _held(series: pd.Series[float]) -> Array:
-    """Return a flow with its gaps closed where it is the same on both sides.
+    """Return a flow with its gaps filled where it is the same on both sides.
 
-    So is that of a recorder that writes it less often than the temperature.
+    All gaps are filled if it is recorded at regular intervals of several rows.
     """
     before, after = series.ffill(), series.bfill()
     steps = np.diff(np.flatnonzero(series.notna()))

@@ -19,8 +19,8 @@ from benchmarks.lib.options import (
     options,
 )
 
-# By quantity and unit, the usual one first: the factor to the units of the plant, s, t/h and
-# degC, and what is added then.
+# Conversion to the units of the plant, s, t/h and degC: factor, then offset, by quantity and
+# unit. The default unit comes first.
 UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "time": {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)},
     "flow": {"t/h": (1.0, 0.0), "kg/s": (3.6, 0.0), "kg/h": (1e-3, 0.0), "%": (1.0, 0.0)},
@@ -42,10 +42,10 @@ def _unit(quantity: str) -> Parameter:
 @options
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Where a log holds what, and in which units."""
+    """The columns of a log and their units."""
 
     time: str = "time"
-    """Column of the times: numbers, or dates."""
+    """Column of the times, numbers or dates."""
     flow: str = "flow"
     """Column of the flow."""
     temperature: str = "temperature"
@@ -53,7 +53,7 @@ class Columns:
     disturbance: Repeated = ()
     """Column of a measured disturbance (repeatable)."""
     sampling_interval: Positive | None = None
-    """s from one row to the next; the column of the times is not read then."""
+    """Time from one row to the next, s; the column of the times is then not read."""
     time_unit: Annotated[str | None, _unit("time")] = None
     flow_unit: Annotated[str | None, _unit("flow")] = None
     temperature_unit: Annotated[str | None, _unit("temperature")] = None
@@ -62,23 +62,23 @@ class Columns:
 @options
 @dataclass(frozen=True, kw_only=True)
 class Knowledge:
-    """What is known beforehand, and what to look for."""
+    """Prior knowledge of the plant, and what to look for."""
 
     longest_delay: Count = 60
     """Longest delay to look for, samples."""
     applied: bool = False
-    """The flow was measured behind the actuator, so that no dead zone is looked for."""
+    """The flow was measured after the actuator, so no dead zone is looked for."""
     u_min: Finite | None = None
-    """Least flow that the actuator can apply, t/h from the operating point (default: the log's
-    least)."""
+    """Smallest flow that the actuator can apply, t/h from the operating point (default: the
+    log's smallest)."""
     u_max: Finite | None = None
     """Largest flow that the actuator can apply, t/h from the operating point (default: the
     log's largest)."""
     operating_flow: Finite | None = None
-    """Flow of the operating point, t/h (default: 0 if the log has flows of both signs, else its
+    """Flow at the operating point, t/h (default: 0 if the log has flows of both signs, else its
     first flow)."""
     orders: Orders | None = None
-    """How many coefficients the polynomials A, B and C have, without the leading 1 of A and C
+    """Number of coefficients of the polynomials A, B and C, without the leading 1 of A and C
     (default: chosen by a criterion)."""
 
 
@@ -87,8 +87,8 @@ class Knowledge:
 class Options:
     """Fit the plant's equations to a recorded log, and tune controllers for it.
 
-    The log is a table with a heading; a row holds the temperature at its time and the flow that
-    is commanded from that time on.
+    The log is a table with a heading; each row holds the temperature at its time and the flow
+    commanded from that time on.
     """
 
     log: Path = field(kw_only=False)
@@ -96,5 +96,5 @@ class Options:
     out: Folder = Path("results/identify")
     columns: Columns = field(default_factory=Columns)
     rows: Count = 20_000
-    """Of a longer log, the last rows are fitted, so many."""
+    """Largest number of rows to fit; of a longer log, the last ones are used."""
     knowledge: Knowledge = field(default_factory=Knowledge)

@@ -1,4 +1,4 @@
-"""Pictures of an identification."""
+"""Draw the figures of an identification."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from benchmarks.identify.model import Model
 from benchmarks.lib.drawing import COLOURS, colours, drawn
 from benchmarks.lib.statistics import ENDS
 
-LAGS = 40  # of the autocorrelation
-LONGEST = 5_000  # samples of a step response that is drawn
-SHOWN = 3_000  # rows of a log: more cannot be told apart
+LAGS = 40  # largest lag of the autocorrelation, samples
+LONGEST = 5_000  # longest step response that is drawn, samples
+SHOWN = 3_000  # rows of a log that are drawn: more would blur
 
 
 def plot_log(model: Model, path: Path) -> None:
-    """Draw what was recorded, and what the model makes of the flow alone."""
+    """Draw the log, and the model's simulation of it."""
     log = model.log
     stop = min(len(log.flow), SHOWN)
     minutes = np.arange(stop) * log.sampling_interval / 60.0
@@ -50,7 +50,7 @@ def plot_residuals(model: Model, path: Path) -> float:
     Returns
     -------
     float
-        The share of autocorrelations beyond the band of chance.
+        The share of autocorrelations outside the 95 % band of white noise.
     """
     known = np.isfinite(model.errors)
     centred = np.where(known, model.errors - np.mean(model.errors[known]), 0.0)
@@ -73,11 +73,11 @@ def plot_residuals(model: Model, path: Path) -> float:
 
 
 def plot_step(model: Model, tested: StepTest, path: Path) -> None:
-    """Draw the step response with its band, and the first-order model of it."""
+    """Draw the step response with its 95 % band, and its first-order model."""
     length = tested.delay + 6.0 * tested.time_constant
     samples = min(int(np.ceil(length / model.plant.sampling_interval)), LONGEST) + 1
     response = model.plant.step_response(samples)
-    with np.errstate(over="ignore", invalid="ignore"):  # of plants that are not stable
+    with np.errstate(over="ignore", invalid="ignore"):  # from unstable plants
         possible = np.array([plant.step_response(samples) for plant in model.possible])
     low, high = np.nanquantile(possible, ENDS, axis=0, method="nearest")
     times = np.arange(samples) * model.plant.sampling_interval
@@ -101,7 +101,7 @@ def plot_step(model: Model, tested: StepTest, path: Path) -> None:
 
 
 def plot_margins(loops: Mapping[str, Loop], path: Path) -> None:
-    """Draw loops, by their names, around -1, and how much they amplify a disturbance."""
+    """Draw the frequency responses of named loops around -1, and their sensitivities."""
     palette = colours(list(loops))
     turn = np.linspace(0.0, 2.0 * np.pi, 200)
     with drawn(path, 10, 4.2) as figure:

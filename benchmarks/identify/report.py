@@ -1,4 +1,4 @@
-"""What an identification found, and what it means for control, as sections of a report."""
+"""Report what an identification found and what it means for control."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ UNITS = {
     "time_constant": "s",
     "noise_variance": "°C²",
 }
-RUNS, SAMPLES, SEED = 20, 1200, 0  # of the controllers on the identified plant
-LONGEST = 6_000  # samples of a run, for which the bounds are computed
-POOR, BEHIND = 0.5, 0.1  # share that a model explains, absolutely and behind its rival's
+RUNS, SAMPLES, SEED = 20, 1200, 0  # for the controllers on the identified plant
+LONGEST = 6_000  # longest run for which the bounds are computed, samples
+POOR, BEHIND = 0.5, 0.1  # least share a model should explain; most that its rival may lead by
 
 
 def report(model: Model, out: Path) -> list[Section]:
-    """Draw the pictures in a folder, and return what there is to say."""
+    """Draw the figures into a folder, and return the sections of the report."""
     step = reduced(model.plant)
     plots.plot_log(model, out / "log.png")
     beyond = plots.plot_residuals(model, out / "residuals.png")
@@ -80,7 +80,7 @@ def report(model: Model, out: Path) -> list[Section]:
 
 
 def fault(model: Model) -> str:
-    """Return why a model should not be used; empty if it should."""
+    """Return why a model should not be used; empty if it may be used."""
     share, rival = model.held_out
     if share < rival - BEHIND:
         return "it explains clearly less than an impulse response does: its form does not fit"
@@ -212,14 +212,14 @@ def _on_the_plant(found: dict[str, Recommended], arguments: dict[str, Any]) -> S
 
 
 def _bounds(arguments: dict[str, Any], samples: int) -> tuple[float, str]:
-    """Return the least possible mean error, degC, NaN if it is not known, and a sentence."""
+    """Return the least possible mean error, degC, NaN if unknown, and a sentence about it."""
     values: list[float] = []
     why = f"{samples} samples are many"
     try:
         for kind in ("preview", "reference") if samples <= LONGEST else ():
             bound = least_possible(samples=samples, kind=kind, folder=None, **arguments)
             values.append(bound.value)
-    except (NotSolvedError, ValueError) as error:  # the set point changes before it has settled
+    except (NotSolvedError, ValueError) as error:  # the set point changes too soon
         why = str(error)
     if not values:
         return math.nan, f"The least possible mean error is not known: {why}."

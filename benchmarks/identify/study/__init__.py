@@ -1,1 +1,1 @@
-"""How often is the identification right? `python -m benchmarks.identify.study`."""
+"""How often is the identification correct? `python -m benchmarks.identify.study`."""

@@ -1,8 +1,8 @@
-"""Counts how often plants are identified right, and how recommended loops do on true plants.
+"""Count how often plants are identified correctly, and try recommended loops on true plants.
 
-The logs are of several kinds. Their plants are those of the random sweep that do not drift, and
-plants of second order, each run in the environment itself. SysIdentPy and a regularised impulse
-response get the same logs. The loops are tried on random plants, of which no two are alike.
+Logs of several kinds are recorded in the environment, with plants of the random sweep that do
+not drift and with second-order plants. SysIdentPy and a regularised impulse response get the
+same logs. The recommended loops are tried on random plants, no two of them alike.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from benchmarks.loop.designs import Arguments, random_design
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 
-NOISE = 0.02, 0.5  # R of the logs, degC^2
+NOISE = 0.02, 0.5  # range of R in the logs, degC^2
 HELD = 30, 120  # samples between two steps of the flow
-LEVELS = -10.0, 10.0  # of the flow, t/h
-LONG, SHORT = (15.0, 40.0), (5.0, 15.0)  # samples, time constants of second order
+LEVELS = -10.0, 10.0  # range of the flow, t/h
+LONG, SHORT = (15.0, 40.0), (5.0, 15.0)  # time constants of second-order plants, samples
 DATA_SHEET = Knowledge(operating_flow=0.0, u_min=LEVELS[0], u_max=LEVELS[1])  # of the actuator
-METER = 0.1  # t/h, of the noise of a flow meter
-DRIFT = 0.05  # degC, of each step of a random walk of the base line
+METER = 0.1  # standard deviation of a flow meter's noise, t/h
+DRIFT = 0.05  # standard deviation of a step of the base line's random walk, degC
 KINDS = ("steps", "loop", "meter", "drift", "second order")  # of logs
 RIVALS = ("this one", "SysIdentPy", "impulse response")
-TELLING = 2.0  # t/h, dead zones that are counted
+TELLING = 2.0  # smallest dead zone that is counted, t/h
 PARTS = ("true", "found", "low", "high")  # of each estimate
-# Random plants for the loops: size of the slowest pole, by kind.
+# Random plants for the loops: magnitude of the slowest pole, by kind.
 POLES = {
     "fast": (0.0, 0.6),
     "ringing": (0.7, 0.97),
@@ -56,8 +56,8 @@ POLES = {
     "slow": (0.9, 0.98),
 }
 OF_LOOPS, HELD_FOR_LOOPS = 1200, (8, 60)  # rows of a log; samples between two steps
-SHARES = 0.01, 0.1  # of the response's deviation: that of its noise
-# Of which estimate, and how far it may be off; None asks whether its interval covers the truth.
+SHARES = 0.01, 0.1  # standard deviation of the noise, as a share of the response's
+# The estimate and how far off it may be; None asks whether its interval covers the truth.
 QUESTIONS: dict[str, tuple[str, float | None]] = {
     "delay within one sample": ("delay", 1.0),
     "gain within 10 %": ("gain", 0.1),
@@ -73,9 +73,9 @@ QUESTIONS: dict[str, tuple[str, float | None]] = {
 def synthetic_plants(
     count: int, seed: int, samples: int, kind: str = "steps"
 ) -> list[Arguments]:
-    """Return plants of the random sweep that do not drift, with noise of `NOISE`.
+    """Return plants of the random sweep that do not drift, with noise in the range `NOISE`.
 
-    Those of the kind "second order" have two time constants, of `LONG` and `SHORT` samples.
+    Plants of the kind "second order" have two time constants, within `LONG` and `SHORT`.
     """
     low, high = NOISE
     plants = [
@@ -92,7 +92,7 @@ def synthetic_plants(
         continuous = signal.zpk2ss([], [-1.0 / slow, -1.0 / fast], gain / (slow * fast))
         sampled = signal.cont2discrete(continuous, 1.0)
         b, a = signal.ss2tf(*sampled[:4])
-        c = [1.0, -float(np.exp(-1.0 / fast))]  # noise of first order, that of the slow pole
+        c = [1.0, -float(np.exp(-1.0 / fast))]  # first-order noise with the slow pole
         plant |= {"a": a.tolist(), "b": b[0, 1:].tolist(), "c": c}
     return plants
 
@@ -100,8 +100,8 @@ def synthetic_plants(
 def synthetic_log(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> Log:
     """Return a log of a plant in the environment; steps and noise are drawn with the seed.
 
-    Of the kinds, a "loop" is one of a PI controller whose set point moves; in all others the
-    flow moves in steps. "meter" adds noise to the flow, and "drift" a walk to the temperature.
+    In the kind "loop", a PI controller follows a moving set point; in all others the flow moves
+    in steps. "meter" adds noise to the flow, and "drift" a random walk to the temperature.
     """
     generator = np.random.default_rng(seed)
     levels: list[float] = []
@@ -127,14 +127,14 @@ def synthetic_log(plant: Arguments, samples: int, seed: int, kind: str = "steps"
 
 
 def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict[str, Any]:
-    """Identify a plant from a log of it.
+    """Identify a plant from a synthetic log.
 
     Returns
     -------
     dict
-        `kind`, the plant, `seconds` of processor time, and `refused`, why the log could not
-        tell. If it could, of each estimate its truth, its value and the ends of its interval,
-        by `PARTS`; and of each of `RIVALS` the share that it explains, its delay and its gain.
+        `kind`, the plant, `seconds` of processor time, and `refused`, the reason if the log is
+        refused. If it is not, also the true value, estimate and interval of each quantity, by
+        `PARTS`, and the share explained, the delay and the gain of each of `RIVALS`.
     """
     true = nominal(Parameters(**plant))
     truths = {
@@ -171,11 +171,11 @@ def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict
 
 
 def narmax(log: Log) -> tuple[float, float, float]:
-    """Return the share explained of the last third, delay and gain, by SysIdentPy.
+    """Return the share of the last third that SysIdentPy explains, its delay and its gain.
 
-    Its linear NARX model has three past outputs and 61 past flows to choose from, by orthogonal
-    least squares and the Bayesian information criterion (W. R. Lacerda Junior et al., Journal
-    of Open Source Software 5, 2020, 2384). All are NaN where the package is not installed.
+    Its linear NARX model selects among three past outputs and 61 past flows by orthogonal least
+    squares and the Bayesian information criterion (W. R. Lacerda Junior et al., Journal of Open
+    Source Software 5, 2020, 2384). All are NaN if the package is not installed.
     """
     try:
         from sysidentpy.basis_function import Polynomial
@@ -193,7 +193,7 @@ def narmax(log: Log) -> tuple[float, float, float]:
     simulated = np.full(len(y), np.nan)
     simulated[cut - lags :] = narx.predict(X=x[cut - lags :], y=y[cut - lags :])[:, 0]
     share_of_last = explained(log.temperature, simulated, np.arange(len(y)) >= cut)
-    # Regressors are 1000 + lag of the output and 2000 + lag of the flow.
+    # Regressors are coded as 1000 + lag of the output and 2000 + lag of the flow.
     codes, values = narx.final_model[:, 0], narx.theta[:, 0]
     flows = codes > 2000
     if not flows.any():
@@ -204,7 +204,7 @@ def narmax(log: Log) -> tuple[float, float, float]:
 
 
 def random_plant(number: int, seed: int) -> dict[str, Any]:
-    """Return arguments of a plant, of the kinds of `POLES` in turn: A, B and the delay."""
+    """Return the arguments of a random plant, with the kinds of `POLES` taking turns."""
     generator = np.random.default_rng([seed, number])
     kind = list(POLES)[number % len(POLES)]
     poles: list[complex] = [generator.uniform(*POLES[kind])]
@@ -227,8 +227,8 @@ def task_of_loops(number: int, seed: int) -> dict[str, Any]:
     Returns
     -------
     dict
-        `refused`, why, if the log could not tell; and `peaks`, infinite of a loop that is not
-        stable.
+        `refused`, the reason if the log is refused, and `peaks`, each Ms, infinite for a loop
+        that is not stable.
     """
     plant = random_plant(number, seed)
     generator = np.random.default_rng([seed, number, 1])
@@ -252,7 +252,7 @@ def task_of_loops(number: int, seed: int) -> dict[str, Any]:
 
 
 def counted(found: list[dict[str, Any]]) -> str:
-    """Return how many loops were recommended, and how they do, in a sentence."""
+    """Return in words how many loops were recommended and how well they do."""
     peaks = np.concatenate([each["peaks"] for each in found])
     refused = sum(bool(each["refused"]) for each in found)
     return (
@@ -297,7 +297,7 @@ def execute(options: Options, console: Console) -> str:
 
 
 def _rounded(found: pd.DataFrame) -> pd.DataFrame:
-    """Return what is kept of each log, with no more digits than tell something."""
+    """Return the columns that are kept, rounded to meaningful digits."""
     kept = found.drop(columns=found.filter(regex="^([abc]|(delay|gain), .*)$").columns)
     for digits, names in ((6, f"_({'|'.join(PARTS)})$"), (4, "^explained, ")):
         for name, values in kept.filter(regex=names).items():
@@ -306,9 +306,9 @@ def _rounded(found: pd.DataFrame) -> pd.DataFrame:
 
 
 def table(found: pd.DataFrame) -> pd.DataFrame:
-    """Return how often estimates are right and intervals cover, by the kind of log.
+    """Return how often estimates are right and intervals cover the truth, by kind of log.
 
-    Dead zones are counted from `TELLING` on. A log that is refused is a wrong estimate, and
+    Dead zones below `TELLING` are not counted. A refused log counts as a wrong estimate, and
     has no interval.
     """
     shown = {
@@ -322,14 +322,14 @@ def table(found: pd.DataFrame) -> pd.DataFrame:
 
 
 def _share(name: str, limit: float | None, found: pd.DataFrame) -> str:
-    """Return how often an estimate is right, with the interval of this share."""
+    """Return how often an estimate is right, with a confidence interval."""
     truth, value, low, high = (found[f"{name}_{part}"] for part in PARTS)
     counted = truth.notna() & ((name != "dead_zone") | (truth >= TELLING))
     if limit is None:
         slack = 1e-9 * truth.abs()
         right = (low - slack <= truth) & (truth <= high + slack)
     else:
-        counted |= truth.isna()  # it is refused
+        counted |= truth.isna()  # refused logs
         absolute = name in ("delay", "dead_zone")
         right = (value - truth if absolute else value / truth - 1.0).abs() <= limit
     if not counted.any():
@@ -339,7 +339,7 @@ def _share(name: str, limit: float | None, found: pd.DataFrame) -> str:
 
 
 def beside_rivals(found: pd.DataFrame) -> pd.DataFrame:
-    """Return the same of the rivals: gain within 10 %, and the median share explained."""
+    """Compare with rivals: median share explained, and how often gain and delay are right."""
     rows = []
     for kind, logs in groups(found[found["refused"] == ""], "kind"):
         for rival in RIVALS:

@@ -11,15 +11,15 @@ from benchmarks.lib.options import FanOutOptions, Folder, Runs, Seed, options
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Identify known plants from synthetic logs, and count how often that is right."""
+    """Identify known plants from synthetic logs, and count how often this is correct."""
 
     logs: Runs = 60
-    """Logs of a kind, each of its plant."""
+    """Number of logs of each kind, each from a plant of its own."""
     plants: Runs | None = None
-    """Random plants besides, on which the recommended loops are tried."""
+    """Number of additional random plants on which recommended loops are tried."""
     samples: Runs = 1200
-    """Rows of a log."""
+    """Number of rows of a log."""
     seed: Seed = 1
-    """Seed that plants, steps of the flow and noise are drawn with."""
+    """Seed of the plants, the steps of the flow and the noise."""
     fan_out: FanOutOptions = field(default_factory=FanOutOptions)
     out: Folder = Path("results/identify-study")

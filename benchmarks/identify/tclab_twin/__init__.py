@@ -1,1 +1,1 @@
-"""Does it work on a plant of others? `python -m benchmarks.identify.tclab_twin`."""
+"""Does it work on someone else's plant? `python -m benchmarks.identify.tclab_twin`."""

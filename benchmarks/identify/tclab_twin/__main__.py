@@ -1,4 +1,4 @@
-"""Identify TCLab's twin and control it: `python -m benchmarks.identify.tclab_twin`."""
+"""Identify and control TCLab's digital twin: `python -m benchmarks.identify.tclab_twin`."""
 
 from benchmarks.lib.commands import command
 

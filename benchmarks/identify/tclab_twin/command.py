@@ -1,10 +1,10 @@
-"""Identify a plant that no one here wrote, TCLab's digital twin, and control it.
+"""Identify and control TCLab's digital twin, a plant from another project.
 
-`python -m benchmarks.identify.tclab_twin`, after `pip install tclab`. The lab is a small heater
-with a sensor, for teaching; its package holds a simulation of it, with four temperatures
-inside, a sensor that counts in steps of 0.32 degC, and noise. Here heater 1, in percent, stands
-for the flow. (28) is identified from steps of the heater, and the controllers that are tuned
-from it run on the twin, beside the PI tuning that courses with this lab hand out.
+Run `python -m benchmarks.identify.tclab_twin` after `pip install tclab`. The lab is a small
+heater with a sensor, for teaching; its package simulates it with four internal temperatures, a
+sensor resolution of 0.32 degC, and noise. Heater 1, in percent, stands for the flow. (28) is
+identified from steps of the heater, and the controllers tuned from it run on the twin, beside
+the PI tuning taught in courses with this lab.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from mptc_gym import Parameters
 
 INTERVAL = 4.0  # s
 HEATER = 40.0  # %, the operating point
-LOW, HIGH = -HEATER, 100.0 - HEATER  # % from there, the heater's limits
+LOW, HIGH = -HEATER, 100.0 - HEATER  # the heater's limits, % from the operating point
 SETTLING = 1200.0  # s at the operating point before anything is recorded
-LEVELS = (55.0, 30.0, 65.0, 45.0, 25.0, 50.0, 35.0, 60.0)  # %, of the experiment
-HELD = 100  # samples that each is held
+LEVELS = (55.0, 30.0, 65.0, 45.0, 25.0, 50.0, 35.0, 60.0)  # heater powers of the experiment, %
+HELD = 100  # samples for which each is held
 SETPOINTS = (8.0, -6.0, 4.0, -8.0)  # degC from the operating point
-EACH = 200  # samples that a set point is held
+EACH = 200  # samples for which each set point is held
 
 # Kc = 6 %/degC and tau_I = 75 s, without derivative action: the PI controller in the PID lesson
 # of the course that came with the hardware (J. D. Hedengren, APMonitor), and widely used since.
@@ -48,31 +48,31 @@ COURSE = PIController(
 class Twin:
     """TCLab's digital twin as a plant in deviations from an operating point.
 
-    Its clock is turned by hand, so that a run takes milliseconds and is the same every time.
+    The clock is advanced step by step, so that a run takes milliseconds and is reproducible.
     The seed is that of the sensor's noise.
     """
 
     def __init__(self, seed: int) -> None:
         random.seed(seed)  # the twin draws from Python's own generator
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints a greeting
             self._lab = tclab.setup(connected=False)(synced=False)
         self._time = 0.0
         self.step(0.0, SETTLING)
         self.rest = float(np.mean([self._lab.T1 for _ in range(20)]))
 
     def temperature(self) -> float:
-        """Return what the sensor shows, degC from the operating point."""
+        """Return the measured temperature, degC from the operating point."""
         return float(self._lab.T1) - self.rest
 
     def step(self, command: float, seconds: float = INTERVAL) -> None:
-        """Hold a heater power for a time, in percent from the operating point."""
+        """Hold a heater power, % from the operating point, for a time."""
         self._lab.Q1(HEATER + command)
         self._time += seconds
         self._lab.update(self._time)
 
 
 def experiment(seed: int = 0) -> Log:
-    """Move the heater in steps, and return the record."""
+    """Move the heater in steps, and return the log."""
     twin = Twin(seed)
     commands = np.repeat(LEVELS, HELD) - HEATER
     temperatures = np.empty(len(commands))
@@ -83,7 +83,7 @@ def experiment(seed: int = 0) -> Log:
 
 
 def model_of(log: Log) -> Model:
-    """Return what the record shows. The heater has no dead zone."""
+    """Return the model identified from a log. The heater has no dead zone."""
     known = Knowledge(
         longest_delay=20, applied=True, u_min=LOW, u_max=HIGH, operating_flow=HEATER
     )
@@ -91,16 +91,16 @@ def model_of(log: Log) -> Model:
 
 
 def controllers(model: Model) -> dict[str, Controller]:
-    """Return those that are tuned from the model, and the course's."""
+    """Return the controllers tuned from the model, and the course's."""
     found = {name: each.controller for name, each in recommended(model).items() if each}
     told = nn_smith(Parameters(**plant_arguments(model)))
     return {**found, "nn-smith": told, "PI, course": COURSE}
 
 
 def run(controller: Controller, seed: int = 1) -> NDArray[np.float64]:
-    """Return set point, temperature and heater, from the operating point, a row a sample.
+    """Return set point, temperature and heater power as deviations, one row per sample.
 
-    As in the environment, row k holds the heater from k on, and what comes of it at k + 1.
+    As in the environment, row k holds the heater power from k on, and its result at k + 1.
     """
     twin = Twin(seed)
     controller.reset()
@@ -116,7 +116,7 @@ def run(controller: Controller, seed: int = 1) -> NDArray[np.float64]:
 
 
 def execute(_options: Options, console: Console) -> str:
-    """Print what was identified, and what the controllers make of the twin."""
+    """Print the identified model, and the results of the controllers on the twin."""
     model = model_of(experiment())
     for name in ("delay", "gain", "time_constant"):
         found = model.estimates[name]
