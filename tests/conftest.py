@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +17,28 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"  # windows that nobody sees
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
 from agents import Controller
 from benchmarks.loop.rollout import Trajectory
+from mptc_gym import MiddlePointVectorEnv
 
 ROOT = Path(__file__).parent.parent
 
 
 def run(
-    env: gymnasium.Env[Any, Any], actions: NDArray[np.float32], seed: int | None = 0
+    env: gymnasium.Env[Any, Any], actions: Iterable[Any], seed: int | None = 0
 ) -> dict[str, NDArray[np.float64]]:
-    """Reset, take all actions, and return observations, rewards and infos, k = 0 first."""
+    """Reset, take all actions, and return observations, rewards and infos, k = 0 first.
+
+    An action may be a function of the observation.
+    """
     observation, info = env.reset(seed=seed)
     observations, rewards, infos = [observation], [], [info]
     for action in actions:
-        observation, reward, terminated, truncated, info = env.step(np.asarray([action]))
+        taken = action(observation) if callable(action) else np.asarray([action])
+        observation, reward, terminated, truncated, info = env.step(taken)
         assert not terminated
         assert not truncated
         observations.append(observation)
@@ -39,6 +46,21 @@ def run(
         infos.append(info)
     record = {key: np.array([info[key] for info in infos]) for key in info}
     return {"observation": np.array(observations), "reward": np.array(rewards)} | record
+
+
+def native_and_sync(
+    num_envs: int, mode: str, limit: int | None = None, **arguments: Any
+) -> tuple[VectorEnv, VectorEnv]:
+    """Return the vector environment, and Gymnasium's of one environment after the other."""
+    native = gymnasium.make_vec(
+        "MiddlePoint-v0", num_envs, max_episode_steps=limit, autoreset_mode=mode, **arguments
+    )
+    sync = gymnasium.make_vec(
+        "MiddlePoint-v0", num_envs, max_episode_steps=-1 if limit is None else limit,
+        vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **arguments,
+    )  # fmt: skip
+    assert type(native) is MiddlePointVectorEnv
+    return native, sync
 
 
 def python(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -51,13 +73,8 @@ def python(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
 def run_closed(
     env: gymnasium.Env[Any, Any], controller: Controller, samples: int, seed: int = 0
 ) -> dict[str, NDArray[np.float64]]:
-    """Let a controller act for so many samples, and return the infos, k = 0 first."""
-    observation, info = env.reset(seed=seed)
-    infos = [info]
-    for _ in range(samples):
-        observation, *_, info = env.step(controller.act(observation))
-        infos.append(info)
-    return {key: np.array([info[key] for info in infos]) for key in info}
+    """Let a controller act for so many samples, and return what `run` does."""
+    return run(env, repeat(controller.act, samples), seed)
 
 
 def random_actions(rng: np.random.Generator, n: int) -> NDArray[np.float32]:

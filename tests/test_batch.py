@@ -290,81 +290,72 @@ def collected(env, steps, name):
     return np.stack([plain(env.step(actions)[-1][name]) for _ in range(steps)])
 
 
+def assert_mean(values, expected):
+    """Compare a mean to within five standard errors, those between plants if they are columns.
+
+    Chance exceeds them once in two million times.
+    """
+    means = np.atleast_2d(values).mean(0)
+    assert abs(means.mean() - expected) <= 5 * means.std() / means.size**0.5
+
+
 class TestDraws:
-    """Within five standard errors, which chance exceeds once in two million times."""
-
-    def test_noise_has_its_variance_and_is_normal_and_of_each_plant_alone(self, library):
-        env = library.make(400, noise_variance=0.5, c=[1.0])
-        env.reset(seed=3)
-        xi = collected(env, 250, "noise") / 0.5**0.5
-        # The variance of xi^p is E xi^2p - (E xi^p)^2: 1, 3 - 1, 15, 105 - 9.
-        for power, (moment, spread) in enumerate([(0, 1), (1, 2), (0, 15), (3, 96)], start=1):
-            assert abs((xi**power).mean() - moment) < 5 * (spread / xi.size) ** 0.5
-        for shifted in (1, 2, 7, 19, 20):
-            product = xi[:, shifted:] * xi[:, :-shifted]
-            assert abs(product.mean()) < 5 / product.size**0.5
-        inside = (np.abs(xi) < 0.6745).mean()  # the quartiles of a normal distribution
-        assert abs(inside - 0.5) < 5 * (0.25 / xi.size) ** 0.5
-
-    def test_noise_has_the_colour_of_c(self, library):
-        n, steps, variance, c = 400, 250, 0.5, [1.0, -0.35740, -0.03392]
-        env = library.make(n, noise_variance=variance, c=c)
+    def test_noise_is_normal_and_has_the_colour_of_c(self, library):
+        variance, c = 0.5, np.array([1.0, -0.35740, -0.03392])
+        env = library.make(400, noise_variance=variance, c=c)
         env.reset(seed=4)
-        noise = collected(env, steps, "noise")[2:] / variance**0.5
+        noise = collected(env, 250, "noise")[2:] / variance**0.5
         for lag in (0, 1, 2, 3, 7, 19, 20):
             product = noise[lag:] * noise[: len(noise) - lag]
-            expected = np.dot(c[lag:], c[: max(len(c) - lag, 0)])
-            # Neighbours in time are hardly independent: the spread is that of the plants'
-            # means.
-            means = product.mean(0)
-            assert abs(means.mean() - expected) < 5 * means.std() / n**0.5
+            assert_mean(product, np.dot(c[lag:], c[: max(len(c) - lag, 0)]))
+        normal = noise / (c @ c) ** 0.5
+        for power, moment in ((1, 0.0), (3, 0.0), (4, 3.0)):
+            assert_mean(normal**power, moment)
+        assert_mean(np.abs(normal) < 0.6745, 0.5)  # the quartiles of a normal distribution
 
     def test_readings_are_off_by_white_noise(self, library):
-        n, steps = 200, 100
+        n = 200
         env = library.make(
             n, measurement_noise_variance=0.3, output_window=1, setpoint=0.0,
             setpoint_window=0, error_window=1,
         )  # fmt: skip
         env.reset(seed=0)
         readings = []
-        for _ in range(steps):
+        for _ in range(100):
             observation, _, _, _, infos = env.step(np.zeros((n, 1)))
             error, reading = plain(observation).T
             np.testing.assert_array_equal(error, -reading)
             assert not infos["output"].any()
             readings.append(reading)
         v = np.stack(readings)
-        assert abs(v.var() - 0.3) < 5 * 0.3 * (2 / v.size) ** 0.5
-        assert abs((v[1:] * v[:-1]).mean()) < 5 * 0.3 / v.size**0.5
+        assert_mean(v**2, 0.3)
+        assert_mean(v[1:] * v[:-1], 0.0)
 
     @pytest.mark.parametrize("period", [600, 7, 1])
     def test_set_points_have_their_levels_and_lengths(self, library, period):
         n, steps, amplitude = 300, 40 * max(period // 6, 3), 4.0
         env = library.make(
-            n, setpoint="random", setpoint_period=period, setpoint_amplitude=amplitude,
-            max_episode_steps=None, delay=25,
-        )  # fmt: skip
+            n, setpoint="random", setpoint_period=period, setpoint_amplitude=amplitude, delay=25
+        )
         _, infos = env.reset(seed=1)
         levels = np.vstack([plain(infos["setpoint"]), collected(env, steps, "setpoint")])
         assert np.abs(levels).max() <= amplitude
         shortest, longest = max(1, -(-period // 6)), max(1, -(-period // 6), period // 2)
-        first = []
+        first, starts = [], []
         for column in levels.T:
             changes = np.flatnonzero(np.diff(column)) + 1
-            lengths = np.diff(np.concatenate(([0], changes)))
+            lengths = np.diff(changes, prepend=0)
             assert set(lengths) <= set(range(shortest, longest + 1))
-            first.append(lengths[:5])
-        lengths = np.concatenate(first)  # as many of each plant, so that none is preferred
-        middle, count = (shortest + longest) / 2, longest - shortest + 1
-        spread = ((count**2 - 1) / 12 / lengths.size) ** 0.5
-        assert abs(lengths.mean() - middle) <= 5 * spread
-        if count < 100:
-            assert {lengths.min(), lengths.max()} == {shortest, longest}
-        starts = levels[0]
-        assert abs(starts.mean()) < 5 * amplitude / (3 * n) ** 0.5
-        # The variance of x^2, x uniform in [-1, 1], is 1/5 - 1/9.
-        squares = (starts / amplitude) ** 2
-        assert abs(squares.mean() - 1 / 3) < 5 * ((1 / 5 - 1 / 9) / n) ** 0.5
+            first.append(lengths[:5])  # as many of each plant, so that none is preferred
+            starts.append(column[changes[:5]])
+        assert_mean(np.transpose(first), (shortest + longest) / 2)
+        if longest < 100:
+            assert (np.min(first), np.max(first)) == (shortest, longest)
+        for each in (levels[0], np.ravel(starts)):
+            assert_mean(each, 0.0)
+            assert_mean(each**2, amplitude**2 / 3)
+        ends = np.min(starts), np.max(starts)
+        assert ends == pytest.approx((-amplitude, amplitude), abs=0.03 * amplitude)
 
     @pytest.mark.parametrize("interval", [50.0, 2.0])
     def test_load_steps_have_their_times_and_levels(self, library, interval):
@@ -374,14 +365,12 @@ class TestDraws:
         load = np.vstack([np.zeros(n), collected(env, steps, "disturbance")])
         changed = np.diff(load, axis=0) != 0.0  # from k to k + 1
         assert not changed[np.arange(1, steps + 1) % 10 != 0].any()
-        chances = changed[9::10]
-        probability = min(10 / interval, 1.0)  # below ten samples, every change is a step
-        spread = (probability * (1 - probability) / chances.size) ** 0.5
-        assert abs(chances.mean() - probability) <= 5 * spread
+        # Below ten samples, every change is a step.
+        assert_mean(changed[9::10], min(10 / interval, 1.0))
         levels = load[1:][changed] / amplitude
         assert np.abs(levels).max() <= 1.0
-        assert abs(levels.mean()) < 5 / (3 * levels.size) ** 0.5
-        assert abs((levels**2).mean() - 1 / 3) < 5 * ((1 / 5 - 1 / 9) / levels.size) ** 0.5
+        assert_mean(levels, 0.0)
+        assert_mean(levels**2, 1 / 3)
 
     def test_ranges_have_both_ends(self, library):
         n = 20_000
@@ -433,15 +422,17 @@ class TestDraws:
             (load[ages == 10], 10.0 * walk),
             (load[ages == 45], 40.0 * walk),
         ):
-            assert abs(found.var() / expected - 1.0) < 5 * (2 / found.size) ** 0.5
+            assert_mean(found**2, expected)
         assert not load[ages < 10].any()
         lengths = np.concatenate(lengths)
         assert (lengths.min(), lengths.max()) == (10, 30)
 
     def test_the_seed_is_all_that_differs(self, library):
         def trajectory(seed):
-            env = library.make(5, **PRESETS["hard"], max_episode_steps=50)
+            signals = {**PRESETS["hard"], "measurement_noise_variance": 0.1}
+            env = library.make(5, **signals, max_episode_steps=50)
             env.reset(seed=seed)
-            return collected(env, 120, "output")
+            # Of the set point and of all noises.
+            return [plain(env.step(np.zeros((5, 1)))[0]) for _ in range(120)]
 
         assert_the_seed_is_all_that_differs(trajectory)

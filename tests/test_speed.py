@@ -28,17 +28,9 @@ def test_it_runs(monkeypatch, capsys):
     main(["--rounds", "1"])
     shown = capsys.readouterr().out
     for words in (
-        "n = 3",
-        "Pendulum-v1",
-        "picture",
-        "batch of 2",
-        "KiB",
-        "PyTorch",
-        "gradient",
-        "import mptc_gym",
-        "3 of a peer",
-        "Without not_installed: pip install",
-    ):
+        "n = 3", "Pendulum-v1", "picture", "batch of 2", "KiB", "PyTorch", "gradient",
+        "import mptc_gym", "3 of a peer", "Without not_installed: pip install",
+    ):  # fmt: skip
         assert words in shown
 
 

@@ -161,20 +161,6 @@ def make(num_envs=2, **arguments):
     return MiddlePointTorchEnv(num_envs, **{"dtype": torch.float64, **arguments})
 
 
-def outputs_of(env, steps):
-    """Return y of all samples from k = 1 on, shape (steps, n), with no flow."""
-    actions = torch.zeros(env.num_envs, 1)
-    return torch.stack([env.step(actions)[-1]["output"].clone() for _ in range(steps)])
-
-
-def test_nothing_is_drawn_from_the_global_generator():
-    torch.manual_seed(0)
-    state = torch.get_rng_state()
-    env = make(5, **PRESETS["hard"], max_episode_steps=20)
-    env.reset(seed=0), outputs_of(env, 60)
-    assert torch.equal(torch.get_rng_state(), state)
-
-
 class TestGradients:
     HARD: ClassVar = {
         **PRESETS["hard"], "delay": 2, "dead_zone": 1.0, "action_window": 3,

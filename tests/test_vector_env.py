@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import time
 import tracemalloc
 from functools import partial
 from unittest.mock import patch
@@ -12,27 +11,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.wrappers import vector
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mptc_gym import MiddlePointVectorEnv
 from tests.arguments import MODES, NOISY, valid_arguments
-from tests.conftest import random_actions
-
-TONNES = np.float32(10.0)  # Gymnasium warns of a loss of precision with others
-
-
-def make_both(num_envs, mode, limit, **arguments):
-    native = gymnasium.make_vec(
-        "MiddlePoint-v0", num_envs, max_episode_steps=limit, autoreset_mode=mode, **arguments
-    )
-    sync = gymnasium.make_vec(
-        "MiddlePoint-v0", num_envs, max_episode_steps=-1 if limit is None else limit,
-        vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **arguments,
-    )  # fmt: skip
-    assert type(native) is MiddlePointVectorEnv
-    return native, sync
+from tests.conftest import native_and_sync, random_actions
 
 
 def assert_equal(ours, theirs):
@@ -80,7 +64,7 @@ def test_it_equals_one_environment_after_the_other(
         patch.multiple("mptc_gym.vector_env", BLOCK=7, STEPS_PER_SHIFT=3),
         patch.multiple("mptc_gym.signals", PLANTS_AT_A_TIME=2),
     ):
-        native, sync = make_both(num_envs, mode, limit, **arguments)
+        native, sync = native_and_sync(num_envs, mode, limit, **arguments)
         assert_equal(native.reset(seed=seed), sync.reset(seed=seed))
         compare(native, sync, steps=50, rng=rng, partial_resets=partial_resets)
         assert_equal(native.reset(), sync.reset())
@@ -95,13 +79,14 @@ def test_it_equals_one_environment_after_the_other(
             ("NextStep", 150, 700, {"delay": delay, "b": [0.3, -0.2, 0.1]})
             for delay in ([0, 7], [2, 40], [0, 100])
         ),
-        # An actuator that does not reach zero flow.
+        # An actuator that does not reach zero flow, and one that ends there, at minus zero.
         ("NextStep", 9, 30, {"u_min": 6.0, "u_max": 8.0, "dead_zone": 2.0, "move_weight": 0.5}),
+        ("NextStep", 9, 30, {"u_min": -0.0, "dead_zone": 0.0}),
     ],
     ids=str,
 )
 def test_it_equals_them_over_long_times_and_at_the_edge(mode, limit, steps, arguments, rng):
-    native, sync = make_both(3, mode, limit, **{"action_window": 3, **arguments})
+    native, sync = native_and_sync(3, mode, limit, **{"action_window": 3, **arguments})
     assert_equal(native.reset(seed=5), sync.reset(seed=5))
     compare(native, sync, steps=steps, rng=rng, partial_resets=0.005)
 
@@ -114,7 +99,7 @@ def test_it_equals_them_over_long_times_and_at_the_edge(mode, limit, steps, argu
     ],
 )  # fmt: skip
 def test_a_plant_beyond_all_floats_equals_the_one_alone(a, reward):
-    native, sync = make_both(
+    native, sync = native_and_sync(
         2, "NextStep", None, a=a, reward=reward, output_window=1, move_weight=0.1,
         noise_variance=0.1, delay=[0, 3],
     )  # fmt: skip
@@ -144,28 +129,6 @@ def test_many_plants_share_a_bounded_memory_for_noise(rng):
     assert large - small > 2 * 8 * 50 * 400  # two signals, 450 samples or 10 at a time
     assert_equal(long.reset(seed=3), short.reset(seed=3))
     compare(long, short, steps=30, rng=rng, partial_resets=0.05)
-
-
-def test_limits_of_minus_zero():
-    native, sync = make_both(2, "NextStep", None, u_min=-0.0, dead_zone=0.0)
-    native.reset(seed=0), sync.reset(seed=0)
-    actions = np.array([[-2.0], [0.0]], np.float32)
-    assert_equal(native.step(actions), sync.step(actions))
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(
-    "wrap",
-    [
-        vector.RecordEpisodeStatistics, vector.NormalizeReward,
-        partial(vector.RescaleAction, min_action=-TONNES, max_action=TONNES),
-    ],
-)  # fmt: skip
-def test_gymnasium_s_wrappers_do_with_it_what_they_do_with_them(wrap, mode, rng, monkeypatch):
-    monkeypatch.setattr(time, "perf_counter", lambda: 0.0)  # which they tell, too
-    native, sync = (wrap(envs) for envs in make_both(3, mode, 20, **NOISY))
-    assert_equal(native.reset(seed=5), sync.reset(seed=5))
-    compare(native, sync, steps=70, rng=rng, partial_resets=0.0)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
