@@ -1,4 +1,4 @@
-"""Search a controller's gains: `python -m benchmarks.tune --help`."""
+"""Tune a controller's gains: `python -m benchmarks.tune --help`."""
 
 from benchmarks.lib.commands import command
 

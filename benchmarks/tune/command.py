@@ -1,4 +1,4 @@
-"""Search gains as the options say, and print the best."""
+"""Run a search for gains from its options, and print the best."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.tune.search import FINAL_RUNS, Search
 
 
 def execute(options: Options, console: Console) -> str:
-    """Search, and write and print what was found."""
+    """Run the search, and write and print its results."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     fan_out, plant = options.fan_out.open(), options.plant.chosen().arguments
     out = out_folder(options.out)

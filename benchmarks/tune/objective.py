@@ -1,4 +1,4 @@
-"""The objective of a search of gains: scenarios that no comparison uses, and one number."""
+"""Compute the objective of a search for gains, on scenarios that no comparison uses."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def _square(
     return Scenario(name, f"square wave{more}", samples, arguments)
 
 
-# Neighbours of the paper's cases, each with its first sample that counts: three that begin with
-# an untrained controller, and two that show what comes after learning.
+# Neighbours of the paper's cases, each with the first sample that counts: three that count from
+# an untrained controller on, and two that count only what follows learning.
 SCENARIOS: tuple[tuple[Scenario, int], ...] = (
     (Scenario("constant", "constant set point", 600, {"setpoint": 4.8}), 0),
     (_square("dead zone", ", dead zone 6.5 t/h", 1280, 5.1, 640, dead_zone=6.5), 0),
@@ -33,18 +33,18 @@ SCENARIOS: tuple[tuple[Scenario, int], ...] = (
 def score(
     factory: Factory, plant: Mapping[str, Any], runs: int, first_run: int, penalty: float
 ) -> dict[str, float]:
-    """Judge a controller on the tuning scenarios, each of so many runs.
+    """Judge a controller on the tuning scenarios, with `runs` runs of each.
 
-    `plant` has arguments of the environment that are not the paper's. `first_run` is the seed
-    of the first run; every scenario has seeds of its own. The penalty, degC, is for failing to
-    settle.
+    `plant` holds arguments of the environment that differ from the paper's. `first_run` is the
+    seed of the first run; every scenario has seeds of its own. The penalty, degC, is for
+    failing to settle.
 
     Returns
     -------
     dict
         For each scenario the median over runs of the mean |e|, degC; `not converged`, the
-        share of runs at the constant set point that failed to; and `objective`: the mean of
-        the medians, plus the penalty times that share.
+        share of runs at the constant set point that fail to settle; and `objective`, the mean
+        of the medians plus the penalty times that share.
     """
     medians: dict[str, float] = {}
     for i, (scenario, first_sample) in enumerate(SCENARIOS):

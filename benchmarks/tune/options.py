@@ -19,11 +19,11 @@ _TRIALS = ", ".join(f"{tuning.trials} for {name}" for name, tuning in TUNED.item
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Search a controller's gains with Optuna.
+    """Tune a controller's gains with Optuna.
 
-    All are judged on the same set points and seeds, which no comparison uses. NN and PI have
-    the same number of trials; PPO has fewer, as each is a training. The search is saved after
-    every trial; the same command continues it, to the same end.
+    All trials use the same set points and seeds, which no comparison uses. NN and PI get the
+    same number of trials; PPO gets fewer, as each trial is a training. The search is saved
+    after every trial; the same command resumes it and gives the same result.
     """
 
     controller: Annotated[str, choice(TUNED, "Whose gains to search")] = field(kw_only=False)

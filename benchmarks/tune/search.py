@@ -1,4 +1,4 @@
-"""A search for a controller's gains with Optuna, of which every trial is kept."""
+"""Search for a controller's gains with Optuna, keeping every trial."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ from benchmarks.lib.storage import write_text
 from benchmarks.lib.tables import write_csv
 from benchmarks.tune.objective import SCENARIOS, score
 
-SEED = 1  # of the search
-FIRST_RUN = 3_000_000  # runs have seeds from here on, which no comparison uses
-FINAL_RUNS, FINAL_FIRST_RUN = 1000, 4_000_000  # for the best, judged again
-DIGITS = 3  # significant, of the gains that are proposed
+SEED = 1  # seed of the search
+FIRST_RUN = 3_000_000  # first seed of the runs; no comparison uses these seeds
+FINAL_RUNS, FINAL_FIRST_RUN = 1000, 4_000_000  # for judging the best again
+DIGITS = 3  # significant digits of the gains that are judged again
 
-Row = dict[str, float]  # gains, and what `score` says of them
+Row = dict[str, float]  # gains, and their result from `score`
 
 
 @dataclass(frozen=True)
 class Search:
-    """A search, which goes on where it was stopped, and ends as it would have ended."""
+    """A search that resumes after an interruption and gives the same result as without it."""
 
     controller: RosterEntry
-    """Whose gains are searched."""
+    """The controller to tune."""
     runs: int
-    """Of each scenario in a trial."""
+    """Runs of each scenario in a trial."""
     plant: Mapping[str, Any]
-    """Arguments of the environment, if it is not the paper's plant."""
+    """Arguments of the environment, if the plant is not the paper's."""
     folder: Path
-    """Where `<controller>.csv` and `<controller>.md` are written. Below it the trials are kept,
-    in a folder that is named after all that shapes them: code, plant, runs and versions."""
+    """Folder for `<controller>.csv` and `<controller>.md`. The trials are kept in a subfolder
+    named after everything that shapes them: code, plant, runs and versions."""
     fan_out: FanOut
-    """Runs the members of a trial, or the finalists, side by side."""
+    """Runs the members of a trial, or the finalists, in parallel."""
 
     @property
     def path(self) -> Path:
-        """Of the table of all trials."""
+        """Path of the table of all trials."""
         return self.folder / f"{self.controller.name}.csv"
 
     @property
     def tuning(self) -> Tuning:
-        """How the gains are searched."""
+        """Settings of the search."""
         assert self.controller.tuning is not None
         return self.controller.tuning
 
@@ -64,14 +64,14 @@ class Search:
         name = fingerprint(
             maker,
             *judges,
-            objective=code("benchmarks.tune.objective"),  # and not all that it imports
+            objective=code("benchmarks.tune.objective"),  # without its imports
             case=[self.runs, dict(self.plant), SEED, FIRST_RUN, optuna.__version__],
             tuning=[self.tuning.space, self.tuning.penalty, self.tuning.startup],
         )
         return self.folder / f"{self.controller.name}-{name}"
 
     def run(self, trials: int) -> pd.DataFrame:
-        """Try gains until so many have been tried in all; one row a trial."""
+        """Try gains until there are `trials` in all, and return one row for each trial."""
         rows: list[Row] = []
         try:
             with tqdm(total=trials, desc=self.controller.name) as bar:
@@ -86,7 +86,7 @@ class Search:
         return pd.DataFrame(rows)
 
     def _judge(self, candidates: Mapping[str, Callable[[], Row]], *, final: bool) -> list[Row]:
-        """Return a row for each candidate: its gains, and the mean of its members' scores."""
+        """Return each candidate's gains with the mean of its members' scores."""
         members = range(self.tuning.members[final])
         runs = (FINAL_RUNS, FINAL_FIRST_RUN) if final else (self.runs, FIRST_RUN)
         judged = partial(_judged, self.controller, self.plant, *runs, final)
@@ -95,7 +95,7 @@ class Search:
             for name, propose in candidates.items()
             for member in members
         }
-        # One alone gains nothing from another process, which takes seconds to start.
+        # A single task gains nothing from another process, which takes seconds to start.
         fan_out = self.fan_out if len(tasks) > 1 else FanOut(jobs=1)
         title = "new runs for the best" if final else ""
         found = fan_out.run(tasks, None if final else self._kept, title)
@@ -106,10 +106,10 @@ class Search:
         return rows
 
     def report(self, trials: pd.DataFrame) -> pd.DataFrame:
-        """Judge the best of the trials again, rounded and on new runs, and write them.
+        """Judge the best trials again, with rounded gains on new runs; write and return them.
 
         The best gains of a search owe some of their result to luck; new runs show how much.
-        They are returned, too, best first.
+        The rows are sorted, best first.
         """
         best = trials.nsmallest(self.tuning.finalists, "objective")
         candidates: dict[str, Callable[[], Row]] = {}
@@ -150,8 +150,8 @@ class Search:
 def _proposed(tuning: Tuning, rows: list[Row]) -> Row:
     """Return the gains to try after these trials.
 
-    The sampler starts anew from the search's seed and the trial's number, so that a search that
-    was interrupted goes on as it would have gone.
+    The sampler is seeded anew with the search's seed and the trial's number, so that an
+    interrupted search continues exactly as it would have without the interruption.
     """
     sampler = optuna.samplers.TPESampler(
         seed=SEED * 1_000_000 + len(rows), n_startup_trials=tuning.startup, multivariate=True
@@ -177,7 +177,7 @@ def _judged(
     propose: Callable[[], Row],
     member: int,
 ) -> Row:
-    """Return gains, and the score of a controller that has them."""
+    """Return gains together with the score of a controller that has them."""
     gains, tuning = propose(), controller.tuning
     assert tuning is not None
     if tuning.train is None:
