@@ -25,15 +25,15 @@ SAMPLES = 1200
 
 @dataclass(frozen=True)
 class Case:
-    """What is run for one figure or more."""
+    """The runs behind one or more figures."""
 
     name: str
-    """Of its file."""
+    """Name of the data file."""
     title: str
     figures: dict[int, tuple[str, ...]]
-    """What each figure shows, from top to bottom: "output" is set point and temperature."""
+    """Signals in each figure, from top to bottom: "output" is set point and temperature."""
     arguments: dict[str, Any] = field(default_factory=dict)
-    """Of the environment."""
+    """Arguments of the environment."""
     nodes: int | None = 3
     """Hidden nodes of the network; None for the paper's PI controller."""
 
@@ -73,19 +73,19 @@ def execute(options: Options, console: Console) -> str:
 
 
 def summarise(trajectory: Trajectory) -> pd.DataFrame:
-    """Return the set point, and each signal in a typical run and over all, row by sample.
+    """Return the set point, and each signal in a typical run and over all, a row per sample.
 
     Returns
     -------
     DataFrame
-        `time_s`, `setpoint`, and for `output`, `command` and `noise`: `_typical`, the run whose
-        mean error is the median (of an even number the better of the two), `_p10` and `_p90`.
+        `time_s`, `setpoint`, and for `output`, `command` and `noise`: `_typical`, the run with
+        the median mean error (the better of two middle runs), `_p10` and `_p90`.
     """
     error = mean_error(trajectory)
     typical = np.argsort(error, kind="stable")[(len(error) - 1) // 2]
     columns = {
         "time_s": np.arange(len(trajectory.setpoint)) * Parameters().sampling_interval,
-        "setpoint": trajectory.setpoint[:, 0],  # that of all runs
+        "setpoint": trajectory.setpoint[:, 0],  # the same in all runs
     }
     for signal in ("output", "command", "noise"):
         values = getattr(trajectory, signal)

@@ -13,9 +13,9 @@ from benchmarks.lib.options import Folder, Runs, options
 class Options:
     """Draw counterparts of the paper's Figs 5 to 12.
 
-    Each case is run a thousand times, with other initial weights and noise each time. A strong
-    line shows a typical run, the one with the median of the mean errors, before the 10th to
-    90th percentile of all runs. What is drawn is in CSV files.
+    Each case is run a thousand times, with different initial weights and noise each time. A
+    strong line shows a typical run, the one with the median mean error, over a band from the
+    10th to the 90th percentile of all runs. The plotted data are in CSV files.
     """
 
     runs: Runs = 1000

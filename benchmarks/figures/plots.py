@@ -1,4 +1,4 @@
-"""Counterparts of the paper's figures, drawn from the curves of a typical run."""
+"""Draw counterparts of the paper's figures: a typical run, and the spread of all runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Panel(NamedTuple):
 
 
 def plot(panels: Sequence[Panel], path: Path, columns: int = 1) -> None:
-    """Draw a figure of the paper, or a sheet of all."""
+    """Draw the counterpart of one figure, or a sheet of all."""
     rows = math.ceil(len(panels) / columns)
     size = (8, 3 * rows) if columns == 1 else (13, 2.4 * rows)
     with drawn(path, *size) as sheet:
