@@ -1,4 +1,4 @@
-"""The claims that the paper makes: how each is examined, and what is asked of it."""
+"""Examine the paper's claims: the runs for each, and the criteria that it must meet."""
 # ruff: noqa: D103 (what each function does stands above it)
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.scenarios import SETPOINTS as CASES
 from mptc_gym import PRESETS, Parameters
 
-# What words are taken to mean: set before the numbers were known, the same for all claims.
-NOTABLE = 0.05  # an error that changes by less has not changed notably
-MUCH = 0.2  # "much better", "seriously worse": an error that differs by this share or more
-SOON = 150  # samples: the paper's own number for the time that the weights take
+# The meaning of words, fixed before the numbers were known and the same for all claims.
+NOTABLE = 0.05  # a smaller relative change of an error is not notable
+MUCH = 0.2  # "much better", "seriously worse": the error differs by at least this share
+SOON = 150  # samples; the paper's own number for the convergence of the weights
 
 NOISY = PRESETS["noisy"]
 NOISY_SQUARE = "square wave, R = 0.5 °C²"
 SQUARE, CONSTANT = (arguments for *_, arguments in CASES)
-# The constant set point first: it shows the first learning alone.
+# The constant set point comes first, as it shows initial learning alone.
 SETPOINTS = tuple((title, arguments, samples) for _, title, samples, arguments in CASES[::-1])
 PAPER_PI = (2.2, 0.3)  # Kp, Ki
 KP, KI = PAPER_PI
 SEARCHED_PI = (SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"])
-LEARNING = 600  # samples after which a network is taken to have learnt
+LEARNING = 600  # samples after which a network counts as trained
 GAINS = {False: "the same gains", True: "gains in proportion"}  # of networks of other shapes
 
 CLAIMS: dict[str, Claim] = {}
@@ -42,7 +42,7 @@ Examination: TypeAlias = Callable[[Batch, Claim], None]
 
 
 def claimed(section: str, statement: str, method: str) -> Callable[[Examination], Examination]:
-    """Enter a claim of the paper under the name of the function that examines it."""
+    """Register a claim of the paper under the name of the function that examines it."""
 
     def enter(examine: Examination) -> Examination:
         name = examine.__name__.replace("_", "-")
@@ -53,7 +53,7 @@ def claimed(section: str, statement: str, method: str) -> Callable[[Examination]
 
 
 def ratio(errors: Array, reference: Array) -> Estimate:
-    """Return the median ratio of the mean errors of two controllers in the same runs."""
+    """Return the median ratio of two controllers' mean errors in the same runs."""
     ratios = errors / reference
     return median(ratios) if len(ratios) > 1 else exact(ratios[0])
 
@@ -168,7 +168,7 @@ def pi_gains(batch: Batch, claim: Claim) -> None:
 
 
 def largest_pole(kp: float, ki: float) -> float:
-    """Return the modulus of the largest pole of the loop of PI controller and linear plant.
+    """Return the largest pole modulus of the closed loop of PI controller and linear plant.
 
     With e = y_d - y and u = -(Kp + Ki / (1 - z^-1)) e, (28) gives the characteristic polynomial
     A(z^-1) (1 - z^-1) - z^-d B(z^-1) (Kp (1 - z^-1) + Ki).
@@ -181,7 +181,7 @@ def largest_pole(kp: float, ki: float) -> float:
 
 
 def versus_pi(gains: tuple[float, float], batch: Batch, claim: Claim) -> None:
-    """Compare the network with a PI controller that has these gains."""
+    """Compare the network with a PI controller of these gains."""
     for noise_name, noise_arguments in (("", {}), (", R = 0.5 °C²", NOISY)):
         for name, setpoint, samples in SETPOINTS:
             arguments = {**setpoint, **noise_arguments}
@@ -239,7 +239,7 @@ def direction(batch: Batch, claim: Claim) -> None:
 def against_the_paper(
     shapes: Mapping[str, Mapping[str, int]], batch: Batch, claim: Claim
 ) -> None:
-    """Compare networks of other shapes, arguments of `Batch.networks`, with the paper's."""
+    """Compare networks of other shapes (arguments of `Batch.networks`) with the paper's."""
     for case, arguments, samples in (*SETPOINTS, (NOISY_SQUARE, NOISY, 1200)):
         paper = mean_error(batch.run_nn(samples, **arguments))
         for (name, shape), slower in itertools.product(shapes.items(), (False, True)):
@@ -346,8 +346,8 @@ def keep_learning(batch: Batch, claim: Claim) -> None:
     "least 90 % of the draws.",
 )
 def direction_only(batch: Batch, claim: Claim) -> None:
-    # The gain changes the flow that a set point needs. With too much gain that lies inside the
-    # dead zone, with too little beyond the limits: for 5 degC below 0.74 and above 1.46.
+    # The flow that a set point needs depends on the gain. For 5 degC it lies beyond the limits
+    # if the gain is below 0.74, and inside the dead zone if it is above 1.46.
     families = {
         "set point 5 °C": (0.75, 1.0, 1.25, 1.4),
         "set point 5 °C times the gain": (0.7, 1.0, 1.25, 1.5),

@@ -1,4 +1,4 @@
-"""Test claims as the options say, and write the verdicts."""
+"""Test the chosen claims, and write the verdicts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.lib.report import provenance_line
 from benchmarks.lib.storage import origin, write_text
 from benchmarks.lib.tables import on_screen, write_csv
 
-LONGEST = "direction-only"  # to examine: it begins first
+LONGEST = "direction-only"  # the slowest claim to examine, which starts first
 
 
 def execute(options: Options, console: Console) -> str:

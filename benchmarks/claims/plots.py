@@ -1,4 +1,4 @@
-"""Draw the tables of examined claims, by their names."""
+"""Draw the tables of examined claims."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.loop.metrics import METRICS
 
 
 def plot_convergence(times: pd.DataFrame, path: Path) -> None:
-    """Draw which share of the networks has converged by when, one line for each set point."""
+    """Draw the share of networks that have converged over time, a line for each set point."""
     with drawn(path, 9, 4) as figure:
         axes = figure.subplots()
         for name, colour in colours(list(times.columns)).items():
@@ -43,7 +43,7 @@ def plot_pi_gains(errors: pd.DataFrame, path: Path) -> None:
 
 
 def plot_other_plants(cells: pd.DataFrame, path: Path) -> None:
-    """Draw maps of the share of networks that settle: over delay and gain, for each case."""
+    """Draw maps of the share of networks that settle over delay and gain, for each case."""
     cases, time_constants = cells["setpoint"].unique(), cells["time_constant"].unique()
     with drawn(path, 10, 2.8 * len(cases), grid=False) as figure:
         panels = figure.subplots(len(cases), len(time_constants), sharex=True, squeeze=False)

@@ -1,4 +1,4 @@
-"""Run the NN and the PI controller on a thousand plants, for claims and figures."""
+"""Run batches of the NN and the PI controller for claims and figures."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 
 Array = NDArray[np.floating]
 
-BAND = 0.05  # of the distance that the weights have travelled
-STILL = 100  # the last samples of a run, in which weights that have converged do not move
+BAND = 0.05  # fraction of the distance that the weights travel
+STILL = 100  # last samples of a run, in which converged weights stay within the band
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Runs side by side; run i has initial weights and noise of the seed `seed + i`."""
+    """A batch of runs; run i has the initial weights and noise of seed `seed + i`."""
 
     runs: int
     seed: int = 0
@@ -29,11 +29,11 @@ class Batch:
     def networks(
         self, *, nodes: int = 3, length: int = 3, slower: bool = False, direction: int = -1
     ) -> DirectNNController:
-        """Return a network for each run, the paper's unless told otherwise.
+        """Return a network for each run, by default the paper's.
 
-        It has so many hidden nodes, and sees `length` set points and errors. The more terms a
-        sum has, the faster it moves when the weights of all of them learn with the same gain:
-        gains that are `slower` make up for it.
+        A network has `nodes` hidden nodes, and sees `length` set points and errors. A sum moves
+        faster the more terms it has, if the weights of all terms learn with the same gain;
+        `slower` scales the gains down to compensate.
         """
         of_nodes, of_inputs = (3 / nodes, 3 / length) if slower else (1.0, 1.0)
         paper = DirectNNController()
@@ -56,7 +56,7 @@ class Batch:
         before: Callable[[int], object] | None = None,
         **arguments: Any,
     ) -> Trajectory:
-        """Run a controller on plants with these arguments; `before` is that of `rollout`."""
+        """Run a controller on plants with these arguments; for `before` see `rollout`."""
         plants = make_plants(self.runs, samples, **arguments)
         return rollout(plants, agent, samples, self.seed, before)
 
@@ -65,7 +65,7 @@ class Batch:
         return self.run(self.networks(), samples, **arguments)
 
     def run_pi(self, kp: float, ki: float, samples: int, **arguments: Any) -> Trajectory:
-        """Run a PI controller: one run stands for all where there is no noise."""
+        """Run a PI controller, only once if there is no noise."""
         noisy = arguments.get("noise_variance", 0.0) > 0.0
         batch = self if noisy else Batch(1, self.seed)
         return batch.run(PIController(kp, ki), samples, **arguments)
@@ -79,26 +79,25 @@ def flat(weights: Weights) -> Array:
 
 
 def converged_at(weights: Array) -> Array:
-    """Return when weights have converged, in samples, shape (runs,).
+    """Return the sample at which weights have converged, shape (runs,).
 
-    That is the first sample from which on their distance to where they end, by the Euclidean
-    norm, is at most `BAND` times the distance they had to travel from their start. Weights that
-    get there only in the last `STILL` samples have not converged, which is infinite: the run's
-    end might be anywhere on their way. `weights` are those before each sample, shape
-    (samples, runs, n).
+    This is the first sample from which on their Euclidean distance to their final values is at
+    most `BAND` times that at the start. It is infinite for weights that come so close only in
+    the last `STILL` samples: they have not converged, as the run might end anywhere on their
+    way. `weights` are those before each sample, shape (samples, runs, n).
     """
     distance = np.linalg.norm(weights - weights[-1], axis=2)
     outside = distance > BAND * distance[0]
     samples = len(weights)
-    # The first sample of the part at the end that is all inside: counted from behind.
+    # The first sample of the final stretch inside the band, found from the end.
     first = np.where(outside.any(axis=0), samples - np.argmax(outside[::-1], axis=0), 0)
     return np.where(first <= samples - STILL, first, np.inf)
 
 
 def fail_node(controller: DirectNNController, stuck_at: int) -> None:
-    """Break a hidden node of every network: its output stays at 0 or 1, whatever it is fed."""
+    """Break a hidden node of every network: its output stays at 0 or 1 for any input."""
     weights = controller.weights
     weights.W[..., 0, :] = 0.0
-    # So far out on the sigmoid that its slope vanishes, and with it all learning of the node.
+    # So far out on the sigmoid the slope vanishes, and the node cannot learn.
     weights.theta_1[..., 0] = 1e6 if stuck_at else -1e6
     controller.weights = weights

@@ -1,4 +1,4 @@
-"""A claim, what is found about it, and the verdict that follows."""
+"""Record findings about the paper's claims, and derive the verdicts."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ OFTEN = 0.9  # "works", "converges": in at least this share of the draws
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, how it is examined, and what came out."""
+    """A claim of the paper, its examination and the findings."""
 
     name: str
-    """Short, for options."""
+    """Short name, for options."""
     section: str
-    """Where the paper makes it."""
+    """Place in the paper."""
     statement: str
     method: str
-    """How it is tested."""
+    """Description of the test."""
     examine: Callable[[Batch, Claim], None]
-    """Runs what must be run, and asks the claim."""
+    """Performs the runs, and records the findings by `ask`."""
     findings: list[dict[str, Any]] = field(default_factory=list)
     """Rows of the table of numbers."""
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
-    """What is drawn, by name."""
+    """Tables to draw, by name."""
 
     def examined(self, batch: Batch) -> Claim:
-        """Return the claim with what is found about it."""
+        """Return the claim with its findings."""
         claim = replace(self, findings=[], tables={})
         self.examine(batch, claim)
         return claim
 
     @property
     def verdict(self) -> str:
-        """What became of it. What is undecided is not shown."""
+        """The verdict in words; an undecided finding counts as not shown."""
         shown = [row["shown"] == "yes" for row in self.findings if row["shown"]]
         if not shown:
             return "cannot be tested from the text"
@@ -60,10 +60,10 @@ class Claim:
         at_least: float = -math.inf,
         at_most: float = math.inf,
     ) -> None:
-        """Note a number: an estimate, the median of one for each run, or an exact one.
+        """Record a number: an estimate, the median of one value per run, or an exact value.
 
-        A bound makes it part of the verdict. It is shown if the whole interval keeps the
-        bound, and not shown if no part of it does.
+        A bound makes the number part of the verdict. It is shown if the whole interval keeps
+        the bound, and not shown if no part of the interval does.
         """
         if not isinstance(found, Estimate):
             found = median(found) if np.ndim(found) else exact(float(np.asarray(found)))
@@ -82,38 +82,38 @@ class Claim:
     def ask_share(
         self, quantity: str, found: NDArray[np.bool_], *, often: bool = False
     ) -> None:
-        """Note in which share of the draws something is found; `often` asks for `OFTEN`."""
+        """Record the share of draws in which `found` is true; `often` requires `OFTEN`."""
         of = share(found)
         in_percent = Estimate(100 * of.value, 100 * of.low, 100 * of.high, of.runs)
         at_least = 100 * OFTEN if often else -math.inf
         self.ask(quantity, in_percent, "% of draws", at_least=at_least)
 
     def ask_time(self, quantity: str, samples: ArrayLike) -> None:
-        """Note when something happens, in 10, 50 and 90 % of the draws; infinite for never."""
+        """Record the 10th, 50th and 90th percentiles of a time; infinite means never."""
         for p in (0.1, 0.5, 0.9):
             self.ask(f"{quantity}, {p:.0%} of draws", quantile(samples, p), "samples")
 
 
 def table(claims: Sequence[Claim]) -> pd.DataFrame:
-    """Return one row for each finding, and one for a claim without any."""
+    """Return one row for each finding, and one for each claim without findings."""
     rows: list[dict[str, Any]] = []
     for claim in claims:
         about = {name: getattr(claim, name) for name in ("section", "statement", "verdict")}
         about = {"claim": claim.name, **about}
         rows += [{**about, **finding} for finding in claim.findings] or [about]
     frame = pd.DataFrame(rows)
-    # Whole numbers, though a claim without findings has none.
+    # Nullable integers, as a claim without findings has no runs.
     return frame.astype({"runs": "Int64"}) if "runs" in frame else frame
 
 
 def overview(claims: Sequence[Claim]) -> pd.DataFrame:
-    """Return the verdicts: one row for each claim."""
+    """Return the verdicts, one row for each claim."""
     rows = [(claim.statement, claim.verdict) for claim in claims]
     return pd.DataFrame(rows, columns=["claim", "verdict"])
 
 
 def markdown(claims: Sequence[Claim], made: str) -> str:
-    """Return all verdicts as a Markdown page, with a line on how they were made."""
+    """Return all verdicts as a Markdown page, with the line `made` on their provenance."""
     parts = [
         "# The paper's claims",
         made,
