@@ -1,4 +1,4 @@
-"""Lower bounds that hold for every controller, a reference, and a score."""
+"""Compute lower bounds for every controller, a reference, and a score."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["LeastPossible", "frontier", "is_random", "least_possible"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for, as SciPy takes longer to load than a command's help."""
+    """Import names lazily, as SciPy takes longer to load than a command's help."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from benchmarks.limits import bounds

@@ -1,4 +1,4 @@
-"""Print what no controller can do better: `python -m benchmarks.limits --help`."""
+"""Print the least possible mean error: `python -m benchmarks.limits --help`."""
 
 from benchmarks.lib.commands import command
 

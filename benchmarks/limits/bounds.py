@@ -1,12 +1,12 @@
-"""The least possible mean error of any case of the environment, and the score that it gives.
+"""Compute the least possible mean error of any case of the environment, and scores from it.
 
-"preview" and "news" are theorems, "reference" holds under a condition; README.md says for whom.
-The mean error is that of the rewards, of |e(k)| over k = 1 to N. Each number is the mean over
-the episodes that the environment draws: for each, the programme of
-`benchmarks.limits.programme` with what `benchmarks.limits.unknown` leaves. All rest on this:
-the plant is (28) and (29), a controller knows at k what the transmitter has shown up to k, and
-any set points, plant numbers and loads up to k besides, but not the true output,
-`info["output"]`; the dead zone may be undone.
+The kinds "preview" and "news" are theorems; "reference" holds under a condition. README.md says
+for which controllers. The mean error is that of the rewards, of |e(k)| over k = 1 to N. A bound
+is the mean over the episodes that the environment draws; for each, it is the optimum of
+`benchmarks.limits.programme` given what `benchmarks.limits.unknown` leaves unknown. The bounds
+assume that the plant is (28) and (29), and that a controller at k knows the transmitter's
+readings up to k, and perhaps any set points, plant numbers and loads up to k, but not the true
+output, `info["output"]`. It may undo the dead zone.
 """
 
 from __future__ import annotations
@@ -37,56 +37,56 @@ from mptc_gym.ranges import numbers_of_plant
 
 Array = NDArray[np.float64]
 
-KINDS = {  # for which controllers nothing better is possible
+KINDS = {  # the controllers that cannot do better
     "preview": "every controller that reads the transmitter and not the true output, even one "
     "that knows the set point beforehand",
     "news": "controllers that read the transmitter and not the true output, and to which a "
     "change of the set point is news",
     "reference": "none: a reference, if each change finds the plant settled",
 }
-DIGITS = 6  # of a bound, degC
-SAME = 1e-4  # degC; where two bounds differ by less, that of every controller is shown
+DIGITS = 6  # decimals of a bound, degC
+SAME = 1e-4  # degC; of two bounds that differ by less, the one for every controller is shown
 CACHE = ROOT / "results" / "limits"
-PRICES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # of travel, for the frontier
+PRICES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # prices of travel on the frontier
 
 
 @dataclass(frozen=True)
 class LeastPossible(Estimate):
     """The least possible mean |e| of a case, degC, with a 95 % interval over drawn episodes.
 
-    `value`, `low`, `high` and `runs` are those of `Estimate`; the ends are `value` where
+    `value`, `low`, `high` and `runs` are those of `Estimate`; the ends equal `value` where
     nothing is drawn.
     """
 
     kind: str
     """One of `KINDS`."""
     idle: float
-    """Mean |e| of the same episodes if the valve is left alone, degC, with its interval."""
+    """Mean |e| of the same episodes with the valve left alone, degC, and its interval."""
     idle_low: float
     idle_high: float
     episodes: tuple[float, ...]
-    """The terms of the mean, degC; element i is for the episode of seed `seed + i`. Those of
-    the kind "news" are bounds in their mean alone."""
+    """Terms of the mean, degC; element i is for the episode of seed `seed + i`. For the kind
+    "news" only their mean is a bound."""
     seed: int
-    """Of the first episode."""
+    """Seed of the first episode."""
 
     @property
     def holds_for(self) -> str:
-        """For which controllers nothing better is possible."""
+        """The controllers that cannot do better."""
         return KINDS[self.kind]
 
     def score(self, errors: ArrayLike) -> Array:
-        """Return 0 for the mean error of a valve that is left alone, 1 for `value`.
+        """Return scores: 0 for the mean error with the valve left alone, 1 for `value`.
 
         Parameters
         ----------
         errors
-            Mean |e| of runs, degC, any shape. Scores of single runs may exceed 1 by chance.
+            Mean |e| of runs, degC, any shape. The score of a single run may exceed 1 by chance.
 
         Raises
         ------
         ValueError
-            If leaving the valve alone is as good as anything.
+            If nothing is better than leaving the valve alone.
         """
         room = self.idle - self.value
         if room <= 1e-9 * max(self.idle, 1.0):
@@ -111,25 +111,25 @@ def least_possible(
     samples
         N, length of an episode.
     kind
-        One of `KINDS`. None is what reports and `mptc_gym.evaluate` use: "news" for random set
-        points; otherwise "reference", or "preview" if a set point changes before the plant has
-        settled, or if both are the same.
+        One of `KINDS`. None chooses as reports and `mptc_gym.evaluate` do: "news" for random
+        set points; otherwise "reference", or "preview" if a set point changes before the plant
+        has settled, or if both are the same.
     episodes
-        How many are drawn, if anything is.
+        Number of episodes, if anything is drawn.
     seed
         Episode i is the one that the environment draws with seed `seed + i`. The defaults are
         the episodes of `mptc_gym.evaluate`.
     folder
-        Where the result is kept, under a name made of the arguments and of the code that
-        computes it. None: it is computed anew.
+        Folder in which the result is kept, under a name made from the arguments and the code
+        that computes it. None: it is computed anew.
     **arguments
-        Of the environment.
+        Arguments of the environment.
 
     Raises
     ------
     ValueError
-        If an argument is out of range; or for the kind "news" if set points are not random; or
-        for the kind "reference" if a set point changes before the plant has settled.
+        If an argument is out of range; if the kind is "news" and set points are not random; or
+        if it is "reference" and a set point changes before the plant has settled.
     """
     parameters = Parameters(**arguments)
     for name, count in (("samples", samples), ("episodes", episodes)):
@@ -138,9 +138,9 @@ def least_possible(
     if kind is None and theorem(parameters) == "preview":
         case = {**arguments, "samples": samples, "episodes": episodes, "seed": seed}
         preview = least_possible(kind="preview", folder=folder, **case)
-        with suppress(ValueError):  # it does not settle between changes
+        with suppress(ValueError):  # the plant does not settle between changes
             found = least_possible(kind="reference", folder=folder, **case)
-            # What cannot be foreseen makes no difference where nothing changes.
+            # Foresight makes no difference where nothing changes.
             return found if abs(found.value - preview.value) >= SAME else preview
         return preview
     kind = kind or "news"
@@ -153,11 +153,11 @@ def least_possible(
         shaped_by = [repr(parameters), samples, kind, episodes, seed]
         code = "benchmarks.limits.bounds"
         file = folder / f"{fingerprint(code, case=shaped_by, scipy=scipy.__version__)}.json"
-        with suppress(OSError, ValueError, TypeError):  # not there, or damaged: made again
+        with suppress(OSError, ValueError, TypeError):  # missing or damaged: computed again
             kept = unseal(file.read_text(encoding="utf-8"))
             return LeastPossible(**{**kept, "episodes": tuple(kept["episodes"])})
     cases, idle = _draw(parameters, samples, episodes, seed)
-    # The same on every machine, as solvers differ in later digits.
+    # Rounded to be the same on every machine, as solvers differ in later digits.
     values = [round(best(kind).cost / samples, DIGITS) for best in cases]
     least, left_alone = student(values), student(idle)
     found = LeastPossible(
@@ -175,7 +175,7 @@ def least_possible(
 
 
 def theorem(parameters: Parameters) -> str:
-    """Return the kind of the highest bound that is proven: the reference may be beaten."""
+    """Return the kind of the highest proven bound; the reference may be beaten."""
     return "news" if parameters.setpoint == "random" else "preview"
 
 
@@ -194,21 +194,21 @@ def frontier(
     controller comes below its value, so none lies below the line error = value - p * travel.
     The points are where these lines touch their envelope; between two points the bound is the
     straight line, by convexity. The travel is that of the applied flow, which may jump over the
-    dead zone: a mean of such flows travels no more than they do on average. It is loose where
-    noise asks for moves that the mean does not show.
+    dead zone: a mean of such flows travels no more than they do on average. The bound is loose
+    where noise requires moves that the mean does not show.
 
     Parameters
     ----------
     samples, kind, episodes, seed, **arguments
-        As of `least_possible`. With "reference", it has the condition of that.
+        See `least_possible`. With "reference", the condition of that kind applies.
     prices
-        Of a t/h of travel, degC times samples.
+        Prices of a t/h of travel, degC times samples.
 
     Returns
     -------
     list of tuple of float
-        Travel, t/h a sample (the sum of |u_a(k) - u_a(k-1)| over `samples`), and error, degC,
-        by descending travel; at the end a valve that does not move.
+        Travel, t/h per sample (the sum of |u_a(k) - u_a(k-1)| divided by `samples`), and error,
+        degC, by descending travel; the last point is a valve that does not move.
     """
     parameters = Parameters(**arguments)
     kind = kind or theorem(parameters)
@@ -223,7 +223,7 @@ def frontier(
 
 
 class _Idle:
-    """Leaves the valve at 0 t/h."""
+    """A controller that leaves the valve at 0 t/h."""
 
     def __init__(self, u_min: Array, u_max: Array) -> None:
         self._actions = np.asarray(action_from_command(0.0, u_min, u_max))[:, np.newaxis]
@@ -240,7 +240,7 @@ def _is_drawn(parameters: Parameters) -> bool:
 
 
 def is_random(parameters: Parameters) -> bool:
-    """Whether episodes differ in their errors, be it in their noise alone."""
+    """Return whether episodes differ in their errors, even if only by their noise."""
     noises = "noise_variance", "measurement_noise_variance"
     noisy = any(parameters.range_of(name)[1] > 0.0 for name in noises)
     return _is_drawn(parameters) or noisy or parameters.is_disturbed
@@ -249,7 +249,7 @@ def is_random(parameters: Parameters) -> bool:
 def _draw(
     parameters: Parameters, samples: int, episodes: int, seed: int
 ) -> tuple[list[Callable[..., Plan]], Array]:
-    """Return `_best` of episodes as they are drawn, and mean |e| with the valve left alone."""
+    """Return `_best` of the drawn episodes, and mean |e| with the valve left alone."""
     count = episodes if _is_drawn(parameters) else 1
     runs = episodes if is_random(parameters) else 1
     numbers = drawn_numbers(parameters, runs, seed)

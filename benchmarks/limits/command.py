@@ -1,4 +1,4 @@
-"""Print bounds as the options say, test them, or write those of the package."""
+"""Print bounds, test them, or write those of the package."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
 
 HEADINGS = {"preview": "with preview", "news": "without preview", "reference": "reference"}
 PACKAGE = ROOT / "mptc_gym" / "bounds.json"
-MORE = 20  # episodes beyond those of a score, to choose policies by
+MORE = 20  # episodes beyond those of a score, for choosing policies
 PACKAGED = PRESETS | {
     f"{name}, random set points": {**PRESETS[name], "setpoint": "random"}
-    for name in ("paper", "disturbed", "fouling")  # of the data sets
+    for name in ("paper", "disturbed", "fouling")  # for the data sets
 }
 
 NOTE = (
@@ -69,7 +69,7 @@ def execute(options: Options, console: Console) -> str:
             check_linear(Parameters(**plant.arguments))
         scenarios = scenarios_of(plant.name, plant.arguments)
         cases = {name: scenario.arguments for name, scenario in scenarios.items()}
-    # Those whose plants are drawn take the longest, and begin first.
+    # Cases with drawn plants take longest, and start first.
     first = sorted(cases, key=lambda name: not Parameters(**cases[name]).ranges)
     tasks: dict[str, Callable[[], Any]] = {
         name: partial(row, name, cases[name], cache, options.episodes, options.mpc)
@@ -101,14 +101,14 @@ def row_of_scenario(scenario: Scenario, cache: Path) -> dict[str, str]:
 def row(
     name: str, arguments: Mapping[str, Any], cache: Path, episodes: int, mpc: int | None
 ) -> dict[str, str]:
-    """Return a row of the table of plants, with the error of so many runs of MPC, if any."""
+    """Return a row of the table of plants, with the error of `mpc` runs of MPC, if any."""
     case = {"samples": SAMPLES, "episodes": episodes, "folder": cache, **arguments}
     of = least_possible(kind="preview", **case)
     idle = Estimate(of.idle, of.idle_low, of.idle_high, of.runs)
     cells = {"plant": name, "valve left alone": f"{idle:.3f}"}
     for kind, heading in HEADINGS.items():
         cells[heading] = ""
-        # "news" is for random set points, "reference" for those that are held long enough.
+        # "news" needs random set points, "reference" those that are held long enough.
         with suppress(ValueError):
             cells[heading] = f"{least_possible(kind=kind, **case):.3f}"
     if mpc:
@@ -118,7 +118,7 @@ def row(
 
 
 def write_package(cache: Path, fan_out: FanOut) -> None:
-    """Write the least possible error of each case, episode by episode where they differ."""
+    """Write the least possible error of each case, for every episode where they differ."""
     case: dict[str, Any] = {"samples": SAMPLES, "seed": SEED, "episodes": EPISODES + MORE}
     tasks = {
         name: partial(least_possible, folder=cache, **{**case, **arguments})

@@ -1,25 +1,25 @@
-"""What it costs not to know the next set point: a penalty on flows that use the future.
+"""Penalise flows that use the future, to bound the cost of not knowing the next set point.
 
 With `setpoint="random"` the set point has a law: levels are independent and uniform in
 [-A, A], and each is held for a number of samples that is uniform from S to L. To a controller
-without preview a change is news. So u_a(j) depends on the set points up to j alone, and for
-every pi(j) that vanishes in the mean over the future, E[pi(j) | set points up to j] = 0,
+without preview a change is news. So u_a(j) depends only on the set points up to j, and for
+every pi(j) with conditional mean zero, E[pi(j) | set points up to j] = 0,
 
     E[sum_j pi(j) u_a(j)] = 0.
 
-Hence the mean error of such a controller is the mean of the sum of |e(k)| and pi(k) u_a(k), and
-that is at least the mean, over the set points, of its minimum over all flows, even those that
+Hence the mean error of such a controller is the mean of the sum of |e(k)| and pi(k) u_a(k),
+which is at least the mean, over the set points, of its minimum over all flows, even those that
 know the future (D. B. Brown, J. E. Smith and P. Sun, "Information relaxations and duality in
 stochastic dynamic programs", Operations Research 58, 2010, 785-801). Every pi gives a bound; a
-good one takes from the programme what it would gain by the future. Here it is
+good pi takes away what the programme would gain from knowing the future. Here it is
 
     pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
 
-G[k, j] is what u_a(j) does to y(k), and g(k) a guess of the slope of E|e(k)|: after a change
-its sign, until the output can have followed; and in the long run of a hold a number between
--1 and 1, odd in the level, that weighs staying against going ahead to where the next level is
-to be expected. The guess is one that lets the conditional means be worked out in closed form.
-A poor guess makes the bound loose, never wrong.
+G[k, j] is the effect of u_a(j) on y(k), and g(k) a guess of the slope of E|e(k)|. After a
+change it is the sign of the change, until the output can have followed; later in a hold it is a
+number between -1 and 1, odd in the level, that weighs staying against moving ahead to where the
+next level is expected. The guess is chosen for conditional means in closed form. A poor guess
+makes the bound loose, never wrong.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
 
-THRESHOLDS = 8  # that stand for the noise in the guess
+THRESHOLDS = 8  # thresholds that represent the noise in the guess
 
 
 class News:
     """The law of random set points, and the guess for it on one course.
 
-    The guess takes the dynamics of the plant at the start of the course.
+    The guess uses the plant's dynamics at the start of the course.
     """
 
     def __init__(self, parameters: Parameters, course: Course, unknown: Unknown) -> None:
@@ -53,33 +53,33 @@ class News:
         gain = float(np.abs(beta.sum() / (1.0 - alpha.sum())))
         pace = float(np.abs(np.roots([1.0, *-alpha])).max(initial=0.0))
         self._reach = gain * min(-course.low, course.high)
-        # Noise blurs the sign of a small error: as many thresholds for it, equally probable.
+        # Noise blurs the sign of a small error; equally probable thresholds represent it.
         deviation = unknown.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
         blur = stats.halfnorm.ppf((np.arange(THRESHOLDS) + 0.5) / THRESHOLDS)
         self._blur = deviation * blur if deviation > 0.0 else np.zeros(1)
-        # After a change the output stands still for `lag` samples. From then on it nears what
-        # the limits let it come to: which share of the way it has made, by age of the level.
+        # After a change the output stands still for `lag` samples. Then it approaches what the
+        # limits allow; this is the share of the way that it has made, by age of the level.
         samples = len(course.load)
         age = np.arange(samples)
         self._share = 1.0 - pace ** np.maximum(age - course.lag + 1, 0)
-        # From here on the largest change that is in reach has been made.
+        # The age from which the largest change within reach has been made.
         far = 2.0 * self._amplitude / max(self._reach + self._amplitude, 1e-9)
         slowly = 1.0 - np.exp(-4.0)
         self._settled = int(np.searchsorted(self._share, min(far, slowly)))
-        # The chance that a level is still held at an age, if it began for certain.
+        # The probability that a level is still held at an age, given that it began.
         self._left = np.clip(
             (self._longest - age) / (self._longest - self._shortest + 1), 0.0, 1.0
         )
         at_start = Coefficients(alpha, beta, course.load[0])
         after = at_start.impulse_response(max(samples - course.delay - 1, 0))
-        # The response to one t/h, after as many samples.
+        # The response to 1 t/h of flow, by the number of samples since.
         self._impulse = np.concatenate([np.zeros(course.delay + 1), after])[:samples]
 
     def penalty(self, setpoint: Array) -> Array:
-        """Return pi, degC times samples for each t/h, for one draw of y_d(k): (samples,)."""
+        """Return pi for one draw of y_d(k), degC times samples per t/h, shape (samples,)."""
         samples, holds = len(setpoint), held(setpoint)
-        stays = []  # g of each level by its age, were it held for ever
-        changed = []  # what a change adds to the mean of g, by age, summed up
+        stays = []  # g of each level by age, if it were held for ever
+        changed = []  # what a change adds to the mean of g, summed up to each age
         guess = np.zeros(samples)
         before = 0.0
         for start, end in holds:
@@ -98,8 +98,8 @@ class News:
         return penalties
 
     def _expected(self, ages: NDArray[np.intp], now: int, stay: Array, change: Array) -> Array:
-        """Return the mean of g at later ages of a level that is held at age `now`."""
-        # The next level begins at one of these ages, each as probable as the others.
+        """Return the mean of g at later ages of a level that is still held at age `now`."""
+        # The next level begins at one of these ages, all equally probable.
         first, last = max(self._shortest, now + 1), self._longest
         count = last - first + 1
         gone = np.clip((ages - first + 1) / count, 0.0, 1.0)
@@ -107,7 +107,7 @@ class News:
         expected: Array = (1.0 - gone) * stay[ages]
         expected += np.where(recent >= 0, change[np.maximum(recent, 0)], 0.0) / count
         expected -= np.where(old >= 0, change[np.maximum(old, 0)], 0.0) / count
-        # After one more change g is positive as often as negative: levels are symmetric.
+        # After one more change g is as often positive as negative, as levels are symmetric.
         return expected
 
     def _slope(self, before: float, after: float) -> Array:
@@ -120,7 +120,7 @@ class News:
         return slope
 
     def _mean_slope(self, before: float) -> Array:
-        """Return the mean of `_slope` over all levels that may follow."""
+        """Return the mean of `_slope` over all possible next levels."""
         A = self._amplitude
         share, blur = self._share[:, np.newaxis], self._blur
         up = A - before - max(self._reach - before, 0.0) * share - blur
@@ -130,10 +130,10 @@ class News:
         return mean
 
     def _lean(self, change: Array) -> Array:
-        """Return g by age in the long run of a hold, for which it pays to stay.
+        """Return g by age late in a hold, such that it pays to stay.
 
-        At every age what a flow does is worth nothing in the mean then: the sum over later
-        ages of its response times the mean of g vanishes. Solved from the last age on.
+        At every age a flow is then worth nothing on average: the sum over later ages of its
+        response times the mean of g vanishes. This is solved backwards from the last age.
         """
         lean = np.zeros(len(change))
         lag = self._course.lag

@@ -13,22 +13,22 @@ from mptc_gym.evaluation import EPISODES
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Print the least possible mean error of cases.
+    """Print the least possible mean error of each case.
 
-    They are those of the comparison and the presets, or those of another plant.
+    The cases are those of the comparison and the presets, or those of another plant.
     """
 
     mpc: Runs | None = None
-    """Run the predictive controller on each plant, too, so many times."""
+    """Also run the predictive controller this many times on each plant."""
     verify: bool = False
     """Run every controller against the bounds instead."""
     package: bool = False
-    """Write the bounds of the presets that come with the package instead."""
+    """Write the bounds of the presets that ship with the package instead."""
     runs: Runs = 300
     """Runs of each controller in each case of --verify."""
     fan_out: FanOutOptions = field(default_factory=FanOutOptions)
     plant: PlantOptions = field(default_factory=PlantOptions)
     episodes: Count = EPISODES
-    """Episodes that a bound is the mean of, where plants or set points are drawn."""
+    """Episodes to average a bound over, where plants or set points are drawn."""
     cache: Path | None = None
-    """Where bounds are kept once they are known (default: results/limits)."""
+    """Folder in which computed bounds are kept (default: results/limits)."""

@@ -1,4 +1,4 @@
-"""The linear programme behind every bound, and the plans that make a reference."""
+"""Solve the linear programme behind every bound, and plan the flow of a reference."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from benchmarks.loop.metrics import held
 
 Array = NDArray[np.float64]
 
-NOTHING = 1e-9  # of the largest response: what is smaller is left out
-SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)  # with presolve or not
-TIME_LIMIT = 30.0  # s, of each attempt
+NOTHING = 1e-9  # fraction of the largest response below which a response is left out
+SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)  # method, and presolve
+TIME_LIMIT = 30.0  # s for each attempt
 
-# Of a reference.
-SETTLED = 0.05  # of the flow's range: how much a flow that has settled may move within the lag
-TAIL = 60  # samples more than the lag that a plan looks beyond the end of a hold
-LEVEL = 0.001  # least slope of an error that counts in plans, so that they end at the set point
-SMOOTH = 1e-4  # price of a t/h of travel, so that of equal plans the quiet one is taken
+# For a reference.
+SETTLED = 0.05  # fraction of the flow's range that a settled flow may move within the lag
+TAIL = 60  # samples that a plan looks beyond the end of a hold, in addition to the lag
+LEVEL = 0.001  # least slope of the error in plans, so that they end at the set point
+SMOOTH = 1e-4  # price of a t/h of travel, which selects the quiet one of equal plans
 
 
 class NotSolvedError(RuntimeError):
@@ -33,25 +33,25 @@ class NotSolvedError(RuntimeError):
 
 @dataclass(frozen=True)
 class Plan:
-    """What the programme found. All arrays have the shape (samples,)."""
+    """A solution of the programme. All arrays have the shape (samples,)."""
 
     error: Array
-    """The bound of E|e(k)|, degC."""
+    """The lower bound of E|e(k)|, degC."""
     output: Array
     """The mean of y(k), degC."""
     flow: Array
     """The mean of u_a(k), t/h."""
     value: float
-    """The least value of what was minimised, degC times samples."""
+    """The minimum of the objective, degC times samples."""
 
     @property
     def cost(self) -> float:
-        """The value over k = 1 to N: nothing changes e(0)."""
+        """The value over k = 1 to N, as no flow changes e(0)."""
         return self.value - float(self.error[0])
 
     @property
     def travel(self) -> float:
-        """The sum of |u_a(k) - u_a(k-1)| of the mean flow, t/h; it is 0 before k = 0."""
+        """The sum of |u_a(k) - u_a(k-1)| of the mean flow, t/h, which is 0 before k = 0."""
         return float(np.abs(np.diff(self.flow, prepend=0.0)).sum())
 
 
@@ -68,36 +68,36 @@ def plan(
 ) -> Plan:
     """Minimise the sum of the bounds of E|e(k)| over the mean flow.
 
-    Let a controller be given, causal or not, and let y and u_a stand for their means over all
-    noise, load and own randomness of the controller. As (28) is linear, the means obey it
-    without noise; as u_a(k) always lies within [low, high], so does its mean; and as E|m - n|
-    is convex in m, its mean over everything that may be known is at least that for the mean of
-    m, which is y_d - y (Jensen). So what the controller comes to is at least the minimum over
-    all mean flows within the limits: a linear programme, as the bounds of E|m - n| are highest
-    lines. The mean travel of a flow is at least the travel of the mean flow, by Jensen again.
+    Take any controller, causal or not, and let y and u_a stand for their means over all noise,
+    load and randomness of the controller. As (28) is linear, the means obey it without noise;
+    as u_a(k) always lies within [low, high], so does its mean; and as E|m - n| is convex in m,
+    its mean over everything that may be known is at least its value at the mean of m, which is
+    y_d - y (Jensen). So the controller's error is at least the minimum over all mean flows
+    within the limits: a linear programme, as each bound of E|m - n| is a maximum of lines. The
+    mean travel of a flow is at least the travel of the mean flow, again by Jensen.
 
-    It is loose where the flow that is needed lies within the dead zone or on both sides of a
-    limit by turns: the mean of 0 and 5 t/h is 2.5 t/h, and that of what the noise asks for may
-    lie within limits that single demands exceed.
+    The bound is loose where the required flow lies within the dead zone, or alternates between
+    the two sides of a limit: the mean of 0 and 5 t/h is 2.5 t/h, and the mean of what the noise
+    requires may lie within limits that single demands exceed.
 
     Parameters
     ----------
     course
-        The plant, for as many samples as there are set points, or more.
+        The plant, for at least as many samples as there are set points.
     unknown
-        What no command can answer in time.
+        What no command can counteract in time.
     setpoint
         y_d(k), degC, shape (samples,).
     before, start
-        Outputs up to sample `start`, and flows before it, are those of this plan. Without it,
-        the plant has been at rest before k = 0, and `start` is 0.
+        Outputs up to sample `start`, and flows before it, are those of the plan `before`.
+        Without one, the plant has been at rest before k = 0, and `start` is 0.
     price
-        Of valve travel, degC times samples for each t/h.
+        Price of valve travel, degC times samples for each t/h.
     penalty
-        What each t/h of u_a(k) costs in addition, shape (samples,).
+        Additional cost of each t/h of u_a(k), shape (samples,).
     least_slope
-        Of the bounds of E|m - n|, while planning: above 0, of all plans that are as good by the
-        bounds, which are level near 0, one that comes to the set point is taken.
+        Least slope of the bounds of E|m - n|, while planning. As these are level near 0, a
+        least slope above 0 selects, of equally good plans, one that comes to the set point.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def plan(
         output[start + 1 :], flow[start:-1] = _solve(
             course, of_now, setpoint, output, flow, start, price, penalty, least_slope
         )
-    # The last flow shows in no output; without a move it costs nothing either.
+    # The last flow affects no output; if it does not move, it costs nothing either.
     flow[-1] = flow[-2] if samples > 1 else 0.0
     error = np.zeros(samples)
     error[start:] = of_now.mean_error(setpoint[start:] - output[start:])
@@ -143,15 +143,15 @@ def _solve(
     """Return outputs after `start`, and flows from it on."""
     samples = len(setpoint)
     n = samples - 1 - start
-    # (28) without noise: A y = B u, rows from start + 1 on; what is past goes to the right.
+    # (28) without noise: A y = B u, rows from start + 1 on; the past goes to the right side.
     A = sparse.eye_array(samples) - _lagged(course.alpha, samples, 1)
     B = _lagged(course.beta, samples, course.delay + 1)
     A, B = A.tocsr()[start + 1 :], B.tocsr()[start + 1 :]
     past = B[:, :start] @ flow[:start] - A[:, : start + 1] @ output[: start + 1]
     A, B = A[:, start + 1 :], B[:, start:-1]
 
-    # y, u, the pieces of E|m - n| for m above and below 0; then the moves up and down, if they
-    # have a price.
+    # The unknowns are y, u, the pieces of E|m - n| for m above and below 0, and the moves up
+    # and down, if they have a price.
     eye, slopes = sparse.eye_array(n), unknown.slopes
     pieces = sparse.hstack([eye, -eye] * len(slopes))
     lengths = np.repeat(unknown.lengths[1:], 2, axis=1).T.ravel()
@@ -172,16 +172,16 @@ def _solve(
         right[-1][0] = flow[start - 1] if start else 0.0
         columns.append(_unknowns(2 * n, price, 0.0, np.inf))
 
-    # With the outputs among the unknowns it is sparse, and fast where A is slow. But where a
-    # zero of B lies outside the unit circle, the flow that belongs to an output grows without
-    # end: solvers that try outputs at will fail, or end at what is not the optimum.
+    # With outputs among the unknowns the programme is sparse, and fast where A is slow. But if
+    # a zero of B lies outside the unit circle, the flow that gives an output grows without
+    # bound: solvers that vary outputs freely fail, or end away from the optimum.
     for_flows_alone = [False, True]
     if np.any(np.abs(np.roots(course.beta[start])) > 1.0):
         for_flows_alone.reverse()
     attempts = list(itertools.product(for_flows_alone, SOLVERS))
     for flows_alone, (method, presolve) in attempts:
         blocks, targets, unknowns = rows, right, columns
-        if flows_alone:  # each output is the sum of what the flows do to it
+        if flows_alone:  # each output is the sum of the effects of the flows
             idle = linalg.solve_triangular(A.toarray(), past, lower=True)
             G = linalg.solve_triangular(A.toarray(), B.toarray(), lower=True)
             G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
@@ -211,7 +211,7 @@ def _unknowns(count: int, cost: Any, low: Any, high: Any) -> Array:
 
 
 def _lagged(coefficients: Array, samples: int, lag: int) -> sparse.sparray:
-    """Return the matrix that adds up coefficients[k, i] times x(k - lag - i)."""
+    """Return the matrix that maps x to the sum over i of coefficients[k, i] x(k - lag - i)."""
     inside = [i for i in range(coefficients.shape[1]) if lag + i < samples]
     if not inside:
         return sparse.csr_array((samples, samples))
@@ -225,11 +225,11 @@ def reference(
 ) -> Plan:
     """Return the best mean flow of a controller that never expects another change.
 
-    Where set points have no law (a square wave, a list), there is no bound but that with
-    preview: for one given course any controller may have the times of the changes built in.
-    This is a reference under a condition. At each change the controller takes, from where it
-    is, the flow that is best if the new set point stays. If the plant has settled by the next
-    change, each change costs the least that it can without preview; see `plan`.
+    Where set points have no law (a square wave, a list), the only bound is that with preview:
+    for one given sequence any controller may have the times of its changes built in. The
+    reference holds under a condition. At each change the controller takes, from where it is,
+    the flow that is best if the new set point stays. If the plant has settled by the next
+    change, each change costs the least that is possible without preview; see `plan`.
 
     Parameters
     ----------
@@ -238,12 +238,12 @@ def reference(
     setpoint
         y_d(k), degC, shape (samples,).
     price
-        Of valve travel, degC times samples for each t/h.
+        Price of valve travel, degC times samples for each t/h.
 
     Raises
     ------
     ValueError
-        If the plant has not settled when a change comes.
+        If the plant has not settled at a change.
     """
     settled = SETTLED * (course.high - course.low)
     error = np.zeros(len(setpoint))

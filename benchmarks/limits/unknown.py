@@ -1,27 +1,27 @@
-"""Bound the mean error from below by what no command can answer in time.
+"""Bound the mean error from below by what no command can counteract in time.
 
-A flow applied at j shows in y(j + d + 1) at the earliest. So the flows that shape y(k) are
-chosen at k - d - 1 or before, and cannot answer what happens after that: d + 1 samples of the
-noise xi, of the load's walk and of its jumps. With n(k) the sum of what these do to y(k),
+A flow applied at j affects y(j + d + 1) at the earliest. So the flows that shape y(k) are
+chosen at k - d - 1 or before, and cannot counteract what happens after that: d + 1 samples of
+the noise xi, of the load's walk and of its jumps. With n(k) the sum of their effects on y(k),
 
-    e(k) = m(k) - n(k),    m(k): the error to be expected from what is known at k - d - 1.
+    e(k) = m(k) - n(k),    m(k): the error expected from what is known at k - d - 1.
 
-The bounds need E|m - n| from below, as a function of m that is convex and piecewise linear.
-Three steps lead there; each can only lower the result.
+The bounds need a lower bound of E|m - n|, a convex and piecewise linear function of m. Three
+steps lead to it; each can only lower the result.
 
-1. More is taken as known than any controller knows: the load w up to k - d - 1, and, for each k
-   by itself, when the load jumps within the d + 1 samples, and to which level unless it is the
-   last of these jumps. What remains of the load is a sum of uniform numbers: the steps of the
-   walk and one level. The true output is not taken as known if the transmitter is noisy: given
-   the load, output and readings are jointly normal, and n has the variance of the best
-   prediction from the readings (Kalman), whatever is read.
+1. More is assumed to be known than any controller knows: the load w up to k - d - 1, and, for
+   each k by itself, when the load jumps within the d + 1 samples, and to which level, except
+   for the level of the last of these jumps. What remains of the load is a sum of uniform
+   numbers: the steps of the walk and one level. If the transmitter is noisy, the true output is
+   not assumed to be known: given the load, output and readings are jointly normal, and n has
+   the variance of the best prediction from the readings (Kalman), whatever they are.
 2. Each distribution is replaced by equally probable atoms, the means of its slices. A convex
-   function has a smaller mean over these (Jensen within each slice).
+   function has a smaller mean over these atoms (Jensen within each slice).
 3. m may depend on the pattern of the jumps. With the tangent of slope s to E|m - n| in each
    pattern, a_pattern + s m, the mean over the patterns is at least
    sum p_pattern a_pattern + s E[m].
 
-It is loose where the load jumps: about 1 % on the preset "disturbed".
+The bound is loose where the load jumps: by about 1 % on the preset "disturbed".
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 
-ATOMS = 128  # that stand for a distribution, equally probable
-SLICES = 4  # of each uniform one that is added to them
-# How many atoms lie below the point where a tangent touches: slopes from 0 to 1.
+ATOMS = 128  # equally probable atoms that represent a distribution
+SLICES = 4  # slices of each uniform distribution that is added to the atoms
+# Numbers of atoms below the points where the tangents touch, for slopes from 0 to 1.
 BELOW = (64, 53, 42, 31, 22, 14, 8, 4, 1, 0)
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """Lower bounds of E|m - n|: intercept + slope * |m|, the highest of all slopes."""
+    """Lower bounds of E|m - n|: the highest of the lines intercept + slope * |m|."""
 
     slopes: Array
     """Ascending, from 0 to 1; or 1 alone if nothing is unknown. Shape (slopes,)."""
@@ -60,9 +60,9 @@ class Unknown:
 
     @property
     def lengths(self) -> Array:
-        """Of the pieces of |m|, each with its slope, that add up to the bound, like intercepts.
+        """Lengths of the pieces of |m| that make up the bound, shaped like `intercepts`.
 
-        They end at the corners between the lines.
+        Each piece has its slope, and ends at a corner between two lines.
         """
         ends = np.full(self.intercepts.shape, np.inf)
         corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)
@@ -70,30 +70,30 @@ class Unknown:
         return np.diff(ends, axis=1, prepend=0.0)
 
     def of(self, start: int, stop: int) -> Unknown:
-        """Return the same for some samples."""
+        """Return the bounds of samples `start` to `stop` - 1."""
         return Unknown(self.slopes, self.intercepts[start:stop])
 
 
 def unknown(course: Course) -> Unknown:
-    """Return what remains unknown at each sample of an episode."""
+    """Return the bounds from what remains unknown at each sample of an episode."""
     numbers, samples = course.numbers, len(course.load)
     deviation = np.sqrt(noise_variance(course))
     walk = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
     amplitude = numbers.disturbance_amplitude
-    # Of the changes of the load in a window, the latest first.
+    # The changes of the load in a window, the latest first.
     inside, weights = np.zeros((samples, 0), np.bool_), np.zeros((samples, 0))
     if walk or amplitude:
         inside, weights = _load_weights(course)
     if not deviation.any() and not inside.any():
         return Unknown(np.ones(1), np.zeros((samples, 1)))
 
-    # Means of slices of the standard normal distribution that are equally probable.
+    # Means of equally probable slices of the standard normal distribution.
     edges = stats.norm.pdf(stats.norm.ppf(np.linspace(0.0, 1.0, ATOMS + 1)))
     atoms = deviation[:, np.newaxis] * (-np.diff(edges) * ATOMS)
     jump = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval) if amplitude else 0.0
     for place in range(weights.shape[1] if walk else 0):
         atoms = _plus_uniform(atoms, walk * weights[:, place])
-    probability = np.ones(samples)  # that no later change was a jump
+    probability = np.ones(samples)  # probability that no later change was a jump
     intercepts = np.zeros((samples, len(BELOW)))
     for place in range(weights.shape[1] if jump else 0):
         jumped = _plus_uniform(atoms, amplitude * weights[:, place])
@@ -107,8 +107,8 @@ def unknown(course: Course) -> Unknown:
 def noise_variance(course: Course) -> Array:
     """Return the variance of the noise in y(k) that is unknown at k - d - 1, degC^2, for all k.
 
-    With a noisy transmitter it is that of the best prediction. At the beginning of an episode
-    less noise has come.
+    With a noisy transmitter it is that of the best prediction. Early in an episode, less noise
+    has accumulated.
     """
     samples = len(course.load)
     R = course.numbers.noise_variance
@@ -124,7 +124,7 @@ def noise_variance(course: Course) -> Array:
             P = Phi[k] @ P @ Phi[k].T + Q
             P = P - np.outer(P[:, 0], P[0]) / (P[0, 0] + V)
             known[k] = P
-    # From k - lag on, one sample after the other, for all k at once.
+    # Predict from k - lag on, sample by sample, for all k at once.
     lag = min(course.lag, samples)
     at = np.arange(samples) - lag
     P = known[np.maximum(at, 0)]
@@ -138,15 +138,15 @@ def noise_variance(course: Course) -> Array:
 
 
 def _load_weights(course: Course) -> tuple[NDArray[np.bool_], Array]:
-    """Return which changes of the load fall into the window of y(k), and what they do to it.
+    """Return which changes of the load fall into the window of y(k), and their effects on it.
 
     Both have the shape (samples, most changes in a window), the latest change first: whether
-    there is one, and what it adds to y(k) for a unit of the load.
+    there is one, and what it adds to y(k) per unit of the load.
     """
     samples, order = course.alpha.shape
     lag = min(course.lag, samples)
     changes = np.arange(LOAD_INTERVAL, samples, LOAD_INTERVAL)
-    # To a unit step at each change, after 0, 1, ... samples.
+    # Responses to a unit step at each change, after 0, 1, ... samples.
     answers = np.empty((lag, len(changes)))
     for t in range(lag):
         at = np.minimum(changes + t, samples - 1)
@@ -166,7 +166,7 @@ def _load_weights(course: Course) -> tuple[NDArray[np.bool_], Array]:
 
 
 def _plus_uniform(atoms: Array, half_width: Array) -> Array:
-    """Add a uniform number to atoms in ascending order, and make as many atoms of the sum."""
+    """Add a uniform number to ascending atoms, and reduce the sum to as many atoms."""
     slices = (np.arange(SLICES) + 0.5) / SLICES * 2.0 - 1.0
     parts = atoms[:, :, np.newaxis] + half_width[:, np.newaxis, np.newaxis] * slices
     parts = np.sort(parts.reshape(len(atoms), -1), axis=1)
@@ -176,7 +176,7 @@ def _plus_uniform(atoms: Array, half_width: Array) -> Array:
 
 def _intercepts(atoms: Array) -> Array:
     """Return min over m of E|m - n| - s m for each slope s of `BELOW`, degC."""
-    # The tangent touches where so many atoms lie below m; above it stand all others.
+    # A tangent touches where so many atoms of `BELOW` lie below m, and all others above it.
     sums = np.cumsum(atoms, axis=1)
     sums = np.hstack([np.zeros((len(atoms), 1)), sums])
     below = sums[:, np.array(BELOW)]

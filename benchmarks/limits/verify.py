@@ -46,9 +46,9 @@ CASES: dict[str, dict[str, Any]] = {
 
 
 class Counting:
-    """Counts samples, and so knows when the square wave changes.
+    """A controller that counts samples, and so knows when the square wave changes.
 
-    The flow is that which holds the set point of d + 10 samples later.
+    On that wave it applies the flow that holds the set point d + 10 samples ahead.
     """
 
     def __init__(self, plant: Parameters, runs: int, seed: int) -> None:
@@ -57,11 +57,11 @@ class Counting:
         self._limits = [np.mean(plant.range_of(name)) for name in ("u_min", "u_max")]
 
     def reset(self) -> None:
-        """Begin to count."""
+        """Restart the count."""
         self._k = self._plant.range_of("delay")[0] + 10
 
     def act(self, observation: Array) -> Array:
-        """Return actions for observations, both of a row for each run."""
+        """Return actions for observations, both with one row for each run."""
         level = np.asarray(observation, dtype=np.float64)[:, 0]
         if self._plant.setpoint == "square":
             period, amplitude = self._plant.setpoint_period, self._plant.setpoint_amplitude
@@ -73,7 +73,7 @@ class Counting:
 
 
 def controllers() -> dict[str, Factory]:
-    """Return factories by name: of the roster, but what has to be trained, and one more."""
+    """Return factories by name: the roster's that need no training, and `Counting`."""
     known = {name: entry.members()[0] for name, entry in ROSTER.items() if not entry.trained}
     return {**known, "counting": Factory(Counting)}
 
@@ -84,10 +84,10 @@ def errors(factory: Factory, runs: int, samples: int, **arguments: Any) -> Array
 
 
 def beats(found: Array, least: LeastPossible) -> bool:
-    """Return whether runs, of the seeds from `least.seed` on, lie below a bound.
+    """Return whether runs, with the seeds from `least.seed` on, beat a bound.
 
-    They do if their mean |e|, degC, is below it beyond the interval of the difference. Where
-    the bound is the mean over as many episodes, each run is compared with its episode.
+    They do if the interval of the difference of their mean |e|, degC, from the bound lies below
+    0. If the bound is the mean over as many episodes, each run is compared with its episode.
     """
     paired = len(least.episodes) == len(found)
     difference = found - (np.array(least.episodes) if paired else least.value)
@@ -97,15 +97,15 @@ def beats(found: Array, least: LeastPossible) -> bool:
 def verify(
     runs: int, folder: Path, fan_out: FanOut, cases: Sequence[str] = ()
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Run every controller on every case, or on some of `CASES`, so many times each.
+    """Run every controller `runs` times on each of `CASES`, or on some of them.
 
     Bounds and runs are kept in a folder as soon as they are known.
 
     Returns
     -------
     DataFrame, list of str
-        A row a case: the bound that applies and the mean error of each controller, degC. And
-        the controllers that beat it, with the case.
+        One row for each case, with the bound that applies and each controller's mean error,
+        degC; and the controllers that beat their bound, with the case.
     """
     cases = cases or tuple(CASES)
     factories = controllers()
