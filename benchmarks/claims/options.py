@@ -13,7 +13,7 @@ from benchmarks.lib.options import FanOutOptions, Folder, Names, Runs, options
 class Options:
     """Test the paper's claims, each on a thousand runs.
 
-    The verdicts go to claims.md, all numbers to claims.csv; plots and their data lie beside.
+    The verdicts go to claims.md, all numbers to claims.csv, plots and their data beside them.
     """
 
     claims: Names = field(default=(), kw_only=False)
