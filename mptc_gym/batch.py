@@ -1,7 +1,7 @@
-"""Hold what the vector environments share: arguments, masks, time limits, autoresets, infos.
+"""Implement what the vector environments share: arguments, masks, time limits, resets, infos.
 
-`MiddlePointVectorEnv` in NumPy and `MiddlePointTorchEnv` in PyTorch each add how their plants
-move, in arrays or in tensors of their own.
+`MiddlePointVectorEnv` adds the motion of plants in NumPy arrays, and `MiddlePointTorchEnv` in
+PyTorch tensors.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mptc_gym.env import action_space, observation_space
 from mptc_gym.parameters import Parameters
 from mptc_gym.signals import FOREVER
 
-Array = Any  # of NumPy or PyTorch, as the environment has them
+Array = Any  # of NumPy or PyTorch, depending on the environment
 Infos = dict[str, Any]
 Mask = NDArray[np.bool_]  # of plants, shape (num_envs,)
 
@@ -29,7 +29,7 @@ FACTORS = ("gain_factor", "time_constant_factor")
 
 
 class BatchEnv(VectorEnv[Array, Array, Array]):
-    """n plants that advance together, without what depends on the library of their arrays."""
+    """n plants that advance together, without what depends on the array library."""
 
     def __init__(
         self,
@@ -49,41 +49,41 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._factors = FACTORS if self.parameters.drifts else ()
         load = ("disturbance",) if self.parameters.is_disturbed else ()
-        self._names = (*INFO, *load, *self._factors)  # of what infos hold
+        self._names = (*INFO, *load, *self._factors)  # keys of the infos
         self._masks = tuple(f"_{name}" for name in self._names)
-        # Each plant's k is the clock less where it started.
+        # Each plant's k is the clock minus its start.
         self._clock = 0
         self._starts = np.zeros(num_envs, np.int64)
         self._first_end = 0
         self._was_reset = False
-        self._ended: Mask | None = None  # those still to be reset, if any
+        self._ended: Mask | None = None  # plants still to be reset, if any
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, Infos]:
-        """Bring all plants, or some, to rest and start an episode of each.
+        """Bring all or some plants to rest and start an episode of each.
 
         Parameters
         ----------
         seed
-            Starts the random numbers anew; see the class docstring. Without it, they go on.
+            Restarts the random numbers; see the class docstring. Without it, they continue.
         options
-            `reset_mask`, an array of bool, shape (num_envs,), says which plants are reset.
+            `reset_mask`, a bool array of shape (num_envs,), selects the plants to reset.
 
         Returns
         -------
         observations
             Shape (num_envs, observation_size); the last one of a plant that was not reset.
         infos
-            Arrays of shape (num_envs,), and a mask of the plants that were reset with each,
-            which may be one array.
+            Arrays of shape (num_envs,), each with a mask of the plants that were reset; the
+            masks may be one array.
 
         Raises
         ------
         ValueError
-            If an argument does not fit. Nothing is changed then.
+            If an argument is invalid. Nothing is then changed.
         ResetNeeded
-            If the first reset is not one of all plants.
+            If the first reset does not include all plants.
         """
         if options is not None and not isinstance(options, Mapping):
             reject("options", options, "a dict or None")
@@ -118,8 +118,8 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
         Raises
         ------
         ValueError
-            If the actions have another shape, or one is not finite. The plants are untouched
-            then.
+            If the actions have another shape, or one is not finite. The plants are then
+            unchanged.
         ResetNeeded
             If the environments have never been reset, or, with autoreset disabled, if one has
             ended.
@@ -143,7 +143,7 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
         return observations, rewards, terminations, truncations, infos
 
     def _end(self, observations: Array, rewards: Array, infos: Infos) -> tuple[Array, ...]:
-        """Do what the end of an episode asks for, also to the infos; return what it changes."""
+        """Handle the end of episodes, also in the infos; return what else it changes."""
         ended = self._clock - self._starts >= self._limit
         flags = self._flags(ended)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
@@ -153,7 +153,7 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
             infos |= {"_final_info": flags, "_final_obs": flags}
             self._restart(ended, infos)
             return self._observations(), rewards, self._flags(ended)
-        if self._ended is not None:  # at the step before this one
+        if self._ended is not None:  # at the previous step
             rewards = self._where(self._flags(self._ended), 0, rewards)
             self._restart(self._ended, infos)
             observations = self._observations()
@@ -162,7 +162,7 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
         return observations, rewards, self._flags(ended)
 
     def _restart(self, mask: Mask, infos: Infos) -> None:
-        """Begin an episode of some plants, and put their infos of k = 0 in."""
+        """Begin an episode of some plants, and insert their infos at k = 0."""
         self._starts[mask] = self._clock
         self._first_end = int(self._starts.min()) + self._limit
         if self._ended is not None:
@@ -175,7 +175,7 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
             infos.setdefault(f"_{name}", flags)
 
     def _checked_mask(self, options: Mapping[str, Any]) -> Mask:
-        """Return which plants a reset is of."""
+        """Return the mask of the plants to reset."""
         if "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)
         given = options["reset_mask"]
@@ -190,21 +190,21 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
             reject("options['reset_mask']", given, allowed)
         return mask.copy()
 
-    # What an environment adds.
+    # To be defined by each environment.
 
     _where: Any  # numpy.where or torch.where
-    _zeros: Array  # one a plant; only to be read
+    _zeros: Array  # one per plant, read-only
 
     def _on_host(self, mask: Any) -> Any:
-        """Return a mask as an array of NumPy, if it is one of the library."""
+        """Return a mask as a NumPy array if it is an array of the environment's library."""
         return mask
 
     def _flags(self, mask: Mask) -> Array:
-        """Return a new array of the library."""
+        """Return a mask as a new array of the environment's library."""
         raise NotImplementedError
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Check the other arguments of `reset`, then do what they say."""
+        """Check the other arguments of `reset`, then apply them."""
         raise NotImplementedError
 
     def _checked_actions(self, actions: Any) -> Array:
@@ -212,15 +212,15 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
         raise NotImplementedError
 
     def _begin(self, mask: Mask) -> dict[str, Array]:
-        """Begin an episode of some plants; return their infos of k = 0 that are not 0."""
+        """Begin an episode of some plants; return their infos at k = 0 that are not 0."""
         raise NotImplementedError
 
     def _advance(self, a: Array) -> tuple[Array, Array, Array, Array, Infos]:
-        """Move all plants by a sample, and return what `step` does where no episode ends."""
+        """Move all plants by one sample, and return what `step` returns if no episode ends."""
         raise NotImplementedError
 
     def _observations(self) -> Array:
-        """Return the present observations, which the caller may overwrite."""
+        """Return the current observations, which the caller may overwrite."""
         raise NotImplementedError
 
     def _final(self, ended: Mask, observations: Array) -> Array:
@@ -229,7 +229,7 @@ class BatchEnv(VectorEnv[Array, Array, Array]):
 
 
 def _checked_count(num_envs: int, parameters: Parameters) -> int:
-    """Return the number of plants, if they fit in the memory of usual machines."""
+    """Return the number of plants, if they fit in the memory of a typical machine."""
     num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
     inputs = parameters.range_of("delay")[1] + len(parameters.b)
     most = int(MOST_NUMBERS // (3 * inputs + parameters.observation_size))
@@ -239,7 +239,7 @@ def _checked_count(num_envs: int, parameters: Parameters) -> int:
 
 
 def _checked_limit(max_episode_steps: int | None) -> int:
-    """Return the samples of an episode; `FOREVER` if there is no limit, None or -1."""
+    """Return the number of samples in an episode; `FOREVER` for None or -1."""
     if max_episode_steps is None:
         return FOREVER
     if not is_count(max_episode_steps, -1) or max_episode_steps == 0:
@@ -249,7 +249,7 @@ def _checked_limit(max_episode_steps: int | None) -> int:
 
 
 def _checked_mode(autoreset_mode: str | AutoresetMode) -> AutoresetMode:
-    """Return an autoreset mode that is given by itself or by its value."""
+    """Return an autoreset mode, given as itself or by its value."""
     try:
         return AutoresetMode(autoreset_mode)
     except ValueError:

@@ -11,37 +11,37 @@ from typing import Any, Final, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-# The largest number that an argument takes. Beyond it, float32 observations and squares lose
-# their meaning.
+# Largest magnitude of an argument. Beyond it, float32 observations and squares become
+# meaningless.
 LARGEST: Final[Any] = 10**9
-# Far more than any plant needs. Beyond them, a mistyped number would fill the memory.
+# Far more than any plant needs. Without these limits, a mistyped number could fill the memory.
 LONGEST: Final = 10_000  # samples of a delay or of a window
 MOST_COEFFICIENTS: Final = 1_000
 COEFFICIENTS: Final = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
-MOST_PLANTS: Final = 10_000_000  # of one environment
-MOST_NUMBERS: Final = 1_000_000_000  # that the plants of one environment keep together
+MOST_PLANTS: Final = 10_000_000  # in one environment
+MOST_NUMBERS: Final = 1_000_000_000  # kept by all plants of one environment together
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
-_FLOAT64 = np.dtype(np.float64)  # quicker to pass on than the type
-_SHOWN = 80  # characters of a value that an error message shows
+_FLOAT64 = np.dtype(np.float64)  # faster to pass than the type
+_SHOWN = 80  # characters of a value shown in an error message
 
 Number = float | Sequence[float]  # or a range, [low, high]
 Check = Callable[[str, Any], Any]
 
 
 def reject(name: str, value: object, allowed: str) -> NoReturn:
-    """Raise the ValueError that says what an argument must be and what it is."""
+    """Raise a ValueError that says what an argument must be and what it is."""
     raise ValueError(f"{name} must be {allowed}, got {shortened(value)}") from None
 
 
 def shortened(value: object) -> str:
-    """Return the value as Python writes it; of a long one the beginning and the length."""
+    """Return the repr of a value; for a long one, its beginning and its length."""
     try:
         text = repr(value)
-    except ValueError:  # Python writes no integers of more than some thousand digits
+    except ValueError:  # Python refuses to print integers of over 4300 digits
         return "a number of thousands of digits"
     size = f" ({len(value)} elements)" if isinstance(value, list | tuple) else ""
-    if hasattr(value, "shape"):  # an array or a tensor, which is written in several lines
+    if hasattr(value, "shape"):  # an array or a tensor, printed in several lines
         text, size = " ".join(text.split()), f" (shape {tuple(value.shape)})"
     if len(text) <= _SHOWN:
         return text
@@ -49,7 +49,7 @@ def shortened(value: object) -> str:
 
 
 def reject_action(action: object) -> NoReturn:
-    """Raise the ValueError that says what the action of one plant must be."""
+    """Raise a ValueError that says what the action of one plant must be."""
     reject("action", action, "one finite number, shape (1,)")
 
 
@@ -57,8 +57,8 @@ def one_action(action: Any) -> float:
     """Return the action of one plant, finite or not."""
     try:
         value = action.item() if hasattr(action, "item") else np.asarray(action).item()
-        return float(value - 0.0)  # text is no number, even where float() reads one
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
+        return float(value - 0.0)  # text is not a number, even if float() parses it
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last: from tensors
         reject_action(action)
 
 
@@ -71,28 +71,28 @@ def many_actions(
         given = np.asarray(actions)
         if given.dtype.hasobject:
             given = np.array((given - 0.0).tolist())
-        # Text is no number, even where NumPy reads one.
+        # Text is not a number, even if NumPy parses it.
         given = given.astype(_FLOAT64, casting="same_kind")
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one: of tensors
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last: from tensors
         given = np.empty(0)
     if given.shape != (num_envs, 1):
         reject("actions", actions, f"numbers, shape ({num_envs}, 1)")
     checked = given.ravel()
     if ignored is not None:
         checked[ignored] = 0.0
-    if not math.isfinite(checked.dot(_faint(num_envs))):  # in one call, whatever their number
+    if not math.isfinite(checked.dot(_faint(num_envs))):  # all in one call
         reject("actions", actions, "finite")
     return checked
 
 
 @lru_cache(4)
 def _faint(size: int) -> NDArray[np.float64]:
-    """Return factors so small that no sum of finite actions overflows with them."""
+    """Return weights so small that no weighted sum of finite actions overflows."""
     return np.full(size, 1e-150)
 
 
 def plain(value: Any) -> Any:
-    """Return the lists and numbers of a NumPy array or scalar; anything else as it is."""
+    """Return a NumPy array or scalar as lists and numbers; anything else unchanged."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
@@ -109,7 +109,7 @@ def is_count(value: Any, minimum: int = 0) -> bool:
 
 
 def _number_that(holds: Callable[[float], bool], allowed: str) -> Callable[[str, Any], float]:
-    """Return a check that takes a number for which something holds, and never returns -0."""
+    """Return a check that takes a number if a condition holds, and never returns -0."""
 
     def checked(name: str, value: Any) -> float:
         if not is_number(value) or not holds(value):
@@ -132,12 +132,12 @@ def count(name: str, value: Any, minimum: int, maximum: int) -> int:
     return int(value)
 
 
-samples = partial(count, minimum=0, maximum=LONGEST)  # that are kept
+samples = partial(count, minimum=0, maximum=LONGEST)  # of a delay or a window
 duration = partial(count, minimum=1, maximum=LARGEST)  # in samples
 
 
 def numbers(name: str, value: Any, allowed: str) -> tuple[float, ...]:
-    """Return a list of one number or more."""
+    """Return the numbers of a list that has at least one."""
     if not isinstance(value, list | tuple) or not value:
         reject(name, value, allowed)
     for i, element in enumerate(value):
@@ -148,7 +148,7 @@ def numbers(name: str, value: Any, allowed: str) -> tuple[float, ...]:
 
 
 def coefficients(name: str, value: Any, allowed: str = COEFFICIENTS) -> tuple[float, ...]:
-    """Return coefficients, up to `MOST_COEFFICIENTS`."""
+    """Return at most `MOST_COEFFICIENTS` coefficients."""
     checked = numbers(name, value, allowed)
     if len(checked) > MOST_COEFFICIENTS:
         reject(name, value, allowed)
@@ -156,7 +156,7 @@ def coefficients(name: str, value: Any, allowed: str = COEFFICIENTS) -> tuple[fl
 
 
 def polynomial(name: str, value: Any) -> tuple[float, ...]:
-    """Return coefficients of which the first is 1."""
+    """Return coefficients, the first of which is 1."""
     allowed = f"{COEFFICIENTS}, the first of them 1"
     checked = coefficients(name, value, allowed)
     if checked[0] != 1.0:
@@ -165,7 +165,7 @@ def polynomial(name: str, value: Any) -> tuple[float, ...]:
 
 
 def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
-    """Return a kind of set point, a constant, or one number a sample."""
+    """Return a kind of set point, a constant, or one number per sample."""
     allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
     if isinstance(value, list | tuple):
         return numbers(name, value, allowed)
@@ -184,7 +184,7 @@ def reward(name: str, value: Any) -> str:
 
 
 def or_range(check: Check) -> Callable[[str, Any], Number]:
-    """Return a check that takes a range [low, high] as well, of what `check` takes."""
+    """Return a check that takes what `check` takes, or a range [low, high] of it."""
 
     def checked(name: str, value: Any) -> Number:
         if not isinstance(value, list | tuple):

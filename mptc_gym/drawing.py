@@ -1,4 +1,4 @@
-"""Draw a record of the loop with pygame: a strip chart in pixels, and a window for it."""
+"""Draw a record of the loop with pygame: a strip chart in pixels, and its window."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Colour = tuple[int, int, int]
 Point = tuple[float, float]
 
 SIZE = 960, 540
-# The lines are of Okabe and Ito's colours, which all eyes can tell apart.
+# The lines have the colours of Okabe and Ito, safe for colour-blind readers.
 TEMPERATURE: Colour = (0, 114, 178)
 SETPOINT: Colour = (213, 94, 0)
 APPLIED: Colour = (0, 158, 115)
@@ -24,7 +24,7 @@ COMMAND: Colour = (40, 40, 40)
 DEAD_ZONE: Colour = (228, 228, 228)
 IN_TRANSIT: Colour = (214, 234, 248)
 LIMIT: Colour = (130, 130, 130)
-FAINT: Colour = (95, 100, 108)  # of words that are no names
+FAINT: Colour = (95, 100, 108)  # of secondary text
 _STILL_TO_COME: Colour = (150, 210, 192)  # a lighter APPLIED
 _PAGE: Colour = (243, 244, 246)
 _PANEL: Colour = (255, 255, 255)
@@ -32,42 +32,42 @@ _GRID: Colour = (232, 233, 236)
 _FRAME: Colour = (160, 164, 170)
 _INK: Colour = (25, 28, 32)
 
-_LEFT, _RIGHT = 72, 842  # of both panels; what is right of them is for the lines' names
-_SMALL, _NORMAL, _LARGE = 18, 20, 32  # of letters
-_FINER = 4  # times as large as it is shown, words are drawn
+_LEFT, _RIGHT = 72, 842  # edges of both panels; names of lines go to the right of them
+_SMALL, _NORMAL, _LARGE = 18, 20, 32  # font sizes
+_FINER = 4  # factor by which text and dots are drawn larger, then reduced
 
 
 class Panel:
-    """A part of the picture with axes of its own, from `top` to `bottom`, in pixels."""
+    """A part of the picture with its own axes, from `top` to `bottom`, in pixels."""
 
     def __init__(self, top: int, bottom: int, record: Record, axis: Axis) -> None:
         self.top, self.bottom = top, bottom
         self.record, self.axis = record, axis
         self.rect = pygame.Rect(_LEFT, top, _RIGHT - _LEFT + 1, bottom - top + 1)
         self._sample = (_RIGHT - _LEFT) / record.span
-        # Samples k, k = first on, and the place where the next one will be.
+        # Positions of all samples shown, and of the next one.
         self.xs = [self.x(k) for k in range(record.first, record.k + 2)]
 
     def x(self, k: float) -> float:
-        """Return where sample k lies."""
+        """Return the horizontal position of sample k."""
         return _LEFT + (k - self.record.first) * self._sample
 
     def minutes(self) -> Iterator[tuple[float, float]]:
-        """Yield the full minutes, or so, and where they lie."""
+        """Yield the ticks of the time axis, in minutes, and their positions."""
         per_minute = 60.0 / self.record.sampling_interval
         for minute in self.record.minutes.ticks():
             yield minute, self.x(minute * per_minute)
 
     def y(self, value: float) -> float:
-        """Return where a value lies."""
+        """Return the vertical position of a value."""
         return self.bottom - self.axis.share(value) * (self.bottom - self.top)
 
     def ys(self, values: Iterable[float]) -> list[float]:
-        """Return where values lie."""
+        """Return the vertical positions of values."""
         low, bottom = self.axis.low, float(self.bottom)
         scale = (bottom - self.top) / (self.axis.high - low)
-        # What lies beyond is drawn at the edge, inside the frame, and so is, in this order of
-        # min and max, what is not a number.
+        # Values beyond the axis are drawn at its edge, inside the frame; so is NaN, given this
+        # order of min and max.
         least, most = self.top + 2.0, bottom - 2.0
         return [max(least, min(most, bottom - (value - low) * scale)) for value in values]
 
@@ -78,7 +78,7 @@ def frame(record: Record) -> NDArray[np.uint8]:
 
 
 def show(record: Record, fps: float) -> None:
-    """Show a picture in the window, which is opened if need be, at most `fps` a second."""
+    """Show a picture in the window, opened if necessary, at most `fps` times a second."""
     pygame.display.init()
     screen = pygame.display.get_surface()
     if screen is None or screen.get_size() != SIZE:
@@ -97,12 +97,12 @@ def close_window() -> None:
 
 @cache
 def clock() -> pygame.time.Clock:
-    """Return what makes a window wait."""
+    """Return the clock that limits the frame rate."""
     return pygame.time.Clock()
 
 
 def draw(record: Record) -> pygame.Surface:
-    """Return a picture; the next one is drawn over it."""
+    """Return a picture; the next call draws over it."""
     surface = _paper()
     surface.fill(_PAGE)
     _header(surface, record)
@@ -116,7 +116,7 @@ def draw(record: Record) -> pygame.Surface:
 
 
 def flow_at(record: Record, point: tuple[int, int]) -> float | None:
-    """Return the flow that a point of a picture stands for, t/h; None outside its panel."""
+    """Return the flow at a point of a picture, t/h; None outside its panel."""
     panel = _flow_panel(record)
     if not panel.rect.collidepoint(point):
         return None
@@ -130,8 +130,7 @@ def _flow_panel(record: Record) -> Panel:
 
 @cache
 def _paper() -> pygame.Surface:
-    # Three bytes a pixel, in the order in which arrays have them: to turn it into an array is
-    # no more than a copy.
+    # Three bytes per pixel, in the order of an array, so that converting it is just a copy.
     return pygame.Surface(SIZE, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
 
 
@@ -143,7 +142,7 @@ def _header(surface: pygame.Surface, record: Record) -> None:
     for i, (name, value) in enumerate(record.readings.items()):
         x = 24 + 156 * i
         _write(surface, name, _SMALL, FAINT, topleft=(x, 12))
-        for character in value:  # one by one: what changes is made of pictures that are kept
+        for character in value:  # one by one, as images of single characters are cached
             image = _words(character, _LARGE, colours.get(name, _INK))
             surface.blit(image, (x, 32))
             x += image.get_width()
@@ -183,7 +182,7 @@ def _flows(surface: pygame.Surface, panel: Panel) -> None:
         _dotted(surface, _LEFT, _RIGHT, panel.y(limit))
     pygame.draw.line(surface, _FRAME, (_LEFT, zero), (_RIGHT, zero))
 
-    # An input is held from its sample to the next. The first entry is of before the episode.
+    # An input is held from its sample to the next. The first entry is from before the episode.
     _, _, commands, applied = (panel.ys(each[1:]) for each in zip(*record.samples, strict=True))
     if applied:
         if record.in_transit:
@@ -203,7 +202,7 @@ def _flows(surface: pygame.Surface, panel: Panel) -> None:
 
 
 def _ground(surface: pygame.Surface, panel: Panel, title: str) -> None:
-    """Draw what lies behind the lines: the panel, its grid and its tick labels."""
+    """Draw the background of the lines: the panel, its grid and its tick labels."""
     surface.fill(_PANEL, panel.rect)
     for _, x in panel.minutes():
         pygame.draw.line(surface, _GRID, (x, panel.top), (x, panel.bottom))
@@ -216,14 +215,14 @@ def _ground(surface: pygame.Surface, panel: Panel, title: str) -> None:
 
 
 def _edge(surface: pygame.Surface, panel: Panel) -> None:
-    """Draw the panel's frame, and a line where the present is."""
+    """Draw the panel's frame, and a line at the present sample."""
     now = panel.x(panel.record.k)
     pygame.draw.line(surface, _FRAME, (now, panel.top), (now, panel.bottom))
     pygame.draw.rect(surface, _FRAME, panel.rect, 1)
 
 
 def _bracket(surface: pygame.Surface, panel: Panel, left: float, right: float) -> None:
-    """Say, above the panel, what is on its way."""
+    """Mark the flow in transit above the panel."""
     y = panel.top - 5
     pygame.draw.line(surface, FAINT, (left, y), (right, y))
     for x in (left, right):
@@ -242,7 +241,7 @@ def _time_axis(surface: pygame.Surface, panel: Panel) -> None:
 
 
 def _legend(surface: pygame.Surface, has_dead_zone: bool) -> None:
-    """Say what shade and dots mean, below the panels, where no line is drawn over it."""
+    """Explain shade and dots below the panels, where no line crosses the text."""
     x, y = _LEFT, SIZE[1] - 10
     _dotted(surface, x, x + 28, y)
     _write(surface, "limits", _SMALL, FAINT, midleft=(x + 36, y))
@@ -254,13 +253,13 @@ def _legend(surface: pygame.Surface, has_dead_zone: bool) -> None:
 
 
 def _dotted(surface: pygame.Surface, left: int, right: int, y: float) -> None:
-    """Draw the line of a limit."""
+    """Draw the dotted line of a limit."""
     for x in range(left, right, 8):
         pygame.draw.line(surface, LIMIT, (x, y), (x + 3, y))
 
 
 def _curve(surface: pygame.Surface, colour: Colour, points: Sequence[Point]) -> None:
-    """Draw a smooth line some three pixels wide: smooth ones come in one width alone."""
+    """Draw an antialiased line about three pixels wide, from lines of pygame's only width."""
     if len(points) < 2:
         return
     for dx, dy in ((0.0, -0.8), (0.0, 0.0), (0.0, 0.8), (0.6, 0.0)):
@@ -270,7 +269,7 @@ def _curve(surface: pygame.Surface, colour: Colour, points: Sequence[Point]) -> 
 def _dashes(
     surface: pygame.Surface, colour: Colour, panel: Panel, heights: Sequence[float]
 ) -> None:
-    """Draw a value that is held from sample to sample, in dashes that move with it."""
+    """Draw a value held from sample to sample, in dashes that move with the samples."""
     record = panel.record
     period = max(2, round(14 * record.span / (_RIGHT - _LEFT)))  # samples
     for i, y in enumerate(heights):
@@ -280,23 +279,23 @@ def _dashes(
 
 
 def _steps(panel: Panel, heights: Sequence[float]) -> list[Point]:
-    """Return the line of a value that is held from each of the latest samples to the next."""
+    """Return the line of the latest values, each held from its sample to the next."""
     points: list[Point] = []
-    before = len(panel.xs) - 2 - len(heights)  # the last two: the present, and the next one
+    before = len(panel.xs) - 2 - len(heights)  # the last two: the present and next samples
     for i, y in enumerate(heights, start=before):
         points += [(panel.xs[i], y), (panel.xs[i + 1], y)]
     return points
 
 
 def _names(surface: pygame.Surface, panel: Panel, *lines: tuple[str, Colour, float]) -> None:
-    """Write the name of two lines beside their ends, one above the other."""
+    """Write the names of two lines beside their ends, one above the other."""
     x = panel.x(panel.record.k) + 10
     (_, _, upper), (_, _, lower) = lines = tuple(sorted(lines, key=lambda line: line[2]))
     middle = (upper + lower) / 2
     apart = max((lower - upper) / 2, 8.0)
     middle = min(max(middle, panel.top + apart), panel.bottom - apart)
     for (name, colour, _), y in zip(lines, (middle - apart, middle + apart), strict=True):
-        for dx, dy in ((-2, 0), (2, 0), (0, -2), (0, 2)):  # so that no grid runs through it
+        for dx, dy in ((-2, 0), (2, 0), (0, -2), (0, 2)):  # so that no grid line crosses it
             _write(surface, name, _NORMAL, _PANEL, midleft=(x + dx, y + dy))
         _write(surface, name, _NORMAL, colour, midleft=(x, y))
 
@@ -304,7 +303,7 @@ def _names(surface: pygame.Surface, panel: Panel, *lines: tuple[str, Colour, flo
 def _write(
     surface: pygame.Surface, words: str, size: int, colour: Colour, **place: Point
 ) -> None:
-    """Write words, and put a place of theirs, such as `topleft`, at a point."""
+    """Write words with one of their anchors, such as `topleft`, at a point."""
     image = _words(words, size, colour)
     surface.blit(image, image.get_rect(**{side: _pixel(at) for side, at in place.items()}))
 
@@ -315,9 +314,9 @@ def _pixel(point: Point) -> tuple[int, int]:
 
 @lru_cache(1024)
 def _words(words: str, size: int, colour: Colour) -> pygame.Surface:
-    # With the font that comes with pygame, so that pictures are the same everywhere. It is
-    # opened for each picture of words, as it would not outlive another's pygame.quit(). At its
-    # final size its letters would stand on whole pixels, unevenly.
+    # pygame's own font makes pictures the same everywhere. It is opened for each image, as it
+    # would not survive a pygame.quit() elsewhere. Drawn at its final size, its letters would be
+    # aligned to whole pixels, unevenly spaced.
     pygame.font.init()
     font = pygame.font.Font(None, size * _FINER)
     return _reduced(font.render(words.replace("-", "\N{MINUS SIGN}"), True, colour))

@@ -1,4 +1,4 @@
-"""Run one plant, its set point and its transmitter: the environment `MiddlePoint-v0`."""
+"""Simulate one plant, its set point and its transmitter: the environment `MiddlePoint-v0`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mptc_gym.ranges import Ranges, numbers_of_plant
 from mptc_gym.record import Record
 from mptc_gym.signals import ONE, Signals, Streams
 
-_FLOAT32 = np.dtype(np.float32)  # quicker to pass on than the type
+_FLOAT32 = np.dtype(np.float32)  # faster to pass than the type
 
 Observation = NDArray[np.float32]
 Action = NDArray[np.float32]
@@ -34,8 +34,8 @@ def action_space() -> Space[Action]:
 def observation_space(parameters: Parameters) -> Space[Observation]:
     """Return the bounds of the observation, shape (observation_size,), float32.
 
-    They depend on the set point only if it leaves the transmitter's range, so that a policy
-    trained on one set point can be run on another.
+    They depend on the set point only if it exceeds the transmitter's range, so that a policy
+    trained on one set point can run on another.
     """
     span = parameters.temperature_span
     setpoint_limit = max(span, parameters.largest_setpoint)
@@ -49,12 +49,12 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
 class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     """Control the temperature at the middle point of a once-through boiler by feedwater flow.
 
-    At the middle point of a once-through boiler, water becomes steam. More feedwater makes it
-    cooler, but only after a transport delay of 18 samples of 8 s; the actuator has a dead zone
-    and saturates; noise disturbs the temperature. The plant is the one of X. Cui and K. G. Shin,
-    "Application of neural networks to temperature control in thermal power plants" (1992);
-    numbers in parentheses are its equations. All quantities are deviations from the operating
-    point. `MiddlePointVectorEnv` runs many of these plants at once.
+    At the middle point of a once-through boiler, water becomes steam. More feedwater lowers the
+    temperature there, but only after a transport delay of 18 samples of 8 s; the actuator has a
+    dead zone and saturates; noise disturbs the temperature. The plant is that of X. Cui and
+    K. G. Shin, "Application of neural networks to temperature control in thermal power plants"
+    (1992); numbers in parentheses are its equations. All quantities are deviations from the
+    operating point. `MiddlePointVectorEnv` runs many of these plants at once.
 
     ## Plant
 
@@ -66,26 +66,26 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         (29)  u_a = 0 where |u| < dead_zone, otherwise u limited to [u_min, u_max]
 
     y is the temperature (degC), y_d its set point, e = y_d - y the error, u the commanded and
-    u_a the applied feedwater flow (t/h). `step` call number k (k = 0, 1, ...) takes u(k), moves
+    u_a the applied feedwater flow (t/h). Call k of `step` (k = 0, 1, ...) applies u(k), moves
     the plant from sample k to k+1 and returns the observation at k+1 and the reward of e(k+1).
     So u(0) first shows in y(19).
 
-    Section 1 of the paper names further difficulties, which (28) does not contain. They are off
-    by default, and `mptc_gym.PRESETS` has variants with them:
+    Section 1 of the paper names further difficulties that (28) does not include. They are off
+    by default; some of `mptc_gym.PRESETS` turn them on:
 
-    - Noise of the transmitter: the observation shows y + v, v ~ N(0, measurement_noise_variance),
-      white, from k = 1 on. Reward and `info["output"]` are those of the true y.
+    - Measurement noise: from k = 1 on, the observation shows y + v with white noise
+      v ~ N(0, measurement_noise_variance). Reward and `info["output"]` use the true y.
     - A load disturbance w, as when the feedwater's temperature, the coal or the fire's position
-      changes: A(1) w(k) is added to (28), so that y comes to w if w stays. It starts at 0 and
-      changes every 10 samples. It is the sum of steps, each to a level uniform within
-      +-`disturbance_amplitude`, at random times, `disturbance_interval` samples apart on
-      average; and of a random walk that gains `disturbance_walk_variance` a sample.
-    - Other dynamics: `gain_factor` times the steady-state gain, `time_constant_factor` times the
-      dominant time constant. With p the slowest pole (0.9515), A = (1 - p z^-1) Q(z^-1), and the
-      time constant is 1 / (1 - p) = 20.6 samples. For t times the time constant and g times the
-      gain, 1 - p is divided by t, Q stays, and B is multiplied by g / t.
-    - Fouling: over `drift_samples` samples gain and time constant drift, linearly, to `gain_drift`
-      and `time_constant_drift` times what they were at k = 0. They change every 10 samples.
+      changes: A(1) w(k) is added to (28), so that a constant w adds w to y in the steady state.
+      It starts at 0 and changes every 10 samples. It is the sum of a random walk that gains a
+      variance of `disturbance_walk_variance` per sample, and of steps to levels uniform within
+      +-`disturbance_amplitude`, at random, every `disturbance_interval` samples on average.
+    - Other dynamics: `gain_factor` times the steady-state gain, `time_constant_factor` times
+      the dominant time constant. With p the slowest pole (0.9515), A = (1 - p z^-1) Q(z^-1),
+      and the time constant is 1 / (1 - p) = 20.6 samples. For t times the time constant and g
+      times the gain, 1 - p is divided by t, Q stays, and B is multiplied by g / t.
+    - Fouling: in `drift_samples` samples, gain and time constant drift linearly to `gain_drift`
+      and `time_constant_drift` times their values at k = 0. They change every 10 samples.
 
     ## Action space
 
@@ -95,12 +95,12 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     |---|---|---|---|---|
     | 0 | feedwater flow u | u_min = -10 | u_max = 10 | t/h |
 
-    An action outside the box is a command outside the range, and the actuator saturates it.
+    An action outside the box is a command outside the range, which the actuator limits.
 
     ## Observation space
 
-    A 1-D float32 `Box` with the following blocks, each with the newest sample first. `y` here is
-    the transmitter's reading, which saturates at +-`temperature_span`.
+    A 1-D float32 `Box` with the following blocks, each with the newest sample first. Here `y`
+    is the transmitter's reading, which saturates at +-`temperature_span`.
 
     | Block | Elements (default) | Bounds (default) | Unit |
     |---|---|---|---|
@@ -109,10 +109,10 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     | outputs y(k), y(k-1), ... | `output_window` (0) | +-50 | degC |
     | actions a(k-1), a(k-2), ... | `action_window` (0) | +-1 | 1 |
 
-    The default is the six inputs of the paper's neural network. Past actions are shown as the
-    actuator limits them, within +-1. With `action_window=delay+2` the noise-free problem is
+    The defaults give the six inputs of the paper's neural network. Past actions are clipped to
+    +-1, as the actuator limits them. With `action_window=delay+2` the noise-free problem is
     Markov while the set point holds. If the set point can exceed the span, its bounds widen to
-    hold it.
+    include it.
 
     ## Reward
 
@@ -122,7 +122,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     | "absolute" | -abs(e(k+1)) / error_scale - move_weight * abs(a(k) - a(k-1)) |
 
     "quadratic" is the negative of the paper's cost (12), scaled. The best possible reward of a
-    step is 0. At the default set point, a plant without any input earns -0.5 a step. There is
+    step is 0. With the default set point, a plant without input earns -0.5 per step. There is
     no lower bound, since e is the error of the true temperature, which the transmitter's range
     does not limit.
 
@@ -131,7 +131,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     Before k = 0 the plant has been at rest: y, y_d, e, u, u_a and xi are all 0, so y(0) = 0.
     All randomness comes from the seed, in separate streams, so that every controller meets the
     same noise, set point, disturbance and plant. The j-th episode after a seed does not depend
-    on how long the episodes before it were. `reset` has no options.
+    on the length of the episodes before it. `reset` has no options.
 
     ## Episode end
 
@@ -139,46 +139,46 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
     ## Arguments
 
-    All are keyword-only and can be given to `gymnasium.make`. An asterisk marks an argument that
-    can also be a range [low, high]: each `reset` draws a number from it, uniformly (an integer
-    where the default is one). They are declared in `mptc_gym/parameters.py`.
+    All are keyword-only and can be given to `gymnasium.make`. An asterisk marks an argument
+    that can also be a range [low, high], from which each `reset` draws a number uniformly (an
+    integer where the default is one). They are declared in `mptc_gym/parameters.py`.
 
     <arguments>
 
-    `render_mode` is None, "human", "rgb_array" or "ansi"; see Rendering. A list or tuple may also
-    be a NumPy array. Numbers are within +-1e9, the delay and each window at most 10,000 samples,
-    and `a`, `b` and `c` have at most 1,000 coefficients each.
+    `render_mode` is None, "human", "rgb_array" or "ansi"; see Rendering. Lists may also be
+    tuples or NumPy arrays. Numbers are within +-1e9, the delay and each window at most 10,000
+    samples, and `a`, `b` and `c` have at most 1,000 coefficients each.
 
     ## Info
 
-    `reset` and `step` return a fresh dict of floats: `output` (the true y, degC), `setpoint`
+    `reset` and `step` return a new dict of floats: `output` (the true y, degC), `setpoint`
     (y_d, degC), `error` (y_d - y, degC), `command` (u, t/h), `applied` (u_a, t/h) and `noise`
-    (n, degC). After a step `command` and `applied` are those of the step, the others those of
-    the sample it leads to. At reset `command`, `applied` and `noise` are 0.
+    (n, degC). After a step, `command` and `applied` belong to the step, the others to the
+    sample it leads to. At reset, `command`, `applied` and `noise` are 0.
 
-    With a load disturbance there is also `disturbance` (w, degC), and with a drift `gain_factor`
-    and `time_constant_factor`, both as they are now. The dict of `reset` also has, under its name,
-    each number that was drawn; a delay is an int.
+    With a load disturbance there is also `disturbance` (w, degC), and with a drift the current
+    `gain_factor` and `time_constant_factor`. The dict of `reset` also holds each number that
+    was drawn, under its name; a delay is an int.
 
     ## Rendering
 
     | `render_mode` | `render` |
     |---|---|
     | "rgb_array" | returns a picture, shape (540, 960, 3), uint8 |
-    | "human" | shows it in a window; so do `reset` and `step`, `metadata["render_fps"]` times a second at most |
+    | "human" | shows it in a window, as do `reset` and `step`, at most `metadata["render_fps"]` times a second |
     | "ansi" | returns a picture in text |
 
     All show a strip chart of the last 200 samples, or of more if the delay is long: set point
-    and true temperature; commanded and applied flow, with the dead zone, the limits and that
-    part of the applied flow which is still on its way to the middle point. Pictures but those
-    in text need pygame: `pip install "mptc_gym[render]"`.
+    and true temperature; commanded and applied flow, with the dead zone, the limits and the
+    part of the applied flow that is still in transit to the middle point. All modes but "ansi"
+    need pygame: `pip install "mptc_gym[render]"`.
 
     ## Errors
 
-    A bad argument, or an unknown `render_mode`, is a `ValueError` from the constructor that
-    names it. A misspelt argument is a `TypeError`. An action that is not one finite number is a
-    `ValueError` from `step` and leaves the plant as it was. Without pygame, the first picture
-    is a `DependencyNotInstalled`.
+    For an invalid argument or `render_mode`, the constructor raises a `ValueError` that names
+    it; for a misspelt argument, a `TypeError`. If an action is not one finite number, `step`
+    raises a `ValueError` and leaves the plant unchanged. Without pygame, the first picture
+    raises `DependencyNotInstalled`.
 
     ## Version history
 
@@ -197,7 +197,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self._record: Record | None = None  # for pictures; None if there are none
         self.action_space = action_space()
         self.observation_space = observation_space(parameters)
-        # What step uses, in two tuples: unpacking one costs less than as many attributes.
+        # Used by step, in two tuples: unpacking one is faster than reading as many attributes.
         self._reward_terms = (
             parameters.error_scale,
             parameters.reward == "quadratic",
@@ -212,11 +212,11 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self._signals = Signals.of(parameters)
         self._has_more_info = parameters.is_disturbed or parameters.drifts
         self._streams: Streams | None = None
-        self._root: np.random.Generator | None = None  # what the streams come from
-        # y_d, n, w and the transmitter's noise of the samples ahead, the next one last.
+        self._root: np.random.Generator | None = None  # source of the streams
+        # y_d, n, w and the measurement noise of the samples ahead, the next one last.
         self._ahead: list[tuple[float, ...]] = []
 
-    # One list of arguments, that of `Parameters`; help() and editors see it spelt out here.
+    # `Parameters` alone lists the arguments; help() and editors see them spelt out here.
     __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
 
     def reset(
@@ -227,8 +227,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         Parameters
         ----------
         seed
-            Starts the environment's random streams anew. Without it, the next episode of the
-            present streams begins.
+            Restarts the environment's random streams. Without it, the next episode of the
+            current streams begins.
         options
             Not used.
 
@@ -250,11 +250,11 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         numbers = numbers_of_plant(drawn, 0)
         self._plant = Plant(parameters, numbers)
 
-        # At rest u is 0, whatever action that is.
+        # At rest u is 0, whichever action that is.
         self._action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         rest_action = _limited(self._action, 1.0)
         size, actions = parameters.observation_size, parameters.action_window
-        # One element to spare at the end: see step.
+        # One spare element at the end: see step.
         self._window = [0.0] * (size - actions) + [rest_action] * (actions + 1)
         self._ahead.clear()
 
@@ -296,13 +296,13 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         Raises
         ------
         ValueError
-            If the action is not one finite number. The plant is untouched then.
+            If the action is not one finite number. The plant is then unchanged.
         ResetNeeded
             If the environment has never been reset.
         """
-        # This is the hot path: what runs in every step avoids function calls.
+        # This is the hot path: code that runs in every step avoids function calls.
         try:
-            a = float(action.item() - 0.0)  # text is no number, even where float() reads one
+            a = float(action.item() - 0.0)  # text is not a number, even if float() parses it
         except (AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
             a = one_action(action)
         shown = a if -1.0 <= a <= 1.0 else _beyond_the_box(a)
@@ -320,8 +320,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             reward -= move_weight * abs(a - self._action)
         self._action = a
 
-        # All blocks move by one at once; what crosses into the next block is overwritten there.
-        # An empty block begins where the next one does, which is written after it, or at the
+        # All blocks shift by one at once; elements that cross into the next are overwritten.
+        # An empty block starts where the next one does, which is written after it, or at the
         # spare element at the end.
         measured = output + transmitter_noise
         if not -span <= measured <= span:
@@ -332,7 +332,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         window[error_head] = setpoint - measured
         window[output_head] = measured
         window[action_head] = shown
-        observation = np.fromiter(window, _FLOAT32, size)  # quicker than np.array
+        observation = np.fromiter(window, _FLOAT32, size)  # faster than np.array
         info = {
             "output": output,
             "setpoint": setpoint,
@@ -354,15 +354,15 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         Returns
         -------
         ndarray, str or None
-            With "rgb_array" a picture, shape (540, 960, 3), uint8; with "ansi" one in text.
-            None with "human", which shows it, and, after a warning, without a mode.
+            For "rgb_array" a picture, shape (540, 960, 3), uint8; for "ansi" one in text.
+            None for "human", which shows it in a window, and, after a warning, without a mode.
 
         Raises
         ------
         ResetNeeded
             If the environment has never been reset.
         DependencyNotInstalled
-            If there is no pygame, for any mode but "ansi".
+            If pygame is not installed, for any mode but "ansi".
         """
         return rendering.render(self.render_mode, self._record, self.metadata["render_fps"])
 
@@ -382,7 +382,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
         self._ahead = self._signals.ahead()[::-1]
 
     def _add_more_info(self, info: dict[str, float], load: float) -> None:
-        """Add to the info what belongs to arguments that are off by default."""
+        """Add the info that belongs to arguments that are off by default."""
         if self.parameters.is_disturbed:
             info["disturbance"] = load
         if self.parameters.drifts:
@@ -390,8 +390,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
 
 def _with_table(docstring: str | None) -> str | None:
-    """Put the table of arguments where the docstring has its place."""
-    if docstring is None:  # as in `python -OO`
+    """Insert the table of arguments at its placeholder in a docstring."""
+    if docstring is None:  # under `python -OO`
         return None
     before = docstring.partition("<arguments>")[0]
     indentation = before[before.rfind("\n") + 1 :]  # none from Python 3.13 on
@@ -402,7 +402,7 @@ MiddlePointEnv.__doc__ = _with_table(MiddlePointEnv.__doc__)
 
 
 def _limited(value: float, limit: float) -> float:
-    return max(-limit, min(limit, value))  # in this order, NaN gives a limit
+    return max(-limit, min(limit, value))  # in this order, NaN becomes a limit
 
 
 def _beyond_the_box(action: float) -> float:

@@ -1,4 +1,4 @@
-"""Declare every argument of the environment, once, in a dataclass that checks itself."""
+"""Declare every argument of the environment once, in a dataclass that checks itself."""
 
 # ruff: noqa: RUF009 (`_linear` makes fields)
 
@@ -17,24 +17,24 @@ import numpy as np
 from mptc_gym import checks
 from mptc_gym.checks import Number, reject
 
-DRAWS: Final = 32  # an episode: enough for every plant number, and for those to come
+DRAWS: Final = 32  # per episode: enough for every plant number, and for future ones
 
 Value = TypeVar("Value")  # of a plant number: float, an array for many plants, or `Number`
 
 
 @dataclass(frozen=True)
 class Argument:
-    """What is declared of an argument of the environment, beside its name and its type."""
+    """Declaration of an argument of the environment, apart from its name and type."""
 
     default: Any
     check: checks.Check  # returns a valid value in plain Python types, or raises a ValueError
-    meaning: str  # and unit: what the tables of arguments say about it
-    # Whether the plant is (28) and (29) whatever its value: linear between the limits. An
-    # analysis that supposes this refuses any other argument that is not at its default.
+    meaning: str  # and unit, as in the tables of arguments
+    # Whether the plant is (28) and (29), linear between the limits, for any value. An analysis
+    # that assumes this refuses any other argument that is not at its default.
     linear: bool
 
     def checked(self, name: str, value: Any) -> Any:
-        """Return a valid value in plain Python types; ValueError, naming it, otherwise."""
+        """Return a value in plain Python types; ValueError, naming it, if it is invalid."""
         check = checks.or_range(self.check) if name in PLANT_NUMBERS else self.check
         return check(name, checks.plain(value))
 
@@ -51,21 +51,21 @@ class Argument:
 
 
 def _argument(default: Any, check: checks.Check, meaning: str, *, linear: bool = False) -> Any:
-    """Declare an argument: a field of a dataclass that carries an `Argument`."""
+    """Declare an argument: a dataclass field that carries an `Argument`."""
     argument = Argument(default, check, meaning, linear)
     return field(default=default, metadata={"argument": argument})
 
 
-_linear = partial(_argument, linear=True)  # one that leaves the plant (28) and (29)
+_linear = partial(_argument, linear=True)  # whatever its value, the plant is (28) and (29)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlantNumbers(Generic[Value]):
     """The numbers of a plant that can differ from episode to episode.
 
-    As arguments they are a `Number` each: a number, or a range to draw from. During an episode
-    they are a float each for one plant, and an array each for many. Field i takes draw i of a
-    reset, which is part of what a seed means: the order never changes, and new ones come last.
+    As an argument, each is a `Number`: a number, or a range to draw from. During an episode,
+    each is a float for one plant, and an array for many. Field i takes draw i of a reset. The
+    order never changes, so that seeds keep their meaning, and new fields come last.
     """
 
     delay: Value = _linear(18, checks.samples, "transport delay d of the plant (28), samples")
@@ -121,17 +121,17 @@ class PlantNumbers(Generic[Value]):
 
 
 def slowest_pole(a: Sequence[float]) -> complex | None:
-    """Return the pole of 1 / A with the largest magnitude, None if there is no pole."""
+    """Return the pole of 1 / A with the largest magnitude, or None if there is no pole."""
     poles = np.roots(a)
     return complex(poles[np.argmax(np.abs(poles))]) if len(poles) else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters(PlantNumbers[Number]):
-    """The arguments of `MiddlePoint-v0`, checked and brought to plain Python types.
+    """The arguments of `MiddlePoint-v0`, checked and converted to plain Python types.
 
     The defaults are the first case of the paper (Section 5, Fig. 5). All quantities are
-    deviations from the operating point. The fields of `PlantNumbers` can be a range.
+    deviations from the operating point. The fields of `PlantNumbers` can be ranges.
 
     Raises
     ------
@@ -163,7 +163,7 @@ class Parameters(PlantNumbers[Number]):
     sampling_interval: float = _linear(  # Section 5
         8.0, checks.positive, "scale of the time axis, without effect on the dynamics, s"
     )
-    # The paper plots the set point and does not state it.
+    # The paper plots the set point without stating it.
     setpoint: str | float | Sequence[float] = _linear(
         "square",
         checks.setpoint,
@@ -219,12 +219,12 @@ class Parameters(PlantNumbers[Number]):
 
     @classmethod
     def of_environment(cls, arguments: Mapping[str, Any]) -> Parameters:
-        """Check what an environment was given by name.
+        """Return the parameters for the keyword arguments of an environment.
 
         Raises
         ------
         TypeError
-            If an argument is unknown; the message names the one that was probably meant.
+            If an argument is unknown; the message suggests the one that was probably meant.
         ValueError
             If an argument is out of range.
         """
@@ -234,18 +234,18 @@ class Parameters(PlantNumbers[Number]):
             if name not in ARGUMENTS:
                 close = difflib.get_close_matches(name, [*ARGUMENTS, "render_mode"], n=1)
                 hint = f": did you mean {close[0]!r}?" if close else ""
-                # In Python's own words, by which callers know that they may leave it out.
+                # In Python's own words, by which callers detect an unsupported argument.
                 raise TypeError(
                     f"MiddlePoint-v0 got an unexpected keyword argument {name!r}{hint}"
                 )
         return cls(**arguments)
 
     def _check_actuator(self) -> None:
-        """Refuse limits and a dead zone that do not fit together, whatever is drawn."""
+        """Refuse limits and a dead zone unless they fit together for every draw."""
         (lowest, low), (high, highest) = self.range_of("u_min"), self.range_of("u_max")
         if low >= high:
             reject("u_min", self.u_min, f"below u_max = {self.u_max}")
-        # The draw that leaves least of both limits.
+        # The least of max(|u_min|, |u_max|) over all draws.
         reach = max(lowest, -low, high, -highest, 0.0)
         if self.range_of("dead_zone")[1] > reach:
             reject(
@@ -256,7 +256,7 @@ class Parameters(PlantNumbers[Number]):
             )
 
     def _check_dynamics(self) -> None:
-        """Refuse a change of dynamics that A has no meaning for."""
+        """Refuse changes of the dynamics that are undefined for A."""
         if self.changes_time_constant:
             names = "time_constant_factor, time_constant_drift"
             refuse = partial(
@@ -316,12 +316,12 @@ class Parameters(PlantNumbers[Number]):
 
     @property
     def changes_time_constant(self) -> bool:
-        """Whether the time constant is, or may come to be, another than that of A."""
+        """Whether the time constant differs, or may come to differ, from that of A."""
         return self._may_change("time_constant_factor", "time_constant_drift")
 
     @property
     def changes_dynamics(self) -> bool:
-        """Whether (28) has, or may come to have, other coefficients than A and B."""
+        """Whether the coefficients of (28) differ, or may come to differ, from A and B."""
         return self.changes_time_constant or self._may_change("gain_factor", "gain_drift")
 
     @property
@@ -336,13 +336,13 @@ class Parameters(PlantNumbers[Number]):
 
     @property
     def heads(self) -> tuple[int, int, int]:
-        """Where the errors, outputs and actions begin in the observation."""
+        """Indices where errors, outputs and actions begin in the observation."""
         setpoints, errors, outputs, _ = self.windows
         return setpoints, setpoints + errors, setpoints + errors + outputs
 
     @property
     def largest_setpoint(self) -> float:
-        """Largest magnitude that the set point can take, in degC."""
+        """Largest magnitude that the set point can take, degC."""
         if isinstance(self.setpoint, str):
             return self.setpoint_amplitude
         levels = self.setpoint if isinstance(self.setpoint, tuple) else (self.setpoint,)
@@ -352,16 +352,16 @@ class Parameters(PlantNumbers[Number]):
 ARGUMENTS: Final[Mapping[str, Argument]] = MappingProxyType(
     {each.name: each.metadata["argument"] for each in fields(Parameters)}
 )
-"""What is declared of each argument, by name."""
+"""The declaration of each argument, by name."""
 
 PLANT_NUMBERS: Final[Mapping[str, int]] = MappingProxyType(
     {each.name: place for place, each in enumerate(fields(PlantNumbers))}
 )
-"""The arguments that can be a range, by name, and which draw of a reset each takes."""
+"""The arguments that can be ranges, by name, and the index of the draw that each takes."""
 
 
 def argument_table() -> str:
-    """Return a Markdown table of all arguments but `render_mode`."""
+    """Return a Markdown table of all arguments except `render_mode`."""
     rows = (argument.row(name) for name, argument in ARGUMENTS.items())
     return "\n".join(["| Argument | Default | Meaning, unit |", "|---|---|---|", *rows])
 

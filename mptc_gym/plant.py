@@ -1,7 +1,7 @@
-"""Move the plant and its actuator: arithmetic on state, input and parameters, nothing else.
+"""Step the plant and its actuator: arithmetic on state, input and parameters, nothing else.
 
-It stands here twice, side by side: `Plant` in plain floats, which are fastest for one plant,
-and `PlantBatch` in arrays. Both do the same operations in the same order, and agree to the bit.
+There are two implementations, side by side: `Plant` in plain floats, fastest for one plant, and
+`PlantBatch` in arrays. Both do the same operations in the same order and agree bit for bit.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from mptc_gym.parameters import PLANT_NUMBERS, Parameters, PlantNumbers, slowest_pole
 
-Values = NDArray[np.float64]  # one a plant, shape (n,)
-DRIFT_INTERVAL: Final = 10  # samples between two changes of drifting dynamics
+Values = NDArray[np.float64]  # one per plant, shape (n,)
+DRIFT_INTERVAL: Final = 10  # samples between changes of drifting dynamics
 
 
 def action_from_command(command: Any, u_min: Any, u_max: Any) -> Any:
@@ -28,19 +28,19 @@ def action_from_command(command: Any, u_min: Any, u_max: Any) -> Any:
 def least_effective(dead_zone: Any, u_min: Any, u_max: Any, rounding: float = 2.0**-50) -> Any:
     """Return the smallest magnitude of a command that passes the dead zone, t/h.
 
-    A command on the edge of the dead zone passes. Scaled to an action and back, it may come out
-    smaller by some roundings, each of 2^-53 of what is rounded; and it passes all the same.
+    A command on the edge of the dead zone passes. Scaled to an action and back, it may shrink
+    by a few roundings, each of at most 2^-53 of the rounded number; it must still pass.
     """
     return dead_zone - rounding * (u_max - u_min + abs(u_max) + abs(u_min))
 
 
 def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
-    """Scale commands (t/h) to the float32 actions that an agent hands to the environment.
+    """Scale commands (t/h) to the float32 actions that an agent passes to the environment.
 
     Rounding to float32 can move a command from the edge of the dead zone into it, where nothing
     is applied: float32(0.7) stands for 6.99999988 t/h. Such an action is moved outwards by the
-    smallest step that float32 has near 1, so that the actuator passes each command that it
-    would pass unrounded. All arguments are in t/h and broadcast.
+    float32 spacing near 1, so that the actuator passes every command that it would pass
+    unrounded. All arguments are in t/h and broadcast.
     """
     command, half_range = np.asarray(command, float), (u_max - u_min) / 2.0
     action = np.asarray(action_from_command(command, u_min, u_max)).astype(np.float32)
@@ -51,14 +51,14 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 
 
 class Dynamics:
-    """How A and B of (28) follow from the steady-state gain and the dominant time constant.
+    """A and B of (28) as functions of the steady-state gain and the dominant time constant.
 
     With p the slowest pole, A = (1 - p z^-1) Q(z^-1). The time constant of p is 1 / (1 - p)
     samples: the area above the step response of 1 / (1 - p z^-1), scaled to end at 1. With t
     times the time constant, 1 - p is divided by t, and Q stays. As A(1) = (1 - p) Q(1) is then
     divided by t as well, the steady-state gain B(1) / A(1) is g times the given one if B is
-    multiplied by g / t. Drifts take g and t from their factors to `gain_drift` and
-    `time_constant_drift` times those, linearly over `drift_samples`.
+    multiplied by g / t. Drifts move g and t linearly over `drift_samples`, from their factors
+    to `gain_drift` and `time_constant_drift` times these.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -75,12 +75,12 @@ class Dynamics:
             self._quotient = (*quotient, 0.0)
 
     def share(self, age: Any) -> Any:
-        """Return how much of the drifts is over, from 0 to 1: arguments as of `factors`."""
+        """Return the completed share of the drifts at k = `age`, from 0 to 1."""
         share = age / self._samples
-        return share * (share < 1.0) + (share >= 1.0)  # at most 1, of arrays of any library
+        return share * (share < 1.0) + (share >= 1.0)  # at most 1, for arrays of any library
 
     def factors(self, numbers: PlantNumbers[Any], age: Any) -> tuple[Any, Any]:
-        """Return g and t at k = `age`, of floats, or of arrays or tensors for many plants."""
+        """Return g and t at k = `age`: floats, or arrays or tensors for many plants."""
         share = self.share(age)
         gain, time_constant = numbers.gain_factor, numbers.time_constant_factor
         return (
@@ -89,10 +89,9 @@ class Dynamics:
         )
 
     def coefficients(self, gain: Any, time_constant: Any) -> tuple[list[Any], Any, Any]:
-        """Return what (28) has for g and t.
+        """Return the coefficients of (28) for g and t.
 
-        These are the coefficients of A from z^-1 on with their signs changed, what B is
-        multiplied with, and A(1).
+        These are the negated coefficients of A from z^-1 on, the factor of B, and A(1).
         """
         alpha: list[Any] = list(self._alpha)
         if self._quotient is not None:
@@ -105,14 +104,14 @@ class Dynamics:
 
 
 class Plant:
-    """Command scaling, actuator (29) and middle-point temperature (28), at rest until moved.
+    """Command scaling, actuator (29) and middle-point temperature (28), initially at rest.
 
     The scaling is the last formula of Section 4, for actions from -1 to 1 in place of network
     outputs from 0 to 1. As printed, (29) compares the magnitude of u with U_min in one of its
     cases. The intended meaning is: a command inside the dead zone has no effect, and any other
     is limited to [U_min, U_max]. A command on the edge of the dead zone passes.
 
-    `factors` are gain and time constant, as multiples of those that A and B have.
+    `factors` are gain and time constant, as multiples of those of A and B.
     """
 
     def __init__(self, parameters: Parameters, numbers: PlantNumbers[float]) -> None:
@@ -125,7 +124,7 @@ class Plant:
         self._age = 0
         self._dynamics = Dynamics(parameters)
         self._update_dynamics()
-        # Each coefficient with its place in the history it is for, and both histories with the
+        # Each coefficient is paired with its index in its history. Both histories have the
         # newest sample first: y(k), y(k-1), ... and u_a(k), u_a(k-1), ...
         delay = int(numbers.delay)
         self._beta = tuple(enumerate(parameters.b, start=delay))
@@ -138,11 +137,11 @@ class Plant:
         Parameters
         ----------
         action
-            a(k), normalised: -1 at U_min and 1 at U_max. An action beyond is a command beyond.
+            a(k), normalised: -1 at U_min and 1 at U_max, and linear beyond these.
         noise
             n(k+1), degC.
         load
-            w(k+1), the load disturbance, degC: what y would come to if it stayed.
+            w(k+1), the load disturbance, degC: what it adds to y in the steady state.
 
         Returns
         -------
@@ -178,7 +177,7 @@ class Plant:
         return command, applied, output
 
     def _update_dynamics(self) -> None:
-        """Bring the dynamics to the plant's age."""
+        """Update the dynamics to the plant's age."""
         gain, time_constant = map(float, self._dynamics.factors(self._numbers, self._age))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(gain, time_constant)
         self._alpha = tuple(enumerate(alpha))
@@ -188,12 +187,12 @@ class Plant:
 class PlantBatch:
     """Many plants side by side: `Plant` in arrays.
 
-    `factors` are as those of `Plant`: of shape (n,) if they drift or are drawn, otherwise ().
+    `factors` are those of `Plant`, of shape (n,) if they drift or are drawn, otherwise ().
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
-        # In arithmetic with arrays, an array of one number costs less than a number. In
-        # comparisons, an array of full length costs still less.
+        # In array arithmetic, an array of one number is faster than a number. In comparisons,
+        # an array of full length is faster still.
         self._num_envs, self._drawn = num_envs, parameters.ranges
         shapes = {name: num_envs if name in self._drawn else () for name in PLANT_NUMBERS}
         self._numbers: PlantNumbers[Values] = PlantNumbers(
@@ -211,28 +210,28 @@ class PlantBatch:
         order = len(self._alpha)
         self._outputs = deque(np.zeros((order, num_envs)), maxlen=order)
 
-        # Because of the delay d, the response to the inputs of d + 1 samples can be worked out
-        # at once, d being the shortest that can be drawn. Inputs lie in a window of these rows,
-        # the oldest first; before those of the d + 1 samples come the older ones that B and
+        # Because of the delay, the response to the inputs of d + 1 samples can be computed at
+        # once, where d is the shortest delay that can be drawn. Inputs lie in a window of these
+        # rows, oldest first; before those of the d + 1 samples come the older ones that B and
         # plants with a longer delay also need.
         shortest, self._longest = map(int, parameters.range_of("delay"))
         self._samples = shortest + 1
         self._beta = tuple(parameters.b)
         self._own_delays = self._longest > shortest
         self._older = len(self._beta) - 1 + self._longest - shortest
-        # With delays of their own the window moves on with the samples, so that the older rows
-        # have to be copied back only where it has come to the end of the rows.
+        # If plants have their own delays, the window moves with the samples, and the older rows
+        # are copied back only when it reaches the end of the rows.
         spare = max(self._older, self._samples) if self._own_delays else 0
         self._inputs = np.zeros((self._older + self._samples + spare, num_envs))
         self._first_row = 0  # of the window
-        rows = len(self._beta) - 1 + self._samples  # of inputs, as each plant's delay has them
+        rows = len(self._beta) - 1 + self._samples  # of inputs, at each plant's delay
         self._taken = np.zeros((rows, num_envs) if self._own_delays else 0, np.intp)
         self._delayed = np.zeros(self._taken.shape)
         self._response = np.zeros((self._samples, num_envs))
         self._place = self._samples - 1  # of the next input among the d + 1
 
     def reset(self, which: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
-        """Bring some of the plants to rest, with new numbers: if drawn, one for each."""
+        """Bring some plants to rest, with new numbers: one per plant if drawn."""
         self._inputs[:, which] = 0.0
         self._response[:, which] = 0.0
         for outputs in self._outputs:
@@ -253,9 +252,9 @@ class PlantBatch:
     def step(
         self, action: Values, noise: Values, load: Values | None = None
     ) -> tuple[Values, Values, Values]:
-        """Move all plants from sample k to k+1, as `Plant.step`, in arrays of shape (n,).
+        """Move all plants from sample k to k+1, like `Plant.step`, in arrays of shape (n,).
 
-        The output is kept here and must not be changed.
+        The plants keep the output, so it must not be modified.
         """
         if self._drifts:
             self._clock += 1
@@ -267,8 +266,8 @@ class PlantBatch:
         command += offset
         applied = np.minimum(command, u_max)  # (29) from here on
         np.maximum(applied, u_min, out=applied)
-        # A product is faster than a mask, whose branches processors cannot predict. It makes -0
-        # of some numbers, and adding 0 makes 0 of that.
+        # A product is faster than a mask, whose branches are unpredictable. It can give -0,
+        # which adding 0 turns into 0.
         applied *= np.abs(command) >= edge
         applied += zero
         place = self._place
@@ -292,7 +291,7 @@ class PlantBatch:
         return command, applied, output
 
     def _respond(self) -> None:
-        """Work out the response to the inputs of d + 1 samples."""
+        """Compute the response to the inputs of d + 1 samples."""
         first, older, samples = self._first_row, self._older, self._samples
         inputs = self._inputs[first : first + older + samples]
         if self._own_delays:
@@ -308,7 +307,7 @@ class PlantBatch:
         self._first_row = first
 
     def _update_actuator(self) -> None:
-        """Work out what commands and (29) take from the plant numbers."""
+        """Update what the scaling of commands and (29) take from the plant numbers."""
         dead_zone, u_min, u_max = (
             getattr(self._numbers, name) for name in ("dead_zone", "u_min", "u_max")
         )
@@ -318,7 +317,7 @@ class PlantBatch:
         self._actuator = *numbers, *limits
 
     def _update_dynamics(self) -> None:
-        """Bring the dynamics to the plants' ages."""
+        """Update the dynamics to the plants' ages."""
         ages = self._clock - self._starts
         slow = ages // DRIFT_INTERVAL * DRIFT_INTERVAL
         self.factors = self._dynamics.factors(self._numbers, slow)

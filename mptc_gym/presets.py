@@ -1,4 +1,4 @@
-"""Name variants of the environment, from the paper's cases to a hard one."""
+"""Define presets of the environment, from the paper's cases to a hard one."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
         "setpoint": "random",
     },
 }
-"""Arguments of the environment by name. Each preset has an id of its own, see `IDS`.
+"""The environment's arguments in each preset. Each preset has its own id, see `IDS`.
 
-| Name | Id | What it is |
+| Name | Id | Description |
 |---|---|---|
 | `paper` | `MiddlePoint-v0` | the paper's first case: dead zone 5 t/h, no noise; the default |
 | `dead-zone-7` | `MiddlePointDeadZone7-v0` | its second case: dead zone 7 t/h |
 | `noisy` | `MiddlePointNoisy-v0` | its third case: R = 0.5 degC^2 |
 | `disturbed` | `MiddlePointDisturbed-v0` | a noisy boiler and transmitter; the load changes |
-| `fouling` | `MiddlePointFouling-v0` | the same, and gain and time constant drift |
+| `fouling` | `MiddlePointFouling-v0` | as `disturbed`, and gain and time constant drift |
 | `randomised` | `MiddlePointRandomised-v0` | a plant drawn at each reset |
 | `hard` | `MiddlePointHard-v0` | everything on, and random set points |
 
@@ -55,4 +55,4 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
 IDS: Final[dict[str, str]] = {
     name: f"MiddlePoint{name.title().replace('-', '')}-v0" for name in PRESETS
 } | {"paper": "MiddlePoint-v0"}
-"""The id of each preset: `gymnasium.make(IDS["noisy"])`, with arguments on top if need be."""
+"""The id of each preset, as in `gymnasium.make(IDS["noisy"])`, with or without arguments."""

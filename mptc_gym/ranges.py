@@ -1,4 +1,4 @@
-"""Draw the plant numbers of an episode from their ranges, or take them as they are given."""
+"""Draw the plant numbers of an episode from their ranges, or take them as given."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from mptc_gym.parameters import ARGUMENTS, DRAWS, PLANT_NUMBERS, Parameters, PlantNumbers
 from mptc_gym.signals import EpisodeStream
 
-Values = NDArray[np.float64]  # of shape (episodes,), or () where all episodes have the same
+Values = NDArray[np.float64]  # shape (episodes,), or () where all episodes share one value
 
 
 class Ranges:
-    """Draws what is given as a range, uniformly; a delay is an integer, both ends included.
+    """Draw arguments that are ranges, uniformly; a delay is an integer, both ends included.
 
-    Every plant number has a draw of its own, whether it is a range or not. So one more range
-    changes nothing in what the others give. `names` are the arguments that are ranges. `given`
-    are all plant numbers, with the lower end of a range, and `given_arrays` the same as arrays
-    of shape ().
+    Every plant number has its own draw, whether it is a range or not, so that one more range
+    does not change the others' draws. `names` are the arguments that are ranges. `given` are
+    all plant numbers, with the lower end of a range, and `given_arrays` the same as arrays of
+    shape ().
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -37,7 +37,7 @@ class Ranges:
     def draw(self, streams: Sequence[EpisodeStream]) -> PlantNumbers[Values]:
         """Begin an episode of each stream, and draw its numbers.
 
-        What is a range has the shape (len(streams),), anything else the shape ().
+        Drawn numbers have the shape (len(streams),), others the shape ().
         """
         if not self._draws:
             return self.given_arrays
@@ -55,7 +55,7 @@ class Ranges:
 
 
 def numbers_of_plant(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
-    """Return the numbers of the i-th of many plants."""
+    """Return the numbers of plant i of many."""
     arrays = numbers.chosen(tuple(PLANT_NUMBERS))
     return PlantNumbers(
         **{name: (array[i] if array.ndim else array).item() for name, array in arrays.items()}

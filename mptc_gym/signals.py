@@ -1,10 +1,10 @@
-"""Make what comes from outside during an episode: set point, noise and load disturbance.
+"""Generate the external signals of an episode: set point, noise and load disturbance.
 
-Every signal has the same verbs. `reset` begins an episode of some plants at k = 0. `next`
-returns the sample that follows of all plants, and `ahead` the next `BLOCK` of one plant alone.
+Every signal has the same methods. `reset` begins an episode of some plants at k = 0. `next`
+returns the next sample of all plants, and `ahead` the next `BLOCK` samples of a single plant.
 
-Noise and disturbance are made a block of samples at a time: drawing many numbers in one call
-costs a small part of drawing them one by one, and gives the same numbers.
+Noise and disturbance are generated a block of samples at a time: drawing many numbers in one
+call is much faster than drawing them one by one, and gives the same numbers.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from numpy.typing import NDArray
 
 from mptc_gym.parameters import Parameters, PlantNumbers
 
-Values = NDArray[np.float64]  # one a plant
+Values = NDArray[np.float64]  # one per plant
 Indices = NDArray[np.intp]  # of some plants, sorted
 
-BLOCK = 600  # samples of a signal that are made together
+BLOCK = 600  # samples of a signal generated together
 FOREVER = 1 << 62  # samples
-PLANTS_AT_A_TIME = 32  # whose draws are made together: they stay in the processor's cache
-LOAD_INTERVAL = 10  # samples between two changes of the load disturbance
-LEVELS_AT_A_TIME = 60  # of the load disturbance, made together
+PLANTS_AT_A_TIME = 32  # few enough that their draws stay in the processor's cache
+LOAD_INTERVAL = 10  # samples between changes of the load disturbance
+LEVELS_AT_A_TIME = 60  # of the load disturbance, generated together
 ONE = np.zeros(1, np.intp)  # the indices of one plant
 
 
 class EpisodeStream:
-    """A stream of random numbers that starts every episode at a place of its own.
+    """A stream of random numbers in which every episode has its own starting point.
 
-    Episode j begins j * 2**64 draws into the stream, whatever earlier episodes have used. So
-    the j-th episode after a seed meets the same draws however long the ones before it were.
-    The `SeedSequence` with these arguments, which starts the stream, is made with the first
-    episode: many plants have streams that are never used.
+    Episode j begins j * 2**64 draws into the stream, however many earlier episodes have used.
+    So the j-th episode after a seed gets the same draws, however long those before it were.
+    The `SeedSequence` with these arguments, which starts the stream, is created at the first
+    episode, as many plants have streams that are never used.
     """
 
     # Without a dict each, the streams of 100,000 plants take little memory.
     __slots__ = ("_episode", "_origin", "_seeds", "generator")
 
-    generator: np.random.Generator  # of the present episode
+    generator: np.random.Generator  # of the current episode
 
     def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
         self._seeds = entropy, spawn_key, pool_size
@@ -56,7 +56,7 @@ class EpisodeStream:
             origin: Any = self.generator.bit_generator.state["state"]
             self._origin = origin["state"], origin["inc"]
         else:
-            # Found through the generator, as a copy of it may have a bit generator of its own.
+            # Taken from the generator, as a copy of it may have its own bit generator.
             bits = cast("np.random.PCG64", self.generator.bit_generator)
             at: Any = dict(zip(("state", "inc"), self._origin, strict=True))
             bits.state = {"bit_generator": "PCG64", "state": at, "has_uint32": 0, "uinteger": 0}
@@ -66,7 +66,7 @@ class EpisodeStream:
 
 
 class Streams(NamedTuple):
-    """All streams of one plant; a new one comes last, and changes none before it."""
+    """All streams of one plant; new ones come last, so that the others do not change."""
 
     noise: EpisodeStream
     setpoint: EpisodeStream
@@ -75,13 +75,13 @@ class Streams(NamedTuple):
 
     @classmethod
     def spawn(cls, seeds: np.random.SeedSequence) -> Streams:
-        """Make the streams of a seed sequence, each of a child of it."""
+        """Make the streams of a seed sequence, each from one of its children."""
         children = seeds.spawn(len(cls._fields))
         return cls(*(EpisodeStream(c.entropy, c.spawn_key, c.pool_size) for c in children))
 
     @classmethod
     def of_seed(cls, seed: int) -> Streams:
-        """Make the streams that `spawn` makes of `SeedSequence(seed)`, in less time."""
+        """Make the streams that `spawn` makes from `SeedSequence(seed)`, but faster."""
         return cls(*(EpisodeStream(seed, (place,)) for place in range(len(cls._fields))))
 
 
@@ -96,21 +96,21 @@ def is_silent(name: str, parameters: Parameters) -> bool:
 
 
 class Noise:
-    """Coloured noise, C(z^-1) xi(k) of (28), or the transmitter's, by name; 0 at k = 0."""
+    """Noise by name, 0 at k = 0: C(z^-1) xi(k) of (28), or the measurement noise."""
 
     def __init__(self, name: str, parameters: Parameters, num_envs: int, block: int) -> None:
         self._name, self._variance = name, f"{name}_variance"
         c = np.array(colour_of(name, parameters))
         self._c = c[:, np.newaxis, np.newaxis]
-        # C times the deviation of xi: [lag, plant, 0], all plants in one if they are alike.
+        # C times the standard deviation of xi: [lag, plant, 0], one plant for all if alike.
         low, high = parameters.range_of(self._variance)
         self._alike = low == high
         self._colour = np.repeat(math.sqrt(low) * self._c, 1 if self._alike else num_envs, 1)
         self._past = np.zeros((num_envs, len(c) - 1))
         self._generators: dict[int, np.random.Generator] = {}
-        # A row a sample: what all plants need at a time lies together.
+        # One row per sample, so that what all plants need at once is contiguous.
         self._block = np.zeros((block, num_envs))
-        self._row = 0  # the next one
+        self._row = 0  # the next row
 
     def reset(
         self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
@@ -143,7 +143,7 @@ class Noise:
         return noise
 
     def _fill(self, which: Indices, first_row: int) -> None:
-        """Make the noise of some plants, from a row on to the end of the block."""
+        """Generate the noise of some plants, from a row to the end of the block."""
         order = len(self._c) - 1
         samples = len(self._block) - first_row
         for start in range(0, len(which), PLANTS_AT_A_TIME):
@@ -153,7 +153,7 @@ class Noise:
             for i, row in zip(plants.tolist(), draws[:, order:], strict=True):
                 self._generators[i].standard_normal(out=row)
             self._past[plants] = draws[:, samples:]
-            # A slice, if there are no gaps, is much faster.
+            # If there are no gaps, a slice is much faster.
             gaps = plants[-1] - plants[0] >= len(plants)
             columns = plants if gaps else slice(plants[0], plants[-1] + 1)
             colour = self._colour if self._alike else self._colour[:, plants]
@@ -161,7 +161,7 @@ class Noise:
 
 
 def _coloured(colour: Sequence[float] | Values, draws: Values) -> Values:
-    """Filter draws along the last axis, of which the first len(colour) - 1 are past ones."""
+    """Filter draws along the last axis; the first len(colour) - 1 are past draws."""
     order = len(colour) - 1
     noise: Values = colour[0] * draws[..., order:]
     for lag, coefficient in enumerate(colour[1:], start=1):
@@ -170,17 +170,17 @@ def _coloured(colour: Sequence[float] | Values, draws: Values) -> Values:
 
 
 class Levels:
-    """How the set point goes on: through levels, each held for a number of samples."""
+    """The levels of a set point, each held for a number of samples."""
 
     def __init__(self, parameters: Parameters) -> None:
         kind, period = parameters.setpoint, parameters.setpoint_period
         self.random = kind == "random"
-        # Random levels are uniform within plus and minus that, degC, and held for so many
-        # samples, both ends included.
+        # Random levels are uniform within +-`amplitude`, degC, and held for `shortest` to
+        # `longest` samples, both included.
         self.amplitude = amplitude = parameters.setpoint_amplitude
         self.shortest = max(1, math.ceil(period / 6))
         self.longest = max(self.shortest, period // 2)
-        # Others are these, degC, again and again, and held for so many samples each.
+        # Others repeat `values`, degC, each held for its number of samples in `lengths`.
         if isinstance(kind, str):  # "square"
             self.values = [amplitude, -amplitude]
             self.lengths = [(period + 1) // 2, period // 2]
@@ -189,7 +189,7 @@ class Levels:
             self.lengths = [1] * (len(self.values) - 1) + [FOREVER]
 
     def next(self, place: int, generator: np.random.Generator | None) -> tuple[float, int]:
-        """Return the level at a place, or draw one, degC, and for how many samples it holds."""
+        """Return the level at a place, or draw one, degC; and for how many samples it holds."""
         if generator is None:
             place %= len(self.values)
             return self.values[place], self.lengths[place]
@@ -198,14 +198,14 @@ class Levels:
 
 
 class _Held:
-    """Values of many plants, each of which is held until it changes."""
+    """Values of many plants, each held until it changes."""
 
     def __init__(self, num_envs: int) -> None:
         self._now = np.zeros(num_envs)
-        # Samples since all plants were made, and when, by that clock, each value changes.
+        # Samples since the plants were created, and when, on that clock, each value changes.
         self._clock = 0
         self._changes = np.zeros(num_envs, np.int64)
-        self._next_change = 0  # the first of them
+        self._next_change = 0  # the earliest of them
 
     def next(self) -> Values:
         """Return the next values of all plants, degC, shape (num_envs,); only to be read."""
@@ -215,13 +215,13 @@ class _Held:
         return self._now
 
     def _catch_up(self) -> None:
-        # More than once where a level is held for no sample, as in a period of one.
+        # Repeated where a level is held for 0 samples, as with a period of 1.
         while self._clock >= self._next_change:
             self._change(self._changes <= self._clock)
             self._next_change = int(self._changes.min())
 
     def _change(self, due: NDArray[np.bool_]) -> None:
-        """Change the values whose time has come, and say when the next changes are."""
+        """Change the values that are due, and set when they change next."""
         raise NotImplementedError
 
 
@@ -250,7 +250,7 @@ class SetPoint(_Held):
         """Return the next block of one plant, degC."""
         level, place = self._now.item(), self._places.item()
         values: list[float] = []
-        end = self._next_change - self._clock - 1  # of the level, counted from here
+        end = self._next_change - self._clock - 1  # of the level, counted from the next sample
         while end < BLOCK:
             values += [level] * (end - len(values))
             level, length = self._levels.next(place, self._generators.get(0))
@@ -274,10 +274,10 @@ class SetPoint(_Held):
 
 
 class Disturbance(_Held):
-    """The load disturbance w(k): steps and a random walk, both from 0.
+    """The load disturbance w(k): the sum of steps and a random walk, both starting at 0.
 
-    It changes every `LOAD_INTERVAL` samples. The walk takes a uniform step, as wide as the
-    variance asks for; the sum of many is normal all the same. With a probability of
+    It changes every `LOAD_INTERVAL` samples. The walk takes a uniform step of the required
+    variance; the sum of many is close to normal. With a probability of
     `LOAD_INTERVAL / disturbance_interval` the other part jumps to a new level, uniform within
     +-`disturbance_amplitude`.
     """
@@ -288,9 +288,9 @@ class Disturbance(_Held):
         self._shapes = np.zeros((num_envs, 3))
         self._last = np.zeros((num_envs, 2))
         self._levels = np.zeros((num_envs, LEVELS_AT_A_TIME))  # those ahead
-        # Where each plant's end, when all lie in a row.
+        # Index of each plant's end in the flattened levels.
         self._ends = np.arange(1, num_envs + 1) * LEVELS_AT_A_TIME
-        self._places = self._ends.copy()  # of the next level, there
+        self._places = self._ends.copy()  # of the next level, in the flattened levels
 
     def reset(
         self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
@@ -304,7 +304,7 @@ class Disturbance(_Held):
         self._places[which] = self._ends[which]
         self._changes[which] = self._clock + LOAD_INTERVAL
         self._next_change = int(self._changes.min())
-        self._ahead = [0.0] * (LOAD_INTERVAL - 1)  # of one plant
+        self._ahead = [0.0] * (LOAD_INTERVAL - 1)  # of a single plant
 
     def ahead(self) -> list[float]:
         """Return the next block of one plant, degC."""
@@ -321,7 +321,7 @@ class Disturbance(_Held):
         self._changes += LOAD_INTERVAL * due
 
     def _refill(self, which: Indices) -> None:
-        """Make the next levels of some plants."""
+        """Generate the next levels of some plants."""
         for start in range(0, len(which), PLANTS_AT_A_TIME):
             plants = which[start : start + PLANTS_AT_A_TIME]
             draws = np.empty((len(plants), LEVELS_AT_A_TIME, 3))
@@ -334,7 +334,7 @@ class Disturbance(_Held):
 
 
 def _shape(numbers: PlantNumbers[Any]) -> tuple[Any, Any, Any]:
-    """Return amplitude, probability of a jump and half width of the walk's steps."""
+    """Return amplitude, probability of a jump, and half width of the walk's steps."""
     return (
         numbers.disturbance_amplitude,
         LOAD_INTERVAL / numbers.disturbance_interval,
@@ -344,10 +344,10 @@ def _shape(numbers: PlantNumbers[Any]) -> tuple[Any, Any, Any]:
 
 
 def _disturbance(draws: Values, shapes: Values, last: Values) -> tuple[Values, Values]:
-    """Make disturbances w, shape (plants, changes), of uniform draws, (plants, changes, 3).
+    """Return disturbances w, (plants, changes), from uniform draws, (plants, changes, 3).
 
-    `shapes` is as of `_shape`, shape (plants, 3). `last` are the levels before, of the steps
-    and of the walk, shape (plants, 2); the new ones are returned, too.
+    `shapes`, shape (plants, 3), come from `_shape`. `last`, shape (plants, 2), are the previous
+    levels of the steps and of the walk; the new ones are returned, too.
     """
     amplitude, probability, width = (shapes[:, [i]] for i in range(3))
     walk = np.hstack((last[:, 1:], (2.0 * draws[..., 0] - 1.0) * width)).cumsum(axis=1)[:, 1:]
@@ -359,7 +359,7 @@ def _disturbance(draws: Values, shapes: Values, last: Values) -> tuple[Values, V
 
 
 class Signals(NamedTuple):
-    """What comes from outside to some plants; None is always 0."""
+    """The external signals of some plants; None stands for a signal that is always 0."""
 
     setpoint: SetPoint
     noise: Noise | None
@@ -368,7 +368,7 @@ class Signals(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Parameters, num_envs: int = 1, block: int = BLOCK) -> Signals:
-        """Make the signals of an environment; noise is made `block` samples at a time."""
+        """Make the signals of an environment, with `block` samples of noise at a time."""
         noise, measurement_noise = (
             None if is_silent(name, parameters) else Noise(name, parameters, num_envs, block)
             for name in ("noise", "measurement_noise")
@@ -379,13 +379,13 @@ class Signals(NamedTuple):
     def reset(
         self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
     ) -> Values:
-        """Begin an episode of some plants, and return their y_d(0); all else is 0 then."""
+        """Begin an episode of some plants, and return y_d(0); the other signals start at 0."""
         for signal in (self.noise, self.disturbance, self.measurement_noise):
             if signal is not None:
                 signal.reset(which, streams, numbers)
         return self.setpoint.reset(which, streams)
 
     def ahead(self) -> list[tuple[float, ...]]:
-        """Return y_d, n, w and the transmitter's noise of one plant, a tuple a sample."""
+        """Return y_d, n, w and the measurement noise of one plant, one tuple per sample."""
         silence = [0.0] * BLOCK
         return list(zip(*(each.ahead() if each else silence for each in self), strict=True))

@@ -1,4 +1,4 @@
-"""Run many plants side by side in PyTorch, on any device and with gradients if asked for."""
+"""Simulate many plants side by side in PyTorch, on any device, optionally with gradients."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from mptc_gym.torch_signals import (
     replaced,
 )
 
-_IN_CACHE = 1 << 17  # numbers that are worked on at once
-_AT_ONCE = 1 << 14  # numbers of observations that are put together at once
+_IN_CACHE = 1 << 17  # numbers processed at once
+_AT_ONCE = 1 << 14  # numbers of observations stacked at once
 
 
 def _usable(device: str | torch.device) -> torch.device:
-    """Return a device on which there can be tensors and a generator; ValueError otherwise."""
+    """Return a device that supports tensors and a generator; ValueError otherwise."""
     try:
         usable = torch.device(device)
         torch.zeros(1, device=usable)
@@ -54,37 +54,37 @@ def _usable(device: str | torch.device) -> torch.device:
 
 
 class MiddlePointTorchEnv(BatchEnv):
-    """n plants that advance together, whose observations, actions and rewards are tensors.
+    """n plants that advance together, with observations, actions and rewards in tensors.
 
     The plant, the spaces, the reward, the infos and the arguments are those of
     `MiddlePointEnv`; resets are those of `MiddlePointVectorEnv`. Given the same signals and
-    actions, all that `reset` and `step` return is the same but for rounding.
+    actions, `reset` and `step` return the same up to rounding.
 
-    Use it to train on a GPU, on thousands of noisy plants, or through the plant. With fewer
-    plants on a CPU, NumPy is quicker: `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
+    Use it to train on a GPU, on thousands of noisy plants, or by gradients through the plant.
+    On a CPU, NumPy steps few plants faster: `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
 
     Parameters
     ----------
     num_envs, max_episode_steps, autoreset_mode
         As for `MiddlePointVectorEnv`. `final_obs` is a tensor, 0 where no episode has ended.
     device
-        Where everything is computed and all tensors are.
+        Device of all computations and tensors.
     dtype
-        torch.float32 or torch.float64, of all that is computed; the spaces say float32.
+        torch.float32 or torch.float64, for all computations; the spaces say float32.
     differentiable
         Whether observations, rewards and infos carry the graph back to the actions, through
         time; see Gradients.
     **arguments
-        Those of `MiddlePointEnv` but `render_mode`, the same for all plants; from a range each
-        draws its own.
+        Those of `MiddlePointEnv` except `render_mode`, the same for all plants; each draws its
+        own from a range.
 
     Attributes
     ----------
     autoreset_mode : AutoresetMode
         The mode.
     checks_actions : bool
-        Whether actions that are not finite are refused, which has to wait for the device; see
-        Waiting.
+        Whether actions that are not finite are refused, which requires waiting for the device;
+        see Waiting.
 
     Raises
     ------
@@ -96,36 +96,35 @@ class MiddlePointTorchEnv(BatchEnv):
     Notes
     -----
     **Random numbers.** All come from one `torch.Generator` on the device, which `reset(seed=)`
-    starts anew: the same seed, arguments and resets give the same numbers on the same device,
-    with the same versions of this package and of PyTorch. They are other numbers than those of
-    the environments in NumPy, which stay from version to version, of the same distributions.
-    There, the j-th episode of a plant is the same however long the episodes before it were, and
-    whatever the other plants do; here it is not. So compare controllers with those, or hand the
-    signals in.
+    restarts: the same seed, arguments and resets give the same numbers on the same device, with
+    the same versions of this package and of PyTorch. They differ from the numbers in NumPy,
+    which stay the same from version to version; the distributions are equal. In NumPy, the j-th
+    episode of a plant depends neither on the length of earlier episodes nor on the other
+    plants; here it does. So compare controllers in NumPy, or on external signals.
 
-    **Signals from outside.** `reset(options={"signals": signals})` takes a dict of tensors:
-    "noise" (n), "setpoint" (y_d), "disturbance" (w) and "measurement_noise", degC, each of
-    shape (samples, num_envs), where row k is that of sample k; and numbers that are ranges by
-    their names, shape (num_envs,). With one dimension more before, the j-th episode of a plant
-    gets the j-th, and after the last one the first again. What is not in the dict is drawn. It
-    is a ValueError if a step needs a sample beyond the last.
+    **External signals.** `reset(options={"signals": signals})` takes a dict of tensors: "noise"
+    (n), "setpoint" (y_d), "disturbance" (w) and "measurement_noise", degC, each of shape
+    (samples, num_envs), with sample k in row k; and values of arguments that are ranges, by
+    name, shape (num_envs,). With a further, leading dimension, the j-th episode of a plant gets
+    the j-th element, and after the last the first again. What is not in the dict is drawn. A
+    step beyond the last sample raises a ValueError.
 
     **Gradients.** The actuator is not smooth. The gradient goes straight through the dead zone,
-    as if it were not there, and is 0 beyond the limits, as nothing changes there; the same
-    holds for readings beyond the transmitter's span. So a policy also learns from commands
-    without effect, which have no gradient in truth. `detach` cuts the graph for truncated
-    backpropagation. An action shows after `delay` + 1 samples: shorter pieces have no gradient.
-    Without `differentiable` nothing of a graph is kept.
+    as if there were none, and is 0 beyond the limits, where nothing changes; readings beyond
+    the transmitter's span have no gradient, either. So a policy also learns from commands
+    without effect, whose true gradient is 0. `detach` cuts the graph for truncated
+    backpropagation. An action shows after `delay` + 1 samples: shorter segments have no
+    gradient. Without `differentiable` no graph is kept.
 
-    **Waiting.** `step` never waits for the device: the host knows when episodes end. For the
-    same reason, actions that are not finite are an error on the CPU only; elsewhere, where
+    **Waiting.** `step` never waits for the device: the host knows when episodes end. To avoid
+    waiting, actions that are not finite are refused on the CPU only; elsewhere, where
     `checks_actions` is False, the plants that got them show NaN until they are reset. `reset`
     may wait.
 
-    **Memory.** What a step returns is the caller's, to keep or to overwrite, except that in the
-    infos masks and the factors of drifts may be one tensor for several steps. Tensors of
-    several steps may share one piece of memory, which is freed when none of them is left.
-    Observations are transposed views: their columns lie one after the other in memory.
+    **Memory.** The caller may keep or overwrite what a step returns, except that, in the infos,
+    masks and drift factors may be one tensor for several steps. Tensors of several steps may
+    share a block of memory, which is freed when none of them is left. Observations are
+    transposed views: each column is contiguous in memory.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as in VectorEnv)
@@ -153,19 +152,19 @@ class MiddlePointTorchEnv(BatchEnv):
         self.checks_actions = self.device.type == "cpu"
         self._seed: int | None = None  # None until the first reset
         self._zeros = torch.zeros(num_envs, dtype=dtype, device=self.device)
-        self._action = self._zeros  # the last one
+        self._action = self._zeros  # of the last step
         self._move_weight = self.parameters.move_weight
 
         self._episodes = Episodes(self.parameters, self._zeros)
         self._plants = TorchPlants(self.parameters, self._episodes)
         self._drawn = drawn_signals(self.parameters, self._episodes)
-        self._handed: dict[str, Handed] = {}  # plant numbers, too
-        self._last: int | None = None  # sample of an episode that all signals handed in have
+        self._handed: dict[str, Handed] = {}  # signals and plant numbers
+        self._last: int | None = None  # last sample that all given signals have
         self._signals: dict[str, Signal] = self._drawn
-        # Blocks of samples that stay in the processor's cache, or that are worth their calls.
+        # Blocks that fit in the processor's cache or, on other devices, are worth their calls.
         in_cache = max(1, _IN_CACHE // num_envs) if self.device.type == "cpu" else LONGEST
         self._block = min(self._plants.most_samples, LONGEST, in_cache)
-        # What the steps ahead return, worked out, the next one last.
+        # Precomputed returns of the steps ahead, the next one last.
         self._ahead: list[tuple[Any, ...]] = []
         self._shown = _Window(self.parameters.windows, self._zeros, differentiable)
 
@@ -179,7 +178,7 @@ class MiddlePointTorchEnv(BatchEnv):
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions, for truncated backpropagation.
 
-        What later steps return then depends on the actions from now on alone.
+        What later steps return then depends only on actions from now on.
         """
         self._plants.detach()
         self._shown.detach()
@@ -199,12 +198,12 @@ class MiddlePointTorchEnv(BatchEnv):
         episodes.taken += 1
         if self._move_weight:
             rewards = rewards - self._move_weight * (a - self._action).abs()
-            self._action = a.clone()  # the caller may write in it
+            self._action = a.clone()  # the caller may overwrite it
         infos["command"], infos["applied"] = command, applied
         return observations, rewards, terminations, truncations, infos
 
     def _look_ahead(self) -> None:
-        """Work out what the next steps return, but for what depends on their actions."""
+        """Compute what the next steps return, except what depends on their actions."""
         samples = max(1, min(self._block, self._first_end - self._clock + 1))
         self._episodes.clock = self._clock
         made = {name: signal.next(samples) for name, signal in self._signals.items()}
@@ -244,7 +243,7 @@ class MiddlePointTorchEnv(BatchEnv):
         self._episodes.taken = 0
 
     def _rewards(self, error: Tensor) -> Tensor:
-        """Return the rewards of errors, but for what moves cost."""
+        """Return the rewards of errors, without the cost of moves."""
         scale = self.parameters.error_scale
         if self.parameters.reward == "quadratic":
             zero = error.new_zeros(())
@@ -282,7 +281,7 @@ class MiddlePointTorchEnv(BatchEnv):
         if seed is not None and not (is_count(seed) and seed < 1 << 63):
             reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
         if "reset_mask" not in options:
-            # Signals and plant numbers instead of draws, if there are any.
+            # Signals and plant numbers that replace draws, if any.
             self._handed, self._last = handed_signals(
                 options.get("signals"), self.parameters, self._episodes
             )
@@ -308,7 +307,7 @@ class MiddlePointTorchEnv(BatchEnv):
         if self._ended is not None:
             a = a.masked_fill(self._flags(self._ended), 0.0)
         if self.checks_actions:
-            # One call tells that all are finite, unless some are huge.
+            # One call shows that all are finite, unless some are huge.
             plain = a.detach() if a.requires_grad else a
             if not math.isfinite(plain.dot(plain).item()) and not plain.isfinite().all():
                 reject("actions", actions, "finite")
@@ -323,17 +322,17 @@ class MiddlePointTorchEnv(BatchEnv):
 
 
 class _Window:
-    """The observations of all plants, with past actions that gradients reach or not."""
+    """The observations of all plants, with or without gradients for past actions."""
 
     def __init__(self, windows: Sequence[int], zeros: Tensor, differentiable: bool) -> None:
         *self._windows, self._past_actions = windows
         self._zeros, self._differentiable = zeros, differentiable
-        self._actions: list[Tensor] = []  # those that are shown, newest first
-        # Set points, errors and outputs, oldest first: as many as an observation shows, and
-        # then those of the block.
+        self._actions: list[Tensor] = []  # those shown, newest first
+        # Set points, errors and outputs, oldest first: those of one observation, then those of
+        # the block.
         self._rows: list[list[Tensor]] = [[] for _ in self._windows]
         self._samples = 0  # of the block
-        # A few observations at a time are put together.
+        # Observations are stacked a few at a time.
         numbers = max(1, sum(self._windows) * len(zeros))
         self._at_once = max(1, _AT_ONCE // numbers) if zeros.is_cpu else LONGEST
         self._together: list[Tensor] = []  # the next one last
@@ -341,7 +340,7 @@ class _Window:
     def reset(
         self, taken: int, which: Tensor | None, setpoint: Tensor, rest_action: Tensor
     ) -> None:
-        """Begin an episode of some plants at rest, once `taken` samples of a block are over."""
+        """Begin an episode of some plants at rest, after `taken` samples of a block."""
         for rows, w, newest in zip(
             self._rows, self._windows, (setpoint, setpoint, self._zeros), strict=True
         ):
@@ -356,14 +355,14 @@ class _Window:
             self._actions = [shown] if self._differentiable else [*shown.split(1)]
 
     def add(self, taken: int, *blocks: Tensor) -> None:
-        """Add a block of set points, errors and outputs, once so many of the last are over."""
+        """Add a block of set points, errors and outputs, after `taken` samples of the last."""
         for rows, w, block in zip(self._rows, self._windows, blocks, strict=True):
             if w:
                 rows[:] = [*rows[taken : taken + w], *block.unbind()]
         self._samples = len(blocks[0])
 
     def next(self, taken: int, a: Tensor) -> Tensor:
-        """Return the observations of a sample of the block, after the action before it."""
+        """Return the observations of a sample of the block, given the action before it."""
         if not self._together:
             self._together = self._stacked(taken + 1, min(self._at_once, self._samples - taken))
         rows = self._together.pop()
@@ -377,7 +376,7 @@ class _Window:
         return rows.t()
 
     def present(self) -> Tensor:
-        """Return the observations of a reset."""
+        """Return the observations after a reset."""
         return torch.cat((*self._stacked(0, 1), *self._actions)).t()
 
     def detach(self) -> None:
@@ -387,7 +386,7 @@ class _Window:
         self._actions = [each.detach() for each in self._actions]
 
     def _stacked(self, first: int, count: int) -> list[Tensor]:
-        """Return observations but for actions, from a place in the rows on, the last first."""
+        """Return observations without actions, from index `first` of the rows, last first."""
         newest_first = [
             row
             for k in range(first, first + count)

@@ -1,6 +1,6 @@
 """Move many plants in PyTorch by (28) and (29), a block of samples at a time.
 
-`PlantBatch` in `mptc_gym.plant` is the same in NumPy, a sample at a time.
+`PlantBatch` in `mptc_gym.plant` does so in NumPy, a sample at a time.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from mptc_gym.torch_signals import Episodes, Number
 def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:
     """Return the flow u_a that the actuator applies, (29), t/h.
 
-    Its gradient with respect to the command is 1 up to the limits, straight through the dead
-    zone as if there were none, and 0 beyond the limits. `edge` is the largest magnitude of a
-    command without effect. The limits are both floats, or both of shape (n,).
+    Its gradient with respect to the command is 1 within the limits, straight through the dead
+    zone as if there were none, and 0 beyond them. `edge` is the largest magnitude of a command
+    without effect. The limits are both floats, or both of shape (n,).
     """
     alike = isinstance(edge, float) and isinstance(u_min, float) and isinstance(u_max, float)
     if alike and not command.requires_grad and u_min <= 0.0 <= u_max:
         shrunk = functional.hardshrink(command, edge)  # type: ignore[arg-type]  # it is a float
         return shrunk.clamp_(u_min, u_max)  # type: ignore[arg-type]  # the same, at once
     limited = torch.clamp(command, u_min, u_max)  # type: ignore[arg-type]
-    # 0 inside the dead zone and 1 outside: a product takes a processor much less time than a
-    # condition that it cannot foresee.
+    # 0 inside the dead zone and 1 outside: a product is much faster than an unpredictable
+    # branch.
     if not command.requires_grad:
         return limited.mul_(command.abs().gt_(edge))
     passes = command.detach().abs().gt_(edge)
@@ -41,7 +41,7 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
 
 
 def _largest_dead(dead_zone: Number, u_min: Number, u_max: Number, like: Tensor) -> Number:
-    """Return the largest magnitude of a command without effect, as numbers of a type go."""
+    """Return the largest magnitude of a command without effect, in the precision of `like`."""
     if like.dtype == torch.float32:
         edge: Number = least_effective(dead_zone, u_min, u_max, rounding=2.0**-21)
         return edge
@@ -54,9 +54,9 @@ def _largest_dead(dead_zone: Number, u_min: Number, u_max: Number, like: Tensor)
 class TorchPlants:
     """Many plants side by side, with gradients where the actions have them.
 
-    Because of the delay d, the outputs of the d + 1 samples after an action follow from the
-    actions so far, whatever comes next. So they are worked out in a block, d being the shortest
-    delay that can be drawn: `most_samples` at most.
+    Because of the delay, the outputs of the d + 1 samples after an action follow from the
+    actions so far, where d is the shortest delay that can be drawn. So they are computed in a
+    block, of at most `most_samples`.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
@@ -70,20 +70,20 @@ class TorchPlants:
         self._order = len(parameters.a) - 1  # of A
 
     def reset(self, which: Tensor | None) -> None:
-        """Bring some plants to rest, or all, with the numbers of the present episodes."""
+        """Bring some plants, or all, to rest, with the numbers of the current episodes."""
         numbers, zeros = self._episodes.numbers, self._zeros
-        self._now: tuple[Any, Any] | None = None  # factors, and what (28) has for them
+        self._now: tuple[Any, Any] | None = None  # factors and coefficients of (28)
         plants = PlantNumbers(**numbers)
         self._factors = self._dynamics.factors(plants, 0)
         if self._drifts:
-            # At the beginning of drifts, and what has been added at their end.
+            # The factors at the start of the drifts, and their total change.
             last = self._dynamics.factors(plants, self._drift_samples)
             self._drift = [
                 (zeros + begin, zeros + (end - begin))
                 for begin, end in zip(self._factors, last, strict=True)
             ]
-        # The flows that are still to have an effect, oldest first, for all terms of B; and the
-        # outputs, also oldest first: what A needs from before the last block, and the block.
+        # Flows that have yet to take effect, for all terms of B; and outputs, those that A
+        # needs from before the last block and those of the block. Both have the oldest first.
         if which is None:
             flows = self._longest + len(self._beta)
             self._flows = deque([zeros] * flows, flows)
@@ -96,7 +96,7 @@ class TorchPlants:
         self._half_range = (u_max - u_min) / 2.0
         self._edge = _largest_dead(numbers["dead_zone"], u_min, u_max, zeros)
         delay, n = numbers["delay"], len(zeros)
-        self._places = None  # of what each plant is shown, where delays differ
+        self._places = None  # of each plant's delayed flows, where delays differ
         if isinstance(delay, Tensor):
             columns = torch.arange(n, device=delay.device)
             rows = torch.arange(self.most_samples + len(self._beta) - 1, device=delay.device)
@@ -104,24 +104,24 @@ class TorchPlants:
             self._places = (rows[:, None] + oldest) * n + columns
 
     def apply(self, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Take a(k) of all plants, shape (n,), and return u(k) and u_a(k), t/h."""
+        """Apply a(k) of all plants, shape (n,), and return u(k) and u_a(k), t/h."""
         u_min, u_max = self._limits
-        # Section 4, last formula. In float64 it rounds as in NumPy, in float32 it is faster.
+        # Section 4, last formula: rounded as in NumPy in float64, faster in float32.
         if actions.dtype == torch.float64:
             command = actions.add(1.0).mul_(self._half_range).add_(u_min)
         else:
             command = _plus(self._middle, self._half_range, actions)
         applied = applied_flow(command, self._edge, u_min, u_max)
-        self._flows.append(applied.clone())  # as the caller may write in what is returned
+        self._flows.append(applied.clone())  # as the caller may overwrite what is returned
         return command, applied
 
     def outputs(
         self, samples: int, noise: Tensor | None, load: Tensor | None
     ) -> tuple[Tensor, list[tuple[Number, Number]]]:
-        """Work out the next samples, once the action before them has been applied.
+        """Compute the outputs of the next samples, after the action before them was applied.
 
-        n and w of these samples, if there are any, and y have the shape (samples, n), degC.
-        Gain and time constant of each, as multiples of those of A and B, are returned, too.
+        n and w of these samples, if any, and y have the shape (samples, n), degC. Also return
+        gain and time constant at each sample, as multiples of those of A and B.
         """
         rows, all_factors = self._past(), []
         response = self._response(samples)
@@ -164,17 +164,17 @@ class TorchPlants:
         return self._history[self._episodes.taken :][: self._order]
 
     def _stretches(self, samples: int) -> list[tuple[int, int]]:
-        """Return from which to which sample the dynamics of no plant change."""
+        """Return the first sample and the end of each stretch with constant dynamics."""
         clock = self._episodes.clock
         begins = [0, *(k for k in range(1, samples) if self._changes_at(clock + k))]
         return list(zip(begins, [*begins[1:], samples], strict=True))
 
     def _changes_at(self, clock: int) -> bool:
-        """Whether the drifting dynamics of a plant change at a sample."""
+        """Whether the drifting dynamics of any plant change at a sample."""
         return self._drifts and clock % DRIFT_INTERVAL in self._episodes.phases
 
     def _drifted(self, clock: int) -> tuple[Any, Any]:
-        """Return gain and time constant at a sample, and what (28) has for them."""
+        """Return gain and time constant at a sample, and the coefficients of (28) for them."""
         if self._now is None or self._changes_at(clock):
             factors: tuple[Any, ...] = self._factors
             if self._drifts:
@@ -189,7 +189,7 @@ class TorchPlants:
 def _follow(
     past: Sequence[Tensor], forced: Iterable[Tensor], alpha: Sequence[Number]
 ) -> list[Tensor]:
-    """Return past outputs and those that follow, by A of (28), oldest first."""
+    """Return past outputs and those that follow by A of (28), oldest first."""
     outputs = list(past)
     for output in forced:
         for lag, coefficient in enumerate(alpha, start=1):

@@ -1,10 +1,10 @@
-"""Make what comes from outside in PyTorch: drawn from one generator, or handed in.
+"""Generate external signals in PyTorch, drawn from one generator, or pass on given ones.
 
-The signals have the two verbs of those in `mptc_gym.signals`, for many plants and a block of
+The signals have two methods of those in `mptc_gym.signals`, for many plants and a block of
 samples at a time, without a loop over plants. `reset(which)` begins an episode of some plants,
-or of all where `which` is None, and returns the signal at k = 0, shape (n,). `next(samples)`
-returns it at the samples that follow, degC, shape (samples, n). What is left of a block when an
-episode begins is dropped.
+or of all if `which` is None, and returns the signal at k = 0, shape (n,). `next(samples)`
+returns the samples that follow, degC, shape (samples, n). The rest of a block is dropped when
+an episode begins.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, Parameters
 from mptc_gym.plant import DRIFT_INTERVAL
 from mptc_gym.signals import LOAD_INTERVAL, Levels, colour_of, is_silent
 
-LONGEST = 64  # samples of a block
+LONGEST = 64  # most samples in a block
 SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
-Number = float | Tensor  # the same for all plants, or one for each, shape (n,)
+Number = float | Tensor  # one for all plants, or one per plant, shape (n,)
 
 
 def replaced(old: Tensor, which: Tensor | None, new: Tensor) -> Tensor:
-    """Return the new values of some plants and the old ones of the others; None for all."""
+    """Return new values for some plants, old ones for the others; None selects all plants."""
     return new if which is None else torch.where(which, new, old)
 
 
 def as_tensor(values: Any, like: Tensor) -> Tensor | None:
-    """Return real numbers as a tensor of a type and device, None if they are not."""
-    if "complex" in str(getattr(values, "dtype", "")):  # PyTorch would drop a part of them
+    """Return real numbers as a tensor of the type and device of `like`, otherwise None."""
+    if "complex" in str(getattr(values, "dtype", "")):  # PyTorch would drop the imaginary part
         return None
     try:
         return torch.as_tensor(values, dtype=like.dtype, device=like.device)
@@ -44,28 +44,28 @@ def as_tensor(values: Any, like: Tensor) -> Tensor | None:
 
 
 class Episodes:
-    """What signals and plants know of the present episodes, and where random numbers are from.
+    """State of the current episodes, shared by signals and plants, and their generator.
 
-    `zeros` are of the device and type to use, shape (n,).
+    `zeros`, shape (n,), have the device and type to use.
     """
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
         self.zeros, self.generator = zeros, torch.Generator(zeros.device)
         self._ranges = {name: parameters.range_of(name) for name in parameters.ranges}
         self._changes = parameters.drifts or parameters.is_disturbed
-        # If one limit is drawn, both are tensors: PyTorch clamps between two numbers or between
-        # two tensors.
+        # If one limit is drawn, both are tensors: PyTorch clamps either between two numbers or
+        # between two tensors.
         limits = {"u_min", "u_max"}
         tensors = {*self._ranges} | (limits if limits & {*self._ranges} else set())
         self.numbers: dict[str, Number] = {}  # of all plants
         for name in PLANT_NUMBERS:
             low = float(parameters.range_of(name)[0])
             self.numbers[name] = zeros + low if name in tensors else low
-        # Samples since the plants were made, at the first sample of the next block, and how
-        # many samples of the last block have passed.
+        # Samples since the plants were created, up to the first sample of the next block; and
+        # the number of samples of the last block that have passed.
         self.clock = self.taken = 0
-        # The clock when each plant's episode began, and the remainders of that when divided by
-        # `DRIFT_INTERVAL`, if anything changes as slowly.
+        # The clock at the start of each plant's episode, and its remainders modulo
+        # `DRIFT_INTERVAL`, if anything changes that slowly.
         self.starts = torch.zeros_like(zeros, dtype=torch.int64)
         self.phases: set[int] = set()
         self._rows = torch.arange(LONGEST, device=zeros.device)[:, None]
@@ -77,9 +77,9 @@ class Episodes:
         clock: int,
         handed: Mapping[str, Handed],
     ) -> dict[str, Tensor]:
-        """Begin an episode of some plants, and return the numbers that are drawn or handed in.
+        """Begin an episode of some plants, and return the numbers that are drawn or given.
 
-        `starts` is the clock when each plant's episode began, with these episodes.
+        `starts` is the clock at the start of each plant's episode, these included.
         """
         first = {}
         for name, (low, high) in self._ranges.items():
@@ -101,25 +101,25 @@ class Episodes:
         return self._rows[:samples] + (self.clock - starts)
 
     def age(self, clock: int) -> int | Tensor:
-        """Return k at a sample of the clock, shape (n,), or one for all."""
+        """Return k at a time of the clock, shape (n,), or one number for all plants."""
         if self._first is not None:
             return clock - self._first
         return (clock - self.starts).to(self.zeros.dtype)
 
     def within_one(self, rows: int) -> Tensor:
-        """Draw numbers from -1 to 1, the latter excluded, shape (rows, n)."""
+        """Draw numbers from -1 to 1, 1 excluded, shape (rows, n)."""
         drawn = self.zeros.new_empty(rows, len(self.zeros))
         return drawn.uniform_(-1.0, 1.0, generator=self.generator)
 
     def within(self, low: float, high: float, whole: bool) -> Tensor:
-        """Draw numbers between two, or whole numbers, both ends included; shape (n,)."""
+        """Draw numbers from a range, or whole numbers, both ends included; shape (n,)."""
         drawn = torch.empty_like(self.zeros)
         drawn.uniform_(low, high + whole, generator=self.generator)
         return (drawn.floor() if whole else drawn).clamp(max=high)
 
 
 class Noise:
-    """Coloured noise, by name, as `mptc_gym.signals.Noise`."""
+    """Coloured noise, by name: see `mptc_gym.signals.Noise`."""
 
     def __init__(self, name: str, parameters: Parameters, episodes: Episodes) -> None:
         self._variance, self._c = f"{name}_variance", tuple(colour_of(name, parameters))
@@ -154,16 +154,16 @@ class Noise:
 
 
 class RandomSetPoint:
-    """A set point that holds each random level for a random number of samples."""
+    """A set point of random levels, each held for a random number of samples."""
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
         self._law, self._episodes = levels, episodes
         zeros = episodes.zeros
         self._rows = torch.arange(LONGEST, dtype=zeros.dtype).to(zeros.device)
-        # The present level and those to come, each with the sample where it ends, as whole
-        # numbers of type float, with which a processor is quickest.
+        # The current level and those to come, each with the sample where it ends: whole numbers
+        # in floats, which are fastest.
         self._levels = [(zeros, zeros)]
-        # How many samples are known, of which those that have passed count from the same place.
+        # Number of known samples, and of those that have passed, from the same origin.
         self._horizon = self._passed = 0
 
     def reset(self, which: Tensor | None) -> Tensor:
@@ -174,7 +174,7 @@ class RandomSetPoint:
         return self._levels[0][1]
 
     def next(self, samples: int) -> Tensor:
-        """Draw the next samples, if they are not known yet."""
+        """Return the next samples, drawn if they are not yet known."""
         shortest, taken = self._law.shortest, self._episodes.taken
         if self._passed + taken + samples > self._horizon:
             self._catch_up()
@@ -191,13 +191,13 @@ class RandomSetPoint:
         return levels
 
     def _drawn(self) -> tuple[Tensor, Tensor]:
-        """Draw for how many samples levels hold, and the levels, each of shape (n,)."""
+        """Draw the lengths of levels, in samples, and the levels, each of shape (n,)."""
         level = self._episodes.within_one(1)[0] * self._law.amplitude
         hold = self._episodes.within(self._law.shortest, self._law.longest, whole=True)
         return hold, level
 
     def _catch_up(self) -> None:
-        """Count from the sample that was taken last, and keep the level there alone."""
+        """Move the origin to the sample last taken, and keep only the level there."""
         end, level = self._levels[0]
         passed = level.new_full((), self._passed + self._episodes.taken)
         for (change, _), (later, following) in pairwise(self._levels):
@@ -230,7 +230,7 @@ class RepeatedSetPoint:
 
 
 class Disturbance:
-    """The load disturbance of `mptc_gym.signals.Disturbance`: steps and a walk."""
+    """The load disturbance, steps and a walk: see `mptc_gym.signals.Disturbance`."""
 
     def __init__(self, episodes: Episodes) -> None:
         self._episodes = episodes
@@ -238,7 +238,7 @@ class Disturbance:
     def reset(self, which: Tensor | None) -> Tensor:
         """Begin an episode of some plants."""
         zeros = self._episodes.zeros
-        # Steps and walk of the sample before the last block, and of those in it.
+        # Steps and walk at the sample before the last block, and at those of the block.
         if which is None:
             self._parts = [(zeros, zeros)]
         else:
@@ -262,7 +262,7 @@ class Disturbance:
         return torch.stack(rows)
 
     def _changed(self, clock: int) -> tuple[Tensor, Tensor]:
-        """Return steps and walk once those have changed whose turn it is."""
+        """Return steps and walk after the plants that are due have changed."""
         numbers, (step, walk) = self._episodes.numbers, self._parts[-1]
         drawn = self._episodes.within_one(2)
         interval = numbers["disturbance_interval"]
@@ -270,7 +270,7 @@ class Disturbance:
             interval = interval.clamp(min=LOAD_INTERVAL)
         else:
             interval = max(interval, LOAD_INTERVAL)
-        # It jumps if this is within +-1, and is then uniform there.
+        # A step occurs if this is within +-1, and is then uniform there.
         place = drawn[0] * (interval / LOAD_INTERVAL)
         jumps = _reached(place.new_ones(()), place.abs())
         level = place * numbers["disturbance_amplitude"]
@@ -285,16 +285,16 @@ class Disturbance:
 
 def _reached(now: Tensor, change: Tensor) -> Tensor:
     """Return 1 where a change has been reached, and 0 elsewhere."""
-    # Of the type of these: to use numbers of type bool as factors takes many times as long.
+    # Of the same type, as factors of type bool are many times slower.
     past = now - change
     return past.ge_(past.new_zeros(()))
 
 
 class Handed:
-    """A signal that is handed in instead of being drawn; or a plant number, by `reset` alone.
+    """A signal that is given instead of drawn; or a plant number, by `reset` alone.
 
-    The values have the shape (episodes, samples, n). After the last episode comes the first one
-    again, and after the last sample the last value is held.
+    The values have the shape (episodes, samples, n). After the last episode, the first follows
+    again; after the last sample, its value is held.
     """
 
     def __init__(self, values: Tensor, episodes: Episodes) -> None:
@@ -320,7 +320,7 @@ Signal = Noise | RandomSetPoint | RepeatedSetPoint | Disturbance | Handed
 
 
 def drawn_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal]:
-    """Return the signals of an environment by name, but for noise that is always 0."""
+    """Return the signals of an environment by name, except noise that is always 0."""
     levels = Levels(parameters)
     setpoint = RandomSetPoint if levels.random else RepeatedSetPoint
     signals: dict[str, Signal] = {"setpoint": setpoint(levels, episodes)}
@@ -335,9 +335,9 @@ def drawn_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signa
 def handed_signals(
     signals: Any, parameters: Parameters, episodes: Episodes
 ) -> tuple[dict[str, Handed], int | None]:
-    """Check signals and plant numbers that are handed in, if there are any.
+    """Check given signals and plant numbers, if any.
 
-    Returns them, and the last sample that all signals have, None if there are none.
+    Return them, and the last sample that all signals have, or None without signals.
     """
     if signals is None:
         return {}, None

@@ -1,4 +1,4 @@
-"""Run many plants side by side in NumPy, as a Gymnasium vector environment."""
+"""Simulate many plants side by side in NumPy, as a Gymnasium vector environment."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ from mptc_gym.signals import BLOCK, Indices, Signals, Streams, Values
 
 Observations = NDArray[np.float32]  # shape (num_envs, observation_size)
 
-NOISE_BYTES = 1 << 27  # of a block of noise, unless a single sample of all plants takes more
-STEPS_PER_SHIFT = 64  # steps until the window of the observations is moved back
+NOISE_BYTES = 1 << 27  # at most, in a block of noise, unless one sample takes more
+STEPS_PER_SHIFT = 64  # steps after which the window of observations is moved back
 
 
-class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at the bases
+class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects the bases
     """n plants that advance together: `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
 
-    Given the same seed, all that `reset` and `step` return equals, to the bit, what Gymnasium's
-    `SyncVectorEnv` of n `MiddlePointEnv` returns. See there for the plant, the spaces, the
-    reward, the infos and the arguments.
+    Given the same seed, `reset` and `step` return bit for bit what Gymnasium's `SyncVectorEnv`
+    of n `MiddlePointEnv` returns. See `MiddlePointEnv` for the plant, the spaces, the reward,
+    the infos and the arguments.
 
     Parameters
     ----------
     num_envs
-        n, number of plants, at most 10 million.
+        Number n of plants, at most 10 million.
     max_episode_steps
-        Samples after which an episode is truncated; None or -1 for never.
+        Samples after which an episode is truncated; None or -1 for no limit.
     autoreset_mode
         An `AutoresetMode` or its value. "NextStep": the step after the end of an episode resets
         the plant, and its action is ignored. "SameStep": the step that ends an episode resets
         the plant, and returns the last observation and info in `final_obs` and `final_info`.
-        "Disabled": the caller resets ended plants by `reset(options={"reset_mask": mask})`.
+        "Disabled": the caller resets ended plants with `reset(options={"reset_mask": mask})`.
     render_mode
         None, or "rgb_array": `render` returns a picture of each plant.
     **arguments
-        Those of `MiddlePointEnv`, the same for all plants; from a range each draws its own.
+        Those of `MiddlePointEnv`, the same for all plants; each draws its own from a range.
 
     Raises
     ------
@@ -60,17 +60,17 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
 
     Notes
     -----
-    `reset(seed=)` starts the random streams of plant i anew with seed + i, or with element i of
-    a list. Without a seed, or where the list says None, the next episode of the present streams
+    `reset(seed=)` restarts the random streams of plant i with seed + i, or with element i of a
+    list. Without a seed, or where the list holds None, the next episode of the current streams
     begins. Rewards are float64, and observations float32.
 
     All plants share one clock, so that a step is array arithmetic alone. There is a Python loop
     over plants only where each draws from its own generators: at the start of an episode, once
-    in some 600 samples of noise, and when a random set point changes. A plant needs the same
-    few KiB however long an episode lasts.
+    every 600 samples or so of noise, and when a random set point changes. A plant needs the
+    same few KiB however long an episode lasts.
 
-    With an unstable `a`, or with actions beyond 1e154, y may leave the range of floats. NumPy
-    then warns here, while `MiddlePointEnv` continues without a warning.
+    With an unstable `a`, or with actions beyond 1e154, y may overflow. NumPy then warns here,
+    while `MiddlePointEnv` continues without a warning.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (as in VectorEnv)
@@ -94,17 +94,17 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
         self.render_mode = render_mode
         self._records: dict[int, Record] = {}  # of every plant, for pictures
         self._seeds: list[int | None] = [None] * num_envs
-        self._streams: dict[int, Streams] = {}  # of every plant, once they have been reset
+        self._streams: dict[int, Streams] = {}  # of every plant, from the first reset on
         self._ranges = Ranges(parameters)
-        # Blocks of noise that come out even at the end of an episode; short ones, which take
-        # longer to make, where the memory of many plants would be large.
+        # Blocks of noise that end with an episode; shorter ones, which are slower, where many
+        # plants would need much memory.
         longest = max(1, min(BLOCK, NOISE_BYTES // (8 * num_envs)))
         block = math.ceil(self._limit / math.ceil(self._limit / longest))
         self._signals = Signals.of(parameters, num_envs, block)
         self._plants = PlantBatch(parameters, num_envs)
         self._shown = _Window(parameters.windows, num_envs)
-        self._actions = np.zeros(num_envs)  # the last ones
-        # Arrays instead of numbers, as in `PlantBatch`.
+        self._actions = np.zeros(num_envs)  # of the last step
+        # Arrays instead of numbers, for speed, as in `PlantBatch`.
         self._zeros = np.zeros(num_envs)
         self._everyone, self._nobody = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
         span = parameters.temperature_span
@@ -129,15 +129,15 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
         Returns
         -------
         tuple of ndarray, or None
-            A picture of each plant, shape (540, 960, 3), uint8. None, after a warning, without
-            a render mode.
+            A picture of each plant, shape (540, 960, 3), uint8. None without a render mode,
+            after a warning.
 
         Raises
         ------
         ResetNeeded
             If the environments have never been reset.
         DependencyNotInstalled
-            If there is no pygame.
+            If pygame is not installed.
         """
         if self.render_mode is None:
             rendering.warn_no_mode()
@@ -171,9 +171,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
             measured = output + of_transmitter.next()
             measured_error = setpoint - measured
         lowest, highest, squared = self._span
-        # Otherwise no single one can be beyond the span.
+        # If the sum of squares is at most the span squared, no reading is beyond the span.
         if not measured.dot(measured) <= squared:
-            measured = np.fmin(measured, highest)  # which takes NaN for the limit
+            measured = np.fmin(measured, highest)  # which turns NaN into the limit
             np.fmax(measured, lowest, out=measured)
             measured_error = setpoint - measured
         observations = self._shown.add(setpoint, measured_error, measured, a)
@@ -269,13 +269,13 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl looks at
 class _Window:
     """The observations of all plants.
 
-    They lie in a row, one after the other, from a place on that moves back by one each step. So
-    all blocks of samples move on by one, and only their first elements have to be written.
+    They lie in a row, one after another, from a place that moves back by one each step. So all
+    blocks of samples shift by one, and only their first elements have to be written.
     """
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
         heads = np.cumsum([0, *windows[:-1]]).tolist()
-        # Where the newest sample of each block lies, if there is the block.
+        # Index of the newest sample of each block; None where the block is empty.
         self._newest = tuple(
             np.s_[:, head] if window else None
             for head, window in zip(heads, windows, strict=True)
@@ -287,11 +287,11 @@ class _Window:
         self._place = STEPS_PER_SHIFT
 
     def present(self) -> Observations:
-        """Return the observations as they lie in the row."""
+        """Return a view of the current observations."""
         return self._row[self._place : self._place + self._elements].reshape(self._shape)
 
     def reset(self, which: Indices, setpoint: Values, rest_action: Values) -> None:
-        """Begin an episode of some plants at rest: y_d(0), and the action of no flow."""
+        """Begin an episode of some plants at rest, with y_d(0) and the action of no flow."""
         rest = np.zeros((len(which), self._shape[1]), np.float32)
         for newest in self._newest[:2]:
             if newest is not None:
@@ -300,7 +300,7 @@ class _Window:
         self.present()[which] = rest
 
     def add(self, setpoint: Values, error: Values, output: Values, a: Values) -> Observations:
-        """Add what is shown of a sample, and return the observations."""
+        """Add a sample, and return the observations."""
         if self._place == 0:
             self._row[STEPS_PER_SHIFT:] = self._row[:-STEPS_PER_SHIFT]
             self._place = STEPS_PER_SHIFT
