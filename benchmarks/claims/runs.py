@@ -15,7 +15,7 @@ from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 
 Array = NDArray[np.floating]
 
-BAND = 0.05  # fraction of the distance that the weights travel
+BAND = 0.05  # fraction of the distance from the first weights to the last
 STILL = 100  # last samples of a run, in which converged weights stay within the band
 
 

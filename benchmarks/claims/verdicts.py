@@ -29,7 +29,7 @@ class Claim:
     method: str
     """Description of the test."""
     examine: Callable[[Batch, Claim], None]
-    """Performs the runs, and records the findings by `ask`."""
+    """Performs the runs, and records the findings with `ask`."""
     findings: list[dict[str, Any]] = field(default_factory=list)
     """Rows of the table of numbers."""
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)

@@ -37,7 +37,7 @@ class Case:
     again: float | None
     """Mean |e| of a second run that keeps what was learnt, degC, if there was one."""
     seconds: float
-    """Duration of the runs."""
+    """Duration of the runs, s."""
 
 
 def run_case(scenario: Scenario, agent: str, members: Sequence[Factory], runs: int) -> Case:

@@ -91,8 +91,8 @@ def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
 
     They are `mean` and `interquartile_mean` of |e|, degC; `ratio`, the mean as a multiple of
     `limit`, the least possible error that applies; `difference`, the mean paired difference
-    from the reference agent; `improvement`, the probability of a smaller error than its; and
-    `student_high`, the upper end of Student's interval of the mean. `preview` is the least
+    from the reference agent; `improvement`, the probability of doing better than that agent;
+    and `student_high`, the upper end of Student's interval of the mean. `preview` is the least
     possible error of any controller. Ends are infinite if runs differ but there is only one.
     """
     rows = []

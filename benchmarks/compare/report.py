@@ -96,7 +96,7 @@ def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -
 
 
 def _draw(kind: str, *arguments: Any) -> str:
-    """Draw a picture, and return an error's message, so that the report is still written."""
+    """Draw a picture and return any error as text, so that the report is still written."""
     from benchmarks.compare import plots  # here, so that only drawing loads Matplotlib
 
     try:

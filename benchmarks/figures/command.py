@@ -73,7 +73,7 @@ def execute(options: Options, console: Console) -> str:
 
 
 def summarise(trajectory: Trajectory) -> pd.DataFrame:
-    """Return the set point, and each signal in a typical run and over all, a row per sample.
+    """Return the set point, and each signal's typical run and percentiles, a row per sample.
 
     Returns
     -------

@@ -202,7 +202,7 @@ def frontier(
     samples, kind, episodes, seed, **arguments
         See `least_possible`. With "reference", the condition of that kind applies.
     prices
-        Prices of a t/h of travel, degC times samples.
+        Prices per t/h of travel, degC times samples.
 
     Returns
     -------

@@ -18,8 +18,8 @@ good pi takes away what the programme would gain from knowing the future. Here i
 G[k, j] is the effect of u_a(j) on y(k), and g(k) a guess of the slope of E|e(k)|. After a
 change it is the sign of the change, until the output can have followed; later in a hold it is a
 number between -1 and 1, odd in the level, that weighs staying against moving ahead to where the
-next level is expected. The guess is chosen for conditional means in closed form. A poor guess
-makes the bound loose, never wrong.
+next level is expected. The guess is chosen so that its conditional means have a closed form.
+A poor guess makes the bound loose, never wrong.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ TIME_LIMIT = 30.0  # s for each attempt
 SETTLED = 0.05  # fraction of the flow's range that a settled flow may move within the lag
 TAIL = 60  # samples that a plan looks beyond the end of a hold, in addition to the lag
 LEVEL = 0.001  # least slope of the error in plans, so that they end at the set point
-SMOOTH = 1e-4  # price of a t/h of travel, which selects the quiet one of equal plans
+SMOOTH = 1e-4  # price per t/h of travel, which selects the quietest of equal plans
 
 
 class NotSolvedError(RuntimeError):

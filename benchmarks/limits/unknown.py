@@ -6,8 +6,8 @@ the noise xi, of the load's walk and of its jumps. With n(k) the sum of their ef
 
     e(k) = m(k) - n(k),    m(k): the error expected from what is known at k - d - 1.
 
-The bounds need a lower bound of E|m - n|, a convex and piecewise linear function of m. Three
-steps lead to it; each can only lower the result.
+The bounds need a lower bound of E|m - n| that is a convex, piecewise linear function of m.
+Three steps lead to it; each can only lower the result.
 
 1. More is assumed to be known than any controller knows: the load w up to k - d - 1, and, for
    each k by itself, when the load jumps within the d + 1 samples, and to which level, except
@@ -117,7 +117,7 @@ def noise_variance(course: Course) -> Array:
         return np.zeros(samples)
     Phi, enters = course.state_space(course.c)
     Q = R * np.outer(enters, enters)
-    known = np.zeros_like(Phi)  # covariance of the state, given all readings
+    known = np.zeros_like(Phi)  # covariance of the state, given all readings so far
     if V > 0.0:
         P = known[0]
         for k in range(1, samples):

@@ -32,7 +32,7 @@ class Options:
     """Seed for the plants of a random or wide design."""
     told: Literal["nominal", "each"] = "nominal"
     """nominal: every controller is made for the one plant above; each: for the plant that it
-    runs on, as that is at the start if it drifts."""
+    runs on, as it is before any drift."""
     runs: Runs = 20
     """Runs of a controller on a plant."""
     samples: Runs = 1200

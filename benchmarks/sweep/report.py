@@ -16,7 +16,7 @@ from benchmarks.loop.designs import Arguments
 from benchmarks.sweep import maps
 
 SEED = 0  # seed of the bootstraps
-OSCILLATES = 1.0  # degC of swing at a held set point beyond that without control
+OSCILLATES = 1.0  # degC by which the swing must exceed that without control
 GROUPS = (  # groups of drifting plants, by half-open intervals; each has a row of its own
     ("gain falls to less than 0.8 times", "gain_drift", 0.0, 0.8),
     ("gain stays within 0.8 to 1.25 times", "gain_drift", 0.8, 1.25),
