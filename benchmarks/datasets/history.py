@@ -22,7 +22,7 @@ BEHAVIOURS = {
     "smith": ("smith",),
     "mixed": ("pi", "pi-simc", "smith", "nn"),  # controllers take turns, episode by episode
 }
-SEED = 9_000_000  # of the first episode; no comparison and no bound uses seeds from here on
+SEED = 9_000_000  # of the first episode; no comparison and no bound uses these seeds
 EVALUATIONS = 50  # episodes to evaluate learners on; the data holds none of them
 
 # The past actions make the problem Markov. The reward of a step is -|e| in degC.
