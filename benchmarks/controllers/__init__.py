@@ -1,1 +1,1 @@
-"""The controllers that are compared: the roster, and those that know a whole plant."""
+"""Provide the controllers to compare: the roster, and those that know a whole plant."""

@@ -30,31 +30,31 @@ Made = TypeVar("Made")
 
 
 class Nothing:
-    """Leaves the valve where it is, at 0 t/h at first, given the actuator's limits, t/h."""
+    """Leave the valve where it is, initially at 0 t/h; the actuator's limits are in t/h."""
 
     def __init__(self, u_min: float = -10.0, u_max: float = 10.0) -> None:
         self.u_min, self.u_max = u_min, u_max
         self.flow = 0.0  # t/h
 
     def reset(self) -> None:
-        """Put the valve back to 0 t/h."""
+        """Return the valve to 0 t/h."""
         self.flow = 0.0
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the action of the flow, shape (runs, 1)."""
+        """Return the action that keeps the flow, shape (runs, 1)."""
         action = action_from_command(self.flow, self.u_min, self.u_max)
         return np.full((len(observation), 1), action, np.float32)
 
 
 def limits(plant: Parameters) -> dict[str, Any]:
-    """Return the limits of the flow, the widest if they are drawn."""
+    """Return the limits of the flow, the widest possible if they are drawn."""
     return {"u_min": plant.range_of("u_min")[0], "u_max": plant.range_of("u_max")[1]}
 
 
 def step_test_and_data_sheet(plant: Parameters) -> dict[str, Any]:
-    """Return what a step test shows and what the actuator's data sheet says.
+    """Return the results of a step test and the actuator's data sheet.
 
-    The dead zone is the middle of one that is drawn.
+    If the dead zone is drawn, the middle of its range is returned.
     """
     dead_zone = sum(plant.range_of("dead_zone")) / 2
     return {**asdict(step_test(plant)), **limits(plant), "dead_zone": dead_zone}
@@ -63,7 +63,7 @@ def step_test_and_data_sheet(plant: Parameters) -> dict[str, Any]:
 def with_limits(
     make: Callable[..., Made], plant: Parameters, runs: int, seed: int, **gains: Any
 ) -> Made:
-    """Return a controller that is told its gains and the limits of the flow, no more."""
+    """Return a controller that is told its gains and the limits of the flow, nothing else."""
     return make(**gains, **limits(plant))
 
 
@@ -80,11 +80,11 @@ searched_pi = partial(paper_pi, **SEARCHED_GAINS)
 self_tuning = partial(with_step_test, SelfTuningController)
 nn_smith = partial(with_step_test, NeuralSmithPredictor)
 nn_self_tuning = partial(with_step_test, NeuralSelfTuningController)
-mpc = PredictiveController  # which is told the whole plant
+mpc = PredictiveController  # is told the whole plant
 
 
 def simc_pi(plant: Parameters, runs: int = 1, seed: int = 0) -> PIController:
-    """Return a PI controller tuned by rule, from a step test of the plant alone."""
+    """Return a PI controller tuned by the SIMC rule from a step test alone."""
     return PIController.simc(**asdict(step_test(plant)), **limits(plant))
 
 
@@ -104,7 +104,7 @@ def direct_nn(plant: Parameters, runs: int, seed: int, **gains: Any) -> DirectNN
 
 
 def frozen_nn(plant: Parameters, runs: int, seed: int) -> DirectNNController:
-    """Return the paper's network once it has learnt, on the plant that it is made for."""
+    """Return the paper's network after it has learnt on the plant that it is made for."""
     controller = Factory(direct_nn, learns=True).in_service(asdict(plant), runs, seed)
     assert isinstance(controller, DirectNNController)
     controller.learning = False

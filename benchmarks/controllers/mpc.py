@@ -1,6 +1,6 @@
-"""A predictive controller that knows the plant and the actuator exactly, but not the future.
+"""Implement a predictive controller that knows plant and actuator exactly, not the future.
 
-It shows how near the bounds of `benchmarks.limits` a controller can come.
+It shows how close a controller can come to the bounds of `benchmarks.limits`.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 
-HORIZON = 5  # commands that are planned; the first is given, then all are planned anew
-SWEEPS, TOLERANCE = 100, 1e-4  # of coordinate descent: how many at most, and t/h to stop at
-TINY = 1e-9  # degC^2, added to the variance of xi: then the filter believes the readings
+HORIZON = 5  # planned commands; the first is applied, then all are planned again
+SWEEPS, TOLERANCE = 100, 1e-4  # of coordinate descent: most sweeps, and t/h to stop at
+TINY = 1e-9  # degC^2, added to the variance of xi so that the filter trusts the readings
 
 
 class PredictiveController:
-    """Plans, at each sample, the inputs that bring the expected output to the set point.
+    """Plan, at each sample, the inputs that bring the expected output to the set point.
 
-    Of the plant (28) it knows A, B, C and d, also where they are drawn, and the course of their
-    drift. A Kalman filter tells it the output, xi and the load from what the transmitter shows;
-    for the jumps of the load, which are not normal, it is the best linear one. From these it
-    predicts the output that is to be expected without further commands. Over the samples that
-    the planned commands reach first it minimises the sum of the squared errors, the set point
-    staying as it is, with inputs within the limits. A first input inside the dead zone becomes
-    0 or what a command on the edge brings about, whichever the rest of a plan makes better.
+    The controller knows A, B, C and d of the plant (28), even where they are drawn, and the
+    course of their drift. A Kalman filter estimates the output, xi and the load from the
+    transmitter's readings; for the jumps of the load, which are not normal, it is the best
+    linear filter. From these estimates follows the output expected without further commands.
+    The plan minimises the sum of squared errors over the samples that its commands reach first,
+    for a constant set point and inputs within the limits. A first input inside the dead zone is
+    replaced by 0 or by the input at a command on the edge, whichever gives the better plan.
 
-    Where plant numbers are ranges, it is told those that loop i draws with seed `seed + i`, in
-    its first episode.
+    Where plant numbers are ranges, the controller is told those that loop i draws with seed
+    `seed + i` in its first episode.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int, seed: int = 0) -> None:
@@ -46,8 +46,8 @@ class PredictiveController:
         self._delay = numbers.delay.astype(np.intp)
         self._u_min, self._u_max = numbers.u_min, numbers.u_max
         self._dead_zone = numbers.dead_zone
-        # Where the load changes: of a level x there remains (1 - p) x in the mean, and its
-        # variance remains the same.
+        # Where the load may change, a level x becomes (1 - p) x in the mean, and its variance
+        # stays the same.
         self._stays = 1.0 - np.minimum(LOAD_INTERVAL / numbers.disturbance_interval, 1.0)
         uniform = np.square(numbers.disturbance_amplitude) / 3.0
         self._step_variance = uniform * (1.0 - np.square(self._stays))
@@ -56,13 +56,13 @@ class PredictiveController:
         # The state: y(k), y(k-1), ...; xi(k), xi(k-1), ...; the steps of the load and its walk.
         self._n_y = max(len(parameters.a) - 1, 1)
         self._size = self._n_y + len(parameters.c) - 1 + 2
-        # For each sample ahead and each b, which of the past inputs shows; beyond: none.
+        # For each sample ahead and each b, the index of the input that shows; below 1, none.
         ahead = np.arange(1, int(self._delay.max()) + HORIZON + 1)
         lag = np.arange(len(parameters.b))
         self._shows = self._delay[:, np.newaxis, np.newaxis] + lag - ahead[:, np.newaxis] + 1
         self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON)
         self._models: dict[int, _Model] = {}  # by age, samples
-        self._model(0)  # which refuses a plant that is not linear
+        self._model(0)  # raises an error if the plant is not linear
         self.reset()
 
     def reset(self) -> None:
@@ -71,7 +71,7 @@ class PredictiveController:
         self._k = 0
         self._state = np.zeros((n, self._size))
         self._covariance = np.zeros((n, self._size, self._size))
-        # u(k-1), u(k-2), ..., after a 0 that stands for inputs to come.
+        # u(k-1), u(k-2), ..., after a 0 that stands for future inputs.
         self._inputs = np.zeros((n, 1 + int(self._delay.max()) + len(self._p.b)))
         self._plan = np.zeros((HORIZON, n))
 
@@ -106,7 +106,7 @@ class PredictiveController:
         return action_from_command(command, self._u_min, self._u_max, self._dead_zone)
 
     def _filter(self, output: Array) -> None:
-        """Move the state from k - 1 to k, and correct it by the reading y(k)."""
+        """Advance the state from k - 1 to k, and correct it with the reading y(k)."""
         k, b = self._k, len(self._p.b)
         model = self._model(k)
         F, Q = self._transition(k, model)
@@ -122,7 +122,7 @@ class PredictiveController:
         self._covariance = P - gain[:, :, np.newaxis] * P[:, np.newaxis, 0]
 
     def _transition(self, k: int, model: _Model) -> tuple[Array, Array]:
-        """Return what moves the state from k - 1 to k, and the covariance of what is added."""
+        """Return the state transition from k - 1 to k, and the process noise's covariance."""
         changes = k % LOAD_INTERVAL == 0
         F = np.zeros((self._num_envs, self._size, self._size))
         xi, steps, walk = np.zeros((3, self._num_envs, self._size))
@@ -138,7 +138,7 @@ class PredictiveController:
         return F, Q
 
     def _predict(self) -> Array:
-        """Return the outputs to be expected from k + 1 on, if no command follows."""
+        """Return the outputs expected from k + 1 on without further commands."""
         c, n_y = self._p.c, self._n_y
         past = self._shows.clip(0)
         moved = self._inputs[np.arange(self._num_envs)[:, np.newaxis, np.newaxis], past]
@@ -171,9 +171,9 @@ class PredictiveController:
     def _optimise(
         self, Q: Array, target: Array, start: Array, first: Array | None = None
     ) -> Array:
-        """Minimise u Q u / 2 - target u within the limits, one coordinate after the other.
+        """Minimise u Q u / 2 - target u within the limits by coordinate descent.
 
-        A plan has a row for each command here, shape (HORIZON, runs).
+        Plans have one row per command here, shape (HORIZON, runs).
         """
         plan = start.copy()
         if first is not None:
@@ -193,7 +193,7 @@ class PredictiveController:
 
 @dataclass(frozen=True)
 class _Model(Coefficients):
-    """Coefficients of the loops at a time; G and Q weigh planned inputs."""
+    """Coefficients of the loops at one time; G maps planned inputs to outputs, Q is G' G."""
 
     G: Array
     Q: Array

@@ -1,4 +1,4 @@
-"""Declare the options that say which controllers are run, and read them."""
+"""Declare and read the options that choose the controllers to run."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ AgentNames = Annotated[
 @options
 @dataclass(frozen=True, kw_only=True)
 class ControllerOptions:
-    """Controllers of one's own, and how those that learn are trained."""
+    """A user's own controllers, and how PPO policies are trained."""
 
     agent: Repeated = ()
-    """A controller of your own beside those of --agents, NAME=MODULE:FACTORY or
-    NAME=PPO:FILE.zip; the same name again is another training of it (repeatable)."""
+    """A controller of your own in addition to those of --agents, NAME=MODULE:FACTORY or
+    NAME=PPO:FILE.zip; the same name again adds another training of it (repeatable)."""
     training_steps: Count | None = None
-    """Train each policy of PPO with so many samples of experience (default: take those that
-    come with the project)."""
+    """Samples of experience to train each PPO policy with (default: use the policies that come
+    with the project)."""
     policies: Count | None = None
-    """How many policies of PPO to run, each from a seed of its own (default: 5)."""
+    """Number of PPO policies to run, each from its own seed (default: 5)."""
     kept: Path = KEPT
-    """Where policies that are trained here are kept; no code in its files is run."""
+    """Folder of locally trained policies; no code in its files is executed."""
     fan_out: FanOutOptions = field(default_factory=FanOutOptions)
     retrain: bool = False
-    """Train policies of PPO anew, which takes many minutes."""
+    """Train PPO policies again, which takes many minutes."""
 
     def training(self) -> PolicyRequest:
-        """Return which trained policies are asked for, if their folder can be written to."""
+        """Return the request for trained policies; if any may be saved, check the folder."""
         is_folder = self.kept.is_dir() or not self.kept.exists()
         if self.retrain or self.training_steps or self.policies or not is_folder:
             out_folder(self.kept, "--kept")
@@ -51,7 +51,7 @@ class ControllerOptions:
 
 
 def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEntry]:
-    """Return controllers of the roster by name, then a user's own, as `--agent` has them.
+    """Return controllers of the roster by name, then a user's own, as given to `--agent`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Make roster entries of a user's own controllers: MODULE:FACTORY, or PPO:model.zip."""
+"""Make roster entries from a user's own controllers: MODULE:FACTORY, or PPO:model.zip."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from mptc_gym import Parameters
 
 
 def own_entry(name: str, locations: Sequence[str]) -> RosterEntry:
-    """Return an entry for a user's own controller, with one member or more for each location.
+    """Return an entry for a user's own controller, with one or more members per location.
 
     Raises
     ------
     UsageError
-        As `own_factory` and `benchmarks.controllers.saved.policies` raise a ValueError.
+        Where `own_factory` or `benchmarks.controllers.saved.policies` raises a ValueError.
     """
     factories: list[Factory] = []
     with blame("--agent"):
@@ -40,12 +40,12 @@ def own_entry(name: str, locations: Sequence[str]) -> RosterEntry:
 def own_factory(location: str) -> Factory:
     """Import a user's factory, `module:factory`, and try its controller on two plants.
 
-    The page of the comparison says which arguments and attributes it may have.
+    The README of `benchmarks.compare` lists the arguments and attributes it may have.
 
     Raises
     ------
     ValueError
-        If there is no such factory, or if what it makes is not a controller of a batch; the
+        If there is no such factory, or if it does not return a controller of a batch; the
         message says what is expected.
     """
     try:
@@ -75,7 +75,7 @@ def own_factory(location: str) -> Factory:
 
 
 def _made(made_by: Callable[..., Agent], plant: Parameters, runs: int, seed: int) -> Agent:
-    """Call a user's factory with what it accepts, by name."""
+    """Call a user's factory with the arguments that it accepts, by name."""
     offered = {"parameters": plant, "num_envs": runs, "seed": seed, **limits(plant)}
     accepted = inspect.signature(made_by).parameters
     if any(each.kind is each.VAR_KEYWORD for each in accepted.values()):

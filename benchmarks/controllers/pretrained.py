@@ -1,4 +1,4 @@
-"""Make controllers of trained networks, and of PPO's policies."""
+"""Make controllers from trained networks and PPO policies."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from mptc_gym import Parameters
 
 
 def trained(network: PolicyNetwork, plant: Parameters, runs: int, seed: int) -> PolicyNetwork:
-    """Return a controller that has the network, and is told the actuator's limits.
+    """Return a controller with the network, told the actuator's limits.
 
-    In velocity form it is told the dead zone, too, if that is a number; ValueError if it leaves
-    no flow on one side.
+    In velocity form it is also told the dead zone, if that is a number; raise a ValueError if
+    it leaves no flow on one side.
     """
     increments = network.increments
     if increments and not isinstance(plant.dead_zone, Sequence):
@@ -29,7 +29,7 @@ def trained(network: PolicyNetwork, plant: Parameters, runs: int, seed: int) -> 
 
 
 def told_network(make: Callable[..., Agent], cost: Cost) -> Members:
-    """Return the one member of a controller that has the told network, read when it is run."""
+    """Return the only member of a controller with the told network, read when it is used."""
 
     def members(_: ppo.PolicyRequest) -> list[Factory]:
         about = {"file": "nn-smith.npz", **LawNetwork.load().provenance}
@@ -41,18 +41,18 @@ def told_network(make: Callable[..., Agent], cost: Cost) -> Members:
 def ppo_policies(
     request: ppo.PolicyRequest, arguments: PPOArguments | None = None
 ) -> list[Factory]:
-    """Return PPO's policies, those for the paper's plant unless `arguments` say otherwise."""
+    """Return PPO policies, those for the paper's plant unless `arguments` say otherwise."""
     policies = ppo.members(request, arguments)
     return [_factory(network, file.name) for file, network in policies.items()]
 
 
 def randomised_policies(request: ppo.PolicyRequest) -> list[Factory]:
-    """Return PPO's policies for many plants."""
+    """Return PPO policies for many plants."""
     return ppo_policies(request, PPOArguments(**RANDOMISED))
 
 
 def tuned_policy(*, final: bool, member: int, **gains: Any) -> Factory:
-    """Train a policy with other settings for a search, of a seed that no comparison has."""
+    """Train a policy with other settings for a search, from a seed that no comparison uses."""
     first = ppo.FINAL_SEED if final else ppo.TUNING_SEED
     arguments = PPOArguments(seed=first + member, **gains)
     return _factory(ppo.train(arguments))
@@ -62,7 +62,7 @@ def _factory(network: PolicyNetwork, file: str = "") -> Factory:
     about = {name: value for name, value in network.provenance.items() if name != "curve"}
     weights = sum(W.size + b.size for W, b in network.layers)
     return Factory(
-        partial(trained, network),  # which goes along to machines where its file is not
+        partial(trained, network),  # sent along to machines that lack its file
         Cost(
             "dead zone; delay, by the past actions it sees",
             f"{weights:,} weights a policy",

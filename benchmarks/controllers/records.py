@@ -1,4 +1,4 @@
-"""Declare what the roster holds: factories of controllers, and what commands know of them."""
+"""Declare the records in the roster: factories of controllers, and facts about them."""
 
 from __future__ import annotations
 
@@ -12,40 +12,40 @@ from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from benchmarks.train.ppo import PolicyRequest
 from mptc_gym import Parameters
 
-LEARNING = 1200  # samples of the square wave with which a network is commissioned
-COMMISSIONING_SEED = 3_000_000  # of plants and noise then
+LEARNING = 1200  # samples of the square wave on which a network is commissioned
+COMMISSIONING_SEED = 3_000_000  # of plants and noise during commissioning
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a controller costs before it runs."""
+    """The cost of a controller before it runs."""
 
     prior_knowledge: str = ""
-    """What it is told about the plant."""
+    """What the controller is told about the plant."""
     parameters: str = ""
-    """How many numbers shape it: gains, and weights if it has any."""
+    """Number of its gains, and of its weights if it has any."""
     samples: str = ""
-    """Samples of the plant, or of a simulated one, that went into tuning and training."""
+    """Samples of the plant, real or simulated, that were used for tuning and training."""
 
 
 @dataclass(frozen=True)
 class Factory:
-    """Makes controllers and runs them, with all that a command has to know of them."""
+    """Make and run controllers, and hold all that commands need to know of them."""
 
     make: Callable[..., Agent]
-    """Called with the plant that the controllers are made for (`Parameters`), how many runs
-    there are, and a seed: run i is to use `seed + i`. Searched gains are given by name."""
+    """Function of the plant that the controllers are made for (`Parameters`), the number of
+    runs, and a seed; run i should use `seed + i`. Searched gains are passed by name."""
     cost: Cost = Cost()
     observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
-    """The windows of the environment that the controllers want."""
+    """The observation windows that the controllers expect, by the environment's arguments."""
     learns: bool = False
-    """Whether they go on learning from run to run."""
+    """Whether the controllers keep learning from run to run."""
     code: str = ""
-    """The module whose code shapes them, if it is not that of `make`."""
+    """The module whose code shapes the controllers, if it is not that of `make`."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    """Where a trained policy comes from, in a form for JSON; empty if nothing was trained."""
+    """Origin of a trained policy, JSON-serialisable; empty if nothing was trained."""
     curve: Sequence[Mapping[str, float]] = ()
-    """Its learning curve, a row an evaluation."""
+    """Learning curve of a trained policy, one row per evaluation."""
 
     @property
     def module(self) -> str:
@@ -54,11 +54,11 @@ class Factory:
         return self.code or make.__module__
 
     def arguments(self, plant: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a plant's arguments of the environment, with the windows that are wanted."""
+        """Return a plant's arguments of the environment, with the observation windows."""
         return {**plant, **self.observation}
 
     def __call__(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller of `runs` plants, made for a plant given by its arguments."""
+        """Return a controller for `runs` plants, made for the plant with these arguments."""
         return self.make(Parameters(**self.arguments(plant)), runs, seed)
 
     def run(
@@ -69,16 +69,16 @@ class Factory:
         seed: int,
         controller: Agent | None = None,
     ) -> Trajectory:
-        """Run a controller, one made for this plant or another that is given; see `rollout`."""
+        """Run the given controller, by default a new one for this plant; see `rollout`."""
         plants = make_plants(runs, samples, **self.arguments(plant))
         trajectory = rollout(plants, controller or self(plant, runs, seed), samples, seed)
         plants.close()
         return trajectory
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller as it comes to plants that it was not made for.
+        """Return a controller that is ready for plants it was not made for.
 
-        One that learns has learnt before, on the plant that it is made for.
+        A controller that learns has already learnt on the plant it is made for.
         """
         controller = self(plant, runs, seed)
         if self.learns:
@@ -87,31 +87,31 @@ class Factory:
         return controller
 
 
-# Returns the factories of a controller's members, given which trained policies are wanted.
+# Returns the factories of a controller's members, given a request for trained policies.
 Members = Callable[[PolicyRequest], Sequence[Factory]]
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """How the gains of a controller are searched."""
+    """The search for the gains of a controller."""
 
     space: Mapping[str, tuple[float, float]]
-    """Name of a gain: lowest and highest value. Gains are searched on a logarithmic scale."""
+    """Lowest and highest value of each gain, by name. The search is on a logarithmic scale."""
     trials: int = 800
     startup: int = 200
-    """How many of the trials are at random, before the sampler learns."""
+    """Number of random trials before the sampler learns."""
     finalists: int = 10
-    """How many of the best are judged again."""
+    """Number of the best trials that are evaluated again."""
     penalty: float = 5.0
-    """For failing to settle at a constant set point, degC: what doing nothing about 5 degC
-    costs."""
+    """Penalty for failing to settle at a constant set point, degC: the cost of doing nothing
+    about an error of 5 degC."""
     members: tuple[int, int] = (1, 1)
-    """How many controllers are made of the same gains, in the search and at last. Their
-    objectives are averaged."""
+    """Number of controllers with the same gains, in the search and in the final evaluation.
+    Their objectives are averaged."""
     train: Callable[..., Factory] | None = None
-    """Called with the gains, `final` (whether they are judged for the last time) and `member`
-    (the number of the controller); returns a factory. None: the controller's own factory makes
-    it with these gains."""
+    """Function of the gains, `final` (whether this is the final evaluation) and `member` (the
+    number of the controller) that returns a factory. If None, the controller's own factory is
+    called with the gains."""
 
 
 @dataclass(frozen=True)
@@ -119,29 +119,29 @@ class RosterEntry:
     """A controller, and how commands treat it."""
 
     name: str
-    """In options and files."""
+    """Name in options and files."""
     label: str
-    """In tables and plots."""
+    """Name in tables and plots."""
     made_by: Factory | Members
-    """Makes it; or a function that returns several, for policies that were trained apart."""
+    """Its factory, or a function that returns several, for policies trained separately."""
     trained: bool = False
     """Whether `made_by` may have to train."""
     tuning: Tuning | None = None
-    """How its gains are searched, if they are."""
+    """The search for its gains, if there is one."""
     compared: bool = True
     swept: bool = True
-    """Whether `compare` and `sweep` run it unless told otherwise."""
+    """Whether `compare` (`compared`) and `sweep` (`swept`) run it by default."""
     drawn: bool = False
     """Whether its responses are drawn in a comparison."""
 
     def members(self, request: PolicyRequest | None = None) -> list[Factory]:
-        """Return the factories of its members: one, or several that were trained apart."""
+        """Return the factories of its members: one, or several trained separately."""
         if isinstance(self.made_by, Factory):
             return [self.made_by]
         return list(self.made_by(request or PolicyRequest()))
 
     def first(self) -> Factory:
-        """Return the factory of the first member; no other is trained for it."""
+        """Return the factory of the first member, without training any other."""
         return self.members(PolicyRequest(policies=1))[0]
 
 

@@ -1,7 +1,7 @@
-"""The roster: one entry for each controller, with all that any command has to know of it.
+"""List one entry per controller in the roster, with all that the commands need to know of it.
 
-A controller is added here and nowhere else. `compare`, `sweep`, `tune`, `train` and `watch`
-know it then. A user's own controllers (`--agent NAME=MODULE:FACTORY`) become such entries, too.
+A controller is added here and nowhere else: `compare`, `sweep`, `tune` and `watch` then know
+it. A user's own controllers (`--agent NAME=MODULE:FACTORY`) also become such entries.
 """
 
 from __future__ import annotations
@@ -115,8 +115,7 @@ _ENTRIES = (
             trials=9,
             startup=5,
             finalists=2,
-            # Without integral action a policy does not settle to the last; only its errors
-            # count.
+            # Without integral action, a policy does not settle exactly; only its errors count.
             penalty=0.0,
             members=(2, 4),
             train=pretrained.tuned_policy,

@@ -1,4 +1,4 @@
-"""Make controllers of policies that Stable-Baselines3 saved: `--agent mine=PPO:model.zip`."""
+"""Make controllers from policies saved by Stable-Baselines3: `--agent mine=PPO:model.zip`."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ LIBRARIES = "stable_baselines3", "sb3_contrib"
 
 
 def policies(location: str) -> list[Factory]:
-    """Return a factory for each saved policy of a location, such as `PPO:model.zip`.
+    """Return a factory for each saved policy at a location, such as `PPO:model.zip`.
 
-    The file may be a pattern, `runs/*.zip`. Loading a zip runs the code that is in it.
+    The file may be a pattern, such as `runs/*.zip`. Loading a zip runs the code in it.
 
     Raises
     ------
@@ -72,10 +72,10 @@ def _policy(algorithm: str, file: Path) -> Factory:
 
 
 class SavedPolicy:
-    """A policy of a zip as a controller, deterministic.
+    """A deterministic controller from a policy in a zip file.
 
-    `increments` are the arguments of `IncrementalAction`, if the policy moves the flow: an
-    actuator turns the flows that it wants into actions.
+    `increments` are the arguments of `IncrementalAction` if the policy moves the flow: an
+    actuator then turns the resulting flows into actions.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class SavedPolicy:
         self.reset()
 
     def reset(self) -> None:
-        """Begin an episode."""
+        """Start an episode."""
         self._act = acting(self._model)
         self._flows = np.zeros(self._runs)
 
@@ -112,7 +112,7 @@ class SavedPolicy:
 
 @cache
 def _loaded(algorithm: str, file: str) -> Any:
-    """Return the model; ValueError if the zip does not hold one of this algorithm."""
+    """Return the model; raise a ValueError if the zip holds none of this algorithm."""
     there = [import_module(name) for name in LIBRARIES if find_spec(name)]
     found: Any = next(
         (vars(each)[algorithm] for each in there if algorithm in vars(each)), None
