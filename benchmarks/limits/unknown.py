@@ -176,7 +176,7 @@ def _plus_uniform(atoms: Array, half_width: Array) -> Array:
 
 def _intercepts(atoms: Array) -> Array:
     """Return min over m of E|m - n| - s m for each slope s of `BELOW`, degC."""
-    # A tangent touches where so many atoms of `BELOW` lie below m, and all others above it.
+    # A tangent touches where `BELOW` atoms lie below m, and all others above it.
     sums = np.cumsum(atoms, axis=1)
     sums = np.hstack([np.zeros((len(atoms), 1)), sums])
     below = sums[:, np.array(BELOW)]
