@@ -196,8 +196,8 @@ class Controller(ABC):
         Raises
         ------
         ValueError
-            If the observation has the wrong shape, another batch size than before since
-            `reset`, or a value that is not finite. The controller is then unchanged.
+            If the observation has the wrong shape, a value that is not finite, or a batch size
+            that differs from the one since `reset`. The controller is then unchanged.
         """
         values = check_numbers("observation", observation)
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs or not len(values):

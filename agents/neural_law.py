@@ -35,7 +35,7 @@ TRUST: Final = (5.0, 30.0)
 SATURATION: Final = 0.07
 CLEARANCE: Final = 0.005  # of half the range, by which commands clear the dead zone
 MOST_ADDED: Final = 0.45  # of half the range
-MOST_WEIGHT: Final = 40.0  # bound on the size of its logarithm
+MOST_WEIGHT: Final = 40.0  # largest logarithm of a weight, in absolute value
 # Logarithms of the means' prior weights, up to a constant: without evidence, no jump of the
 # load is expected. The network tilts those of the load means.
 PREFERENCE: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.5, 2.5, 0.0, 1.0, 0.0)

@@ -30,7 +30,7 @@ class PredictiveController:
     The controller knows A, B, C and d of the plant (28), even where they are drawn, and the
     course of their drift. A Kalman filter estimates the output, xi and the load from the
     transmitter's readings; for the jumps of the load, which are not normal, it is the best
-    linear filter. From these estimates follows the output expected without further commands.
+    linear filter. The output expected without further commands follows from these estimates.
     The plan minimises the sum of squared errors over the samples that its commands reach first,
     for a constant set point and inputs within the limits. A first input inside the dead zone is
     replaced by 0 or by the input at a command on the edge, whichever gives the better plan.

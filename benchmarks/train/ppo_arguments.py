@@ -59,7 +59,7 @@ class PPOArguments:
     gamma: float = 0.95
     """Discount factor per sample."""
     gae_lambda: float = 1.0
-    """GAE's lambda; below 1, advantages rely on values, even for effects still in transit."""
+    """GAE's lambda; below 1, the value function also stands in for effects in transit."""
     clip_range: float = 0.2
     """How far an update may move the probability ratio of an action from 1."""
     log_std: tuple[float, float] = (-1.0, -3.0)

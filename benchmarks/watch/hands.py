@@ -18,7 +18,7 @@ HELP = (
 )
 FLOW_STEP = 0.5  # t/h
 STEP = 1.0  # of set point and load, degC
-FASTEST = 1920  # samples a second
+FASTEST = 1920  # samples per second
 
 _FLOWS = {pygame.K_UP: FLOW_STEP, pygame.K_DOWN: -FLOW_STEP}
 _SETPOINTS = {pygame.K_PAGEUP: STEP, pygame.K_PAGEDOWN: -STEP}
@@ -35,7 +35,7 @@ class Hands(Nothing):
 
     def __init__(self, u_min: float, u_max: float, speed: float) -> None:
         super().__init__(u_min, u_max)
-        self.speed = speed  # samples a second
+        self.speed = speed  # samples per second
         self.setpoint = self.load = 0.0  # added to both by hand, degC
         self.paused = False  # whether the plant stands still
 
