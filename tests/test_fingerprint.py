@@ -36,6 +36,8 @@ def test_comments_docstrings_and_layout_do_not_count(own):
     edited = '"""A helper."""\n\n\ndef double(x):\n    """Twice."""\n'
     edited += "    # really\n    return (2 * x)\n"
     assert own() == own(helper=edited)
+    field = "class Options:\n    runs: int = 1\n"
+    assert own(user=USER + field) == own(user=USER + field + '    """Number of runs."""\n')
 
 
 def test_code_that_is_imported_counts(own):

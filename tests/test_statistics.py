@@ -35,6 +35,7 @@ def test_quantile_of_some_that_never_end():
 def test_few_runs_promise_little():
     estimate = median([1.0, 2.0, 3.0])
     assert (estimate.value, estimate.low, estimate.high) == (2.0, -math.inf, math.inf)
+    assert f"{estimate:.0f}" == "2 (too few runs)"
 
 
 def test_share_by_hand():

@@ -23,7 +23,6 @@ import mptc_gym
 from benchmarks.lib.storage import ROOT, versions
 
 SAMPLES = 60  # length of each trajectory
-DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def fingerprint(*modules: str, **shaped_by: Any) -> str:
@@ -72,8 +71,14 @@ def code(module: str) -> str:
     """Return a hash of a module's code, which ignores comments, docstrings and layout."""
     path = ROOT.joinpath(*module.split("."))
     file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        if isinstance(node, DOCUMENTED) and ast.get_docstring(node) is not None:
-            del node.body[0]
+    tree = _WithoutTexts().visit(ast.parse(file.read_text(encoding="utf-8")))
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+class _WithoutTexts(ast.NodeTransformer):
+    """Removes docstrings, those below the fields of a dataclass included."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        """Drop a text that stands alone."""
+        is_text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if is_text else node

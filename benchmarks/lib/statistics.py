@@ -28,11 +28,11 @@ class Estimate:
     def __format__(self, form: str) -> str:
         """Return `value (low to high)`; the value alone if nothing was random.
 
-        If the interval extends to infinity, "(one run)" takes its place.
+        If the interval extends to infinity, the reason takes its place.
         """
         value, low, high = (format(end, form) for end in (self.value, self.low, self.high))
         if math.isinf(self.high):
-            return f"{value} (one run)"
+            return f"{value} ({'one run' if self.runs == 1 else 'too few runs'})"
         return value if low == high else f"{value} ({low} to {high})"
 
 
