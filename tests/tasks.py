@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,15 @@ def hold(pipe: str, seconds: float) -> None:
     """Write to a pipe, and keep it open as long as the process lives."""
     os.write(os.open(pipe, os.O_WRONLY), b"x")
     time.sleep(seconds)
+
+
+def until(condition: Callable[[], object], seconds: float = 30.0) -> bool:
+    """Wait until a condition holds, but not for ever."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.05)
+    return True
 
 
 def fail(seed: int) -> Rows:

@@ -2,6 +2,7 @@
 
 import math
 import re
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
@@ -219,10 +220,8 @@ class TestCommand:
         assert not set(networks[0]) & set(networks[1])
 
     def test_interrupted(self, tmp_path, monkeypatch, capsys):
-        def stop(*_):
-            raise KeyboardInterrupt
-
-        monkeypatch.setitem(CLAIMS, "noise", Claim("noise", "", "", "", stop))
+        stopped = Claim("noise", "", "", "", Mock(side_effect=KeyboardInterrupt))
+        monkeypatch.setitem(CLAIMS, "noise", stopped)
         assert run_claims(tmp_path, "direction", "noise") == 130
         assert "Interrupted" in capsys.readouterr().out
         assert set(pd.read_csv(tmp_path / "claims.csv")["claim"]) == {"direction"}

@@ -11,6 +11,7 @@ import re
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import DEFAULT, Mock
 
 import matplotlib.image
 import numpy as np
@@ -30,7 +31,7 @@ from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.statistics import Estimate
 from benchmarks.limits import least_possible
 from benchmarks.loop.metrics import METRICS, measure
-from benchmarks.loop.rollout import Trajectory, make_plants, rollout
+from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import SCENARIOS
 from benchmarks.train import ppo, ppo_training
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
@@ -58,10 +59,8 @@ class TestMeasures:
         assert values["itae"] == pytest.approx(7)
         # 2 beyond a change of 4; the second change, of -6, is not exceeded
         assert values["overshoot"] == pytest.approx(50)
-
-    def test_overshoot_downwards(self):
-        values = measured(trajectory([0, -4, -4], [9, 0, -5]))
-        assert values["overshoot"] == pytest.approx(25)
+        downwards = measured(trajectory([0, -4, -4], [9, 0, -5]))
+        assert downwards["overshoot"] == pytest.approx(25)
 
     @pytest.mark.parametrize(
         ("setpoint", "output", "time"),
@@ -85,13 +84,6 @@ class TestMeasures:
         assert values["total_variation"] == 6 + 6 + 5 + 15 + 0 + 10
         assert values["dead_zone_share"] == pytest.approx(100 * 2 / 6)
         assert values["saturation_share"] == pytest.approx(100 * 2 / 6)
-
-    def test_what_cannot_be_measured_of_drawn_actuators_is_not(self):
-        runs = Trajectory(*np.zeros((6, 3, 1)))
-        values = measure(runs, Parameters(dead_zone=[4, 6]))
-        assert np.isnan(values["dead_zone_share"]).all()
-        assert np.isnan(values["saturation_share"]).all()
-        assert values["mae"] == 0.0
 
 
 class TestTables:
@@ -204,12 +196,12 @@ class TestReport:
 
 
 def test_samples_line_up():
-    down = PIController()
-    down.act = lambda observation: np.array([[-1.0], [-1.0]])
-    runs = rollout(make_plants(2, 50, setpoint=5.0), down, 50, seed=0)
-    assert np.all(runs.command == -10.0)  # u(0) is in row 0 ...
+    runs = rollout(make_plants(1, 50, setpoint=5.0), PIController(2.2, 0.3), 50, seed=0)
+    error = runs.setpoint - runs.output
+    law = -2.2 * error - 0.3 * np.cumsum(error, axis=0)
+    np.testing.assert_allclose(runs.command, law, rtol=1e-6)  # u(k) is in the row of e(k) ...
     assert np.all(runs.output[:19] == 0.0)
-    assert np.all(runs.output[19] == pytest.approx(0.456))  # ... and shows in row 19
+    assert runs.output[19] == pytest.approx(0.456)  # ... and u(0) shows in row 19
 
 
 class TestStorage:
@@ -353,10 +345,8 @@ class TestCompare:
             assert b"bounds" in one
 
     def test_a_picture_that_cannot_be_drawn_is_a_sentence(self, tmp_path, monkeypatch):
-        def fails(*arguments):
-            raise ValueError("Axis limits cannot be NaN or Inf")
-
-        monkeypatch.setattr(plots, "plot_travel", fails)
+        error = ValueError("Axis limits cannot be NaN or Inf")
+        monkeypatch.setattr(plots, "plot_travel", Mock(side_effect=error))
         options = ("--agents", "pi", "--scenarios", "constant", "--runs", 1)
         assert run_compare(tmp_path / "out", *options) == 0
         page = (tmp_path / "out/report.md").read_text()
@@ -444,14 +434,8 @@ class TestCompare:
         assert runs["mae"].iloc[0] == pytest.approx(0.283, abs=0.001)  # that of the gains
 
     def run_and_stop(self, out, monkeypatch, error, after):
-        calls = itertools.count()
-
-        def stopped(*arguments):
-            if next(calls) >= after:
-                raise error
-            return rollout(*arguments)
-
-        monkeypatch.setattr(records, "rollout", stopped)
+        ends = itertools.chain([DEFAULT] * after, itertools.repeat(error))
+        monkeypatch.setattr(records, "rollout", Mock(wraps=rollout, side_effect=ends))
         return run_compare(
             out, "--agents", "pi", "nn", "--scenarios", "constant", "square", "--runs", 1
         )
@@ -498,11 +482,7 @@ class TestCompare:
         self, tmp_path, monkeypatch, capsys
     ):
         out = tmp_path / "out"
-
-        def interrupted(*arguments):
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(report, "write_report", interrupted)
+        monkeypatch.setattr(report, "write_report", Mock(side_effect=KeyboardInterrupt))
         assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=2) == 130
         assert "Interrupted" in capsys.readouterr().out
         assert self.the_first_are_kept(out)
@@ -513,10 +493,8 @@ class TestCompare:
         for out in (tmp_path / "file", tmp_path / "file" / "below"):
             assert f"--out: {out} cannot be written to" in refused(main, ["--out", out])
 
-        def read_only(dir):  # noqa: A002
-            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-        monkeypatch.setattr(tempfile, "TemporaryFile", read_only)
+        read_only = OSError(errno.EROFS, os.strerror(errno.EROFS))
+        monkeypatch.setattr(tempfile, "TemporaryFile", Mock(side_effect=read_only))
         assert "Read-only file system" in refused(main, ["--out", tmp_path / "out"])
 
     @pytest.mark.parametrize("name", ["runs.csv", "limits.png", "report.html"])
@@ -592,12 +570,13 @@ class TestOtherPlants:
         plant = {"b": [0.04560, 0.00404], "delay": 9, "a": [1, -0.9]}
         (tmp_path / "plant.json").write_text(json.dumps(plant))
         options = ("--plant", tmp_path / "plant.json", "--agents", "pi-simc", "smith")
-        assert (
-            run_compare(tmp_path / "out", *options, "--scenarios", "square", "--runs", 1) == 0
-        )
+        options += ("--scenarios", "square", "--runs", 1)
+        assert run_compare(tmp_path / "out", *options) == 0
         errors = pd.read_csv(tmp_path / "out/runs.csv").set_index("agent")["mae"]
         # Its gain has the other sign: who is told about the paper's plant drives it to a limit.
         assert (errors < 3.0).all()
+        provenance = json.loads((tmp_path / "out/provenance.json").read_text())
+        assert provenance["scenarios"]["square"]["arguments"] == plant
 
     def test_a_part_goes_to_a_folder_of_its_own(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

@@ -1,6 +1,7 @@
 """Offline data sets: what was logged can be replayed, and scored on an absolute scale."""
 
-import gymnasium
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
@@ -42,18 +43,12 @@ def test_the_recorded_actions_give_the_recorded_observations(name, minari, tmp_p
 
 
 def test_the_pi_of_the_set_is_the_paper_s():
-    logged = history.record("paper", "pi", episodes=2, seed=3)
-    env = gymnasium.make("MiddlePoint-v0", setpoint="random")
-    controller = PIController()
-    observation, info = env.reset(seed=4)
-    errors = []
-    for k in range(1200):
-        action = controller.act(observation)
-        assert logged.actions[1, k] == np.clip(action, -1.0, 1.0)
-        observation, _, _, _, info = env.step(action)
-        assert logged.observations[1, k + 1, 3] == observation[3]
-        errors.append(abs(info["error"]))
-    assert -logged.rewards[1].mean() == pytest.approx(np.mean(errors), rel=1e-12)
+    # That the environment answers so to these actions is tested above.
+    logged, controller = history.record("paper", "pi", episodes=2, seed=3), PIController()
+    actions = [controller.act(observation) for observation in logged.observations[1, :-1]]
+    np.testing.assert_array_equal(logged.actions[1], np.clip(actions, -1.0, 1.0))
+    errors = np.abs(logged.observations[1, 1:, 3])
+    np.testing.assert_allclose(-logged.rewards[1], errors, atol=1e-6)
 
 
 def test_a_mixed_set_has_all_controllers_and_no_seed_twice():
@@ -109,10 +104,8 @@ def test_writing_again_replaces_and_a_failure_changes_nothing(minari, monkeypatc
         assert main([name, "--episodes", episodes]) == 0
     assert minari.load_dataset(name).total_episodes == 3
 
-    def fail(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(minari, "create_dataset_from_buffers", fail)
+    stopped = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr(minari, "create_dataset_from_buffers", stopped)
     assert main([name, "--episodes", "2"]) == 130
     assert minari.load_dataset(name).total_episodes == 3
     assert [path.name for path in tmp_path.iterdir()] == ["middlepoint"]

@@ -1,5 +1,7 @@
 """The paper's figures drawn anew: what is typical, and that there is something to see."""
 
+from unittest.mock import DEFAULT, Mock
+
 import matplotlib.image
 import numpy as np
 import pandas as pd
@@ -37,14 +39,9 @@ def test_every_figure_is_drawn(tmp_path, monkeypatch, capsys):
 
 def test_interrupted(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(figures, "SAMPLES", 60)
-    whole, calls = figures.summarise, iter(range(3))
-
-    def stop_at_the_third(trajectory):
-        if next(calls) == 2:
-            raise KeyboardInterrupt
-        return whole(trajectory)
-
-    monkeypatch.setattr(figures, "summarise", stop_at_the_third)
+    at_the_third = [DEFAULT, DEFAULT, KeyboardInterrupt]
+    stopped = Mock(wraps=figures.summarise, side_effect=at_the_third)
+    monkeypatch.setattr(figures, "summarise", stopped)
     assert main(["--runs", "2", "--out", str(tmp_path)]) == 130
     assert "Interrupted" in capsys.readouterr().out
     kept = {path.name for path in tmp_path.iterdir()}

@@ -23,7 +23,7 @@ from benchmarks.train.command import trained
 from benchmarks.train.through_plant import Training
 from tests import tasks
 from tests.conftest import ROOT, python
-from tests.test_fan_out import counted, until, work
+from tests.test_fan_out import counted, work
 
 NODES = ROOT / "tests" / "nodes"
 SECONDS = 300.0  # after which something hangs, on the slowest machine
@@ -107,7 +107,7 @@ def test_a_sweep_loses_a_node(cluster, results):
     ) as driver:  # fmt: skip
         begun = "tasks/*/limit *.json"
         try:
-            until(lambda: driver.poll() or len(list(there.glob(begun))) > 1, SECONDS)
+            tasks.until(lambda: driver.poll() or len(list(there.glob(begun))) > 1, SECONDS)
             cluster.order("lose")
             assert not (there / "runs.csv").exists()  # the end was not reached
             said = driver.communicate(timeout=SECONDS)[0]

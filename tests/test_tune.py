@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from unittest.mock import DEFAULT, Mock
 
 import numpy as np
 import optuna
@@ -122,15 +123,9 @@ class TestSearch:
         self, tmp_path, monkeypatch, capsys
     ):
         run_tune(tmp_path / "whole")
-        calls, score = iter(range(5)), tune.score
-
-        def stop_at_the_fifth(*arguments):
-            if next(calls) == 4:
-                raise KeyboardInterrupt
-            return score(*arguments)
-
+        at_the_fifth = [*[DEFAULT] * 4, KeyboardInterrupt]
         with monkeypatch.context() as patch:
-            patch.setattr(tune, "score", stop_at_the_fifth)
+            patch.setattr(tune, "score", Mock(wraps=tune.score, side_effect=at_the_fifth))
             assert run_tune(tmp_path / "halves") == 130
         assert "Interrupted" in capsys.readouterr().out
         assert len(pd.read_csv(tmp_path / "halves/pi.csv")) == 4
@@ -158,17 +153,11 @@ class TestSearch:
                 assert low < getattr(default, name) < high
 
     def test_ppo_is_trained_once_a_trial(self, tmp_path, monkeypatch):
-        trained = []
-
         state = ppo_training.begin(SMALL).policy.state_dict()
-        network = ppo_training.exported(state, SMALL)
-
-        def train(arguments):
-            trained.append(arguments)
-            return network
-
+        train = Mock(return_value=ppo_training.exported(state, SMALL))
         monkeypatch.setattr(ppo_training, "train", train)
         assert run_tune(tmp_path, "ppo", trials=2) == 0
+        trained = [call.args[0] for call in train.call_args_list]
         search = [ppo.TUNING_SEED + i for i in range(2)]
         final = [ppo.FINAL_SEED + i for i in range(4)]
         assert [arguments.seed for arguments in trained] == [*search * 2, *final * 2]
@@ -179,13 +168,13 @@ class TestSearch:
 @pytest.fixture
 def search(tmp_path, short, monkeypatch):
     """Return a function that searches to a number of trials, and says how many were new."""
-    score, judged = tune.score, []
-    monkeypatch.setattr(tune, "score", lambda *given: judged.append(1) or score(*given))
+    score = Mock(wraps=tune.score)
+    monkeypatch.setattr(tune, "score", score)
 
     def go(trials, runs=1):
-        before = len(judged)
+        score.reset_mock()
         rows = tune.Search(ROSTER["pi"], runs, {}, tmp_path, FanOut(1)).run(trials)
-        return rows, len(judged) - before
+        return rows, score.call_count
 
     return go
 

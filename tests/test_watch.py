@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pygame
@@ -49,10 +50,8 @@ def test_a_gif_shows_the_run(tmp_path, capsys):
     shown = list(pictures(path))
     assert len(shown) == SAMPLES / 5
 
-    env, controller = (
-        MiddlePointEnv(noise_variance=0.5, render_mode="rgb_array"),
-        PIController(),
-    )
+    env = MiddlePointEnv(noise_variance=0.5, render_mode="rgb_array")
+    controller = PIController()
     observation, info = env.reset(seed=7)
     errors = []
     for k in range(SAMPLES):
@@ -117,11 +116,8 @@ def test_a_window_shows_the_run(window, tmp_path):
 
 
 def test_interrupted(tmp_path, monkeypatch, capsys):
-    def stop(*_):
-        raise KeyboardInterrupt
-
     (tmp_path / "film.gif").write_bytes(b"earlier")
-    monkeypatch.setattr(rivals, "rollout", stop)
+    monkeypatch.setattr(rivals, "rollout", Mock(side_effect=KeyboardInterrupt))
     assert main(["--video", "film.gif"]) == 130
     assert "Interrupted" in capsys.readouterr().out
     assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"earlier"]
@@ -154,14 +150,9 @@ def test_closing_the_window_ends_it(window):
 # A bound takes seconds, and is tested where it is made.
 @pytest.fixture
 def quick_bound(monkeypatch):
-    asked = []
-
-    def bound(**arguments):
-        asked.append(arguments)
-        return SimpleNamespace(value=0.123)
-
+    bound = Mock(return_value=SimpleNamespace(value=0.123))
     monkeypatch.setattr(rivals, "least_possible", bound)
-    return asked
+    return bound
 
 
 def window_point(flow):
@@ -205,7 +196,7 @@ def test_your_hands_are_on_the_valve(window, quick_bound, capsys):
     assert pi.split()[1] == f"{np.mean(errors):.3f}"
     assert "0.123" in shown
     assert "you on square wave" in shown
-    assert "setpoint" not in quick_bound[0]
+    assert "setpoint" not in quick_bound.call_args.kwargs
 
 
 def test_keys_move_set_point_and_load_under_any_controller(window, quick_bound, capsys):
@@ -221,7 +212,7 @@ def test_keys_move_set_point_and_load_under_any_controller(window, quick_bound, 
     # The controller saw it: it does what it does on a plant with these set points.
     own = run_closed(MiddlePointEnv(setpoint=setpoints), PIController(), SAMPLES)["output"]
     assert [sample[1] for sample, _ in screen] == pytest.approx(own, abs=1e-5)
-    assert quick_bound[0]["setpoint"] == setpoints
+    assert quick_bound.call_args.kwargs["setpoint"] == setpoints
     assert "Smith" in capsys.readouterr().out
 
 
@@ -233,7 +224,7 @@ def test_a_load_step_shows_as_in_the_plant_s_equation(window, quick_bound, capsy
     a = [1.0, -0.45181, -0.47546]  # (28): w adds A(1) w to the right-hand side
     load = np.r_[np.zeros(5), np.ones(SAMPLES - 4)]
     assert added == pytest.approx(signal.lfilter([sum(a)], a, load), abs=1e-9)
-    assert quick_bound == []  # there is no bound for a load by hand
+    quick_bound.assert_not_called()  # there is no bound for a load by hand
     assert "least possible" not in capsys.readouterr().out
 
 
