@@ -290,6 +290,9 @@ def collected(env, steps, name):
     return np.stack([plain(env.step(actions)[-1][name]) for _ in range(steps)])
 
 
+SIGNALS = "setpoint", "noise", "disturbance"
+
+
 def assert_mean(values, expected):
     """Compare a mean to within five standard errors, those between plants if they are columns.
 
@@ -347,13 +350,12 @@ class TestDraws:
             lengths = np.diff(changes, prepend=0)
             assert set(lengths) <= set(range(shortest, longest + 1))
             first.append(lengths[:5])  # as many of each plant, so that none is preferred
-            starts.append(column[changes[:5]])
+            starts.append(column[np.append(0, changes[:5])])
         assert_mean(np.transpose(first), (shortest + longest) / 2)
         if longest < 100:
             assert (np.min(first), np.max(first)) == (shortest, longest)
-        for each in (levels[0], np.ravel(starts)):
-            assert_mean(each, 0.0)
-            assert_mean(each**2, amplitude**2 / 3)
+        assert_mean(np.ravel(starts), 0.0)
+        assert_mean(np.ravel(starts) ** 2, amplitude**2 / 3)
         ends = np.min(starts), np.max(starts)
         assert ends == pytest.approx((-amplitude, amplitude), abs=0.03 * amplitude)
 
@@ -385,47 +387,39 @@ class TestDraws:
             # 20 / n at one end is e^-20.
             assert 0.75 <= gains.min() < 0.75 + 0.75 * 20 / n
             assert 1.5 - 0.75 * 20 / n < gains.max() <= 1.5
-            assert abs(gains.mean() - 1.125) < 5 * 0.75 / (12 * n) ** 0.5
-            assert abs(np.corrcoef(delays, gains)[0, 1]) < 5 / n**0.5
+            assert_mean(gains, 1.125)
+            assert_mean((delays - 18) * (gains - 1.125), 0.0)
 
     def test_resets_leave_the_distributions_as_they_are(self, library):
-        n, steps, variance, walk = 1500, 250, 2.0, 0.01
+        n, steps, variance, walk, jump = 1500, 250, 2.0, 0.01, 0.3
         env = library.make(
             n, noise_variance=variance, c=[1.0, 3.0], disturbance_walk_variance=walk,
-            setpoint="random", setpoint_period=60, max_episode_steps=100,
+            disturbance_amplitude=jump, disturbance_interval=10, setpoint="random",
+            setpoint_period=60, max_episode_steps=100,
         )  # fmt: skip
         _, infos = env.reset(seed=6)
-        rng, ended = np.random.default_rng(0), np.zeros(n, bool)
-        age, begun = np.zeros(n, int), np.zeros(n, int)  # of the episode; when it last changed
-        level = plain(infos["setpoint"])
-        noise, load, ages, lengths = [], [], [], []
+        rng, age, ended = np.random.default_rng(0), np.zeros(n, int), np.zeros(n, bool)
+        rows = [(age.copy(), *(plain(infos[name]) for name in SIGNALS))]
         for _ in range(steps):
             _, _, _, truncated, infos = plain(env.step(np.zeros((n, 1))))
             age = np.where(ended, 0, age + 1)
-            begun[ended] = 0
-            changed = (infos["setpoint"] != level) & ~ended
-            lengths.append((age - begun)[changed])
-            begun[changed], level = age[changed], infos["setpoint"]
-            noise.append(infos["noise"])
-            load.append(infos["disturbance"])
-            ages.append(age.copy())
             mask = rng.random(n) < 0.02
-            if mask.any():
-                _, infos = env.reset(options={"reset_mask": mask})
-                level = np.where(mask, plain(infos["setpoint"]), level)
-                age[mask] = begun[mask] = 0
+            _, first = plain(env.reset(options={"reset_mask": mask}))
+            age[mask] = 0
             ended = truncated & ~mask
-        noise, load, ages = np.array(noise), np.array(load), np.array(ages)
-        for found, expected in (
-            (noise[ages == 1], variance),
-            (noise[ages == 2], 10.0 * variance),  # 1 + 3^2
-            (load[ages == 10], 10.0 * walk),
-            (load[ages == 45], 40.0 * walk),
-        ):
-            assert_mean(found**2, expected)
+            found = (np.where(mask, first[name], infos[name]) for name in SIGNALS)
+            rows.append((age.copy(), *found))
+        ages, setpoint, noise, load = np.swapaxes(rows, 0, 1)
+        assert_mean(noise[ages == 1] ** 2, variance)
+        assert_mean(noise[ages == 2] ** 2, variance * (1 + 3**2))
         assert not load[ages < 10].any()
-        lengths = np.concatenate(lengths)
-        assert (lengths.min(), lengths.max()) == (10, 30)
+        assert_mean(load[ages == 10] ** 2, 10 * walk + jump**2 / 3)
+        assert_mean(load[ages == 45] ** 2, 40 * walk + jump**2 / 3)
+        lengths = set()
+        for level, age in zip(setpoint.T, ages.T, strict=True):
+            begun = np.flatnonzero((np.diff(level, prepend=0) != 0) | (age == 0))
+            lengths |= {*np.diff(age[begun])[age[begun[1:]] > 0]}
+        assert (min(lengths), max(lengths)) == (10, 30)
 
     def test_the_seed_is_all_that_differs(self, library):
         def trajectory(seed):

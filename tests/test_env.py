@@ -95,12 +95,6 @@ def test_timeline_by_hand():
     assert list(record["observation"][4]) == [1, 1, 1, -2.5, 2, 3, 3.5, -1, 0, -1]
 
 
-def test_quadratic_reward_by_hand():
-    env = MiddlePointEnv(setpoint=4.0, error_scale=2.0)
-    assert run(env, np.zeros(1))["reward"][0] == -2.0  # -(4 / 2)^2 / 2
-    assert run(MiddlePointEnv(), np.zeros(1))["reward"][0] == -0.5
-
-
 def test_rest_of_an_unsymmetric_actuator_is_zero_flow():
     env = MiddlePointEnv(u_min=-5.0, u_max=15.0, action_window=2, move_weight=1.0)
     observation, _ = env.reset(seed=0)

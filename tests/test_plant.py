@@ -113,7 +113,6 @@ def test_only_commands_on_the_edge_are_moved(scaled, rng):
     plain = action_from_command(commands, -10.0, 10.0).astype(np.float32)
     np.testing.assert_array_equal(scaled(commands, -10.0, 10.0, 7.0).ravel(), plain)
     inside = np.nextafter(7.0, 0.0)  # stays inside
-    assert applied(7.0, dead_zone=7.0) == 7.0
     assert step(scaled(inside, -10, 10, 7.0).item(), dead_zone=7.0)[1] == 0.0
     # Many at a time, each with limits of its own.
     dead_zones, limits = np.array([4.1, 6.3, 7.0]), np.array([10.0, 11.0, 12.0])
