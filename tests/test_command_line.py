@@ -88,11 +88,9 @@ REFUSED = {
         (["--set", "render_mode=human"], "--set: render_mode is not an argument of the plant"),
         (["--agent", "PI=agents:PIController"], "'PI' is taken"),
         (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
-        (["--agent", "x=agents:Nothing"], "agents:Nothing"),
-        (["--agent", "x=.:y"], "'.:y' cannot be imported"),
-        (["--agent", "x=..a:y"], "'..a:y' cannot be imported"),
     ],
     "identify": [
+        (["none.csv"], "none.csv cannot be read: No such file"),
         ([LOG, "--orders", "0", "1", "0"], "--orders: A and B must have at least 1"),
         ([LOG, "--orders", "2", "0", "2"], "--orders: A and B must have at least 1"),
         ([LOG, "--u-min", "nan"], 'value "nan" for --u-min. Must be < inf'),

@@ -41,6 +41,7 @@ from tests.small_training import SMALL
 
 # Those that are compared without any training before.
 FIXED = [name for name, each in ROSTER.items() if each.compared and not each.trained]
+QUICK = "--agents pi --scenarios constant --runs 1 --jobs 1"
 
 
 def measured(runs, **arguments):
@@ -265,20 +266,23 @@ class TestStorage:
         assert (tmp_path / "table.csv").read_bytes() == b"a\n1\n2\n"
 
 
-def run_compare(out, *options):
-    policies = out.parent / "policies"
-    # In this process, unless an option says otherwise.
-    options = ("--jobs", 1, *options)
-    return main(["--out", str(out), "--kept", str(policies), *map(str, options)])
+@pytest.fixture
+def compared(tmp_path):
+    """Return a function that compares, and returns the folder of the results."""
+
+    def compared(options, *more, status=0, into="out"):
+        out, policies = tmp_path / into, tmp_path / "policies"
+        # In this process, unless an option says otherwise.
+        given = ["--out", out, "--kept", policies, "--jobs", 1, *options.split(), *more]
+        assert main([str(each) for each in given]) == status
+        return out
+
+    return compared
 
 
 class TestCompare:
-    def test_files_and_their_contents(self, tmp_path, capsys):
-        out = tmp_path / "out"
-        status = run_compare(
-            out, "--agents", "nn,pi", "--scenarios", "constant", "constant-noise", "--runs", 3
-        )
-        assert status == 0
+    def test_files_and_their_contents(self, compared, capsys):
+        out = compared("--agents nn,pi --scenarios constant constant-noise --runs 3")
         runs = pd.read_csv(out / "runs.csv")
         assert list(runs.columns) == ["scenario", "agent", "policy", "seed", *METRICS]
         cells = [(s, a) for a in ("nn", "pi") for s in ("constant", "constant-noise")]
@@ -321,7 +325,7 @@ class TestCompare:
             picture = matplotlib.image.imread(out / name)
             assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
 
-    def test_the_count_of_cores_changes_no_number(self, tmp_path, monkeypatch):
+    def test_the_count_of_cores_changes_no_number(self, compared, tmp_path, monkeypatch):
         (tmp_path / "locked.py").write_text(
             "import threading\n"
             "from agents import PIController\n"
@@ -333,42 +337,36 @@ class TestCompare:
             "make = Factory()\n"
         )
         monkeypatch.syspath_prepend(tmp_path)
-        options = (
-            "--agents", "nn", "pi", "--agent", "bounds=locked:make", "--runs", 2,
-            "--scenarios", "constant-noise", "constant",
-        )  # fmt: skip
-        for jobs in (1, 2):
-            assert run_compare(tmp_path / str(jobs), *options, "--jobs", jobs) == 0
+        given = "--agents nn pi --agent bounds=locked:make --scenarios constant-noise constant"
+        for jobs in ("1", "2"):
+            compared(f"{given} --runs 2 --jobs {jobs}", into=jobs)
         for name in ("runs.csv", "summary.csv", "estimates.csv", "constant-noise.csv"):
-            one, two = ((tmp_path / str(jobs) / name).read_bytes() for jobs in (1, 2))
+            one, two = ((tmp_path / jobs / name).read_bytes() for jobs in ("1", "2"))
             assert one == two
             assert b"bounds" in one
 
-    def test_a_picture_that_cannot_be_drawn_is_a_sentence(self, tmp_path, monkeypatch):
+    def test_a_picture_that_cannot_be_drawn_is_a_sentence(self, compared, monkeypatch):
         error = ValueError("Axis limits cannot be NaN or Inf")
         monkeypatch.setattr(plots, "plot_travel", Mock(side_effect=error))
-        options = ("--agents", "pi", "--scenarios", "constant", "--runs", 1)
-        assert run_compare(tmp_path / "out", *options) == 0
-        page = (tmp_path / "out/report.md").read_text()
+        page = (compared(QUICK) / "report.md").read_text()
         assert "travel.png could not be drawn (ValueError: Axis limits cannot be" in page
         assert "(travel.png)" not in page
 
-    @pytest.mark.parametrize("agents", [("pi", "pi-simc"), ("nothing",)])
-    def test_one_run_in_noise_is_drawn(self, agents, tmp_path):
-        options = ("--agents", *agents, "--scenarios", "constant-noise", "--runs", 1)
-        assert run_compare(tmp_path / "out", *options) == 0
-        page = (tmp_path / "out/report.md").read_text()
+    @pytest.mark.parametrize("agents", ["pi pi-simc", "nothing"])
+    def test_one_run_in_noise_is_drawn(self, agents, compared):
+        out = compared(f"--agents {agents} --scenarios constant-noise --runs 1")
+        page = (out / "report.md").read_text()
         assert "could not be drawn" not in page
         assert "(one run)" in page
 
-    def test_a_row_of_the_presets_is_what_evaluate_says(self, tmp_path):
-        quick = [agent for agent in FIXED if agent != "mpc"]
-        parts = {"hard": quick, "noisy": ["mpc"]}
-        for preset, agents in parts.items():
-            options = ("--scenarios", preset, "--agents", *agents, "--runs", 2)
-            run_compare(tmp_path / preset, "--presets", *options)
+    def test_a_row_of_the_presets_is_what_evaluate_says(self, compared):
+        parts = {"hard": [agent for agent in FIXED if agent != "mpc"], "noisy": ["mpc"]}
+        folders = [
+            compared(f"--presets --runs 2 --scenarios {preset} --agents", *agents, into=preset)
+            for preset, agents in parts.items()
+        ]
         runs, estimates = (
-            pd.concat([pd.read_csv(tmp_path / part / name) for part in parts])
+            pd.concat([pd.read_csv(folder / name) for folder in folders])
             .set_index(["agent", "scenario"])
             .sort_index()
             for name in ("runs.csv", "estimates.csv")
@@ -386,8 +384,8 @@ class TestCompare:
             assert against["limit"] == pytest.approx(found.least_possible, abs=1e-12)
             assert against["ratio"] == pytest.approx(found.multiple, abs=1e-12)
 
-    def test_the_second_run_goes_on_with_what_was_learnt(self, tmp_path):
-        run_compare(tmp_path, "--agents", "nn", "--scenarios", "square", "--runs", 3)
+    def test_the_second_run_goes_on_with_what_was_learnt(self, compared):
+        out = compared("--agents nn --scenarios square --runs 3")
         network, plants = DirectNNController(num_envs=3, seed=SEED), make_plants(3, 1200)
         while_learning, after = (
             np.abs(run.error).mean()
@@ -395,56 +393,57 @@ class TestCompare:
         )
         assert after < 0.95 * while_learning
         row = f"{while_learning:.3f} | {after:.3f} |"
-        assert row in re.sub(" +", " ", (tmp_path / "report.md").read_text())
+        assert row in re.sub(" +", " ", (out / "report.md").read_text())
 
-    def test_ppo_is_trained_once(self, tmp_path, monkeypatch, capsys):
+    def test_ppo_is_trained_once(self, compared, monkeypatch, capsys):
         monkeypatch.setattr(ppo, "PPOArguments", lambda: SMALL)
         monkeypatch.setattr(ppo, "POLICIES", 2)
-        options = ("--agents", "ppo", "--scenarios", "constant", "--runs", 1)
-        options += ("--training-steps", 256)
-        assert run_compare(tmp_path / "one", *options) == 0
-        curve = pd.read_csv(tmp_path / "one/learning.csv")
+        given = "--agents ppo --scenarios constant --runs 1 --training-steps 256"
+        one = compared(given, into="one")
+        curve = pd.read_csv(one / "learning.csv")
         assert curve.groupby("policy")["steps"].max().to_dict() == {0: 256, 1: 256}
-        assert (tmp_path / "one/learning.png").exists()
-        provenance = json.loads((tmp_path / "one/provenance.json").read_text())
+        assert (one / "learning.png").exists()
+        provenance = json.loads((one / "provenance.json").read_text())
         for seed, used in enumerate(provenance["policies"]["ppo"]):
             assert used["arguments"]["seed"] == seed
             assert used["arguments"]["steps"] == 256
             assert used["file"] == "policy.npz"
-        runs = pd.read_csv(tmp_path / "one/runs.csv")
+        runs = pd.read_csv(one / "runs.csv")
         assert list(runs["policy"]) == [0, 1]
 
         monkeypatch.setattr(ppo_training.PPO, "learn", None)  # training again would raise
-        assert run_compare(tmp_path / "two", *options) == 0
-        pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "two/runs.csv"), runs)
-        assert run_compare(tmp_path / "three", *options, "--retrain") == 1
+        again = compared(given, into="two")
+        pd.testing.assert_frame_equal(pd.read_csv(again / "runs.csv"), runs)
+        compared(f"{given} --retrain", into="three", status=1)
         assert "policy.npz: TypeError" in capsys.readouterr().out
 
-    def test_the_example_of_the_page(self, tmp_path, monkeypatch):
+    def test_the_example_of_the_page(self, compared, tmp_path, monkeypatch):
         readme = (ROOT / "benchmarks/compare/README.md").read_text(encoding="utf-8")
         (example,) = re.findall(r"```python\n(from agents import PIC.*?)```", readme, re.DOTALL)
         (option,) = re.findall(r"--agent (\w+=my_\S+)`", readme)
         (tmp_path / "my_controllers.py").write_text(example)
         monkeypatch.syspath_prepend(tmp_path)
-        run_compare(
-            tmp_path / "out", "--agents", "--agent", option, "--scenarios", "constant",
-            "--runs", 1,
-        )  # fmt: skip
-        runs = pd.read_csv(tmp_path / "out/runs.csv")
+        out = compared(f"--agents --agent {option} --scenarios constant --runs 1")
+        runs = pd.read_csv(out / "runs.csv")
         assert runs["mae"].iloc[0] == pytest.approx(0.283, abs=0.001)  # that of the gains
 
-    def run_and_stop(self, out, monkeypatch, error, after):
-        ends = itertools.chain([DEFAULT] * after, itertools.repeat(error))
-        monkeypatch.setattr(records, "rollout", Mock(wraps=rollout, side_effect=ends))
-        return run_compare(
-            out, "--agents", "pi", "nn", "--scenarios", "constant", "square", "--runs", 1
-        )
+    @pytest.fixture
+    def stopped(self, compared, monkeypatch, capsys):
+        """Return a function whose runs end in an error, and which returns what is said."""
+
+        def stopped(error, after, status=130):
+            ends = itertools.chain([DEFAULT] * after, itertools.repeat(error))
+            monkeypatch.setattr(records, "rollout", Mock(wraps=rollout, side_effect=ends))
+            compared("--agents pi nn --scenarios constant square --runs 1", status=status)
+            return capsys.readouterr().out
+
+        return stopped
 
     @staticmethod
-    def the_first_are_kept(out, count=2):
+    def assert_the_first_are_kept(out, count):
         kept = ["constant", "square", "constant"][:count]
         assert list(pd.read_csv(out / "runs.csv")["scenario"]) == kept
-        return json.loads((out / "provenance.json").read_text())["complete"] is False
+        assert json.loads((out / "provenance.json").read_text())["complete"] is False
 
     @pytest.mark.parametrize(
         ("error", "after", "status", "said"),
@@ -454,17 +453,15 @@ class TestCompare:
         ],
     )
     def test_a_run_that_is_stopped_and_one_that_fails_keep_what_they_have(
-        self, error, after, status, said, tmp_path, monkeypatch, capsys
+        self, error, after, status, said, stopped, tmp_path
     ):
-        out = tmp_path / "out"
-        assert self.run_and_stop(out, monkeypatch, error, after) == status
-        shown = capsys.readouterr().out
+        shown = stopped(error, after, status)
         assert all(words in shown for words in said)
-        assert self.the_first_are_kept(out, after)
-        assert (out / "report.md").exists()
-        assert (out / "square.png").exists()
+        self.assert_the_first_are_kept(tmp_path / "out", after)
+        assert (tmp_path / "out/report.md").exists()
+        assert (tmp_path / "out/square.png").exists()
 
-    def test_every_case_is_saved_before_the_next_begins(self, tmp_path, monkeypatch):
+    def test_every_case_is_saved_before_the_next_begins(self, compared, tmp_path, monkeypatch):
         saved = []
 
         def watched(*arguments):
@@ -474,18 +471,15 @@ class TestCompare:
 
         monkeypatch.setattr(records, "rollout", watched)
         monkeypatch.setattr(command, "PAUSE", 0.0)
-        scenarios = ("constant", "square", "constant-noise")
-        run_compare(tmp_path / "out", "--agents", "pi", "--runs", 2, "--scenarios", *scenarios)
+        compared("--agents pi --runs 2 --scenarios constant square constant-noise")
         assert saved == [0, 2, 4]
 
     def test_a_second_interruption_while_the_report_is_written(
-        self, tmp_path, monkeypatch, capsys
+        self, stopped, tmp_path, monkeypatch
     ):
-        out = tmp_path / "out"
         monkeypatch.setattr(report, "write_report", Mock(side_effect=KeyboardInterrupt))
-        assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=2) == 130
-        assert "Interrupted" in capsys.readouterr().out
-        assert self.the_first_are_kept(out)
+        assert "Interrupted" in stopped(KeyboardInterrupt, after=2)
+        self.assert_the_first_are_kept(tmp_path / "out", 2)
 
     def test_a_folder_that_cannot_be_written_to(self, tmp_path, monkeypatch, refused):
         (tmp_path / "file").write_text("in the way")
@@ -498,7 +492,7 @@ class TestCompare:
         assert "Read-only file system" in refused(main, ["--out", tmp_path / "out"])
 
     @pytest.mark.parametrize("name", ["runs.csv", "limits.png", "report.html"])
-    def test_a_disk_that_gets_full(self, name, tmp_path, monkeypatch, capsys):
+    def test_a_disk_that_gets_full(self, name, compared, monkeypatch, capsys):
         real = Path.replace
 
         def replace(self, target):
@@ -507,22 +501,20 @@ class TestCompare:
             return real(self, target)
 
         monkeypatch.setattr(Path, "replace", replace)
-        options = ("--agents", "pi", "--runs", 1, "--scenarios", "constant")
-        assert run_compare(tmp_path / "out", *options) == 1
+        out = compared(QUICK, status=1)
         shown = capsys.readouterr().out
         assert f"{name} could not be written: No space left on device" in shown
-        assert not list((tmp_path / "out").glob(".*"))
+        assert not list(out.glob(".*"))
 
-    def test_interrupted_before_anything_has_finished(self, tmp_path, monkeypatch):
-        out = tmp_path / "out"
-        out.mkdir()
-        (out / "runs.csv").write_text("of an earlier run")
-        assert self.run_and_stop(out, monkeypatch, KeyboardInterrupt, after=0) == 130
-        assert (out / "runs.csv").read_text() == "of an earlier run"
+    def test_interrupted_before_anything_has_finished(self, stopped, tmp_path):
+        runs = tmp_path / "out" / "runs.csv"
+        runs.parent.mkdir()
+        runs.write_text("of an earlier run")
+        stopped(KeyboardInterrupt, after=0)
+        assert runs.read_text() == "of an earlier run"
 
     def test_as_a_command(self, tmp_path):
-        command = ["-m", "benchmarks.compare", "--agents", "pi", "--runs", "1", "--jobs", "1"]
-        command += ["--scenarios", "constant", "--out", str(tmp_path / "out")]
+        command = ["-m", "benchmarks.compare", *QUICK.split(), "--out", str(tmp_path / "out")]
         # Neither a backend that there is not nor a terminal without ° stops it.
         odd = os.environ | {"MPLBACKEND": "nonsense", "PYTHONIOENCODING": "ascii"}
         done = python(*command, env=odd, check=True)
@@ -556,31 +548,26 @@ def test_a_long_legend_leaves_the_responses_their_room(tmp_path, monkeypatch):
 class TestOtherPlants:
     @pytest.mark.parametrize(("preset", "drawn"), [("disturbed", False), ("hard", True)])
     def test_what_needs_the_actuators_numbers_is_not_measured_where_they_are_drawn(
-        self, preset, drawn, tmp_path
+        self, preset, drawn, compared
     ):
-        options = ("--preset", preset, "--agents", "nothing", "pi", "--runs", 2)
-        assert run_compare(tmp_path / "out", *options) == 0
-        report = (tmp_path / "out/report.md").read_text()
+        out = compared(f"--preset {preset} --agents nothing pi --runs 2")
+        report = (out / "report.md").read_text()
         assert "| PI" in report
         assert ("not measured" in report) is drawn
-        provenance = json.loads((tmp_path / "out/provenance.json").read_text())
-        assert provenance["complete"] is True
 
-    def test_controllers_are_told_about_the_plant_that_is_run(self, tmp_path):
+    def test_controllers_are_told_about_the_plant_that_is_run(self, compared, tmp_path):
         plant = {"b": [0.04560, 0.00404], "delay": 9, "a": [1, -0.9]}
         (tmp_path / "plant.json").write_text(json.dumps(plant))
-        options = ("--plant", tmp_path / "plant.json", "--agents", "pi-simc", "smith")
-        options += ("--scenarios", "square", "--runs", 1)
-        assert run_compare(tmp_path / "out", *options) == 0
-        errors = pd.read_csv(tmp_path / "out/runs.csv").set_index("agent")["mae"]
+        given = "--agents pi-simc smith --scenarios square --runs 1 --plant"
+        out = compared(given, tmp_path / "plant.json")
+        errors = pd.read_csv(out / "runs.csv").set_index("agent")["mae"]
         # Its gain has the other sign: who is told about the paper's plant drives it to a limit.
         assert (errors < 3.0).all()
-        provenance = json.loads((tmp_path / "out/provenance.json").read_text())
+        provenance = json.loads((out / "provenance.json").read_text())
         assert provenance["scenarios"]["square"]["arguments"] == plant
 
     def test_a_part_goes_to_a_folder_of_its_own(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
-        options = ["--agents", "pi", "--scenarios", "constant", "--runs", "1", "--jobs", "1"]
-        assert main([*options, "--set", "delay=30"]) == 0
+        assert main([*QUICK.split(), "--set", "delay=30"]) == 0
         (folder,) = (tmp_path / "results").iterdir()
         assert folder.name == "compare-pi-constant-delay-30-1-runs"

@@ -1,5 +1,7 @@
 """The roster: what holds for any controller, as every command runs it; and a user's own."""
 
+import re
+
 import gymnasium
 import numpy as np
 import pytest
@@ -146,9 +148,12 @@ class TestOwnControllers:
         factory = own_factory("agents:PIController")
         assert errors(factory, 1, 60, setpoint_window=7) == errors(factory, 1, 60)
 
-    @pytest.mark.parametrize("location", ["agents", "agents:", "nowhere:x", "agents:__name__"])
+    @pytest.mark.parametrize(
+        "location",
+        ["agents", "agents:", "agents:No", "agents:__name__", "nowhere:x", ".:y", "..a:y"],
+    )
     def test_bad_locations(self, location):
-        with pytest.raises(UsageError, match=location):
+        with pytest.raises(UsageError, match=re.escape(f"--agent: {location!r} ")):
             chosen([], [f"mine={location}"])
 
     @pytest.mark.parametrize(
