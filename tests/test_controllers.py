@@ -176,14 +176,10 @@ class TestOwnControllers:
 @pytest.fixture(scope="module")
 def zips(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
+    velocity = {"max_move": 0.3, "undo_dead_zone": True}
     for seed in (0, 1):
-        plants = make_vec_env(
-            "MiddlePoint-v0",
-            2,
-            wrapper={"max_move": 0.3, "undo_dead_zone": True},
-            action_window=20,
-            error_window=2,
-        )
+        windows = {"action_window": 20, "error_window": 2}
+        plants = make_vec_env("MiddlePoint-v0", 2, wrapper=velocity, **windows)
         model = PPO("MlpPolicy", plants, n_steps=8, batch_size=16, seed=seed, device="cpu")
         model.save(folder / f"velocity-{seed}.zip")
     bare = PPO("MlpPolicy", gymnasium.make("MiddlePoint-v0"), device="cpu")

@@ -56,13 +56,9 @@ class TestDeclarations:
 class TestTransmitter:
     def test_the_observation_sees_its_noise_and_nothing_else_does(self, rng):
         actions = rng.uniform(-1, 1, 5_000)
-        true = run(MiddlePointEnv(noise_variance=0.5, output_window=1), actions)
-        seen = run(
-            MiddlePointEnv(
-                noise_variance=0.5, output_window=1, measurement_noise_variance=0.09
-            ),
-            actions,
-        )
+        plant = {"noise_variance": 0.5, "output_window": 1}
+        true = run(MiddlePointEnv(**plant), actions)
+        seen = run(MiddlePointEnv(measurement_noise_variance=0.09, **plant), actions)
         for name in ("output", "error", "reward", "noise"):
             np.testing.assert_array_equal(seen[name], true[name])
         noise = seen["observation"][:, -1] - seen["output"]
@@ -75,9 +71,8 @@ class TestTransmitter:
         )
 
     def test_the_reading_saturates(self):
-        env = MiddlePointEnv(
-            measurement_noise_variance=100.0, output_window=1, temperature_span=5.0
-        )
+        noisy = {"measurement_noise_variance": 100.0, "temperature_span": 5.0}
+        env = MiddlePointEnv(output_window=1, **noisy)
         reading = run(env, np.zeros(300))["observation"][:, -1]
         assert np.abs(reading).max() == 5.0
 

@@ -106,14 +106,14 @@ class TestCells:
         assert calm["swing"][0] < 0.2
 
 
-def run_sweep(out, *options):
-    arguments = ["--agents", "nn", "nn-frozen", "pi-simc", "--runs", "2", "--samples", "700"]
-    return main([*arguments, "--jobs", "1", "--out", str(out), *map(str, options)])
+def run_sweep(out, options):
+    given = f"--agents nn nn-frozen pi-simc --runs 2 --samples 700 --jobs 1 {options}"
+    return main([*given.split(), "--out", str(out)])
 
 
 class TestSweep:
     def test_random_design(self, tmp_path, capsys):
-        assert run_sweep(tmp_path, "--design", "random", "--plants", 6) == 0
+        assert run_sweep(tmp_path, "--design random --plants 6") == 0
         runs = pd.read_csv(tmp_path / "runs.csv")
         assert len(runs) == 3 * 6 * 2
         np.testing.assert_allclose(runs["ratio"], runs["mae"] / runs["limit"])
@@ -128,41 +128,41 @@ class TestSweep:
         # Again: nothing is run, and nothing changes.
         saved = {file: file.stat().st_mtime_ns for file in (tmp_path / "tasks").rglob("*.json")}
         assert len(saved) == 6 * (3 + 2)
-        assert run_sweep(tmp_path, "--design", "random", "--plants", 6) == 0
+        assert run_sweep(tmp_path, "--design random --plants 6") == 0
         assert {file: file.stat().st_mtime_ns for file in saved} == saved
         pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "runs.csv"), runs)
 
     def test_tasks_of_other_options_are_not_taken(self, tmp_path, monkeypatch):
         monkeypatch.setattr(command, "report", lambda *_: [])  # which takes its time to draw
-        given = ["--design", "random", "--plants", 2, "--agents", "pi-simc", "--samples", 60]
+        given = "--design random --plants 2 --agents pi-simc --samples 60"
         changes = [  # and how many folders are new: of the limit, of nothing, of the controller
-            ([], 3), (["--runs", 3], 2), (["--samples", 50], 3), (["--design-seed", 1], 3),
-            (["--design", "wide"], 3), (["--told", "each"], 2), (["--agents", "pi"], 1),
-            (["--set", "dead_zone=7"], 2), ([], 0),
+            ("", 3), ("--runs 3", 2), ("--samples 50", 3), ("--design-seed 1", 3),
+            ("--design wide", 3), ("--told each", 2), ("--agents pi", 1),
+            ("--set dead_zone=7", 2), ("", 0),
         ]  # fmt: skip
         for options, anew in changes:
             kept = len(list(tmp_path.glob("tasks/*")))
-            run_sweep(tmp_path, *given, *options)
+            run_sweep(tmp_path, f"{given} {options}")
             assert len(list(tmp_path.glob("tasks/*"))) == kept + anew
         # Neither are those of another training.
         trained = Factory(simc_pi, provenance={"file": "b"})
         monkeypatch.setitem(ROSTER, "pi-simc", replace(ROSTER["pi-simc"], made_by=trained))
-        run_sweep(tmp_path, *given)
+        run_sweep(tmp_path, given)
         assert len(list(tmp_path.glob("tasks/*"))) == kept + anew + 1
 
     def test_told_each_plant_a_controller_does_better(self, tmp_path, monkeypatch):
         monkeypatch.setattr(command, "report", lambda *_: [])
         errors = {}
         for told in ("nominal", "each"):
-            given = ["--design", "random", "--plants", 4, "--agents", "smith", "--told", told]
-            assert run_sweep(tmp_path, *given) == 0
+            given = f"--design random --plants 4 --agents smith --told {told}"
+            assert run_sweep(tmp_path, given) == 0
             errors[told] = pd.read_csv(tmp_path / "runs.csv")["mae"]
         assert errors["each"].mean() < errors["nominal"].mean() - 0.05
 
     def test_grid(self, tmp_path, monkeypatch):
         monkeypatch.setitem(designs.GRID, "delay", range(10, 22, 10))
         monkeypatch.setitem(designs.GRID, "gain_factor", np.array([1.0, 1.2]))
-        assert run_sweep(tmp_path, "--design", "grid") == 0
+        assert run_sweep(tmp_path, "--design grid") == 0
         runs = pd.read_csv(tmp_path / "runs.csv")
         assert set(zip(runs["delay"], runs["gain_factor"], strict=True)) == {
             (10, 1.0), (20, 1.0), (10, 1.2), (20, 1.2),
@@ -173,9 +173,8 @@ class TestSweep:
         self, tmp_path, monkeypatch
     ):
         monkeypatch.setattr(command, "report", lambda *_: [])
-        given = ["--set", "b=[-0.03,-0.02,-0.01]", "--plants", 2, "--agents", "pi"]
-        own = ["--agent", "limit=agents:PIController"]
-        assert run_sweep(tmp_path, "--design", "random", *given, *own) == 0
+        given = "--design random --set b=[-0.03,-0.02,-0.01] --plants 2 --agents pi"
+        assert run_sweep(tmp_path, f"{given} --agent limit=agents:PIController") == 0
         runs = pd.read_csv(tmp_path / "runs.csv").set_index("agent")
         assert (len(runs.loc["pi"]), len(runs.loc["limit"])) == (4, 4)
         assert list(runs.loc["pi", "ratio"]) == list(runs.loc["limit", "ratio"])
@@ -187,7 +186,7 @@ class TestSweep:
         fails = Factory(Mock(side_effect=RuntimeError("no luck")))
         failing = replace(ROSTER["pi-simc"], made_by=fails)
         monkeypatch.setitem(ROSTER, "pi-simc", failing)
-        assert run_sweep(tmp_path, "--design", "random", "--plants", 2) == 1
+        assert run_sweep(tmp_path, "--design random --plants 2") == 1
         assert "pi-simc 0" in capsys.readouterr().out
         assert len(list((tmp_path / "tasks").rglob("nn *.json"))) == 2
 

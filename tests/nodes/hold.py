@@ -1,7 +1,6 @@
-"""Holds a Ray cluster of three nodes with a core each, and does what it reads a line at a time.
+"""Holds a Ray cluster of three nodes with a core each, and prints its address.
 
-"lose": end a node that is in the middle of a task. "join": add one. It prints the address at
-first, and a line when something is done.
+For each line that it reads it ends a node that is in the middle of a task, and prints a line.
 """
 
 import os
@@ -51,14 +50,11 @@ cluster = Cluster(
 )
 others = [cluster.add_node(**NODE) for _ in range(2)]
 print(cluster.address, flush=True)
-for line in sys.stdin:
-    if line == "lose\n":
-        last = time.monotonic() + 60.0
-        while not (working := [node for node in others if at_work(node)]):
-            assert time.monotonic() < last, "no node has anything to do"
-            time.sleep(0.01)
-        end(working[0])
-    else:
-        others.append(cluster.add_node(**NODE))
+for _line in sys.stdin:
+    last = time.monotonic() + 60.0
+    while not (working := [node for node in others if at_work(node)]):
+        assert time.monotonic() < last, "no node has anything to do"
+        time.sleep(0.01)
+    end(working[0])
     print("done", flush=True)
 cluster.shutdown()
