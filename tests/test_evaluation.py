@@ -54,8 +54,7 @@ class TestEvaluate:
         found = evaluate(PIController(), IDS[name], episodes=3)
         assert list(found.seeds) == [SEED, SEED + 1, SEED + 2]
         for i, seed in enumerate(found.seeds):
-            env = gymnasium.make(IDS[name], max_episode_steps=-1)
-            infos = run_closed(env, PIController(), 1200, seed)
+            infos = run_closed(MiddlePointEnv(**PRESETS[name]), PIController(), 1200, seed)
             errors, travel = np.abs(infos["error"][1:]), np.abs(np.diff(infos["applied"]))
             assert found.errors[i] == pytest.approx(errors.mean(), abs=1e-12)
             assert found.travels[i] == pytest.approx(travel.sum(), abs=1e-9)

@@ -10,13 +10,10 @@ import pytest
 
 from tests.conftest import ROOT
 
-STDLIB = set(sys.stdlib_module_names)
 ALLOWED = {
     "mptc_gym": {"mptc_gym", "gymnasium", "numpy", "pygame"},  # the last when it is used
     "agents": {"agents", "numpy"},
 }
-
-
 SOURCES = {
     path: path.read_text(encoding="utf-8")
     for package in ("mptc_gym", "agents", "benchmarks")
@@ -42,7 +39,7 @@ def packages(code: str) -> set[str]:
 @pytest.mark.parametrize("package", ALLOWED)
 def test_layers_import_downwards_only(package):
     for path in (ROOT / package).rglob("*.py"):
-        allowed = ALLOWED[package] | STDLIB
+        allowed = ALLOWED[package] | sys.stdlib_module_names
         allowed |= {"torch"} if "torch" in path.stem else set()
         allowed |= {"stable_baselines3"} if path.stem == "sb3" else set()
         assert packages(SOURCES[path]) <= allowed, path
