@@ -130,6 +130,9 @@ def test_the_text():
         "command 4.00 t/h", "applied 0.00 t/h",
     ):  # fmt: skip
         assert words in shown
+    quick = rendering.text(record(*[(5.0, -4.875, 4.0, 0.0)] * 31, sampling_interval=2.0))
+    assert "time 1.03 min" in quick
+    assert quick.endswith(" 6.667 min")  # 200 samples
     shown = rendering.text(record(*[(10.0, -10.0, 4.0, 0.0)] * 200))
     assert max(map(len, shown.splitlines())) <= 82
     lines = shown.splitlines()
@@ -307,3 +310,4 @@ def test_the_axis_holds_all_of_the_episode():
     axis = made.temperatures
     assert axis.low < -12.0
     assert axis.high > 30.0
+    assert record(setpoint=30.0).temperatures.high > 30.0
