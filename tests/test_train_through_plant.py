@@ -14,13 +14,11 @@ from benchmarks.controllers.roster import ROSTER  # noqa: E402
 from benchmarks.examples import through_plant as example  # noqa: E402
 from benchmarks.loop.rollout import make_plants, rollout  # noqa: E402
 from benchmarks.train import __main__ as program  # noqa: E402
-from benchmarks.train import through_plant  # noqa: E402
+from benchmarks.train import loops, through_plant  # noqa: E402
+from benchmarks.train.loops import Draw, Loops, environment  # noqa: E402
 from benchmarks.train.through_plant import (  # noqa: E402
-    Draw,
-    Loops,
     Net,
     Training,
-    environment,
     loss_of,
     train,
     training_key,
@@ -58,22 +56,22 @@ class TestLaw:
     def test_what_is_trained_is_what_runs(self, first):
         # The same plant, set point and network, in PyTorch with its gradient and in NumPy.
         net, n, samples = lively(SMALL), 1, 150
-        numbers = Draw(SMALL, n, samples, 3).plants()
+        numbers = Draw(n, samples, SMALL.spread, 3).plants()
         for name in numbers:
             if name.endswith(("_variance", "_amplitude")):
                 numbers[name] = torch.zeros(n)
             if name.endswith("_drift"):
                 numbers[name] = torch.ones(n)
         numbers["setpoint"] = torch.where(torch.arange(samples + 1) < 70, 3.0, -4.0)[:, None]
-        told = Draw(SMALL, n, samples, 4).told(numbers, exact=True)
+        told = Draw(n, samples, SMALL.spread, 4).told(numbers, exact=True)
         told["first"] = torch.tensor([first])
         told["uncertainty"] = torch.tensor([0.1])
         with torch.no_grad():
             plants = environment(n, samples)
             errors, _ = Loops(plants, numbers, told, 0).run(net, samples)
         of = {name: values.item() for name, values in numbers.items() if values.ndim == 1}
-        pole = 1.0 - through_plant.RATE / of["time_constant_factor"]
-        alpha, scale, _ = through_plant.DYNAMICS.coefficients(
+        pole = 1.0 - loops.RATE / of["time_constant_factor"]
+        alpha, scale, _ = loops.DYNAMICS.coefficients(
             of["gain_factor"], of["time_constant_factor"]
         )
         a, b = [1.0, *(-x for x in alpha)], [scale * x for x in Parameters().b]
@@ -111,15 +109,15 @@ class TestLaw:
             np.testing.assert_allclose(ours, theirs.detach().numpy(), atol=1e-5)
 
     def test_plants_can_be_made_and_their_set_points_held(self):
-        numbers = Draw(SMALL, 500, 60, 0).plants()
+        numbers = Draw(500, 60, SMALL.spread, 0).plants()
         room = torch.minimum(-numbers["u_min"], numbers["u_max"])
-        reach = room * numbers["gain_factor"] * through_plant.GAIN
+        reach = room * numbers["gain_factor"] * loops.GAIN
         assert (numbers["setpoint"].abs().amax(0) <= reach).all()
         assert (numbers["dead_zone"] < room).all()
         assert 0.1 < (numbers["noise_variance"] == 0.0).float().mean() < 0.7
 
     def test_what_is_told_wrongly_is_told_to_be_uncertain(self):
-        draw = Draw(replace(SMALL, spread=0.3), 4000, 1, 0)
+        draw = Draw(4000, 1, 0.3, 0)
         numbers = draw.plants()
         told = draw.told(numbers)
         off = (told["gain_factor"] / numbers["gain_factor"]).log()
@@ -134,7 +132,7 @@ class TestLaw:
 class TestGradient:
     def test_it_is_that_of_differences(self):
         net, samples = lively(SMALL).double(), 60
-        draw = Draw(SMALL, 3, samples, 0)
+        draw = Draw(3, samples, SMALL.spread, 0)
         numbers = {name: value.double() for name, value in draw.plants().items()}
         numbers |= {"dead_zone": torch.zeros(3, dtype=torch.double)}
         told = draw.told(numbers, exact=True)
