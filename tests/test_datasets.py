@@ -34,12 +34,11 @@ def test_the_recorded_actions_give_the_recorded_observations(name, minari, tmp_p
         assert np.array_equal(observation, episode.observations[0])
         for k, action in enumerate(episode.actions):
             assert env.action_space.contains(action)
-            observation, reward, terminated, truncated, _ = env.step(action)
+            observation, reward, *ended, _ = env.step(action)
             assert np.array_equal(observation, episode.observations[k + 1])
             assert reward == episode.rewards[k]
-            ended = episode.terminations[k], episode.truncations[k]
-            assert (terminated, truncated) == ended
-        assert truncated
+            assert ended == [episode.terminations[k], episode.truncations[k]]
+        assert ended == [False, True]
 
 
 def test_the_pi_of_the_set_is_the_paper_s():

@@ -9,13 +9,13 @@ import pytest
 
 from benchmarks.figures import command as figures
 from benchmarks.figures.__main__ import main
-from benchmarks.loop.rollout import Trajectory
+from benchmarks.loop.metrics import join
+from tests.conftest import trajectory
 
 
 def test_the_typical_run_is_the_median_one():
-    outputs = np.array([[1.0, 9.0, 4.0, 2.0]])  # errors 4, 4, 1, 3 of set point 5
-    still = np.zeros((1, 4))
-    runs = Trajectory(np.full((1, 4), 5.0), outputs, 10 * outputs, still, still, 5.0 - outputs)
+    outputs = [1.0, 9.0, 4.0, 2.0]  # errors 4, 4, 1, 3 of set point 5
+    runs = join([trajectory([5.0], [y], [10.0 * y]) for y in outputs])
     row = figures.summarise(runs).iloc[0]
     assert (row["setpoint"], row["output_typical"], row["command_typical"]) == (5.0, 2.0, 20.0)
     assert row["output_p10"] == pytest.approx(1 + 0.3 * (2 - 1))

@@ -1,6 +1,7 @@
 """The robustness study: its plants, its tasks, and what it makes of them."""
 
 import inspect
+import itertools
 import json
 from dataclasses import replace
 from unittest.mock import Mock
@@ -196,21 +197,16 @@ class TestFindings:
 
     @staticmethod
     def runs():
-        rows = []
-        for plant in range(20):
-            drift = None if plant < 10 else (0.5 if plant < 15 else 2.0)
-            for agent, late in (("nn", 1.0), ("nn-frozen", 2.0), ("pi-simc", 1.5)):
-                for run in range(3):
-                    better = agent == "nn" and drift == 2.0
-                    rows.append(
-                        {
-                            "agent": agent, "plant": plant, "run": run, "gain_drift": drift,
-                            "late": late + 2.0 * better, "mae": late, "ratio": late,
-                            "oscillates": plant == 0, "total_variation": 10.0, "useless": False,
-                            "delay": 18,
-                        }
-                    )  # fmt: skip
-        return pd.DataFrame(rows)
+        errors, drifts = {"nn": 1.0, "nn-frozen": 2.0, "pi-simc": 1.5}, [np.nan, 0.5, 2.0]
+        cells = itertools.product(errors, range(20), range(3))
+        runs = pd.DataFrame(cells, columns=["agent", "plant", "run"])
+        error = runs["agent"].map(errors)
+        drift = np.repeat(drifts, [10, 5, 5])[runs["plant"]]
+        worse = (runs["agent"] == "nn") & (drift == 2.0)
+        return runs.assign(
+            gain_drift=drift, late=error + 2.0 * worse, mae=error, ratio=error,
+            oscillates=runs["plant"] == 0, total_variation=10.0, useless=False, delay=18,
+        )  # fmt: skip
 
     def test_differences(self):
         table = report.differences(self.runs(), [("nn", "pi-simc")], "late").set_index("plants")

@@ -104,9 +104,9 @@ def window(monkeypatch):
 
 
 def test_interrupted(tmp_path, monkeypatch, capsys):
-    (tmp_path / "film.gif").write_bytes(b"earlier")
+    (tmp_path / "film.mp4").write_bytes(b"earlier")
     monkeypatch.setattr(rivals, "rollout", Mock(side_effect=KeyboardInterrupt))
-    assert main(["--video", "film.gif"]) == 130
+    assert main(["--video", "film.mp4"]) == 130
     assert "Interrupted" in capsys.readouterr().out
     assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"earlier"]
 
@@ -174,10 +174,8 @@ def test_your_hands_are_on_the_valve(window, quick_bound, capsys):
     errors = [abs(sample[0] - sample[1]) for sample, _ in screen[1:]]
     applied = [sample[3] for sample, _ in screen]
     mine = next(line for line in shown.splitlines() if line.split()[:1] == ["you"])
-    assert mine.split()[1:] == [
-        f"{np.mean(errors):.3f}",
-        f"{np.abs(np.diff(applied)).sum():.0f}",
-    ]
+    travel = np.abs(np.diff(applied)).sum()
+    assert mine.split()[1:] == [f"{np.mean(errors):.3f}", f"{travel:.0f}"]
     # Beside the controllers, on the same plant, and the bound.
     errors = np.abs(run_closed(MiddlePointEnv(), PIController(), SAMPLES)["error"][1:])
     pi = next(line for line in shown.splitlines() if line.split()[:1] == ["PI"])
