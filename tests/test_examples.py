@@ -122,7 +122,7 @@ class TestPPOInPyTorch:
 
     def test_values_at_an_end_are_those_of_the_last_observation(self, monkeypatch):
         monkeypatch.setitem(ppo_torch.TRAINING, "max_episode_steps", 5)
-        forward, estimate, kept = ppo_torch.Agent.forward, ppo_torch.estimate, []
+        forward, estimate, kept = ppo_torch.ActorCritic.forward, ppo_torch.estimate, []
 
         def error_for_a_value(agent, observations):
             return forward(agent, observations)[0], observations[:, 3]
@@ -131,7 +131,7 @@ class TestPPOInPyTorch:
             kept.append([x.clone() for x in (rewards, values, next_values, ends)])
             return estimate(rewards, values, next_values, ends, arguments)
 
-        monkeypatch.setattr(ppo_torch.Agent, "forward", error_for_a_value)
+        monkeypatch.setattr(ppo_torch.ActorCritic, "forward", error_for_a_value)
         monkeypatch.setattr(ppo_torch, "estimate", spy)
         ppo_torch.train(self.SMALL)
         for rewards, values, next_values, ends in kept:

@@ -7,7 +7,7 @@ from benchmarks.speed.__main__ import main
 def test_ratios_compare_rounds_with_each_other(monkeypatch):
     clock = iter([0, 1, 1, 3, 3, 5, 5, 6, 6, 7, 7, 11])  # began and ended, case after case
     monkeypatch.setattr(speed.time, "perf_counter", lambda: next(clock))
-    cases = [speed.Case("slow", lambda: None, 100), speed.Case("fast", lambda: None, 400)]
+    cases = [speed.Timed("slow", lambda: None, 100), speed.Timed("fast", lambda: None, 400)]
     table = speed.compare(cases, rounds=3)
     # Seconds: 1, 2, 1 and 2, 1, 4. Ratios of steps a second: 200/100, 400/50, 100/100.
     assert list(table["steps a second"]) == ["100", "200"]
@@ -15,7 +15,7 @@ def test_ratios_compare_rounds_with_each_other(monkeypatch):
 
 
 def peer(n):
-    yield speed.Case(f"{n} of a peer", lambda: None, n)
+    yield speed.Timed(f"{n} of a peer", lambda: None, n)
 
 
 def test_it_runs(monkeypatch, capsys):

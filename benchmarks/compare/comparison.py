@@ -25,7 +25,7 @@ LONG = {"mpc", "nn-self-tuning", "ppo", "self-tuning", "nn-smith"}
 
 
 @dataclass(frozen=True)
-class Case:
+class CaseResult:
     """The results of a controller in a scenario."""
 
     scenario: str
@@ -40,7 +40,9 @@ class Case:
     """Duration of the runs, s."""
 
 
-def run_case(scenario: Scenario, agent: str, members: Sequence[Factory], runs: int) -> Case:
+def run_case(
+    scenario: Scenario, agent: str, members: Sequence[Factory], runs: int
+) -> CaseResult:
     """Run all members of a controller on a scenario."""
     began = time.perf_counter()
     trajectories, rows, again = [], [], []
@@ -57,7 +59,7 @@ def run_case(scenario: Scenario, agent: str, members: Sequence[Factory], runs: i
         about = {"scenario": scenario.name, "agent": agent, "policy": number}
         seeds = {**about, "seed": range(SEED, SEED + runs)}
         rows.append(pd.DataFrame({**seeds, **measure(trajectory, scenario.parameters)}))
-    return Case(
+    return CaseResult(
         scenario.name,
         agent,
         pd.concat(rows, ignore_index=True),
@@ -76,16 +78,16 @@ class Comparison:
     """The members of each controller."""
     count: int
     """Number of runs of each member: the first episodes of `mptc_gym.evaluate`."""
-    cases: dict[tuple[str, str], Case] = field(default_factory=dict)
+    cases: dict[tuple[str, str], CaseResult] = field(default_factory=dict)
     """Finished cases, by controller and scenario."""
     scales: dict[str, Scale] = field(default_factory=dict)
     """The bounds that errors are measured against, by scenario."""
 
-    def run(self, fan_out: FanOut) -> Iterator[Case]:
+    def run(self, fan_out: FanOut) -> Iterator[CaseResult]:
         """Run everything and yield each case as it finishes; raise at the end if any failed."""
         scenarios = self.scenarios.values()
         # The bounds of drawn plants are the longest tasks of all.
-        tasks: dict[str, Callable[[], Case | Scale]] = {
+        tasks: dict[str, Callable[[], CaseResult | Scale]] = {
             f"{each.name}: bounds": partial(bounds, each, self.count)
             for each in sorted(scenarios, key=lambda each: not each.parameters.ranges)
         }
@@ -94,14 +96,14 @@ class Comparison:
             case = partial(run_case, each, agent, self.controllers[agent], self.count)
             tasks[f"{agent}, {each.name}"] = case
         for _, result in fan_out.stream(tasks, "compare"):
-            if isinstance(result, Case):
+            if isinstance(result, CaseResult):
                 self.cases[result.agent, result.scenario] = result
                 yield result
             else:
                 self.scales[result.scenario] = result
 
     @property
-    def finished(self) -> list[Case]:
+    def finished(self) -> list[CaseResult]:
         """Finished cases, in the order of controllers and scenarios."""
         order = itertools.product(self.controllers, self.scenarios)
         return [self.cases[key] for key in order if key in self.cases]

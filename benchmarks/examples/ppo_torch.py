@@ -71,7 +71,7 @@ DEGREES = 5.0  # divisor of temperatures at the inputs of the networks
 app = App(help=__doc__, version_flags=(), result_action="return_value")
 
 
-class Agent(nn.Module):
+class ActorCritic(nn.Module):
     """A Gaussian policy and a value function."""
 
     scale: Tensor
@@ -121,7 +121,7 @@ def estimate(
 
 
 @app.default
-def train(arguments: Annotated[Arguments, Parameter(name="*")] = DEFAULTS) -> Agent:
+def train(arguments: Annotated[Arguments, Parameter(name="*")] = DEFAULTS) -> ActorCritic:
     """Train a policy and return it."""
     torch.manual_seed(arguments.seed)
     device = arguments.device
@@ -132,7 +132,9 @@ def train(arguments: Annotated[Arguments, Parameter(name="*")] = DEFAULTS) -> Ag
     plants = MiddlePointTorchEnv(
         arguments.num_envs, device=device, autoreset_mode="SameStep", **TRAINING
     )
-    agent = Agent(cast("gymnasium.spaces.Box", plants.single_observation_space)).to(device)
+    agent = ActorCritic(cast("gymnasium.spaces.Box", plants.single_observation_space)).to(
+        device
+    )
     optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5)
     shape = arguments.num_steps, arguments.num_envs
     observations = torch.zeros(*shape, len(agent.scale), device=device)

@@ -52,7 +52,7 @@ PLANTS: dict[str, dict[str, Any]] = {"": {}, ", R = 0.5": NOISE, ", hard": PRESE
 
 
 @dataclass(frozen=True)
-class Case:
+class Timed:
     """A piece of code to time."""
 
     name: str
@@ -95,7 +95,7 @@ def execute(options: Options, console: Console) -> str:
 
     python = [sys.executable, "-c"]
     imports = [
-        Case(module, partial(subprocess.run, [*python, f"import {module}"], check=True), 1)
+        Timed(module, partial(subprocess.run, [*python, f"import {module}"], check=True), 1)
         for module in ("gymnasium", "mptc_gym")
     ]
     taken = 1000 * _alternately(imports, rounds)
@@ -111,7 +111,7 @@ def execute(options: Options, console: Console) -> str:
     )
 
 
-def compare(cases: list[Case], rounds: int) -> pd.DataFrame:
+def compare(cases: list[Timed], rounds: int) -> pd.DataFrame:
     """Time cases in turns for some rounds, and return one row per case.
 
     The ratio compares a case's steps a second with those of the first case in the same round.
@@ -151,7 +151,7 @@ def _memory(env: Any) -> int:
     return size
 
 
-def _single(name: str, special: str = "", **arguments: Any) -> Case:
+def _single(name: str, special: str = "", **arguments: Any) -> Timed:
     """Return the case of one environment, rendered at each step if it has a render mode."""
     env = gymnasium.make(name, **arguments)
     env.action_space.seed(0)
@@ -167,10 +167,10 @@ def _single(name: str, special: str = "", **arguments: Any) -> Case:
             if draws:
                 env.render()
 
-    return Case(name + special, run, len(actions))
+    return Timed(name + special, run, len(actions))
 
 
-def _vector(n: int) -> Iterable[Case]:
+def _vector(n: int) -> Iterable[Timed]:
     """Yield the cases of vector environments; a call is one plant episode and its reset."""
     kinds = [(REFERENCE, "", {}), *(("MiddlePoint-v0", *plant) for plant in PLANTS.items())]
     for name, special, arguments in kinds:
@@ -184,7 +184,7 @@ def _vector(n: int) -> Iterable[Case]:
         yield from PEERS[peer](n)
 
 
-def _envpool(n: int) -> Iterable[Case]:
+def _envpool(n: int) -> Iterable[Timed]:
     """Yield the case of CartPole in C++, on one thread."""
     import envpool
 
@@ -194,7 +194,7 @@ def _envpool(n: int) -> Iterable[Case]:
     yield _stepping(f"{REFERENCE} of envpool", envs, actions, PEER_STEPS)
 
 
-def _gymnax(n: int) -> Iterable[Case]:
+def _gymnax(n: int) -> Iterable[Timed]:
     """Yield CartPole in JAX on one CPU thread, step by step and as one compiled loop."""
     flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
     os.environ.setdefault("XLA_FLAGS", flags)  # read on the first use of JAX
@@ -228,13 +228,13 @@ def _gymnax(n: int) -> Iterable[Case]:
 
     for name, run in {"": stepped, ", one compiled loop": compiled}.items():
         run()  # the first call compiles
-        yield Case(f"{REFERENCE} of gymnax{name}", run, n * PEER_STEPS)
+        yield Timed(f"{REFERENCE} of gymnax{name}", run, n * PEER_STEPS)
 
 
-PEERS: dict[str, Callable[[int], Iterable[Case]]] = {"envpool": _envpool, "gymnax": _gymnax}
+PEERS: dict[str, Callable[[int], Iterable[Timed]]] = {"envpool": _envpool, "gymnax": _gymnax}
 
 
-def _in_torch(n: int, device: str, steps: int) -> Iterable[Case]:
+def _in_torch(n: int, device: str, steps: int) -> Iterable[Timed]:
     """Yield the cases of the PyTorch environment; a call waits for the device to finish."""
     for special, arguments in PLANTS.items():
         envs = MiddlePointTorchEnv(n, device=device, **arguments)
@@ -257,7 +257,7 @@ def on_device(device: str, rounds: int) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _through_the_plant(n: int) -> Case:
+def _through_the_plant(n: int) -> Timed:
     """Return the case of a forward and backward pass through plants and a policy."""
     envs = MiddlePointTorchEnv(n, max_episode_steps=None, differentiable=True)
     size = envs.parameters.observation_size
@@ -273,7 +273,7 @@ def _through_the_plant(n: int) -> Case:
             total = total + rewards.mean()
         total.backward()
 
-    return Case(f"gradient through {n:,} plants and {BACKWARD} samples", train, n * BACKWARD)
+    return Timed(f"gradient through {n:,} plants and {BACKWARD} samples", train, n * BACKWARD)
 
 
 def _stepping(
@@ -282,7 +282,7 @@ def _stepping(
     actions: list[Any],
     steps: int,
     wait: Callable[[], object] = lambda: None,
-) -> Case:
+) -> Timed:
     """Return the case of a batch that cycles through the actions, then waits for its device."""
 
     def run() -> None:
@@ -290,10 +290,10 @@ def _stepping(
             envs.step(actions[k % len(actions)])
         wait()
 
-    return Case(name, run, steps * len(actions[0]))
+    return Timed(name, run, steps * len(actions[0]))
 
 
-def _alone() -> Case:
+def _alone() -> Timed:
     """Return the case of one plant and its network, without a batch."""
     env = gymnasium.make("MiddlePoint-v0", **NOISE)
     controller = DirectNNController()
@@ -304,17 +304,17 @@ def _alone() -> Case:
         for _ in range(EPISODE):
             observation, *_ = env.step(controller.act(observation))
 
-    return Case("one, no batch", step, EPISODE)
+    return Timed("one, no batch", step, EPISODE)
 
 
-def _closed_loop(n: int) -> Case:
+def _closed_loop(n: int) -> Timed:
     """Return the case of a batch of plants and their networks."""
     plants, controller = make_plants(n, EPISODE, **NOISE), DirectNNController(num_envs=n)
     run = partial(rollout, plants, controller, EPISODE, seed=0)
-    return Case(f"batch of {n:,}", run, n * EPISODE)
+    return Timed(f"batch of {n:,}", run, n * EPISODE)
 
 
-def _alternately(cases: list[Case], rounds: int) -> pd.DataFrame:
+def _alternately(cases: list[Timed], rounds: int) -> pd.DataFrame:
     """Time the cases in turns, and return seconds: one row per round, one column per case."""
     rows = []
     for _ in tqdm(range(rounds), leave=False):
