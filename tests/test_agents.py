@@ -378,8 +378,6 @@ class TestFiles:
             with pytest.raises(ValueError, match=f"holds no {kind}"):
                 SAVED[kind].load(file)
         assert capsys.readouterr().out == ""
-
-    def test_a_missing_one(self, tmp_path, kind):
         with pytest.raises(FileNotFoundError):
             SAVED[kind].load(tmp_path / "missing.npz")
 

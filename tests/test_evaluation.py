@@ -222,8 +222,9 @@ class TestRefusals:
         network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
         with pytest.raises(ValueError, match=r"the windows that policy wants, .*=\d+, got"):
             evaluate(network)
-        with pytest.raises(ValueError, match="newest error as element 3"):
-            evaluate(PIController(), setpoint_window=7)
+        for windows in ({"setpoint_window": 7}, {"error_window": 0, "output_window": 3}):
+            with pytest.raises(ValueError, match="newest error as element 3"):
+                evaluate(PIController(), **windows)
 
     def test_episodes_that_end_apart(self):
         class Ends(gymnasium.Wrapper):

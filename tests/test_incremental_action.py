@@ -1,6 +1,5 @@
 """The wrappers whose action changes the flow."""
 
-import json
 import warnings
 from functools import partial
 
@@ -89,12 +88,9 @@ def test_drawn_numbers_are_those_of_the_episode():
     for _ in range(5):
         _, info = env.reset(seed=None if drawn else 3)
         drawn.add(info["dead_zone"])
-        least = env.step(np.array([1e-9]))[4]["applied"]
-        assert least == pytest.approx(info["dead_zone"], abs=1e-4)
-        assert env.step(np.array([1.0]))[4]["applied"] == pytest.approx(info["u_max"], abs=1e-4)
-        assert env.step(np.array([-1.0]))[4]["applied"] == pytest.approx(
-            info["u_min"], abs=1e-4
-        )
+        applied = [env.step(np.array([move]))[4]["applied"] for move in (1e-9, 1.0, -1.0)]
+        drawn_numbers = [info[name] for name in ("dead_zone", "u_max", "u_min")]
+        assert applied == pytest.approx(drawn_numbers, abs=1e-4)
     assert len(drawn) == 5
 
 
@@ -172,7 +168,6 @@ def test_the_spec_makes_it_again():
     spec = EnvSpec.from_json(env.spec.to_json())
     again = gymnasium.make(spec)
     assert isinstance(again, IncrementalAction)
-    assert json.loads(again.spec.to_json()) == json.loads(env.spec.to_json())
     for _ in range(2):
         assert infos_of(env, [0.4, -1.0, 0.2]) == infos_of(again, [0.4, -1.0, 0.2])
 
