@@ -141,6 +141,13 @@ class Controller(ABC):
     Controllers are dataclasses: their fields are the arguments of the constructor, and types
     such as `Positive` state which values are allowed.
 
+    Parameters
+    ----------
+    u_min
+        Lower limit of the actuator, t/h.
+    u_max
+        Upper limit of the actuator, t/h. Limits scale the action; they do not clip commands.
+
     Attributes
     ----------
     n_obs : int
@@ -156,9 +163,7 @@ class Controller(ABC):
     """
 
     u_min: Number = -10.0
-    """Lower limit of the actuator, t/h."""
     u_max: Number = 10.0
-    """Upper limit of the actuator, t/h. Limits scale the action; they do not clip commands."""
     n_obs: int = field(init=False, repr=False)
     command: Values = field(init=False, repr=False)
 
@@ -225,19 +230,30 @@ class Controller(ABC):
 
 @dataclass(eq=False, kw_only=True)
 class ToldController(Controller):
-    """A controller that is told the results of a step test and the actuator's numbers."""
+    """A controller that is told the results of a step test and the actuator's numbers.
+
+    The limits are those of `Controller`.
+
+    Parameters
+    ----------
+    gain
+        Steady-state gain of the plant, degC per t/h; positive or negative.
+    time_constant
+        Time constant of the plant, s.
+    delay
+        Delay of the plant, s, including the one sample that any input takes to show.
+    dead_zone
+        Half width of the actuator's dead zone, t/h; 0 if unknown. Commands inside it reach the
+        plant as 0; those on its edge have an effect.
+    sampling_interval
+        Sampling interval, s.
+    """
 
     gain: Gain
-    """Steady-state gain of the plant, degC per t/h; positive or negative."""
     time_constant: Positive
-    """Time constant of the plant, s."""
     delay: NotNegative
-    """Delay of the plant, s, including the one sample that any input takes to show."""
     dead_zone: NotNegative = 0.0
-    """Half width of the actuator's dead zone, t/h; 0 if unknown. Commands inside it reach the
-    plant as 0; those on its edge have an effect."""
     sampling_interval: Positive = 8.0
-    """Sampling interval, s."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -67,40 +67,57 @@ class DirectNNController(Controller):
     sample k, then their update from e(k) and the activations of that pass. All it knows of the
     plant is the direction D(G) of its response. `u_min` and `u_max` are U_min and U_max, the
     range of the command.
+
+    Parameters
+    ----------
+    n_inputs
+        N, number of inputs, which are the first N elements of the observation.
+    n_hidden
+        N_1, number of hidden nodes.
+    eta
+        eta^y, gain factor of W, the weights from the inputs to the hidden nodes.
+    eta_1
+        eta_1^y, gain factor of W_1, the weights from the hidden nodes to the output.
+    eta_theta
+        eta_theta^y, gain factor of theta_1, the thresholds of the hidden nodes.
+    eta_1_theta
+        eta_1theta^y, gain factor of theta_2, the threshold of the output.
+    direction
+        D(G): -1 for a plant whose output falls when its input rises, 1 for the opposite.
+    input_scale
+        Factor from the observation (degC) to the inputs X_i. The paper does not state one.
+    weight_scale
+        Initial weights and thresholds are drawn uniformly from [-weight_scale, weight_scale].
+        The paper says "selected randomly".
+    error_index
+        Index of e(k), degC, in the observation.
+    seed
+        Seed of the initial weights.
+    num_envs
+        Number of loops in a batch, each with its own network; None for a single loop. Member i
+        equals a single controller with seed `seed + i`, bit for bit.
+    learning
+        Whether the weights are updated; it can be changed at any time.
+    update_interval
+        The weights are updated at every `update_interval`-th sample, starting with the first of
+        an episode.
     """
 
     n_inputs: Size = 6
-    """N, number of inputs, which are the first N elements of the observation."""
     n_hidden: Size = 3
-    """N_1, number of hidden nodes."""
     # `python -m benchmarks.tune nn` found the gain factors and both scales.
     eta: NotNegative = 5.3
-    """eta^y, gain factor of W, the weights from the inputs to the hidden nodes."""
     eta_1: NotNegative = 0.0303
-    """eta_1^y, gain factor of W_1, the weights from the hidden nodes to the output."""
     eta_theta: NotNegative = 0.0462
-    """eta_theta^y, gain factor of theta_1, the thresholds of the hidden nodes."""
     eta_1_theta: NotNegative = 0.0372
-    """eta_1theta^y, gain factor of theta_2, the threshold of the output."""
     direction: Number = -1
-    """D(G): -1 for a plant whose output falls when its input rises, 1 for the opposite."""
     input_scale: Number = 0.021
-    """Factor from the observation (degC) to the inputs X_i. The paper does not state one."""
     weight_scale: NotNegative = 1.68
-    """Initial weights and thresholds are drawn uniformly from [-weight_scale, weight_scale].
-    The paper says "selected randomly"."""
     error_index: Index = 3
-    """Index of e(k), degC, in the observation."""
     seed: Index = 0
-    """Seed of the initial weights."""
     num_envs: int | None = None
-    """Number of loops in a batch, each with its own network; None for a single loop. Member i
-    equals a single controller with seed `seed + i`, bit for bit."""
     learning: Flag = True
-    """Whether the weights are updated; it can be changed at any time."""
     update_interval: Count = 1
-    """The weights are updated at every `update_interval`-th sample, starting with the first of
-    an episode."""
 
     observation = PAPER_WINDOWS  # for the default indices
 

@@ -24,15 +24,23 @@ class NeuralSelfTuningController(SelfTuningController):
     The bank of models replaces the model that a `NeuralSmithPredictor` is told, and the spread
     of the bank replaces the uncertainty. New estimates are adopted at once: the network was
     trained on models that are wrong, and is told how wrong they may be.
+
+    The other parameters are those of `SelfTuningController`, except for
+    `closed_loop_time_constant`.
+
+    Parameters
+    ----------
+    network
+        The weights; by default those that come with the project.
+    haste
+        How much quicker the law is than the network asks for, see `agents.neural_law.Law`. The
+        network was trained with fixed models; the residual of a changing model is sooner out of
+        date. 0 halves the valve travel in noise.
     """
 
     forgetting: Positive = 0.999
     network: LawNetwork = field(default_factory=LawNetwork.load, repr=False)
-    """The weights; by default those that come with the project."""
     haste: NotNegative = 0.75
-    """How much quicker the law is than the network asks for, see `agents.neural_law.Law`. The
-    network was trained with fixed models; the residual of a changing model is sooner out of
-    date. 0 halves the valve travel in noise."""
     closed_loop_time_constant: float = field(init=False, default=0.15)
 
     _every, _share, _caution, _noise = 2, 1.0, 1.0, 0.25

@@ -29,21 +29,31 @@ class NeuralSmithPredictor(ToldController):
     inputs are scaled by the plant's reach and by the sampling interval, so one set of weights
     serves plants of either sign, with any limits and any sampling interval. With a first-order
     model and a time constant of at least 90 samples, it acts every second sample or less often.
+
+    The other parameters are those of `ToldController`.
+
+    Parameters
+    ----------
+    coefficients
+        A and B of the stable plant, if more than a first-order model is known: `a[0]` is 1, and
+        `b` begins with z^-1. Their gain replaces `gain`.
+    uncertainty
+        Standard deviation of the gain, as a share of it; 0 where the numbers are exact. It also
+        stands for the time constant, which may be wrong by half as much again, and for the
+        delay: 0.1 means two samples.
+    setpoint_index
+        Index of y_d(k), degC, in the observation.
+    error_index
+        Index of e(k), degC, in the observation.
+    network
+        The weights; by default those that come with the project.
     """
 
     coefficients: tuple[Sequence[float], Sequence[float]] | None = None
-    """A and B of the stable plant, if more than a first-order model is known: `a[0]` is 1, and
-    `b` begins with z^-1. Their gain replaces `gain`."""
     uncertainty: NotNegative = 0.0
-    """Standard deviation of the gain, as a share of it; 0 where the numbers are exact. It also
-    stands for the time constant, which may be wrong by half as much again, and for the delay:
-    0.1 means two samples."""
     setpoint_index: Index = 0
-    """Index of y_d(k), degC, in the observation."""
     error_index: Index = 3
-    """Index of e(k), degC, in the observation."""
     network: LawNetwork = field(default_factory=LawNetwork.load, repr=False)
-    """The weights; by default those that come with the project."""
 
     observation = PAPER_WINDOWS  # for the default indices
 

@@ -29,19 +29,28 @@ class PIController(Controller):
 
     The signs suit a plant whose output falls when its input rises, D(G) = -1. For a plant of
     the opposite direction, both gains are negative.
+
+    `u_min` and `u_max` are those of `Controller`.
+
+    Parameters
+    ----------
+    kp
+        Proportional gain Kp, t/h per degC.
+    ki
+        Integral gain Ki, t/h per degC and sample.
+    anti_windup
+        Whether to hold the sum while the command is beyond a limit and the error would drive it
+        further (conditional integration; Astrom and Hagglund, "PID Controllers", 2nd edition,
+        1995, section 3.5). The paper's controller always integrates.
+    error_index
+        Index of e(k), degC, in the observation.
     """
 
     kp: Number = 2.2
-    """Proportional gain Kp, t/h per degC."""
     ki: Number = 0.3
-    """Integral gain Ki, t/h per degC and sample."""
     _: KW_ONLY
     anti_windup: Flag = False
-    """Whether to hold the sum while the command is beyond a limit and the error would drive it
-    further (conditional integration; Astrom and Hagglund, "PID Controllers", 2nd edition, 1995,
-    section 3.5). The paper's controller always integrates."""
     error_index: Index = 3
-    """Index of e(k), degC, in the observation."""
 
     observation = PAPER_WINDOWS  # for the default indices
 

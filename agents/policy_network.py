@@ -59,23 +59,34 @@ class PolicyNetwork(Controller):
     The observation is multiplied by `input_scale` and passed through the layers. The activation
     follows every layer but the last, whose single output is clipped to [-1, 1]. This output is
     the action or, with `increments`, the velocity of the valve. All arithmetic is in float64.
+
+    `u_min` and `u_max` are those of `Controller`.
+
+    Parameters
+    ----------
+    layers
+        Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
+    observation
+        The windows of the observation that the network expects, by the names of the
+        environment's arguments: `setpoint_window`, `error_window`, `output_window`,
+        `action_window`. A window that is not named is 0.
+    input_scale
+        Factor for each element of the observation; shape (n_obs,).
+    activation
+        Activation of the hidden layers: "elu", "relu" or "tanh".
+    increments
+        The velocity form, if the network was trained in it; otherwise None.
+    provenance
+        Origin of the weights, JSON-serialisable.
     """
 
     layers: Sequence[tuple[Array, Array]] = field(repr=False)
-    """Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer."""
     _: KW_ONLY
     observation: Mapping[str, int]
-    """The windows of the observation that the network expects, by the names of the
-    environment's arguments: `setpoint_window`, `error_window`, `output_window`,
-    `action_window`. A window that is not named is 0."""
     input_scale: Array = field(repr=False)
-    """Factor for each element of the observation; shape (n_obs,)."""
     activation: str = "elu"
-    """Activation of the hidden layers: "elu", "relu" or "tanh"."""
     increments: Increments | None = None
-    """The velocity form, if the network was trained in it; otherwise None."""
     provenance: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    """Origin of the weights, JSON-serialisable."""
 
     _advice = "; the environment needs the network's `observation` as arguments"
 

@@ -73,23 +73,35 @@ class SelfTuningController(ToldController):
       so keep its sign.
     - Without evidence, the controller is that of the step test. Errors below 0.02 degC are no
       evidence, and a new design is adopted gradually.
+
+    The other parameters are those of `ToldController`.
+
+    Parameters
+    ----------
+    dead_zone
+        Best guess of the half width of the actuator's dead zone, t/h. The bank holds this one
+        and up to seven around it.
+    shortest_delay
+        Shortest delay d that the plant may have, samples; an input shows after d + 1.
+    longest_delay
+        Longest delay d that the plant may have, samples; at most 10,000.
+    closed_loop_time_constant
+        Time constant of the closed loop, as a share of the identified one of the plant.
+    forgetting
+        Forgetting factor per sample, above 0 and at most 1; 1 forgets nothing.
+    setpoint_index
+        Index of y_d(k), degC, in the observation.
+    error_index
+        Index of e(k), degC, in the observation.
     """
 
     dead_zone: NotNegative = 5.0
-    """Best guess of the half width of the actuator's dead zone, t/h. The bank holds this one
-    and up to seven around it."""
     shortest_delay: Index = 6
-    """Shortest delay d that the plant may have, samples; an input shows after d + 1."""
     longest_delay: Index = 36
-    """Longest delay d that the plant may have, samples; at most 10,000."""
     closed_loop_time_constant: Positive = 0.15
-    """Time constant of the closed loop, as a share of the identified one of the plant."""
     forgetting: Positive = 0.996
-    """Forgetting factor per sample, above 0 and at most 1; 1 forgets nothing."""
     setpoint_index: Index = 0
-    """Index of y_d(k), degC, in the observation."""
     error_index: Index = 3
-    """Index of e(k), degC, in the observation."""
 
     observation = PAPER_WINDOWS  # for the default indices
 

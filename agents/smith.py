@@ -26,10 +26,16 @@ class SmithPredictor(ToldController, PIController):
     Progress 53, 1957, 217-219).
     The gains are SIMC's for the plant without delay, with anti-windup. The model sees the
     command as the actuator passes it, after the dead zone and the limits.
+
+    The other parameters are those of `ToldController`, and `error_index`.
+
+    Parameters
+    ----------
+    closed_loop_time_constant
+        Time constant of the closed loop without the delay, s.
     """
 
     closed_loop_time_constant: Positive
-    """Time constant of the closed loop without the delay, s."""
     kp: Number = field(init=False)
     ki: Number = field(init=False)
     anti_windup: Flag = field(init=False, default=True)
