@@ -125,14 +125,6 @@ class TestFit:
         assert model.estimates["delay"].value == 18
         assert model.plant.gain == pytest.approx(whole.plant.gain, rel=0.05)
 
-    def test_gap_in_the_middle_is_no_bridge(self):
-        first, second, hole = recorded(700), recorded(700, seed=702), np.full(80, np.nan)
-        flow = np.concatenate([first.flow, hole, second.flow])
-        temperature = np.concatenate([first.temperature, hole, second.temperature])
-        model = identify(Log(flow, temperature, 8.0))
-        assert model.estimates["delay"].value == 18
-        assert model.estimates["noise_variance"].value == pytest.approx(0.05, rel=0.1)
-
     @pytest.mark.parametrize(
         ("plant", "longest_delay", "said"),
         [
