@@ -1,4 +1,4 @@
-"""What holds for many plants in NumPy and in PyTorch alike: the shell that both share."""
+"""Test the shell that batches in NumPy and in PyTorch share."""
 
 import inspect
 from functools import partial

@@ -1,4 +1,4 @@
-"""What all commands have in common: their help, and how they end."""
+"""Test what all commands have in common: their help, and how they end."""
 
 import importlib
 import re

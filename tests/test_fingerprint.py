@@ -1,4 +1,4 @@
-"""What makes a kept result valid, and what does not."""
+"""Test which changes invalidate a kept result."""
 
 import sys
 

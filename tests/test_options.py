@@ -1,4 +1,4 @@
-"""What is off by default: transmitter noise, disturbance, other dynamics, fouling, ranges."""
+"""Test what is off by default: transmitter noise, load, other dynamics, fouling, ranges."""
 
 from pathlib import Path
 
