@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from agents.controller import (
 SEARCHED_GAINS = {"kp": 1.34, "ki": 0.0456}
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class PIController(Controller):
     """PI controller u(k) = -Kp e(k) - Ki sum_{i<=k} e(i), as printed in Section 5.
 
@@ -46,9 +46,8 @@ class PIController(Controller):
         Index of e(k), degC, in the observation.
     """
 
-    kp: Number = 2.2
-    ki: Number = 0.3
-    _: KW_ONLY
+    kp: Number = field(default=2.2, kw_only=False)
+    ki: Number = field(default=0.3, kw_only=False)
     anti_windup: Flag = False
     error_index: Index = 3
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, field
+from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -52,7 +52,7 @@ class Increments:
         check_number("dead_zone", self.dead_zone, 0)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class PolicyNetwork(Controller):
     """A feed-forward network from the latest observation to an action.
 
@@ -80,8 +80,7 @@ class PolicyNetwork(Controller):
         Origin of the weights, JSON-serialisable.
     """
 
-    layers: Sequence[tuple[Array, Array]] = field(repr=False)
-    _: KW_ONLY
+    layers: Sequence[tuple[Array, Array]] = field(repr=False, kw_only=False)
     observation: Mapping[str, int]
     input_scale: Array = field(repr=False)
     activation: str = "elu"
