@@ -66,6 +66,12 @@ def test_stable_baselines3_learns_with_the_lines_of_the_page():
         assert model.learn(1).num_timesteps == 8 * model.n_envs
 
 
+def test_the_page_names_the_one_change_that_cleanrl_needs():
+    page = (ROOT / "benchmarks/examples/clients.md").read_text(encoding="utf-8")
+    (change,) = re.findall(r"change\s+`(.+?)`\s+to\s+`(.+?)`", page)  # .ci/clients makes it
+    assert change == ("np.clip(obs, -10, 10))", "np.clip(obs, -10, 10), env.observation_space)")
+
+
 @pytest.mark.parametrize("algorithm", [PPO, SAC])
 def test_settings_for_rl_zoo_make_a_model_that_learns(algorithm):
     file = ROOT / f"benchmarks/examples/rl_zoo/{algorithm.__name__.lower()}.yml"
