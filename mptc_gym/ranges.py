@@ -19,8 +19,7 @@ class Ranges:
 
     Every plant number has its own draw, whether it is a range or not, so that one more range
     does not change the others' draws. `names` are the arguments that are ranges. `given` are
-    all plant numbers, with the lower end of a range, and `given_arrays` the same as arrays of
-    shape ().
+    all plant numbers, with the lower end of a range, as arrays of shape ().
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -28,10 +27,8 @@ class Ranges:
         # The disturbance's draws follow those of the plant numbers.
         self._draws = bool(self.names) or parameters.is_disturbed
         self._ranges = {name: parameters.range_of(name) for name in self.names}
-        lows = {name: parameters.range_of(name)[0] for name in PLANT_NUMBERS}
-        self.given: PlantNumbers[float] = PlantNumbers(**lows)
-        self.given_arrays: PlantNumbers[Values] = PlantNumbers(
-            **{name: np.array(low) for name, low in lows.items()}
+        self.given: PlantNumbers[Values] = PlantNumbers(
+            **{name: np.array(parameters.range_of(name)[0]) for name in PLANT_NUMBERS}
         )
 
     def draw(self, streams: Sequence[EpisodeStream]) -> PlantNumbers[Values]:
@@ -40,7 +37,7 @@ class Ranges:
         Drawn numbers have the shape (len(streams),), others the shape ().
         """
         if not self._draws:
-            return self.given_arrays
+            return self.given
         draws = np.empty((len(streams), DRAWS))
         for stream, row in zip(streams, draws, strict=True):
             stream.next_episode().random(out=row)
@@ -51,7 +48,7 @@ class Ranges:
                 drawn[name] = low + np.floor(share * (high + 1 - low)).astype(int)
             else:
                 drawn[name] = low + share * (high - low)
-        return replace(self.given_arrays, **drawn)
+        return replace(self.given, **drawn)
 
 
 def numbers_of_plant(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:

@@ -17,7 +17,7 @@ from benchmarks.loop import linear
 from benchmarks.loop.linear import Coefficients, LinearModel, course, nominal
 from mptc_gym import MiddlePointEnv, Parameters
 from mptc_gym.parameters import ARGUMENTS
-from mptc_gym.ranges import Ranges
+from mptc_gym.ranges import Ranges, numbers_of_plant
 from tests.conftest import run
 
 OTHER = {"delay": 7, "gain_factor": 1.3, "time_constant_factor": 2.0, "dead_zone": 0.0}
@@ -45,7 +45,7 @@ def test_a_course_is_the_environment_while_it_drifts(rng):
     arguments = {**OTHER, **DRIFT}
     flow, output = outputs(rng, **arguments)
     parameters = Parameters(**arguments)
-    of_plant = course(parameters, Ranges(parameters).given, len(flow))
+    of_plant = course(parameters, numbers_of_plant(Ranges(parameters).given, 0), len(flow))
     np.testing.assert_allclose(of_plant.flow_response() @ flow, output, rtol=0, atol=1e-12)
     assert np.abs(nominal(parameters).response(flow) - output).max() > 0.1
 

@@ -54,7 +54,7 @@ def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vect
 
 def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[Array]:
     """Return the plant numbers that the environment draws for each run, shape (runs,)."""
-    numbers = Ranges(parameters).given_arrays.chosen(tuple(PLANT_NUMBERS))
+    numbers = Ranges(parameters).given.chosen(tuple(PLANT_NUMBERS))
     if parameters.ranges:
         plants = make_plants(runs, 1, **asdict(parameters))
         _, info = plants.reset(seed=seed)
