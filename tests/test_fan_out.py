@@ -58,6 +58,12 @@ class TestNumbers:
         assert [path.name for path in tmp_path.iterdir()] == ["a%2Fb%3A c.json"]
         assert fresh["a/b: c"] == {"numbers": [1, 0.1, float("inf")], "text": "°C"}
 
+    def test_a_result_that_json_cannot_hold_costs_no_other(self, tmp_path):
+        with pytest.raises(TasksFailedError, match="a set: TypeError") as raised:
+            run({"a set": partial(set, "a"), **work(2)}, tmp_path, jobs=1)
+        assert [*raised.value.errors] == ["a set"]
+        assert run(work(2), tmp_path) == run(work(2))
+
 
 class TestResume:
     def test_only_what_is_missing_runs(self, tmp_path, calls):

@@ -7,6 +7,7 @@ process runs the task, or when, as long as all its randomness comes from its arg
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 import time
@@ -14,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
@@ -95,12 +96,11 @@ class FanOut:
         for key, file in files.items():
             with suppress(FileNotFoundError, ValueError):  # not there, or damaged
                 results[key] = unseal(file.read_text(encoding="utf-8"))
-        missing = {key: tasks[key] for key in tasks if key not in results}
-        for key, result in self.stream(missing, title, len(results)):
-            text = seal(result)
-            results[key] = unseal(text)
+        missing = {key: partial(_as_json, tasks[key]) for key in tasks if key not in results}
+        for key, text in self.stream(missing, title, len(results)):
+            results[key] = json.loads(text)
             if folder:
-                write_text(files[key], text)
+                write_text(files[key], seal(results[key]))
         return {key: results[key] for key in tasks}
 
     def stream(self, tasks: Tasks, title: str = "", done: int = 0) -> Iterator[tuple[str, Any]]:
@@ -151,7 +151,10 @@ def _local(tasks: Tasks, jobs: int | None) -> Iterator[cluster.Answer]:
                 yield key, result, error, False
         except BrokenExecutor as lost:
             # Any of the tasks under way may have killed the worker.
-            losses.update(key for key in started if key in away)
+            under_way = [key for key in started if key in away]
+            if not under_way:
+                raise
+            losses.update(under_way)
             for key in suspects:
                 del away[key]
                 yield key, None, f"{lost}\nIts worker was lost each time.", True
@@ -187,6 +190,11 @@ def _travels(task: Callable[[], Any]) -> bool:
     except Exception:
         return False
     return True
+
+
+def _as_json(task: Callable[[], Any]) -> str:
+    """Run a task; a result that JSON cannot hold is then an error of that task alone."""
+    return json.dumps(task())
 
 
 def _answer(key: str, task: Callable[[], Any], parent: int) -> tuple[str, Any, str]:
