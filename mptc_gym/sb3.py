@@ -3,7 +3,7 @@
     from stable_baselines3 import PPO
     from mptc_gym.sb3 import ScoreCallback, make_vec_env
 
-    plants = make_vec_env("MiddlePoint-v0", 64, seed=0, wrapper={"undo_dead_zone": True},
+    plants = make_vec_env("MiddlePoint-v0", 64, seed=0, wrapper={"compensate_dead_zone": True},
                           action_window=20, setpoint="random")
     model = PPO("MlpPolicy", plants, n_steps=64).learn(200_000, ScoreCallback(path="best.zip"))
 

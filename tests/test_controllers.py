@@ -176,7 +176,7 @@ class TestOwnControllers:
 @pytest.fixture(scope="module")
 def zips(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
-    velocity = {"max_move": 0.3, "undo_dead_zone": True}
+    velocity = {"max_move": 0.3, "compensate_dead_zone": True}
     for seed in (0, 1):
         windows = {"action_window": 20, "error_window": 2}
         plants = make_vec_env("MiddlePoint-v0", 2, wrapper=velocity, **windows)

@@ -32,7 +32,7 @@ def proportional(observations):
 
 def wrapped(**arguments):
     env = gymnasium.make(HARD, action_window=20, **arguments)
-    return IncrementalAction(env, max_move=0.2, undo_dead_zone=True)
+    return IncrementalAction(env, max_move=0.2, compensate_dead_zone=True)
 
 
 class TestPresets:
@@ -119,7 +119,7 @@ class TestEvaluate:
         made = partial(MiddlePointEnv, **PRESETS["hard"], action_window=20)
         one_by_one = evaluate(
             proportional,
-            lambda: IncrementalAction(made(), max_move=0.2, undo_dead_zone=True),
+            lambda: IncrementalAction(made(), max_move=0.2, compensate_dead_zone=True),
             episodes=4,
         )
         assert by_spec.least_possible is not None

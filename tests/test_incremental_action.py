@@ -54,16 +54,26 @@ def infos_of(env, moves, *, seed=0):
         ({"dead_zone": 0.0}, {"max_move": 0.3}, [17], [3]),
         # The first flow is none, whatever the limits.
         *(
-            ({"u_min": -7.3, "u_max": 12.9}, {"undo_dead_zone": undo}, [0], [0])
-            for undo in (False, True)
+            ({"u_min": -7.3, "u_max": 12.9}, {"compensate_dead_zone": compensate}, [0], [0])
+            for compensate in (False, True)
         ),
-        # A number is undone, whatever the dead zone is: a quarter wants half of the way.
+        # A number is compensated, whatever the dead zone is: a quarter wants half of the way.
         *(
-            ({"dead_zone": z}, {"max_move": 2, "undo_dead_zone": 6}, [0.25], [6 + 4 * 0.5])
+            (
+                {"dead_zone": z},
+                {"max_move": 2, "compensate_dead_zone": 6},
+                [0.25],
+                [6 + 4 * 0.5],
+            )
             for z in (0.0, [1.0, 4.0], 5.0)
         ),
         # A limit within the dead zone is reached.
-        ({"u_min": -3, "u_max": 9}, {"max_move": 2, "undo_dead_zone": True}, [-0.1], [-3]),
+        (
+            {"u_min": -3, "u_max": 9},
+            {"max_move": 2, "compensate_dead_zone": True},
+            [-0.1],
+            [-3],
+        ),
     ],
 )
 def test_flows_by_hand(arguments, wrapper, moves, flows):
@@ -72,8 +82,8 @@ def test_flows_by_hand(arguments, wrapper, moves, flows):
 
 
 @pytest.mark.parametrize("dead_zone", [0.1, 5.0, 7.0, 10.0])
-def test_every_flow_passes_the_dead_zone_that_is_undone(dead_zone):
-    env = make({"dead_zone": dead_zone}, max_move=2.0, undo_dead_zone=True)
+def test_every_flow_passes_the_dead_zone_that_is_compensated(dead_zone):
+    env = make({"dead_zone": dead_zone}, max_move=2.0, compensate_dead_zone=True)
     for wanted in (1e-12, 1e-3, 0.5, 1.0, -1e-12, -0.3, -1.0):
         # 2 is the whole range, from -1 to 1, and so a move of w / 2 wants w.
         env.reset(seed=0)
@@ -83,7 +93,7 @@ def test_every_flow_passes_the_dead_zone_that_is_undone(dead_zone):
 
 
 def test_drawn_numbers_are_those_of_the_episode():
-    env = make(RANGES, max_move=2.0, undo_dead_zone=True)
+    env = make(RANGES, max_move=2.0, compensate_dead_zone=True)
     drawn = set()
     for _ in range(5):
         _, info = env.reset(seed=None if drawn else 3)
@@ -122,9 +132,9 @@ def test_a_bad_action_changes_nothing(plants, bad):
     ("name", "value"),
     [
         ("max_move", 0.0), ("max_move", 2.1), ("max_move", float("nan")), ("max_move", "x"),
-        ("max_move", True), ("undo_dead_zone", -1.0), ("undo_dead_zone", float("inf")),
-        ("undo_dead_zone", "yes"), ("undo_dead_zone", None),
-        ("undo_dead_zone", 10**400),
+        ("max_move", True), ("compensate_dead_zone", -1.0), ("compensate_dead_zone", np.inf),
+        ("compensate_dead_zone", "yes"), ("compensate_dead_zone", None),
+        ("compensate_dead_zone", 10**400),
     ],
 )  # fmt: skip
 def test_bad_arguments_are_named(name, value):
@@ -164,7 +174,7 @@ def test_tensors_are_actions_but_those_with_a_graph_are_refused_for_many():
 
 
 def test_the_spec_makes_it_again():
-    env = make({"action_window": 20}, max_move=0.3, undo_dead_zone=True)
+    env = make({"action_window": 20}, max_move=0.3, compensate_dead_zone=True)
     spec = EnvSpec.from_json(env.spec.to_json())
     again = gymnasium.make(spec)
     assert isinstance(again, IncrementalAction)
@@ -177,7 +187,7 @@ def test_both_checkers_have_no_complaint():
         warnings.simplefilter("error")
         # That it is a wrapper is all that Gymnasium's has to say.
         warnings.filterwarnings("ignore", message=".*is different from the unwrapped version")
-        env = IncrementalAction(MiddlePointEnv(action_window=20), undo_dead_zone=True)
+        env = IncrementalAction(MiddlePointEnv(action_window=20), compensate_dead_zone=True)
         check_env(env, skip_render_check=True)
         checker = pytest.importorskip("stable_baselines3.common.env_checker")
         checker.check_env(env)
@@ -189,22 +199,22 @@ def test_reset_comes_first(env):
         env.step(np.zeros(env.action_space.shape, np.float32))
 
 
-def batches(mode, *, undo):
+def batches(mode, *, compensate):
     """Return three times the same: wrapped one by one, and two batches that are wrapped."""
-    wrapped = partial(make, RANGES, undo_dead_zone=undo)
+    wrapped = partial(make, RANGES, compensate_dead_zone=compensate)
     return (
         SyncVectorEnv([wrapped] * PLANTS, autoreset_mode=mode),
         *(
-            many.IncrementalAction(envs, undo_dead_zone=undo)
+            many.IncrementalAction(envs, compensate_dead_zone=compensate)
             for envs in native_and_sync(PLANTS, mode, LIMIT, **RANGES)
         ),
     )
 
 
-@pytest.mark.parametrize("undo", [False, True, 4.0])
+@pytest.mark.parametrize("compensate", [False, True, 4.0])
 @pytest.mark.parametrize("mode", MODES)
-def test_a_batch_is_each_of_them_wrapped(rng, mode, undo):
-    envs = batches(mode, undo=undo)
+def test_a_batch_is_each_of_them_wrapped(rng, mode, compensate):
+    envs = batches(mode, compensate=compensate)
     reference = envs[0]
     for env in envs[1:]:
         assert env.single_action_space == reference.single_action_space

@@ -81,7 +81,7 @@ class TestPPO:
         assert [count for count, _ in replace(SMALL, calm=0.0).plants] == [4]
         assert [count for count, _ in replace(SMALL, calm=1.0).plants] == [4]
 
-    def test_the_action_changes_the_flow_and_the_dead_zone_is_undone(self):
+    def test_the_action_changes_the_flow_and_the_dead_zone_is_compensated(self):
         plants = ppo_training.begin(replace(SMALL, max_move=0.2)).get_env()
         plants.seed(0)
         plants.reset()
@@ -168,7 +168,7 @@ def test_without_torch_a_policy_does_what_it_does_in_its_wrapper(scale):
     network = ppo_training.exported(model.policy.state_dict(), SMALL)
     plants = make_plants(3, 80, setpoint=5.0, noise_variance=0.5, **SMALL.observation)
     run = rollout(plants, network, 80, seed=1)
-    wrapped = IncrementalAction(plants, max_move=SMALL.max_move, undo_dead_zone=5.0)
+    wrapped = IncrementalAction(plants, max_move=SMALL.max_move, compensate_dead_zone=5.0)
     observations, info = wrapped.reset(seed=1)
     moves = []
     for k in range(80):

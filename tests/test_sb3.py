@@ -25,7 +25,7 @@ ARGUMENTS = {
     "max_episode_steps": 30, "noise_variance": 0.5, "setpoint": "random", "setpoint_period": 20,
 }  # fmt: skip
 TWO = [(3, ARGUMENTS), (1, {**ARGUMENTS, "noise_variance": 0.0})]
-VELOCITY = {"max_move": 0.3, "undo_dead_zone": True}
+VELOCITY = {"max_move": 0.3, "compensate_dead_zone": True}
 TRAINING = {"action_window": 20, "setpoint": "random", "reward": "absolute"}
 
 

@@ -46,7 +46,7 @@ def make_model(seed: int) -> PPO:
     plants = make_vec_env(
         "MiddlePoint-v0",
         64,
-        wrapper={"max_move": 1.0, "undo_dead_zone": True},
+        wrapper={"max_move": 1.0, "compensate_dead_zone": True},
         setpoint_window=SETPOINTS,
         error_window=ERRORS,
         action_window=ACTIONS,

@@ -24,9 +24,9 @@ class PPOArguments:
     samples do not remove it."""
     max_move: float = 1.0
     """Change of the flow at an action of 1, as a share of half its range."""
-    undo_dead_zone: float = DEAD_ZONE
-    """Half width of the dead zone that is undone between policy and plant, t/h. A comparison
-    uses that of the plant it runs."""
+    compensate_dead_zone: float = DEAD_ZONE
+    """Half width of the dead zone that is compensated between policy and plant, t/h. A
+    comparison uses that of the plant it runs."""
     noise_variance: float = 0.5
     """R of the noisy training plants, degC^2. A policy trained with noise acts less nervously,
     and does better on a different dead zone than a policy trained with that one."""

@@ -98,7 +98,7 @@ def begin(arguments: PPOArguments, start: int = 0) -> PPO:
             IncrementalAction(
                 gymnasium.make_vec("MiddlePoint-v0", count, autoreset_mode="SameStep", **given),
                 max_move=arguments.max_move,
-                undo_dead_zone=arguments.undo_dead_zone,
+                compensate_dead_zone=arguments.compensate_dead_zone,
             )
             for count, given in arguments.plants
         )
@@ -149,7 +149,7 @@ def exported(state: Mapping[str, torch.Tensor], arguments: PPOArguments) -> Poli
         observation={name: getattr(parameters, name) for name in WINDOWS},
         input_scale=np.ones(parameters.observation_size),
         activation="tanh",
-        increments=Increments(arguments.max_move, arguments.undo_dead_zone),
+        increments=Increments(arguments.max_move, arguments.compensate_dead_zone),
         provenance={"arguments": asdict(arguments)},
     )
 

@@ -36,7 +36,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     and the command is u(k) = v(k). This spares the valve, and makes exploration effective, as
     changes last.
 
-    With `undo_dead_zone`, the command skips the dead zone, of half width z::
+    With `compensate_dead_zone`, the command skips the dead zone, of half width z::
 
         v > 0:   u =  z + (u_max - z) v / u_max
         v = 0:   u =  0
@@ -60,10 +60,11 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     max_move
         Change of the wanted flow by an action of 1, as a share of half the range: above 0, up
         to 2.
-    undo_dead_zone
-        False leaves the dead zone as it is. True undoes the plant's own; if that is a range,
-        the one drawn for the episode, from the info of `reset`. A number undoes a dead zone of
-        that half width in t/h, whatever the plant's. Drawn limits are also the episode's.
+    compensate_dead_zone
+        False leaves the dead zone as it is. True compensates the plant's own; if that is a
+        range, the one drawn for the episode, from the info of `reset`. A number compensates a
+        dead zone of that half width in t/h, whatever the plant's. Drawn limits are also the
+        episode's.
 
     Raises
     ------
@@ -78,7 +79,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     >>> import gymnasium, mptc_gym
     >>> from mptc_gym.wrappers import IncrementalAction
     >>> env = gymnasium.make("MiddlePoint-v0", action_window=20)
-    >>> env = IncrementalAction(env, max_move=0.4, undo_dead_zone=True)
+    >>> env = IncrementalAction(env, max_move=0.4, compensate_dead_zone=True)
     """
 
     def __init__(
@@ -86,18 +87,20 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         env: gymnasium.Env[Any, Any],
         *,
         max_move: float = 0.4,
-        undo_dead_zone: bool | float = False,
+        compensate_dead_zone: bool | float = False,
     ) -> None:
         if isinstance(env, VectorEnv):
             allowed = "one environment; mptc_gym.wrappers.vector.IncrementalAction takes many"
             reject("env", env, allowed)
-        RecordConstructorArgs.__init__(self, max_move=max_move, undo_dead_zone=undo_dead_zone)
+        RecordConstructorArgs.__init__(
+            self, max_move=max_move, compensate_dead_zone=compensate_dead_zone
+        )
         gymnasium.ActionWrapper.__init__(self, env)
         parameters = getattr(env.unwrapped, "parameters", None)
         if not isinstance(parameters, Parameters):
             reject("env", env, "a MiddlePointEnv, in wrappers or not")
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
-        self._arguments = max_move, undo_dead_zone
+        self._arguments = max_move, compensate_dead_zone
         self._numbers = {name: parameters.range_of(name)[0] for name in NUMBERS}
         self._actuator = Actuator(self._numbers, *self._arguments)
         self._flow: float | None = None
@@ -133,19 +136,23 @@ class Actuator:
     """
 
     def __init__(
-        self, numbers: Mapping[str, Any], max_move: float, undo_dead_zone: bool | float
+        self, numbers: Mapping[str, Any], max_move: float, compensate_dead_zone: bool | float
     ) -> None:
         if not is_number(max_move) or not 0.0 < max_move <= 2.0:
             reject("max_move", max_move, "a number above 0, up to 2")
-        if not isinstance(undo_dead_zone, bool) and not (
-            is_number(undo_dead_zone) and undo_dead_zone >= 0.0
+        if not isinstance(compensate_dead_zone, bool) and not (
+            is_number(compensate_dead_zone) and compensate_dead_zone >= 0.0
         ):
-            reject("undo_dead_zone", undo_dead_zone, "True, False or a number from 0 to 1e9")
+            reject(
+                "compensate_dead_zone",
+                compensate_dead_zone,
+                "True, False or a number from 0 to 1e9",
+            )
         own, self.u_min, self.u_max = (numbers[name] for name in NUMBERS)
         half_range = (self.u_max - self.u_min) / 2.0
         self.move = max_move * half_range  # change of the wanted flow by an action of 1, t/h
-        self._undoes = undo_dead_zone is not False
-        self._zone = z = own if undo_dead_zone is True else undo_dead_zone
+        self._compensates = compensate_dead_zone is not False
+        self._zone = z = own if compensate_dead_zone is True else compensate_dead_zone
         # A limit inside the dead zone is reached by commanding the edge, which (29) limits.
         self._above, self._below = (
             np.maximum(limit - z, 0.0) / np.where(limit > 0.0, limit, 1.0)
@@ -159,7 +166,7 @@ class Actuator:
 
     def action(self, flow: Any) -> Any:
         """Return the environment's action for a wanted flow in t/h, a float or an array."""
-        if not self._undoes:
+        if not self._compensates:
             return action_from_command(flow, self.u_min, self.u_max)
         above, below = flow > 0.0, flow < 0.0
         flow = above * (self._zone + self._above * flow) - below * (

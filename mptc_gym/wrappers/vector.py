@@ -32,7 +32,7 @@ class IncrementalAction(VectorActionWrapper):
     env
         A `MiddlePointVectorEnv`, or another vector environment of `MiddlePointEnv` in NumPy,
         such as Gymnasium's `SyncVectorEnv`. All three autoreset modes and partial resets work.
-    max_move, undo_dead_zone
+    max_move, compensate_dead_zone
         See `mptc_gym.wrappers.IncrementalAction`.
 
     Raises
@@ -47,7 +47,7 @@ class IncrementalAction(VectorActionWrapper):
         env: VectorEnv[Any, Any, Any],
         *,
         max_move: float = 0.4,
-        undo_dead_zone: bool | float = False,
+        compensate_dead_zone: bool | float = False,
     ) -> None:
         if not isinstance(env, VectorEnv):
             allowed = "a vector environment; mptc_gym.wrappers.IncrementalAction takes one"
@@ -55,7 +55,7 @@ class IncrementalAction(VectorActionWrapper):
         super().__init__(env)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._arguments = max_move, undo_dead_zone
+        self._arguments = max_move, compensate_dead_zone
         plants = _parameters(env)
         self._numbers = {
             name: np.array([plant.range_of(name)[0] for plant in plants]) for name in NUMBERS
