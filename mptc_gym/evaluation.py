@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 import warnings
 from collections.abc import Callable
 from contextlib import closing
@@ -23,7 +24,7 @@ from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.policies import acting, check_fit, trained_on
-from mptc_gym.presets import IDS
+from mptc_gym.presets import IDS, PRESETS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
@@ -68,7 +69,7 @@ class Evaluation:
     seeds: range
     """Seeds of the episodes."""
     least_possible: float | None = None
-    """Least possible mean error of these episodes, degC: see `benchmarks/limits`."""
+    """Least possible mean error of these episodes, degC: see `benchmarks/bounds`."""
     multiple: float | None = None
     """`mean_error / least_possible`."""
     score: float | None = None
@@ -179,7 +180,7 @@ valve travel 0 t/h; 100 episodes, all alike
     )
     least = least_errors(parameters, samples, seeds)
     if least is None:
-        return dataclasses.replace(found, missing=_missing(parameters))
+        return dataclasses.replace(found, missing=_missing(parameters, samples, seeds))
     plants: Batch = partial(MiddlePointVectorEnv, **dataclasses.asdict(parameters))
     rest = action_from_command(0.0, parameters.u_min, parameters.u_max)
     idle, _, _ = _run(plants, lambda seen: np.full((len(seen), 1), rest), seeds, samples)
@@ -212,7 +213,7 @@ def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values |
 
 @cache
 def _kept() -> dict[Parameters, Values]:
-    """Return the bounds written by `python -m benchmarks.limits --package`, by case."""
+    """Return the bounds written by `python -m benchmarks.bounds --package`, by case."""
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
     cases = json.loads(text)["cases"].values()
     return {_case(Parameters(**case["arguments"])): np.array(case["least"]) for case in cases}
@@ -224,15 +225,24 @@ def _case(parameters: Parameters) -> Parameters:
     return dataclasses.replace(parameters, **defaults)
 
 
-def _missing(parameters: Parameters) -> str:
-    """Return a message that says how to compute a missing bound."""
-    case = dataclasses.asdict(_case(parameters))
-    options = "".join(
-        f" --set {name}={value if isinstance(value, str) else json.dumps(value)}"
-        for name, value in case.items()
-        if value != ARGUMENTS[name].default
-    ).replace(", ", ",")
-    return f"no bound is kept for this case: python -m benchmarks.limits{options}"
+def _missing(parameters: Parameters, samples: int, seeds: range) -> str:
+    """Return a message with the command that computes a missing bound."""
+    case, options = _case(parameters), []
+    for name, given in PRESETS.items():
+        if case == _case(Parameters(**given)):
+            options = ["--preset", name]
+    if not options:
+        for name, value in dataclasses.asdict(case).items():
+            if value != ARGUMENTS[name].default:
+                text = json.dumps(value, separators=(",", ":")).strip('"')
+                options += ["--set", f"{name}={text}"]
+    asked = {"samples": samples, "episodes": len(seeds), "seed": seeds.start}
+    usual = {"samples": SAMPLES, "episodes": EPISODES, "seed": SEED}
+    for name, value in asked.items():
+        if value != usual[name]:
+            options += [f"--{name}", str(value)]
+    command = shlex.join(["python", "-m", "benchmarks.bounds", *options])
+    return f"no bound is kept for this case: {command}"
 
 
 def _interval(gained: Values, possible: Values) -> tuple[float, float]:

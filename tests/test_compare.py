@@ -19,6 +19,7 @@ import pandas as pd
 import pytest
 
 from agents import DirectNNController, PIController
+from benchmarks.bounds import least_possible
 from benchmarks.compare import command, plots, report
 from benchmarks.compare import tables as compare_tables
 from benchmarks.compare.__main__ import main
@@ -29,7 +30,6 @@ from benchmarks.lib import storage, tables
 from benchmarks.lib.drawing import drawn
 from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.statistics import Estimate
-from benchmarks.limits import least_possible
 from benchmarks.loop.metrics import METRICS, measure
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import SCENARIOS
@@ -310,7 +310,7 @@ class TestCompare:
         responses = pd.read_csv(out / "constant.csv")
         assert len(responses) == 2 * 600
         assert (responses["output_p10"] <= responses["output_p90"]).all()
-        for name in ("constant.png", "constant-noise.png", "limits.png", "runs.png"):
+        for name in ("constant.png", "constant-noise.png", "bounds.png", "runs.png"):
             picture = matplotlib.image.imread(out / name)
             assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
 
@@ -480,7 +480,7 @@ class TestCompare:
         monkeypatch.setattr(tempfile, "TemporaryFile", Mock(side_effect=read_only))
         assert "Read-only file system" in refused(main, ["--out", tmp_path / "out"])
 
-    @pytest.mark.parametrize("name", ["runs.csv", "limits.png", "report.html"])
+    @pytest.mark.parametrize("name", ["runs.csv", "bounds.png", "report.html"])
     def test_a_disk_that_gets_full(self, name, compared, monkeypatch, capsys):
         real = Path.replace
 

@@ -13,7 +13,6 @@ from benchmarks.controllers.options import chosen
 from benchmarks.controllers.own import own_factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command_line import UsageError
-from benchmarks.limits.verify import errors
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.scenarios import Scenario
 from benchmarks.sweep.tasks import agent_task
@@ -22,6 +21,7 @@ from benchmarks.watch import rivals
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from mptc_gym.sb3 import make_vec_env, spec_of
+from tests.verify_bounds import errors
 
 ACTUATOR = {"u_min": -9.0, "u_max": 14.0, "dead_zone": 4.0}
 # A plant of the other direction, which shows an input sooner.

@@ -1,6 +1,7 @@
 """Tests of `mptc_gym.evaluate`, of the bounds that come with it, and of the presets' ids."""
 
 import json
+import shlex
 from functools import partial
 from types import SimpleNamespace
 
@@ -12,8 +13,9 @@ from gymnasium.spaces import Box
 
 from agents import DirectNNController, PIController, PolicyNetwork
 from agents.archive import PRETRAINED
-from benchmarks.limits import least_possible
-from benchmarks.limits.command import PACKAGED as CASES
+from benchmarks.bounds import least_possible
+from benchmarks.bounds.__main__ import main as bounds_command
+from benchmarks.bounds.command import PACKAGED as CASES
 from mptc_gym import IDS, PRESETS, MiddlePointEnv, Parameters, evaluate
 from mptc_gym.evaluation import SEED, least_errors
 from mptc_gym.wrappers import IncrementalAction
@@ -153,10 +155,32 @@ class TestEvaluate:
         assert len(repr(found)) < 80
         same = str(evaluate(idle, episodes=2))  # an interval of no width would mean nothing
         assert same.endswith("score 0.000; valve travel 0 t/h; 2 episodes, all alike")
-        other = evaluate(PIController(), episodes=2, delay=[5, 9], setpoint="random")
-        assert str(other).endswith(
-            "python -m benchmarks.limits --set delay=[5,9] --set setpoint=random"
-        )
+
+    @pytest.mark.parametrize(
+        ("arguments", "advice"),
+        [
+            ({"max_episode_steps": 60}, "--preset paper --samples 60 --episodes 2"),
+            ({"env": HARD, "seed": 3}, "--preset hard --episodes 2 --seed 3"),
+            (
+                {"delay": [5, 9], "setpoint": "random", "seed": SEED + 7},
+                "--set 'delay=[5,9]' --set setpoint=random --episodes 2 --seed 7000007",
+            ),
+            ({"setpoint": [1, 2.5], "a": (1.0, -0.9), "b": (0.2,), "max_episode_steps": 30},
+             "--set 'a=[1.0,-0.9]' --set 'b=[0.2]' --set 'setpoint=[1.0,2.5]' --samples 30 "
+             "--episodes 2"),
+        ],
+    )  # fmt: skip
+    def test_where_no_bound_is_kept_it_says_the_command_that_computes_it(
+        self, arguments, advice, tmp_path, capsys
+    ):
+        found = str(evaluate(idle, episodes=2, **arguments))
+        command = f"python -m benchmarks.bounds {advice}"
+        assert found.endswith(f"no bound is kept for this case: {command}")
+        case = {"samples": arguments.pop("max_episode_steps", 1200), "episodes": 2, **arguments}
+        case = {**PRESETS["hard" if case.pop("env", "") else "paper"], **case}
+        least = least_possible(kind="preview", folder=None, **case)
+        assert bounds_command([*shlex.split(command)[3:], f"--cache={tmp_path}"]) == 0
+        assert f"{least:.3f}" in capsys.readouterr().out
 
     def test_it_needs_numpy_and_gymnasium_alone(self):
         code = (

@@ -7,12 +7,12 @@ import pytest
 from scipy import signal
 
 from agents import PIController
+from benchmarks.bounds import __main__ as command
+from benchmarks.bounds import frontier, least_possible
 from benchmarks.controllers import engineered
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.step_test import step_test
 from benchmarks.identify.margins import Loop
-from benchmarks.limits import __main__ as limits
-from benchmarks.limits import frontier, least_possible
 from benchmarks.loop import linear
 from benchmarks.loop.linear import Coefficients, LinearModel, course, nominal
 from mptc_gym import MiddlePointEnv, Parameters
@@ -98,7 +98,7 @@ def nonlinear_span(monkeypatch):
 
 @pytest.mark.usefixtures("nonlinear_span")
 def test_the_command_for_bounds_says_that_a_plant_is_not_linear(refused):
-    said = refused(limits.main, ["--set", "temperature_span=49"])
+    said = refused(command.main, ["--set", "temperature_span=49"])
     assert "temperature_span=49: temperature_span must be 50.0" in said
 
 

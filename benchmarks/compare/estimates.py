@@ -25,7 +25,7 @@ from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
 
 if TYPE_CHECKING:
-    from benchmarks.limits import LeastPossible
+    from benchmarks.bounds import LeastPossible
 
 Score = tuple[Estimate, dict[str, float]]  # overall, and by scenario
 
@@ -39,8 +39,8 @@ class Scale:
 
     scenario: str
     least: LeastPossible
-    """The least possible error that applies: of the kind "news", "reference" or "preview", as
-    `benchmarks.limits.least_possible` chooses."""
+    """The least possible error that applies: of the kind "causal", "reference" or "preview", as
+    `benchmarks.bounds.least_possible` chooses."""
     preview: LeastPossible
     """The least possible error of any controller, even with preview."""
     drawn: bool
@@ -54,7 +54,7 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
 
     Bounds of drawn plants and set points are means over the episodes that are run.
     """
-    from benchmarks.limits import is_random, least_possible  # here, as SciPy is slow to load
+    from benchmarks.bounds import is_random, least_possible  # here, as SciPy is slow to load
 
     case: dict[str, Any] = {
         "samples": scenario.samples,
@@ -69,10 +69,10 @@ def bounds(scenario: Scenario, runs: int) -> Scale:
     """Return the bounds on the errors of a scenario, with the frontier.
 
     The frontier is sorted by descending travel; between two of its points the bound is the
-    straight line. Drawn plants and set points have no frontier: it would take linear programmes
+    straight line. Drawn plants and set points have no frontier: it would take linear programs
     for every episode, more than a picture is worth.
     """
-    from benchmarks.limits import frontier
+    from benchmarks.bounds import frontier
 
     scale, parameters = scale_of(scenario, runs), scenario.parameters
     if parameters.ranges or parameters.setpoint == "random":

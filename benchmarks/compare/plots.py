@@ -56,7 +56,7 @@ def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> N
         below.set_xlim(0, minutes.max())
 
 
-def plot_limits(estimates: pd.DataFrame, path: Path) -> None:
+def plot_bounds(estimates: pd.DataFrame, path: Path) -> None:
     """Draw mean errors with 95 % intervals; each axis begins at the least possible error."""
     with _scenario_panels(path, estimates) as (found, shades):
         for axes, rows in found:

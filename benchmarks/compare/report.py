@@ -59,7 +59,7 @@ def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -
 
     plots: dict[str, tuple[Any, ...]] = {
         "travel.png": ("travel", summary, scales),
-        "limits.png": ("limits", estimates),
+        "bounds.png": ("bounds", estimates),
         "runs.png": ("runs", runs),
     }
     drawn = [agent for agent in agents if agent not in ROSTER or ROSTER[agent].drawn] or agents
@@ -147,7 +147,7 @@ def _sections(
                 "at the least possible error, the vertical line.",
             ],
             tables.ratio_table(estimates, scales),
-            ["limits.png"],
+            ["bounds.png"],
         ),
         Section(
             "Error against valve travel",

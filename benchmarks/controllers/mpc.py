@@ -1,6 +1,6 @@
 """Implement a predictive controller that knows plant and actuator exactly, not the future.
 
-It shows how close a controller can come to the bounds of `benchmarks.limits`.
+It shows how close a controller can come to the bounds of `benchmarks.bounds`.
 """
 
 from __future__ import annotations

@@ -8,13 +8,13 @@ from typing import Any
 
 import pandas as pd
 
+from benchmarks.bounds import least_possible
+from benchmarks.bounds.linear_program import NotSolvedError
 from benchmarks.identify import plots
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import plant_arguments
 from benchmarks.identify.tuning import Recommended, recommended, reduced
 from benchmarks.lib.report import Section
-from benchmarks.limits import least_possible
-from benchmarks.limits.programme import NotSolvedError
 from benchmarks.loop.metrics import mean_error, reversals, travel
 from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
@@ -225,8 +225,8 @@ def _bounds(arguments: dict[str, Any], samples: int) -> tuple[float, str]:
         return math.nan, f"The least possible mean error is not known: {why}."
     least = f"{values[-1]:.4g} °C"
     if len(values) > 1:
-        least += " if a change of the set point is news and finds the plant settled, and "
-        least += f"{values[0]:.4g} °C"
+        least += " for one that learns of a change when it happens, with the plant settled, "
+        least += f"and {values[0]:.4g} °C"
     return values[-1], (
         f"The least possible mean error is {least} for a controller that knows the set point "
         "beforehand."

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.bounds import least_possible
 from benchmarks.controllers.records import Factory
-from benchmarks.limits import least_possible
 from benchmarks.loop.designs import Arguments
 from benchmarks.loop.metrics import held, measure
 from benchmarks.loop.rollout import Trajectory
@@ -20,7 +20,7 @@ def limit_task(plant: Arguments, samples: int) -> float | None:
     """Return the least mean |e| on a plant, degC; None if it does not settle between changes.
 
     This is the least possible error if each change of the set point finds the plant settled
-    and is not foreseen; see `benchmarks.limits`.
+    and is not foreseen; see `benchmarks.bounds`.
     """
     case = {**plant, **SETPOINT}
     try:

@@ -9,9 +9,9 @@ from typing import Any
 import pandas as pd
 from gymnasium.vector import SyncVectorEnv
 
+from benchmarks.bounds import least_possible
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.limits import least_possible
 from benchmarks.loop.metrics import mean_error, travel
 from benchmarks.loop.rollout import Agent, Trajectory, rollout
 from benchmarks.loop.scenarios import Scenario

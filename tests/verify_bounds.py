@@ -1,23 +1,20 @@
-"""Run every controller against its bound, on cases that nothing was tuned on."""
+"""Run every controller against its bound, an hour on one core: `python -m tests.verify_bounds`.
+
+Nothing was tuned on these cases. The output is kept in benchmarks/published.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from benchmarks.bounds.least import LeastPossible, least_possible, theorem
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import student
-from benchmarks.limits.bounds import LeastPossible, least_possible, theorem
 from benchmarks.loop.linear import nominal
 from benchmarks.loop.metrics import mean_error
 from mptc_gym import PRESETS, Parameters
@@ -94,49 +91,21 @@ def beats(found: Array, least: LeastPossible) -> bool:
     return student(difference).high < -1e-6 * least.value
 
 
-def verify(
-    runs: int, folder: Path, fan_out: FanOut, cases: Sequence[str] = ()
-) -> tuple[pd.DataFrame, list[str]]:
-    """Run every controller `runs` times on each of `CASES`, or on some of them.
-
-    Bounds and runs are kept in a folder as soon as they are known.
-
-    Returns
-    -------
-    DataFrame, list of str
-        One row for each case, with the bound that applies and each controller's mean error,
-        degC; and the controllers that beat their bound, with the case.
-    """
-    cases = cases or tuple(CASES)
-    factories = controllers()
-    tasks: dict[str, Callable[[], Any]] = {}
-    for case in cases:
-        tasks[f"bound, {case}"] = partial(_bound, runs, CASES[case])
-        for name, factory in factories.items():
-            tasks[f"{name}, {case}"] = partial(_errors, factory, runs, CASES[case])
-    sources = [factory.module for factory in factories.values()]
-    kept = folder / f"verify-{fingerprint('benchmarks.limits.verify', *sources, runs=runs)}"
-    results = fan_out.run(tasks, kept, title="verify")
-    rows, beaten = [], []
-    for case in cases:
-        least = LeastPossible(**results[f"bound, {case}"])
-        row = {"case": case, "bound": f"{least.value:.3f}", "kind": least.kind}
-        for name in factories:
-            found = np.array(results[f"{name}, {case}"])
-            row[name] = f"{found.mean():.3f}"
-            if beats(found, least):
-                beaten.append(f"{name} in {case} ({found.mean():.4f}, bound {least.value:.4f})")
-                row[name] += " !"
-        rows.append(row)
-    return pd.DataFrame(rows), beaten
+def main(runs: int = 300) -> int:
+    """Print the bound of each case and each controller's mean error, degC."""
+    rows, beaten, factories = [], [], controllers()
+    for name, arguments in CASES.items():
+        kind = theorem(Parameters(**arguments))
+        least = least_possible(samples=SAMPLES, kind=kind, episodes=runs, **arguments)
+        rows.append({"case": name, "bound": f"{least.value:.3f}", "kind": least.kind})
+        for each, factory in factories.items():
+            found = errors(factory, runs, SAMPLES, **arguments)
+            rows[-1][each] = f"{found.mean():.3f}"
+            beaten += [f"{each}: {name}"] if beats(found, least) else []
+    print(pd.DataFrame(rows).to_string(index=False))
+    print("Beaten beyond the interval:", ", ".join(beaten) or "no bound")
+    return 1 if beaten else 0
 
 
-def _bound(runs: int, case: dict[str, Any]) -> dict[str, Any]:
-    kind = theorem(Parameters(**case))
-    return asdict(
-        least_possible(samples=SAMPLES, kind=kind, episodes=runs, folder=None, **case)
-    )
-
-
-def _errors(factory: Factory, runs: int, case: dict[str, Any]) -> list[float]:
-    return list(errors(factory, runs, SAMPLES, **case))
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,13 +1,13 @@
-"""Declare the options of `python -m benchmarks.limits`."""
+"""Declare the options of `python -m benchmarks.bounds`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.lib.options import Count, FanOutOptions, Runs, options
+from benchmarks.lib.options import Count, FanOutOptions, Runs, Seed, options
 from benchmarks.loop.plants import PlantOptions
-from mptc_gym.evaluation import EPISODES
+from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
 
 
 @options
@@ -20,15 +20,15 @@ class Options:
 
     mpc: Runs | None = None
     """Also run the predictive controller this many times on each plant."""
-    verify: bool = False
-    """Run every controller against the bounds instead."""
     package: bool = False
     """Write the bounds of the presets that ship with the package instead."""
-    runs: Runs = 300
-    """Runs of each controller in each case of --verify."""
     fan_out: FanOutOptions = field(default_factory=FanOutOptions)
     plant: PlantOptions = field(default_factory=PlantOptions)
+    samples: Count = SAMPLES
+    """Length of an episode of each plant, samples."""
     episodes: Count = EPISODES
     """Episodes to average a bound over, where plants or set points are drawn."""
+    seed: Seed = SEED
+    """Seed of the first episode."""
     cache: Path | None = None
-    """Folder in which computed bounds are kept (default: results/limits)."""
+    """Folder in which computed bounds are kept (default: results/bounds)."""

@@ -1,4 +1,4 @@
-"""Print bounds, test them, or write those of the package."""
+"""Print bounds, or write those of the package."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from typing import Any
 import pandas as pd
 from rich.console import Console
 
+from benchmarks.bounds.least import CACHE, least_possible
+from benchmarks.bounds.options import Options
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import UsageError, blame, out_folder
+from benchmarks.lib.command_line import blame, out_folder
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import Estimate, bootstrap
 from benchmarks.lib.storage import ROOT, commit, versions, write_json
 from benchmarks.lib.tables import on_screen
-from benchmarks.limits.bounds import CACHE, least_possible
-from benchmarks.limits.options import Options
-from benchmarks.limits.verify import errors, verify
 from benchmarks.loop.linear import check_linear
+from benchmarks.loop.metrics import mean_error
+from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.scenarios import SCENARIOS, Scenario, scenarios_of
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
 
-HEADINGS = {"preview": "with preview", "news": "without preview", "reference": "reference"}
+HEADINGS = {"preview": "with preview", "causal": "without preview", "reference": "reference"}
 PACKAGE = ROOT / "mptc_gym" / "bounds.json"
 MORE = 20  # episodes beyond those of a score, for choosing policies
 PACKAGED = PRESETS | {
@@ -36,35 +37,23 @@ PACKAGED = PRESETS | {
 
 NOTE = (
     "With preview: no controller does better on average, even one that knows the set point "
-    "beforehand. Without: none to which a change of the set point is news; for random set "
-    "points alone, which have a law. Reference: without preview, if each change finds the "
+    "beforehand. Without: none that learns of a change of the set point when it happens; for "
+    "random set points alone, which have a law. Reference: the same, if each change finds the "
     "plant settled; a controller that counts samples can come below it. Where a set point "
     "never changes, the three are the same. 95 % intervals over drawn episodes."
 )
 
 
 def execute(options: Options, console: Console) -> str:
-    """Print the bounds of the scenarios and of the presets, or test them.
-
-    With `--verify` the exit status is 1 if a controller beats a bound beyond its interval.
-    """
-    plant = options.plant.chosen()
-    if options.verify and (plant.arguments or options.mpc):
-        raise UsageError("--verify: goes without --mpc, --plant, --preset and --set")
+    """Print the bounds of the scenarios and of the presets, or of another plant."""
+    plant, one = options.plant.chosen(), options.plant != PlantOptions()
     cache = out_folder(options.cache or CACHE, "--cache")
     fan_out = options.fan_out.open()
     if options.package:
         write_package(cache, fan_out)
         return f"Written to {PACKAGE}"
-    if options.verify:
-        table, beaten = verify(options.runs, cache, fan_out)
-        console.print(on_screen(table))
-        if beaten:
-            console.print(f"Beaten beyond the interval: {'; '.join(beaten)}.")
-            raise SystemExit(1)
-        return "No controller beats the bound that applies to it, beyond its interval."
     cases: Mapping[str, Mapping[str, Any]] = PRESETS
-    if plant.arguments:
+    if one:
         with blame(plant.name):
             check_linear(Parameters(**plant.arguments))
         scenarios = scenarios_of(plant.name, plant.arguments)
@@ -72,10 +61,9 @@ def execute(options: Options, console: Console) -> str:
     # Cases with drawn plants take longest, and start first.
     first = sorted(cases, key=lambda name: not Parameters(**cases[name]).ranges)
     tasks: dict[str, Callable[[], Any]] = {
-        name: partial(row, name, cases[name], cache, options.episodes, options.mpc)
-        for name in first
+        name: partial(row, name, cases[name], cache, options) for name in first
     }
-    compared = [] if plant.arguments else list(SCENARIOS.values())
+    compared = [] if one or options.samples != SAMPLES else list(SCENARIOS.values())
     tasks |= {
         f"scenario {each.name}": partial(row_of_scenario, each, cache) for each in compared
     }
@@ -84,7 +72,7 @@ def execute(options: Options, console: Console) -> str:
         console.print("The scenarios of `python -m benchmarks.compare`, °C:")
         table = pd.DataFrame([rows[f"scenario {each.name}"] for each in compared])
         console.print(on_screen(table))
-    console.print(f"{plant.name if plant.arguments else 'The presets'}, mean |e| in °C:")
+    console.print(f"{plant.name if one else 'The presets'}, mean |e| in °C:")
     console.print(on_screen(pd.DataFrame([rows[name] for name in cases])))
     return NOTE
 
@@ -99,21 +87,23 @@ def row_of_scenario(scenario: Scenario, cache: Path) -> dict[str, str]:
 
 
 def row(
-    name: str, arguments: Mapping[str, Any], cache: Path, episodes: int, mpc: int | None
+    name: str, arguments: Mapping[str, Any], cache: Path, options: Options
 ) -> dict[str, str]:
-    """Return a row of the table of plants, with the error of `mpc` runs of MPC, if any."""
-    case = {"samples": SAMPLES, "episodes": episodes, "folder": cache, **arguments}
+    """Return a row of the table of plants."""
+    numbers = {each: getattr(options, each) for each in ("samples", "episodes", "seed")}
+    case = {**numbers, "folder": cache, **arguments}
     of = least_possible(kind="preview", **case)
     idle = Estimate(of.idle, of.idle_low, of.idle_high, of.runs)
     cells = {"plant": name, "valve left alone": f"{idle:.3f}"}
     for kind, heading in HEADINGS.items():
         cells[heading] = ""
-        # "news" needs random set points, "reference" those that are held long enough.
+        # "causal" needs random set points, "reference" those that are held long enough.
         with suppress(ValueError):
             cells[heading] = f"{least_possible(kind=kind, **case):.3f}"
-    if mpc:
+    if options.mpc:
         (predictive,) = ROSTER["mpc"].members()
-        cells["MPC"] = f"{bootstrap(errors(predictive, mpc, SAMPLES, **arguments), seed=0):.3f}"
+        runs = predictive.run(arguments, options.samples, options.mpc, options.seed)
+        cells["MPC"] = f"{bootstrap(mean_error(runs), seed=0):.3f}"
     return cells
 
 
@@ -130,9 +120,9 @@ def write_package(cache: Path, fan_out: FanOut) -> None:
         for name, arguments in PACKAGED.items()
     }
     about = {
-        "command": "python -m benchmarks.limits --package",
+        "command": "python -m benchmarks.bounds --package",
         "commit": commit(),
-        "code": fingerprint("benchmarks.limits.bounds"),
+        "code": fingerprint("benchmarks.bounds.least"),
         "versions": versions(),
         "unit": "degC, mean of |e(k)| over k = 1 to samples",
     }

@@ -8,14 +8,12 @@ import pytest
 from scipy import linalg, optimize, signal
 
 from agents import PIController
+from benchmarks.bounds import command, frontier, least, least_possible, linear_program
+from benchmarks.bounds.__main__ import main
+from benchmarks.bounds.causal import SetPointLaw
+from benchmarks.bounds.linear_program import plan, reference
+from benchmarks.bounds.unknown import noise_variance, unknown
 from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.lib.fan_out import FanOut
-from benchmarks.limits import bounds, command, frontier, least_possible, programme, verify
-from benchmarks.limits.__main__ import main
-from benchmarks.limits.news import News
-from benchmarks.limits.programme import plan, reference
-from benchmarks.limits.unknown import noise_variance, unknown
-from benchmarks.limits.verify import beats, controllers, errors
 from benchmarks.loop.linear import course
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import make_plants, rollout
@@ -23,6 +21,7 @@ from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.ranges import Ranges
+from tests.verify_bounds import beats, controllers, errors
 
 CALM = Parameters()
 MPC, COUNTING = (controllers()[name] for name in ("mpc", "counting"))
@@ -106,7 +105,7 @@ class TestSetPointChanges:
 
     @pytest.mark.parametrize(
         ("name", "mae"),
-        # As a programme gave them that has nothing of this one but the solver.
+        # As a linear program gave them that has nothing of this one but the solver.
         [
             ("square", 0.9115), ("square-dead-zone-7", 0.9115), ("square-noise", 1.6069),
             ("constant", 0.2308), ("constant-dead-zone-7", 0.2308), ("constant-noise", 1.0043),
@@ -150,13 +149,13 @@ class TestProgramme:
     def test_what_cannot_be_solved_is_said(self, monkeypatch):
         given_up = optimize.OptimizeResult(success=False, message="Time limit reached")
         monkeypatch.setattr(optimize, "linprog", lambda *_, **__: given_up)
-        with pytest.raises(programme.NotSolvedError, match="any of 6 ways: Time limit"):
+        with pytest.raises(linear_program.NotSolvedError, match="any of 6 ways: Time limit"):
             best_plan(np.repeat([1.5, -1.0], 300))
 
     @pytest.mark.parametrize("plant", ODD)
     def test_descent_on_the_plant_comes_to_the_same(self, plant):
         # Another method on another model: L-BFGS-B on sqrt(e^2 + s^2), s falling, with the
-        # response of scipy's filter. It comes from above, the programme from below.
+        # response of scipy's filter. It comes from above, the linear program from below.
         n = 90
         setpoint = np.repeat([1.5, -1.0, 2.0], n // 3)
         parameters = Parameters(**plant)
@@ -277,13 +276,13 @@ class TestUnknown:
 RANDOM = {"setpoint": "random", "setpoint_period": 120}
 
 
-class TestNews:
+class TestCausal:
     def test_the_toll_is_0_in_the_mean_over_the_future(self):
         # The mean over the future of pi(j) times anything that is known at j.
         samples, runs = 150, 300
         parameters = Parameters(**RANDOM)
         of_plant = course_of(samples, **RANDOM)
-        law = News(parameters, of_plant, unknown(of_plant))
+        law = SetPointLaw(parameters, of_plant, unknown(of_plant))
         plants = make_plants(runs, samples, **RANDOM)
         setpoints = rollout(plants, PIController(0.0, 0.0), samples, seed=1).setpoint
         penalties = np.array([law.penalty(s) for s in setpoints.T])
@@ -300,13 +299,13 @@ class TestNews:
         arguments = {"setpoint": "random", "dead_zone": 0.0}
         kinds = {
             kind: least_possible(samples=900, kind=kind, episodes=15, folder=None, **arguments)
-            for kind in ("preview", "news", "reference")
+            for kind in ("preview", "causal", "reference")
         }
         found = errors(MPC, 10, 600, **arguments)
-        assert not beats(found, kinds["news"])
-        assert kinds["preview"].value < 0.5 * kinds["news"].value
-        assert kinds["news"].value < kinds["reference"].value
-        assert found.mean() < 1.3 * kinds["news"].value
+        assert not beats(found, kinds["causal"])
+        assert kinds["preview"].value < 0.5 * kinds["causal"].value
+        assert kinds["causal"].value < kinds["reference"].value
+        assert found.mean() < 1.3 * kinds["causal"].value
 
 
 class TestLeastPossible:
@@ -319,7 +318,7 @@ class TestLeastPossible:
                 (300, {"setpoint": "random"}),
             )
         ]  # fmt: skip
-        assert [least.kind for least in found] == ["reference", "preview", "preview", "news"]
+        assert [least.kind for least in found] == ["reference", "preview", "preview", "causal"]
         assert found[0].value == pytest.approx(0.9115, abs=1e-4)
 
     @pytest.mark.parametrize("period", [20, 38, 76, 100, 160])
@@ -365,7 +364,7 @@ class TestLeastPossible:
         first = least_possible(**ask)
         (file,) = tmp_path.iterdir()
         with monkeypatch.context() as patch:
-            patch.setattr(bounds, "_draw", None)  # nothing is computed now
+            patch.setattr(least, "_draw", None)  # nothing is computed now
             assert least_possible(**ask) == first
         for other in ({"samples": 61}, {"delay": 3}, {"kind": "reference"}, {"seed": 1}):
             least_possible(**{**ask, **other})
@@ -381,7 +380,7 @@ class TestLeastPossible:
             ({"samples": 0}, "samples must be an integer"),
             ({"samples": 9, "episodes": 0}, "episodes must be an integer"),
             ({"samples": 9, "kind": "best"}, "kind must be one of"),
-            ({"samples": 9, "kind": "news"}, 'kind must not be "news"'),
+            ({"samples": 9, "kind": "causal"}, 'kind must not be "causal"'),
             ({"samples": 9, "delay": -1}, "delay must be"),
         ],
     )
@@ -485,11 +484,3 @@ def test_command(capsys, tmp_path, monkeypatch):
     for name in (*SCENARIOS, *some):
         assert name in shown
     assert "0.9114" in shown
-
-
-def test_controllers_are_held_against_theorems(tmp_path, monkeypatch):
-    # One that counts samples comes below the reference, which is no bound.
-    monkeypatch.setattr(verify, "controllers", lambda: {"counting": COUNTING})
-    table, beaten = verify.verify(1, tmp_path, FanOut(1), ["square, held 20"])
-    assert float(table["counting"][0]) < 5.9  # the reference: 5.997
-    assert (table["kind"][0], beaten) == ("preview", [])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from benchmarks.limits.bounds import LeastPossible, frontier, is_random, least_possible
+    from benchmarks.bounds.least import LeastPossible, frontier, is_random, least_possible
 
 __all__ = ["LeastPossible", "frontier", "is_random", "least_possible"]
 
@@ -14,6 +14,6 @@ def __getattr__(name: str) -> Any:
     """Import names lazily, as SciPy takes longer to load than a command's help."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from benchmarks.limits import bounds
+    from benchmarks.bounds import least
 
-    return getattr(bounds, name)
+    return getattr(least, name)

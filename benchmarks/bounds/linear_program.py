@@ -1,4 +1,4 @@
-"""Solve the linear programme behind every bound, and plan the flow of a reference."""
+"""Solve the linear program behind every bound, and plan the flow of a reference."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize, sparse
 
-from benchmarks.limits.unknown import Unknown
+from benchmarks.bounds.unknown import Unknown
 from benchmarks.loop.linear import Course
 from benchmarks.loop.metrics import held
 
@@ -28,12 +28,12 @@ SMOOTH = 1e-4  # price per t/h of travel, which selects the quietest of equal pl
 
 
 class NotSolvedError(RuntimeError):
-    """The optimum of a linear programme was not found; the message says why."""
+    """The optimum of a linear program was not found; the message says why."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A solution of the programme. All arrays have the shape (samples,)."""
+    """A solution of the linear program. All arrays have the shape (samples,)."""
 
     error: Array
     """The lower bound of E|e(k)|, degC."""
@@ -73,7 +73,7 @@ def plan(
     as u_a(k) always lies within [low, high], so does its mean; and as E|m - n| is convex in m,
     its mean over everything that may be known is at least its value at the mean of m, which is
     y_d - y (Jensen). So the controller's error is at least the minimum over all mean flows
-    within the limits: a linear programme, as each bound of E|m - n| is a maximum of lines. The
+    within the limits: a linear program, as each bound of E|m - n| is a maximum of lines. The
     mean travel of a flow is at least the travel of the mean flow, again by Jensen.
 
     The bound is loose where the required flow lies within the dead zone, or alternates between
@@ -172,7 +172,7 @@ def _solve(
         right[-1][0] = flow[start - 1] if start else 0.0
         columns.append(_unknowns(2 * n, price, 0.0, np.inf))
 
-    # With outputs among the unknowns the programme is sparse, and fast where A is slow. But if
+    # With outputs among the unknowns the program is sparse, and fast where A is slow. But if
     # a zero of B lies outside the unit circle, the flow that gives an output grows without
     # bound: solvers that vary outputs freely fail, or end away from the optimum.
     for_flows_alone = [False, True]
@@ -201,7 +201,7 @@ def _solve(
         if solved.success:
             return solved.x[:n], solved.x[n : 2 * n]
     raise NotSolvedError(
-        f"the linear programme of {n} samples was not solved in any of {len(attempts)} ways: "
+        f"the linear program of {n} samples was not solved in any of {len(attempts)} ways: "
         f"{solved.message}"
     )
 

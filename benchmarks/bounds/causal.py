@@ -1,9 +1,9 @@
 """Penalise flows that use the future, to bound the cost of not knowing the next set point.
 
 With `setpoint="random"` the set point has a law: levels are independent and uniform in
-[-A, A], and each is held for a number of samples that is uniform from S to L. To a controller
-without preview a change is news. So u_a(j) depends only on the set points up to j, and for
-every pi(j) with conditional mean zero, E[pi(j) | set points up to j] = 0,
+[-A, A], and each is held for a number of samples that is uniform from S to L. A controller
+without preview learns of a change when it happens. So u_a(j) depends only on the set points up
+to j, and for every pi(j) with conditional mean zero, E[pi(j) | set points up to j] = 0,
 
     E[sum_j pi(j) u_a(j)] = 0.
 
@@ -11,7 +11,7 @@ Hence the mean error of such a controller is the mean of the sum of |e(k)| and p
 which is at least the mean, over the set points, of its minimum over all flows, even those that
 know the future (D. B. Brown, J. E. Smith and P. Sun, "Information relaxations and duality in
 stochastic dynamic programs", Operations Research 58, 2010, 785-801). Every pi gives a bound; a
-good pi takes away what the programme would gain from knowing the future. Here it is
+good pi takes away what the linear program would gain from knowing the future. Here it is
 
     pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
 
@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.limits.unknown import Unknown
+from benchmarks.bounds.unknown import Unknown
 from benchmarks.loop.linear import Coefficients, Course
 from benchmarks.loop.metrics import held
 from mptc_gym import Parameters
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 THRESHOLDS = 8  # thresholds that represent the noise in the guess
 
 
-class News:
+class SetPointLaw:
     """The law of random set points, and the guess for it on one course.
 
     The guess uses the plant's dynamics at the start of the course.

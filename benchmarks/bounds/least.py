@@ -1,10 +1,10 @@
 """Compute the least possible mean error of any case of the environment, and scores from it.
 
-The kinds "preview" and "news" are theorems; "reference" holds under a condition. README.md says
-for which controllers. The mean error is that of the rewards, of |e(k)| over k = 1 to N. A bound
-is the mean over the episodes that the environment draws; for each, it is the optimum of
-`benchmarks.limits.programme` given what `benchmarks.limits.unknown` leaves unknown. The bounds
-assume that the plant is (28) and (29), and that a controller at k knows the transmitter's
+The kinds "preview" and "causal" are theorems; "reference" holds under a condition. README.md
+says for which controllers. The mean error is that of the rewards, of |e(k)| over k = 1 to N. A
+bound is the mean over the episodes that the environment draws; for each, it is the optimum of
+`linear_program.py`, given what `unknown.py` leaves unknown. The bounds assume that the plant is
+(28) and (29), and that a controller at k knows the transmitter's
 readings up to k, and perhaps any set points, plant numbers and loads up to k, but not the true
 output, `info["output"]`. It may undo the dead zone.
 """
@@ -22,12 +22,12 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from benchmarks.bounds.causal import SetPointLaw
+from benchmarks.bounds.linear_program import SMOOTH, TAIL, Plan, plan, reference
+from benchmarks.bounds.unknown import Unknown, unknown
 from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.lib.storage import ROOT, seal, unseal, write_text
-from benchmarks.limits.news import News
-from benchmarks.limits.programme import SMOOTH, TAIL, Plan, plan, reference
-from benchmarks.limits.unknown import Unknown, unknown
 from benchmarks.loop.linear import Course, course
 from benchmarks.loop.rollout import drawn_numbers, make_plants, rollout
 from mptc_gym import Parameters
@@ -40,13 +40,13 @@ Array = NDArray[np.float64]
 KINDS = {  # the controllers that cannot do better
     "preview": "every controller that reads the transmitter and not the true output, even one "
     "that knows the set point beforehand",
-    "news": "controllers that read the transmitter and not the true output, and to which a "
-    "change of the set point is news",
+    "causal": "controllers that read the transmitter and not the true output, and that learn "
+    "of a change of the set point when it happens",
     "reference": "none: a reference, if each change finds the plant settled",
 }
 DIGITS = 6  # decimals of a bound, degC
 SAME = 1e-4  # degC; of two bounds that differ by less, the one for every controller is shown
-CACHE = ROOT / "results" / "limits"
+CACHE = ROOT / "results" / "bounds"
 PRICES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # prices of travel on the frontier
 
 
@@ -66,7 +66,7 @@ class LeastPossible(Estimate):
     idle_high: float
     episodes: tuple[float, ...]
     """Terms of the mean, degC; element i is for the episode of seed `seed + i`. For the kind
-    "news" only their mean is a bound."""
+    "causal" only their mean is a bound."""
     seed: int
     """Seed of the first episode."""
 
@@ -111,7 +111,7 @@ def least_possible(
     samples
         N, length of an episode.
     kind
-        One of `KINDS`. None chooses as reports and `mptc_gym.evaluate` do: "news" for random
+        One of `KINDS`. None chooses as reports and `mptc_gym.evaluate` do: "causal" for random
         set points; otherwise "reference", or "preview" if a set point changes before the plant
         has settled, or if both are the same.
     episodes
@@ -128,8 +128,8 @@ def least_possible(
     Raises
     ------
     ValueError
-        If an argument is out of range; if the kind is "news" and set points are not random; or
-        if it is "reference" and a set point changes before the plant has settled.
+        If an argument is out of range; if the kind is "causal" and set points are not random;
+        or if it is "reference" and a set point changes before the plant has settled.
     """
     parameters = Parameters(**arguments)
     for name, count in (("samples", samples), ("episodes", episodes)):
@@ -143,15 +143,15 @@ def least_possible(
             # Foresight makes no difference where nothing changes.
             return found if abs(found.value - preview.value) >= SAME else preview
         return preview
-    kind = kind or "news"
+    kind = kind or "causal"
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
-    if kind == "news" and theorem(parameters) != "news":
-        raise ValueError(f'kind must not be "news" for the set point {parameters.setpoint!r}')
+    if kind == "causal" and theorem(parameters) != "causal":
+        raise ValueError(f'kind must not be "causal" for the set point {parameters.setpoint!r}')
     file = None
     if folder is not None:
         shaped_by = [repr(parameters), samples, kind, episodes, seed]
-        code = "benchmarks.limits.bounds"
+        code = "benchmarks.bounds.least"
         file = folder / f"{fingerprint(code, case=shaped_by, scipy=scipy.__version__)}.json"
         with suppress(OSError, ValueError, TypeError):  # missing or damaged: computed again
             kept = unseal(file.read_text(encoding="utf-8"))
@@ -176,7 +176,7 @@ def least_possible(
 
 def theorem(parameters: Parameters) -> str:
     """Return the kind of the highest proven bound; the reference may be beaten."""
-    return "news" if parameters.setpoint == "random" else "preview"
+    return "causal" if parameters.setpoint == "random" else "preview"
 
 
 def frontier(
@@ -190,7 +190,7 @@ def frontier(
 ) -> list[tuple[float, float]]:
     """Return the least mean error for a given mean travel of the valve.
 
-    For each price p of travel the programme minimises mean error plus p times mean travel. No
+    For each price p of travel the program minimises mean error plus p times mean travel. No
     controller comes below its value, so none lies below the line error = value - p * travel.
     The points are where these lines touch their envelope; between two points the bound is the
     straight line, by convexity. The travel is that of the applied flow, which may jump over the
@@ -279,6 +279,6 @@ def _best(
     samples = len(setpoint)
     course, unknown = course.first(samples), unknown.of(0, samples)
     penalty = None
-    if kind == "news" and parameters.setpoint_amplitude > 0.0:
-        penalty = News(parameters, course, unknown).penalty(setpoint)
+    if kind == "causal" and parameters.setpoint_amplitude > 0.0:
+        penalty = SetPointLaw(parameters, course, unknown).penalty(setpoint)
     return plan(course, unknown, setpoint, price=price, penalty=penalty)
