@@ -1,5 +1,6 @@
 """The bounds against independent computations, and the controllers that come near them."""
 
+import itertools
 import json
 from dataclasses import replace
 
@@ -273,27 +274,30 @@ class TestUnknown:
             assert least == pytest.approx(np.abs(m + draws).mean(), rel=0.01)
 
 
-RANDOM = {"setpoint": "random", "setpoint_period": 120}
-
-
 class TestCausal:
-    def test_the_toll_is_0_in_the_mean_over_the_future(self):
-        # The mean over the future of pi(j) times anything that is known at j.
-        samples, runs = 150, 300
-        parameters = Parameters(**RANDOM)
-        of_plant = course_of(samples, **RANDOM)
-        law = SetPointLaw(parameters, of_plant, unknown(of_plant))
-        plants = make_plants(runs, samples, **RANDOM)
-        setpoints = rollout(plants, PIController(0.0, 0.0), samples, seed=1).setpoint
-        penalties = np.array([law.penalty(s) for s in setpoints.T])
-        # Whether the level has been held for longer than 30 samples.
-        old = np.array([[k > 30 and np.ptp(s[k - 30 : k + 1]) == 0.0 for k in range(samples)]
-                        for s in setpoints.T])  # fmt: skip
-        assert np.abs(penalties).mean() > 0.05
-        for known in (np.ones_like(penalties), setpoints.T, np.sign(setpoints.T) * old):
-            sums = (penalties * known).sum(axis=1)
-            assert abs(sums.mean()) < 4 * sums.std() / np.sqrt(runs)
-            assert sums.std() > 1.0
+    @pytest.mark.parametrize(
+        "past", [[3.0], [3.0] * 4, [-4.0] * 3 + [2.0] * 3, [-4.0] * 4 + [1.0] * 6], ids=str
+    )
+    def test_the_penalty_is_0_in_the_mean_over_the_future(self, past, rng):
+        # A level is held for 3 to 6 samples. The futures of the past have the next two holds in
+        # all lengths and the next level on a grid, and each comes with its mirror image.
+        samples, plant = 14, {"a": (1.0, -0.5), "b": (-0.5,), "c": (1.0,), "delay": 1}
+        case = {"setpoint": "random", "setpoint_period": 13, "noise_variance": 0.1, **plant}
+        of_plant = course_of(samples, **case)
+        law = SetPointLaw(Parameters(**case), of_plant, unknown(of_plant))
+        now = len(past) - 1
+        age = now - past.index(past[-1])
+        penalties = []
+        for first, second in itertools.product(range(max(3, age + 1), 7), range(3, 7)):
+            for level in np.arange(0.5, 8.0) / 8.0 * 5.0:
+                later = np.repeat(rng.uniform(-5, 5, samples), rng.integers(3, 7, samples))
+                future = np.array([*[level] * second, *later])
+                for sign in (-1, 1):
+                    still = past[-1:] * (first - age - 1)
+                    setpoint = np.array([*past, *still, *sign * future])[:samples]
+                    penalties.append(law.penalty(setpoint)[now])
+        assert abs(np.mean(penalties)) < 0.005 * np.std(penalties)
+        assert np.std(penalties) > 0.2
 
     def test_no_controller_beats_it_and_it_is_tighter_than_that_with_preview(self):
         arguments = {"setpoint": "random", "dead_zone": 0.0}
