@@ -2,7 +2,6 @@
 
 import importlib
 import re
-from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -18,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import mptc_gym.sb3
 from benchmarks.datasets.history import arguments_of, record
-from benchmarks.examples import offline, ppo_torch, sb3
+from benchmarks.examples import offline, sb3
 from mptc_gym import evaluate
 from mptc_gym.sb3 import spec_of
 from tests.conftest import ROOT, assert_the_seed_is_all_that_differs, python
@@ -100,70 +99,17 @@ def test_settings_for_rl_zoo_make_a_model_that_learns(algorithm):
     assert file.name in text
 
 
-class TestPPOInPyTorch:
-    SMALL = ppo_torch.Arguments(
-        steps=512, num_envs=8, num_steps=16, epochs=2, minibatches=2, evaluations=2
-    )
-
-    def test_it_runs(self, capsys):
-        ppo_torch.app(["--steps", "1024", "--num-envs", "8", "--evaluations", "2"])
-        assert capsys.readouterr().out.count("mean error") == 2
-
-    def test_the_seed_is_all_that_differs(self):
-        assert_the_seed_is_all_that_differs(
-            lambda seed: weights(ppo_torch.train(replace(self.SMALL, seed=seed)))
-        )
-
-    def test_an_episode_that_is_cut_off_is_worth_its_future(self):
-        # gamma = lambda = 1/2. Backwards: 3 + 8/2 - 2 = 5, which ends an episode, so that what
-        # is found after it does not count; then 2 + 4/2 - 2 = 2, plus 5/4; 1 + 2/2 - 4 = -2,
-        # plus 3.25/4. The last, of the next episode: 1 + 6/2 - 0 = 4.
-        rewards, values = torch.tensor([1.0, 2.0, 3.0, 1.0]), torch.tensor([4.0, 2.0, 2.0, 0.0])
-        following, ends = torch.tensor([2.0, 4.0, 8.0, 6.0]), torch.tensor([0.0, 0.0, 1.0, 0.0])
-        arguments = ppo_torch.Arguments(gamma=0.5, gae_lambda=0.5)
-        found = ppo_torch.estimate(
-            *(x[:, None] for x in (rewards, values, following, ends)), arguments
-        )
-        assert found[:, 0].tolist() == [-1.1875, 3.25, 5.0, 4.0]
-
-    def test_values_at_an_end_are_those_of_the_last_observation(self, monkeypatch):
-        monkeypatch.setitem(ppo_torch.TRAINING, "max_episode_steps", 5)
-        forward, estimate, kept = ppo_torch.ActorCritic.forward, ppo_torch.estimate, []
-
-        def error_for_a_value(agent, observations):
-            return forward(agent, observations)[0], observations[:, 3]
-
-        def spy(rewards, values, next_values, ends, arguments):
-            kept.append([x.clone() for x in (rewards, values, next_values, ends)])
-            return estimate(rewards, values, next_values, ends, arguments)
-
-        monkeypatch.setattr(ppo_torch.ActorCritic, "forward", error_for_a_value)
-        monkeypatch.setattr(ppo_torch, "estimate", spy)
-        ppo_torch.train(self.SMALL)
-        for rewards, values, next_values, ends in kept:
-            # The reward is that of the error that a step leads to, also at an end.
-            torch.testing.assert_close(next_values.abs(), -50.0 * rewards)
-            went_on = ends[:-1] == 0.0
-            assert torch.equal(next_values[:-1][went_on], values[1:][went_on])
-            assert not torch.equal(next_values[:-1][~went_on], values[1:][~went_on])
-        assert torch.stack([ends for *_, ends in kept]).mean() == pytest.approx(0.2, abs=0.02)
-
-
-def test_controllers_need_neither_torch_nor_sb3():
+def test_controllers_are_evaluated_without_any_extra():
     program = """
-import runpy, sys
+import sys
 for name in ("torch", "stable_baselines3", "scipy", "pandas", "matplotlib"):
     sys.modules[name] = None  # an import is an error from now on
-sys.argv = ["torch_free", "MiddlePointNoisy-v0"]
-runpy.run_module("benchmarks.examples.torch_free", run_name="__main__")
+import agents, mptc_gym
+print(mptc_gym.evaluate(agents.PIController(), "MiddlePointNoisy-v0").mean_error)
 """
     done = python("-c", program)
     assert done.returncode == 0, done.stderr
-    # The least possible error is 1.60 degC, and an idle valve has 5 degC.
-    names = re.findall(r"^(NN|PI): MiddlePointNoisy-v0: mean error", done.stdout, re.MULTILINE)
-    errors = [float(each) for each in re.findall(r"mean error ([\d.]+)", done.stdout)]
-    assert names == ["NN", "PI"]
-    assert 1.6 < errors[0] < errors[1] < 5.0
+    assert 1.6 < float(done.stdout) < 5.0  # the least possible error, and that of an idle valve
 
 
 class TestOffline:

@@ -72,5 +72,5 @@ def test_imports_are_followed_through_modules():
     } <= found
     assert not any(name.startswith("mptc_gym") for name in found)
     # Without loading them.
-    assert "benchmarks.examples.rllib" not in sys.modules
-    assert "benchmarks.examples.rllib" in imported("benchmarks.examples.rllib")
+    assert "benchmarks.examples.through_plant" not in sys.modules
+    assert "benchmarks.examples.through_plant" in imported("benchmarks.examples.through_plant")

@@ -22,13 +22,10 @@ from torch.utils.data import TensorDataset
 import mptc_gym
 
 BATCH = 256  # transitions per gradient step
-WIDTH = 64  # units in each of the two hidden layers
 LEARNING_RATE = 1e-3  # initial value; falls linearly to a tenth
 GAMMA = 0.97  # discount per sample
 TAU = 0.01  # update rate of the target networks
 ALPHA = 0.05  # weight of the value relative to staying near the data
-SMOOTHING, CLIP = 0.1, 0.25  # standard deviation and limit of the noise on target actions
-DELAY = 2  # critic steps per actor step
 LAST_ACTION = 6  # index in an observation, after three set points and three errors
 
 
@@ -48,28 +45,26 @@ def transitions_of(episodes: Iterable[Any]) -> TensorDataset:
 class Network(nn.Module):
     """A network with two hidden layers; its inputs are temperatures over 5 degC and actions."""
 
-    scale: Tensor
-
     def __init__(self, high: np.ndarray) -> None:
         super().__init__()
         # Fixed factors are the same in training and evaluation.
-        self.register_buffer("scale", torch.where(torch.as_tensor(high) > 1.0, 0.2, 1.0))
-        layers = nn.Linear(len(high), WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU()
-        self.layers = nn.Sequential(*layers, nn.Linear(WIDTH, 1))
+        self.scale = torch.where(torch.as_tensor(high) > 1.0, 0.2, 1.0)
+        layers = nn.Linear(len(high), 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU()
+        self.layers = nn.Sequential(*layers, nn.Linear(64, 1))
 
-    def forward(self, values: Tensor) -> Tensor:
+    def forward(self, *columns: Tensor) -> Tensor:
         """Return one number per row, shape (n, 1)."""
-        result: Tensor = self.layers(values * self.scale)
+        result: Tensor = self.layers(torch.hstack(columns) * self.scale)
         return result
 
 
 class Actor(Network):
     """A policy whose output is an increment to the last action, like a valve's move."""
 
-    def act(self, observations: Tensor) -> Tensor:
+    def forward(self, *columns: Tensor) -> Tensor:
         """Return actions within [-1, 1], shape (n, 1)."""
-        changed: Tensor = observations[:, LAST_ACTION, None] + self(observations)
-        return changed.clamp(-1.0, 1.0)
+        change = super().forward(*columns)
+        return (columns[0][:, LAST_ACTION, None] + change).clamp(-1.0, 1.0)
 
 
 def learn(
@@ -77,63 +72,46 @@ def learn(
 ) -> Actor:
     """Train an actor by TD3+BC (Fujimoto & Gu 2021), or by behaviour cloning if alpha is 0.
 
-    Parameters
-    ----------
-    data
-        Transitions to learn from.
-    high
-        Upper bounds of the observation, shape (n_obs,).
-    alpha
-        Weight of the value relative to staying near the data.
-    steps
-        Number of gradient steps.
-    seed
-        Seed of the weights, the batches and the noise.
+    `high` are the upper bounds of the observation, shape (n_obs,).
     """
     torch.manual_seed(seed)
     actor = Actor(high)
     critics = nn.ModuleList(Network(np.append(high, np.float32(1.0))) for _ in range(2))
-    target_actor = copy.deepcopy(actor).requires_grad_(False)
-    target_critics = copy.deepcopy(critics).requires_grad_(False)
-    leaders = [*actor.parameters(), *critics.parameters()]
-    followers = [*target_actor.parameters(), *target_critics.parameters()]
-    actor_optimizer, critic_optimizer = optimizers = [
-        torch.optim.Adam(module.parameters(), LEARNING_RATE) for module in (actor, critics)
-    ]
+    networks = nn.ModuleList([actor, critics])
+    targets: Any = copy.deepcopy(networks).requires_grad_(False)
+    target_actor, target_critics = targets
+    optimizers = [torch.optim.Adam(each.parameters(), LEARNING_RATE) for each in networks]
+
+    def descend(optimizer: torch.optim.Optimizer, loss: Any) -> None:
+        optimizer.param_groups[0]["lr"] = LEARNING_RATE * (0.1 + 0.9 * (1.0 - step / steps))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
     for step in range(steps):
-        for optimizer in optimizers:
-            optimizer.param_groups[0]["lr"] = LEARNING_RATE * (0.1 + 0.9 * (1.0 - step / steps))
         seen, taken, rewards, following = data[torch.randint(len(data), (BATCH,))]
         if alpha > 0.0:
-            noise = (torch.randn_like(taken) * SMOOTHING).clamp(-CLIP, CLIP)
-            next_action = (target_actor.act(following) + noise).clamp(-1.0, 1.0)
-            ahead = torch.hstack((following, next_action))
-            worth = torch.min(*(critic(ahead) for critic in target_critics))
-            goal = rewards + GAMMA * worth
-            now = torch.hstack((seen, taken))
-            _descend(critic_optimizer, sum(functional.mse_loss(c(now), goal) for c in critics))
-        if step % DELAY == 0 or alpha == 0.0:
-            action = actor.act(seen)
+            noise = (torch.randn_like(taken) * 0.1).clamp(-0.25, 0.25)
+            ahead = following, (target_actor(following) + noise).clamp(-1.0, 1.0)
+            goal = rewards + GAMMA * torch.min(*(critic(*ahead) for critic in target_critics))
+            losses = [functional.mse_loss(critic(seen, taken), goal) for critic in critics]
+            descend(optimizers[1], sum(losses))
+        if step % 2 == 0 or alpha == 0.0:  # the critics take two steps for one of the actor
+            action = actor(seen)
             loss = functional.mse_loss(action, taken)
             if alpha > 0.0:
-                value = critics[0](torch.hstack((seen, action)))
+                value = critics[0](seen, action)
                 loss = loss - alpha * value.mean() / value.abs().mean().detach()
-            _descend(actor_optimizer, loss)
+            descend(optimizers[0], loss)
         with torch.no_grad():
-            for follower, leader in zip(followers, leaders, strict=True):
-                follower.lerp_(leader, TAU)
+            for target, each in zip(targets.parameters(), networks.parameters(), strict=True):
+                target.lerp_(each, TAU)
     return actor
-
-
-def _descend(optimizer: torch.optim.Optimizer, loss: Any) -> None:
-    optimizer.zero_grad()
-    loss.backward()
-    optimizer.step()
 
 
 def policy_of(actor: Actor) -> Any:
     """Return the policy of an actor, a function of observations, for `mptc_gym.evaluate`."""
-    return lambda observations: actor.act(torch.as_tensor(observations)).detach().numpy()
+    return lambda observations: actor(torch.as_tensor(observations)).detach().numpy()
 
 
 def main(
