@@ -10,7 +10,7 @@ import numpy as np
 import pygame
 from numpy.typing import NDArray
 
-from mptc_gym.record import Axis, Record
+from mptc_gym.record import Axis, Record, flow_axis
 
 Colour = tuple[int, int, int]
 Point = tuple[float, float]
@@ -33,6 +33,7 @@ _FRAME: Colour = (160, 164, 170)
 _INK: Colour = (25, 28, 32)
 
 _LEFT, _RIGHT = 72, 842  # edges of both panels; names of lines go to the right of them
+_FLOW_PANEL = 346, 496  # its top and bottom
 _SMALL, _NORMAL, _LARGE = 18, 20, 32  # font sizes
 _FINER = 4  # factor by which text and dots are drawn larger, then reduced
 
@@ -107,7 +108,7 @@ def draw(record: Record) -> pygame.Surface:
     surface.fill(_PAGE)
     _header(surface, record)
     top = Panel(86, 304, record, record.temperatures)
-    bottom = _flow_panel(record)
+    bottom = Panel(*_FLOW_PANEL, record, record.flows)
     _temperatures(surface, top)
     _flows(surface, bottom)
     _time_axis(surface, bottom)
@@ -115,17 +116,12 @@ def draw(record: Record) -> pygame.Surface:
     return surface
 
 
-def flow_at(record: Record, point: tuple[int, int]) -> float | None:
+def flow_at(point: tuple[int, int], u_min: float, u_max: float) -> float | None:
     """Return the flow at a point of a picture, t/h; None outside its panel."""
-    panel = _flow_panel(record)
-    if not panel.rect.collidepoint(point):
+    (x, y), (top, bottom), axis = point, _FLOW_PANEL, flow_axis(u_min, u_max)
+    if not (_LEFT <= x <= _RIGHT and top <= y <= bottom):
         return None
-    share = (panel.bottom - point[1]) / (panel.bottom - panel.top)
-    return panel.axis.low + share * (panel.axis.high - panel.axis.low)
-
-
-def _flow_panel(record: Record) -> Panel:
-    return Panel(346, 496, record, record.flows)
+    return axis.low + (bottom - y) / (bottom - top) * (axis.high - axis.low)
 
 
 @cache

@@ -145,8 +145,8 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
 
     <arguments>
 
-    `render_mode` is None, "human", "rgb_array" or "ansi"; see Rendering. Lists may also be
-    tuples or NumPy arrays. Numbers are within +-1e9, the delay and each window at most 10,000
+    `render_mode` is None, "human" or "rgb_array"; see Rendering. Lists may also be tuples or
+    NumPy arrays. Numbers are within +-1e9, the delay and each window at most 10,000
     samples, and `a`, `b` and `c` have at most 1,000 coefficients each.
 
     ## Info
@@ -166,12 +166,11 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     |---|---|
     | "rgb_array" | returns a picture, shape (540, 960, 3), uint8 |
     | "human" | shows it in a window, as do `reset` and `step`, at most `metadata["render_fps"]` times a second |
-    | "ansi" | returns a picture in text |
 
-    All show a strip chart of the last 200 samples, or of more if the delay is long: set point
+    Both show a strip chart of the last 200 samples, or of more if the delay is long: set point
     and true temperature; commanded and applied flow, with the dead zone, the limits and the
-    part of the applied flow that is still in transit to the middle point. All modes but "ansi"
-    need pygame: `pip install "mptc_gym[render]"`.
+    part of the applied flow that is still in transit to the middle point. Both need pygame:
+    `pip install "mptc_gym[render]"`.
 
     ## Errors
 
@@ -186,7 +185,7 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
     """  # noqa: E501 (the tables)
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (as in Env)
-        "render_modes": ["human", "rgb_array", "ansi"],
+        "render_modes": ["human", "rgb_array"],
         "render_fps": 30,
     }
 
@@ -348,21 +347,31 @@ class MiddlePointEnv(gymnasium.Env[Observation, Action]):
             self._show()
         return observation, reward, False, False, info
 
-    def render(self) -> rendering.Frame | str | None:
+    def disturb(self, *, setpoint: float = 0.0, load: float = 0.0) -> None:
+        """Add to the set point and to the load disturbance of the next sample, degC.
+
+        For experiments in which they change while the plant runs: call it before each `step`.
+        """
+        if not self._ahead:
+            self._look_ahead()
+        y_d, noise, w, transmitter_noise = self._ahead[-1]
+        self._ahead[-1] = y_d + setpoint, noise, w + load, transmitter_noise
+
+    def render(self) -> rendering.Frame | None:
         """Draw the last minutes of the episode.
 
         Returns
         -------
-        ndarray, str or None
-            For "rgb_array" a picture, shape (540, 960, 3), uint8; for "ansi" one in text.
-            None for "human", which shows it in a window, and, after a warning, without a mode.
+        ndarray or None
+            For "rgb_array" a picture, shape (540, 960, 3), uint8. None for "human", which shows
+            it in a window, and, after a warning, without a mode.
 
         Raises
         ------
         ResetNeeded
             If the environment has never been reset.
         DependencyNotInstalled
-            If pygame is not installed, for any mode but "ansi".
+            If pygame is not installed.
         """
         return rendering.render(self.render_mode, self._record, self.metadata["render_fps"])
 

@@ -91,9 +91,7 @@ class Record:
     @property
     def flows(self) -> Axis:
         """The flow axis, t/h: the range of the actuator, with a margin."""
-        low, high = min(self.plant.u_min, 0.0), max(self.plant.u_max, 0.0)
-        margin = 0.12 * (high - low)
-        return Axis(low - margin, high + margin, _round_step((high - low) / 4))
+        return flow_axis(self.plant.u_min, self.plant.u_max)
 
     @property
     def readings(self) -> dict[str, str]:
@@ -109,6 +107,13 @@ class Record:
             "command": f"{_short(command)} t/h",
             "applied": f"{_short(applied)} t/h",
         }
+
+
+def flow_axis(u_min: float, u_max: float) -> Axis:
+    """Return the flow axis for the limits of an actuator, t/h."""
+    low, high = min(u_min, 0.0), max(u_max, 0.0)
+    margin = 0.12 * (high - low)
+    return Axis(low - margin, high + margin, _round_step((high - low) / 4))
 
 
 def _round_step(least: float) -> float:

@@ -115,7 +115,7 @@ REFUSED = {
         (["--agent", "lqr"], "--agent: no 'lqr'; there are nothing, nn"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
         (["--scenario", "triangle"], "--scenario.*constant-noise"),
-        (["--video", "film.avi"], "--video.*.mp4 or .gif"),
+        (["--video", "film.avi"], "--video: must end in .gif"),
         (["--seed", "-1"], "--seed. Must be >= 0"),
         (["--speed", "0"], "--speed. Must be >= 1"),
         # Of a machine without a screen.

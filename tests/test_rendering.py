@@ -119,27 +119,17 @@ def test_what_is_in_transit_is_shaded(k, delay, expected):
     assert width == pytest.approx(expected / 200 * 770, abs=3)
     if expected:
         assert columns.max() == pytest.approx(column(k), abs=2)  # up to now
-    marks = rendering.text(made).splitlines()[-2]
-    assert marks.count("^") == pytest.approx(expected / 200 * 71, abs=1)
 
 
-def test_the_text():
-    shown = rendering.text(record(*[(5.0, -4.875, 4.0, 0.0)] * 31))
-    for words in (
-        "time 4.1 min", "set point 5.00 °C", "temperature -4.88 °C", "error 9.88 °C",
-        "command 4.00 t/h", "applied 0.00 t/h",
-    ):  # fmt: skip
-        assert words in shown
-    quick = rendering.text(record(*[(5.0, -4.875, 4.0, 0.0)] * 31, sampling_interval=2.0))
-    assert "time 1.03 min" in quick
-    assert quick.endswith(" 6.667 min")  # 200 samples
-    shown = rendering.text(record(*[(10.0, -10.0, 4.0, 0.0)] * 200))
-    assert max(map(len, shown.splitlines())) <= 82
-    lines = shown.splitlines()
-    rows = [next(i for i, line in enumerate(lines) if line.count(c) > 60) for c in "-*+#"]
-    assert rows == sorted(rows)
-    assert lines[rows[-1]].startswith("      0 |")
-    assert sum("::::" in line for line in lines) == 1  # of three rows, two are hidden
+def test_the_readings():
+    samples = [(5.0, -4.875, 4.0, 0.0)] * 31
+    assert record(*samples).readings == {
+        "time": "4.1 min", "set point": "5.00 °C", "temperature": "-4.88 °C",
+        "error": "9.88 °C", "command": "4.00 t/h", "applied": "0.00 t/h",
+    }  # fmt: skip
+    quick = record(*samples, sampling_interval=2.0)
+    assert quick.readings["time"] == "1.03 min"
+    assert quick.minutes.high == pytest.approx(200 * 2 / 60)
 
 
 def test_frames_do_not_change_afterwards():
@@ -154,7 +144,7 @@ def test_frames_do_not_change_afterwards():
     np.testing.assert_array_equal(first, kept)
 
 
-@pytest.mark.parametrize("mode", ["rgb_array", "ansi", "human"])
+@pytest.mark.parametrize("mode", ["rgb_array", "human"])
 def test_nothing_else_changes(mode, rng):
     actions = rng.uniform(-1.5, 1.5, 40)
     plain = run(MiddlePointEnv(**NOISY), actions)
@@ -231,7 +221,7 @@ def test_a_window_keeps_time(monkeypatch):
 def test_what_has_no_window_closes_nobodys():
     env = MiddlePointEnv(render_mode="human")
     env.reset(seed=0)
-    for mode in (None, "rgb_array", "ansi", "human"):
+    for mode in (None, "rgb_array", "human"):
         MiddlePointEnv(render_mode=mode).close()
     assert pygame.display.get_init()
     env.close()
@@ -250,20 +240,15 @@ def test_what_cannot_be_drawn_is_said(made):
         assert env.render() is None
 
 
-def test_without_pygame_only_text_is_drawn(monkeypatch):
+def test_without_pygame_the_first_picture_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    env, envs, text, window = (
-        MiddlePointEnv(render_mode="rgb_array"),
-        MiddlePointVectorEnv(2, render_mode="rgb_array"),
-        MiddlePointEnv(render_mode="ansi"),
-        MiddlePointEnv(render_mode="human"),
-    )
-    for each in (env, envs, text):
-        each.reset(seed=0)
+    env = MiddlePointEnv(render_mode="rgb_array")
+    envs = MiddlePointVectorEnv(2, render_mode="rgb_array")
+    window = MiddlePointEnv(render_mode="human")
+    env.reset(seed=0), envs.reset(seed=0)
     for draw in (env.render, envs.render, window.reset):
         with pytest.raises(DependencyNotInstalled, match=r'pip install "mptc_gym\[render\]"'):
             draw()
-    assert "set point" in text.render()
 
 
 def test_fonts_outlive_another_s_end_of_pygame():
@@ -294,7 +279,6 @@ def test_anything_can_be_drawn(samples, delay, dead_zone, limits, sampling_inter
         sampling_interval=sampling_interval,
     )  # fmt: skip
     assert rendering.frame(made).shape == SHAPE
-    assert "temperature" in rendering.text(made)
     for axis in (made.minutes, made.temperatures, made.flows):
         assert 2 <= len(list(axis.ticks())) <= 12
 

@@ -16,7 +16,7 @@ from benchmarks.lib.command_line import UsageError
 
 EXTRAS = {
     "compare": "cyclopts joblib matplotlib pandas rich scipy tabulate tqdm",
-    "render": "moviepy pygame",
+    "render": "pygame",
     "data": "h5py minari",
     "bench": "optuna PIL stable_baselines3",
     "ray": "ray",

@@ -38,4 +38,4 @@ class Options:
     speed: Count = MiddlePointEnv.metadata["render_fps"]
     """Samples per second."""
     video: Path | None = None
-    """Write a film to this file, .mp4 or .gif, instead of opening a window."""
+    """Write a film to this file, .gif, instead of opening a window."""
