@@ -13,46 +13,12 @@ from typing import Annotated, Any, Final, get_type_hints
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from agents.actuator import float32_action
+
 # Observation windows that the default indices assume: the paper's six inputs.
 PAPER_WINDOWS: Final[Mapping[str, int]] = {"setpoint_window": 3, "error_window": 3}
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
 MOST = 1_000_000  # nodes, loops, elements or samples; a larger number is a mistake
-
-
-def action_from_command(
-    command: Values,
-    u_min: Values | float,
-    u_max: Values | float,
-    dead_zone: Values | float = 0.0,
-) -> NDArray[np.float32]:
-    """Scale commands to normalised actions, -1 at `u_min` and 1 at `u_max`.
-
-    Actions are float32. Rounding can move a command from the edge of the dead zone to its
-    inside, where it has no effect. Such an action is moved outwards by one float.
-
-    Parameters
-    ----------
-    command
-        u, t/h, any shape. Commands beyond the limits become actions beyond +-1.
-    u_min, u_max
-        The actuator's limits, t/h.
-    dead_zone
-        The actuator's dead zone, t/h; a command outside it stays outside. 0 if unknown.
-
-    Returns
-    -------
-    ndarray of float32
-        Actions, with a trailing axis of length 1.
-    """
-    exact = 2.0 * (command - u_min) / (u_max - u_min) - 1.0
-    action = np.asarray(exact, dtype=np.float32)
-    if np.any(np.asarray(dead_zone) > 0.0):
-        arrives = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0
-        lost = (np.abs(command) >= dead_zone) & (np.abs(arrives) < dead_zone)
-        # The plant adds 1, which rounds away steps finer than the float spacing at 1.
-        outwards = np.copysign(np.spacing(np.maximum(np.abs(action), np.float32(1))), command)
-        action = np.where(lost, action + outwards, action).astype(np.float32)
-    return action[..., np.newaxis]
 
 
 def check_count(name: str, value: Any, least: int, most: int | None = None) -> int:
@@ -221,7 +187,7 @@ class Controller(ABC):
         self.command = self._control(values)
         if self._remembers:
             self._loops_before = now
-        return action_from_command(self.command, self.u_min, self.u_max, self._edge)
+        return float32_action(self.command, self.u_min, self.u_max, self._edge)[..., np.newaxis]
 
     @abstractmethod
     def _control(self, observation: NDArray[np.float64]) -> Values:

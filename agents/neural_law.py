@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.actuator import avoid_dead_zone
 from agents.archive import PRETRAINED, reading
 
 Array = NDArray[np.float64]
@@ -229,9 +230,7 @@ class Law:
         """Move flows in the dead zone to its edge or 0; return them, also clipped to limits."""
         xp, zone, hard = self._xp, self.prior.dead_zone, self._still(flow)
         edge = zone + CLEARANCE * (zone > 0.0)
-        size = abs(hard)
-        moved = xp.where(size < edge, edge * xp.sign(hard) * (size >= edge / 2.0), hard)
-        flow = flow + (moved - hard)  # straight-through gradient
+        flow = flow + (avoid_dead_zone(hard, edge, xp) - hard)  # straight-through gradient
         return flow, xp.clip(flow, self.prior.centre - 1.0, self.prior.centre + 1.0)
 
     def _of_each_mean(self, load: Any, residual: Any) -> Any:

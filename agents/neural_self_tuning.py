@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.actuator import applied_flow
 from agents.controller import NotNegative, Positive
 from agents.neural_law import Law, LawNetwork, Prior
 from agents.neural_smith import NOMINAL
@@ -107,8 +108,8 @@ class NeuralSelfTuningController(SelfTuningController):
             np.einsum("ij,ij->i", self._sums, self._units[:, self._now - ago]) / self._reach
             for ago in range(2)
         )
-        passed = self._flows[:, self._now - 1]
-        passed = passed * (np.abs(passed) >= self._zone) / self._flow
+        flow = self._flows[:, self._now - 1]
+        passed = applied_flow(flow, self._zone, self.u_min, self.u_max) / self._flow
         wanted = rule.flow(
             self.network,
             setpoint / self._reach,

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from agents.actuator import compensate_dead_zone
 from agents.archive import reading
 from agents.controller import (
     Controller,
@@ -37,15 +38,13 @@ ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
 
 @dataclass(frozen=True)
 class Increments:
-    """Velocity form: the network's output changes the valve's position."""
+    """Velocity form: the network's output changes the wanted flow, which is 0 at first."""
 
     max_move: float
-    """Change of the position per sample at an output of 1. Positions range from -1 to 1, as
-    actions do."""
+    """Change of the wanted flow per sample at an output of 1, as a share of half the range."""
     dead_zone: float = 0.0
-    """Half width of the dead zone to skip, t/h. If it is above 0, positions are spread over the
-    flows outside the dead zone: just above 0 is its upper edge, just below 0 its lower one. If
-    it is 0, a position is an action."""
+    """Half width of the dead zone to compensate, t/h; see `compensate_dead_zone`. If it is 0,
+    the wanted flow is the command."""
 
     def __post_init__(self) -> None:
         check_number("max_move", self.max_move, 0)
@@ -58,7 +57,7 @@ class PolicyNetwork(Controller):
 
     The observation is multiplied by `input_scale` and passed through the layers. The activation
     follows every layer but the last, whose single output is clipped to [-1, 1]. This output is
-    the action or, with `increments`, the velocity of the valve. All arithmetic is in float64.
+    the action or, with `increments`, moves the wanted flow. All arithmetic is in float64.
 
     `u_min` and `u_max` are those of `Controller`.
 
@@ -100,11 +99,6 @@ class PolicyNetwork(Controller):
         }
         self.n_obs = sum(self.observation.values())
         self._edge = self.increments.dead_zone if self.increments else 0.0
-        if self._edge > 0.0 and self._edge >= min(-self.u_min, self.u_max):
-            raise ValueError(
-                f"increments.dead_zone must be inside the limits {self.u_min!r} and "
-                f"{self.u_max!r}, got {self._edge!r}"
-            )
         if self.activation not in [*ACTIVATIONS]:
             raise ValueError(
                 f"activation must be one of {[*ACTIVATIONS]}, got {self.activation!r}"
@@ -112,7 +106,7 @@ class PolicyNetwork(Controller):
         self._remembers = self.increments is not None
         self.input_scale = _finite("input_scale", self.input_scale, (self.n_obs,))
         self.layers = _checked(self.layers, self.n_obs)
-        self._position: Values | None = None  # of the valve, in velocity form
+        self._flow: Values | None = None  # wanted, as a share of half the range
 
     @classmethod
     def load(
@@ -162,9 +156,9 @@ class PolicyNetwork(Controller):
             np.savez_compressed(file, **arrays)
 
     def reset(self) -> None:
-        """Forget the episode, which is the valve's position in velocity form."""
+        """Forget the episode, which is the wanted flow in velocity form."""
         super().reset()
-        self._position = None
+        self._flow = None
 
     def _control(self, observation: Array) -> Values:
         if observation.shape[-1] != self.n_obs:
@@ -176,17 +170,16 @@ class PolicyNetwork(Controller):
         *hidden, (last_W, last_b) = self.layers
         for W, b in hidden:
             x = ACTIVATIONS[self.activation](x @ W.T + b)
-        position: Values = np.clip(x @ last_W[0] + last_b[0], -1.0, 1.0)
+        output: Values = np.clip(x @ last_W[0] + last_b[0], -1.0, 1.0)
+        half_range, lowest = (self.u_max - self.u_min) / 2.0, -1.0
         if self.increments is not None:
-            before = 0.0 if self._position is None else self._position
-            moved = before + self.increments.max_move * position
-            self._position = position = np.clip(moved, -1.0, 1.0)
-        edge = self._edge
-        if edge == 0.0:
-            return self.u_min + (position + 1.0) * (self.u_max - self.u_min) / 2.0
-        limit = np.where(position > 0.0, self.u_max, -self.u_min)
-        flow: Values = np.sign(position) * (edge + np.abs(position) * (limit - edge))
-        return flow
+            lowest, highest = self.u_min / half_range, self.u_max / half_range
+            before = 0.0 if self._flow is None else self._flow
+            moved = before + self.increments.max_move * output
+            self._flow = output = np.clip(moved, lowest, highest)
+            if self._edge > 0.0:
+                return compensate_dead_zone(output, self._edge, self.u_min, self.u_max)
+        return self.u_min + (output - lowest) * half_range
 
 
 def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:

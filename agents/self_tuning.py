@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.actuator import applied_flow, avoid_dead_zone
 from agents.controller import (
     PAPER_WINDOWS,
     Index,
@@ -267,7 +268,8 @@ class SelfTuningController(ToldController):
             self._learn()
             self._design(self._share)
 
-        command = self._beyond_the_dead_zone(self._law(setpoint))
+        edge = np.where(self._zone > 0.0, self._zone + CLEARANCE, 0.0)
+        command: Array = avoid_dead_zone(self._law(setpoint), edge)
         self._apply(command)
         return command if observation.ndim == 2 else command[0]
 
@@ -288,22 +290,14 @@ class SelfTuningController(ToldController):
         """Return the output of each model at gain 1, some samples ago."""
         return self._units[:, self._now - self._delays - ago].reshape(self._loops, -1)
 
-    def _beyond_the_dead_zone(self, command: Array) -> Array:
-        """Move commands within the dead zone to its edge or to 0, whichever is nearer."""
-        edge = np.where(self._zone > 0.0, self._zone + CLEARANCE, 0.0)
-        size = np.abs(command)
-        moved = np.where(size < edge / 2.0, 0.0, np.copysign(edge, command))
-        return np.where(size < edge, moved, command)
-
     def _apply(self, command: Array) -> None:
         """Update the undelayed responses with a command."""
-        flow = np.clip(command, self.u_min, self.u_max)
-        column = flow[:, np.newaxis]
-        applied = column * (np.abs(column) >= self._dead_zones)
+        column = command[:, np.newaxis]
+        applied = applied_flow(column, self._dead_zones, self.u_min, self.u_max)
         now = self._now
         units = self._poles * self._units[:, now] + (1.0 - self._poles) * applied
         filtered = self._filter(self._filtered[:, now], units, self._units[:, now])
-        self._flows[:, now] = flow
+        self._flows[:, now] = np.clip(command, self.u_min, self.u_max)
         if now + 1 == self._units.shape[1]:
             for history in (self._units, self._filtered, self._flows):
                 history[:, : self._history] = history[:, _ROOM + 1 :].copy()

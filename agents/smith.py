@@ -9,6 +9,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 
+from agents.actuator import applied_flow
 from agents.controller import Flag, Number, Positive, ToldController, Values
 from agents.pi import PIController
 
@@ -87,7 +88,6 @@ class SmithPredictor(ToldController, PIController):
         foreseen = np.array(observation)
         foreseen[..., self.error_index] -= now - delayed
         command = super()._control(foreseen)
-        applied = np.clip(command, self.u_min, self.u_max)
-        applied = np.where(np.abs(applied) < self.dead_zone, 0.0, applied)
+        applied = applied_flow(command, self.dead_zone, self.u_min, self.u_max)
         self._model = [*self._model[1:], self._pole * now + self._input_gain * applied]
         return command

@@ -290,14 +290,22 @@ class TestSmithPredictor:
     def smith(self, **changes):
         return SmithPredictor(**{**PLANT, "closed_loop_time_constant": 80.0, **changes})
 
-    @pytest.mark.parametrize("setpoint", [2.0, 6.5])  # the latter takes more than the limits
-    def test_with_the_right_model_there_is_no_delay_to_the_loop(self, setpoint):
+    @pytest.mark.parametrize(
+        ("setpoint", "actuator"),
+        [
+            (2.0, {"dead_zone": 0.0}),
+            (6.5, {"dead_zone": 0.0}),  # takes more than the limits
+            (2.0, {"dead_zone": 5.0, "u_min": -3.0}),  # the limit lies inside the dead zone
+        ],
+    )
+    def test_with_the_right_model_there_is_no_delay_to_the_loop(self, setpoint, actuator):
         # On a plant that is its model, the output is that of the loop without delay, later.
         pole = np.exp(-8 / 161)
-        plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), "dead_zone": 0.0}
+        plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), **actuator}
         plant["setpoint"] = setpoint
-        late = rollout(make_plants(1, 200, **plant), self.smith(), 200, seed=0)
-        prompt = PIController(self.smith().kp, self.smith().ki, anti_windup=True)
+        smith = self.smith(**actuator)
+        late = rollout(make_plants(1, 200, **plant), smith, 200, seed=0)
+        prompt = PIController(smith.kp, smith.ki, anti_windup=True, u_min=smith.u_min)
         soon = rollout(make_plants(1, 200, **plant, delay=0), prompt, 200, seed=0)
         np.testing.assert_allclose(late.output[18:], soon.output[:-18], atol=1e-4)
 

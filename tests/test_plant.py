@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 import mptc_gym
-from agents.controller import action_from_command as agents_action
+from agents import actuator
 from mptc_gym.parameters import PlantNumbers
 from mptc_gym.plant import Plant, action_from_command, float32_action
 from mptc_gym.ranges import Ranges
@@ -75,7 +75,7 @@ def test_scaling_by_hand():
         assert action_from_command(command, -4.0, 8.0) == action
 
 
-BOTH = pytest.mark.parametrize("scaled", [float32_action, agents_action])
+BOTH = pytest.mark.parametrize("scaled", [float32_action, actuator.float32_action])
 
 
 @BOTH

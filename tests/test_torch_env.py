@@ -14,7 +14,13 @@ from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from mptc_gym import PRESETS, MiddlePointVectorEnv  # noqa: E402
+from agents.actuator import applied_flow  # noqa: E402
+from mptc_gym import (  # noqa: E402
+    PRESETS,
+    MiddlePointEnv,
+    MiddlePointVectorEnv,
+    Parameters,
+)
 from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
 from mptc_gym.ranges import Ranges  # noqa: E402
 from mptc_gym.signals import Signals, Streams  # noqa: E402
@@ -145,6 +151,35 @@ class TestEdgeOfTheDeadZone:
         actions = action_of(commands, **drawn)[:, None]
         for applied in (env.step(torch.tensor(actions)), envs.step(actions)):
             np.testing.assert_allclose(applied[-1]["applied"], commands, rtol=0, atol=atol)
+
+    @pytest.mark.parametrize(
+        "numbers",
+        [
+            {},
+            {"dead_zone": 0.0},
+            {"dead_zone": 4.0, "u_min": -12.0, "u_max": 6.0},
+            {"dead_zone": 5.0, "u_min": -3.0},  # this limit lies inside
+            {"dead_zone": 2.0, "u_min": 6.0, "u_max": 8.0},
+        ],
+    )
+    def test_the_actuator_is_one_for_plants_and_controllers(self, numbers):
+        sizes = np.array(
+            [0.0, 1e-9, 1.0, 2.0, 3.0, 3.999, 4.0, 4.001, 5.0, 6.0, 9.0, 12.0, 1e3]
+        )
+        commands = np.concatenate([-sizes, sizes])
+        n, parameters = len(commands), Parameters(**numbers)
+        limits = parameters.dead_zone, parameters.u_min, parameters.u_max
+        expected = applied_flow(commands, *limits)
+        actions = action_from_command(commands, *limits[1:])[:, np.newaxis]
+        one, many = MiddlePointEnv(**numbers), MiddlePointVectorEnv(n, **numbers)
+        tensors = make(n, **numbers)
+        for env in (one, many, tensors):
+            env.reset(seed=0)
+        alone = [one.step(action)[-1]["applied"] for action in actions]
+        batch = many.step(actions)[-1]["applied"]
+        in_torch = tensors.step(torch.tensor(actions))[-1]["applied"]
+        for found in (alone, batch, in_torch):
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
     def test_limits_in_odd_numbers(self):
         env = make(1, u_min=-8.62, dead_zone=10.0)

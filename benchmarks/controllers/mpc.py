@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import action_from_command
+from agents.actuator import applied_flow, float32_action
 from benchmarks.loop.linear import Coefficients, coefficients
 from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
@@ -86,24 +86,25 @@ class PredictiveController:
         target = np.einsum("ni,nij->nj", setpoint[:, np.newaxis] - free, model.G)
         start = np.vstack([self._plan[1:], self._plan[-1:]])
         plan = self._optimise(model.Q, target, start)
-        inside = np.abs(plan[0]) < self._dead_zone
+        command = plan[0]
+        inside = np.abs(command) < self._dead_zone
         if inside.any():
-            edge = np.copysign(self._dead_zone, plan[0]).clip(self._u_min, self._u_max)
-            plans = [
-                self._optimise(model.Q, target, plan, first)
+            edge = np.copysign(self._dead_zone, command)
+            firsts = [
+                applied_flow(first, self._dead_zone, self._u_min, self._u_max)
                 for first in (np.zeros_like(edge), edge)
             ]
+            plans = [self._optimise(model.Q, target, plan, first) for first in firsts]
             costs = [_cost(model.Q, target, np.ascontiguousarray(p.T)) for p in plans]
-            plan = np.where(inside, np.where(costs[0] <= costs[1], *plans), plan)
-        applied = plan[0]
+            rests = costs[0] <= costs[1]
+            plan = np.where(inside, np.where(rests, *plans), plan)
+            command = np.where(inside, np.where(rests, 0.0, edge), command)
         self._plan = plan
         self._inputs[:, 2:] = self._inputs[:, 1:-1].copy()
-        self._inputs[:, 1] = applied
+        self._inputs[:, 1] = plan[0]
         self._k += 1
-        # A limit inside the dead zone is reached by a command on the edge.
-        needed = np.copysign(np.maximum(np.abs(applied), self._dead_zone), applied)
-        command = np.where(applied == 0.0, 0.0, needed)
-        return action_from_command(command, self._u_min, self._u_max, self._dead_zone)
+        action = float32_action(command, self._u_min, self._u_max, self._dead_zone)
+        return action[:, np.newaxis]
 
     def _filter(self, output: Array) -> None:
         """Advance the state from k - 1 to k, and correct it with the reading y(k)."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from benchmarks.loop.rollout import Trajectory
 from mptc_gym import Parameters
+from mptc_gym.plant import least_effective
 
 Array = NDArray[np.float64]
 
@@ -52,8 +53,9 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     drawn = {"dead_zone", "u_min", "u_max"} & set(parameters.ranges)
     inside = saturated = np.full(command.shape, np.nan)
     if not drawn:
-        inside = np.abs(command) < parameters.dead_zone
-        saturated = (command <= parameters.u_min) | (command >= parameters.u_max)
+        zone, u_min, u_max = parameters.dead_zone, parameters.u_min, parameters.u_max
+        inside = np.abs(command) < least_effective(zone, u_min, u_max)  # as the plant judges it
+        saturated = (command <= u_min) | (command >= u_max)
     by_steps = [
         _measure_steps(setpoint, output)
         for setpoint, output in zip(trajectory.setpoint.T, trajectory.output.T, strict=True)

@@ -1,0 +1,68 @@
+"""Model the actuator (29), and choose commands that it passes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def applied_flow(command: Any, dead_zone: Any, u_min: Any, u_max: Any) -> Array:
+    """Return the flow u_a that the actuator applies for a command, (29), all in t/h.
+
+    A command inside the dead zone has no effect, and any other is limited. Arguments broadcast.
+    """
+    return np.where(np.abs(command) < dead_zone, 0.0, np.clip(command, u_min, u_max))
+
+
+def float32_action(
+    command: Any, u_min: Any, u_max: Any, dead_zone: Any = 0.0
+) -> NDArray[np.float32]:
+    """Scale commands to normalised float32 actions, -1 at `u_min` and 1 at `u_max`.
+
+    Rounding can move a command from the edge of the dead zone to its inside, where it has no
+    effect. Such an action is moved outwards by one float.
+
+    Parameters
+    ----------
+    command
+        u, t/h, any shape. Commands beyond the limits become actions beyond +-1.
+    u_min, u_max
+        The actuator's limits, t/h.
+    dead_zone
+        The actuator's dead zone, t/h; a command outside it stays outside. 0 if unknown.
+    """
+    action = np.asarray(2.0 * (command - u_min) / (u_max - u_min) - 1.0, dtype=np.float32)
+    if np.any(np.asarray(dead_zone) > 0.0):
+        arrives = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0
+        lost = (np.abs(command) >= dead_zone) & (np.abs(arrives) < dead_zone)
+        # The plant adds 1, which rounds away steps finer than the float spacing at 1.
+        outwards = np.copysign(np.spacing(np.maximum(np.abs(action), np.float32(1))), command)
+        action = np.where(lost, action + outwards, action).astype(np.float32)
+    return action
+
+
+def compensate_dead_zone(flow: Any, dead_zone: float, u_min: float, u_max: float) -> Array:
+    """Spread wanted flows over those that pass the dead zone.
+
+    With z the dead zone and v the wanted flow, the command is z + (u_max - z) v / u_max above
+    0, -z + (u_min + z) v / u_min below, and 0 at 0. A limit inside the dead zone is reached by
+    commanding its edge, which (29) limits. In place of v, `flow` is 2 v / (u_max - u_min).
+    """
+    limit = np.where(flow > 0.0, u_max, -u_min)
+    limit = np.where(flow == 0.0, 1.0, limit)
+    share = np.abs(flow) * ((u_max - u_min) / 2.0 / limit)
+    command: Array = np.sign(flow) * (dead_zone + share * np.maximum(limit - dead_zone, 0.0))
+    return command
+
+
+def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:
+    """Move commands closer to 0 than `edge` to this edge or to 0, whichever is nearer.
+
+    `xp` is the array module, NumPy or PyTorch.
+    """
+    size = abs(command)
+    return xp.where(size < edge, edge * xp.sign(command) * (size >= edge / 2.0), command)
