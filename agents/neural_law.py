@@ -88,23 +88,19 @@ class Law:
     ----------
     prior
         What is known of the plants.
-    xp
-        The array module, NumPy or PyTorch.
-    still
-        Function that returns an array without its gradient.
     haste
         How much quicker the law is than the network asks for: it tilts the load means to newer
         samples, and is added to the logit of the rate.
     """
 
-    def __init__(
-        self,
-        prior: Prior,
-        xp: Any = np,
-        still: Callable[[Any], Any] = lambda value: value,
-        haste: float = 0.0,
-    ) -> None:
-        self._xp, self._still = xp, still
+    # Those of the class and not of its objects, so that these can be copied and pickled.
+    _xp: Any = np  # the array module, NumPy or PyTorch
+
+    @staticmethod
+    def _stop_gradient(value: Any) -> Any:
+        return value
+
+    def __init__(self, prior: Prior, haste: float = 0.0) -> None:
         zero = self._zero = prior.unit * 0.0
         self._rates = self._array(LOAD_RATES + RESIDUAL_RATES)
         self._tilt, self._haste = self._array(TILT), haste
@@ -169,10 +165,10 @@ class Law:
         state
             The model's undelayed output, the one before it, and the last flow that passed.
         """
-        xp, still = self._xp, self._still
+        xp = self._xp
         now, before, last = state
         missed = load[:, None] - self._means[:, :_LOADS]
-        news, size = missed[:, REFERENCE], abs(still(missed))
+        news, size = missed[:, REFERENCE], abs(self._stop_gradient(missed))
         size = xp.clip(size, None, 4.0 * self._misses[0] + LEAST_NOISE)  # limits outliers
         self._misses = [
             misses + rate * (size - misses)
@@ -228,7 +224,7 @@ class Law:
 
     def applied(self, flow: Any) -> tuple[Any, Any]:
         """Move flows in the dead zone to its edge or 0; return them, also clipped to limits."""
-        xp, zone, hard = self._xp, self.prior.dead_zone, self._still(flow)
+        xp, zone, hard = self._xp, self.prior.dead_zone, self._stop_gradient(flow)
         edge = zone + CLEARANCE * (zone > 0.0)
         flow = flow + (avoid_dead_zone(hard, edge, xp) - hard)  # straight-through gradient
         return flow, xp.clip(flow, self.prior.centre - 1.0, self.prior.centre + 1.0)

@@ -1,5 +1,7 @@
 """The roster: what holds for any controller, as every command runs it; and a user's own."""
 
+import copy
+import pickle
 import re
 
 import gymnasium
@@ -8,7 +10,7 @@ import pytest
 from stable_baselines3 import PPO
 
 from benchmarks.compare.comparison import run_case
-from benchmarks.controllers import pretrained
+from benchmarks.controllers import engineered, pretrained
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.own import own_factory
 from benchmarks.controllers.roster import ROSTER
@@ -17,7 +19,7 @@ from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.scenarios import Scenario
 from benchmarks.sweep.tasks import agent_task
 from benchmarks.train.ppo import PolicyRequest
-from benchmarks.watch import rivals
+from benchmarks.watch import game
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from mptc_gym.sb3 import make_vec_env, spec_of
@@ -50,7 +52,7 @@ def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, mo
     ways = {
         "compare": run_case(scenario, entry.name, [factory], 2).runs["mae"],
         "sweep": agent_task(factory, plant, plant, 900, 2)["mae"],
-        "watch": mean_error(rivals.replay(factory, scenario, 0)),
+        "watch": mean_error(game.replay(factory, scenario, 0, {})),
     }
     for way, found in ways.items():
         if entry.name == "nothing":
@@ -107,6 +109,21 @@ def test_a_mirrored_plant_gets_the_mirrored_flow(entry, factory, run):
 )
 def test_it_asks_for_its_own_windows(factory, windows):
     assert errors(factory, 1, 60, **windows) == errors(factory, 1, 60)
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda controller: pickle.loads(pickle.dumps(controller))]
+)
+def test_a_copy_goes_on_like_the_original_in_mid_episode(factory, copied, rng):
+    controller = factory(ACTUATOR, 2, 5)
+    size = Parameters(**factory.arguments(ACTUATOR)).observation_size
+    before, after = np.float32(rng.uniform(-3, 3, (2, 30, 2, size)))
+    for observation in before:
+        controller.act(observation)
+    twin = copied(controller)
+    ours = [controller.act(observation) for observation in after]
+    np.testing.assert_array_equal([twin.act(observation) for observation in after], ours)
+    assert len(np.unique(ours)) > 1 or isinstance(controller, engineered.Nothing)
 
 
 def test_its_cost_is_known(factory):

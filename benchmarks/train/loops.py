@@ -143,6 +143,16 @@ def environment(
     )
 
 
+class _TorchLaw(Law):
+    """The law in tensors."""
+
+    _xp = torch
+
+    @staticmethod
+    def _stop_gradient(value: Tensor) -> Tensor:
+        return value.detach()
+
+
 class Loops:
     """A batch of plants controlled by the network, starting from rest.
 
@@ -164,7 +174,7 @@ class Loops:
         newer, older = (unit * (b / sum(NOMINAL.b)) for b in NOMINAL.b)
         self._beta = torch.where(first, unit, newer), torch.where(first, zero, older)
         self._delay = told["delay"].long()
-        self._law = Law(
+        self._law = _TorchLaw(
             Prior(
                 unit=unit,
                 fading=pole ** (told["delay"] + 1.0 + 0.5 * first),
@@ -174,8 +184,6 @@ class Loops:
                 centre=-(high + low) / (high - low),
                 uncertainty=told["uncertainty"],
             ),
-            torch,
-            Tensor.detach,
         )
         self._before = torch.zeros(LONGEST + BLOCK, len(gain))  # the model's outputs
         self._new: list[Tensor] = []
