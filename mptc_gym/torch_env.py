@@ -28,29 +28,28 @@ from mptc_gym.torch_signals import (
     LONGEST,
     SIGNALS,
     Episodes,
-    Handed,
+    Given,
     Signal,
     as_tensor,
-    drawn_signals,
-    handed_signals,
-    replaced,
+    make_signals,
+    read_signals,
+    select,
 )
 
 _IN_CACHE = 1 << 17  # numbers processed at once
-_AT_ONCE = 1 << 14  # numbers of observations stacked at once
 
 
-def _usable(device: str | torch.device) -> torch.device:
+def _check_device(device: str | torch.device) -> torch.device:
     """Return a device that supports tensors and a generator; ValueError otherwise."""
     try:
-        usable = torch.device(device)
-        torch.zeros(1, device=usable)
-        torch.Generator(usable)
+        checked = torch.device(device)
+        torch.zeros(1, device=checked)
+        torch.Generator(checked)
     except (AssertionError, RuntimeError, TypeError, ValueError) as error:
         raise ValueError(
             f"device must be one that PyTorch can use here, got {device!r}: {error}"
         ) from error
-    return usable
+    return checked
 
 
 class MiddlePointTorchEnv(BatchEnv):
@@ -147,7 +146,7 @@ class MiddlePointTorchEnv(BatchEnv):
             reject("dtype", dtype, "torch.float32 or torch.float64")
         if not isinstance(differentiable, bool):
             reject("differentiable", differentiable, "True or False")
-        self.device, self.dtype = _usable(device), dtype
+        self.device, self.dtype = _check_device(device), dtype
         self.differentiable = differentiable
         self.checks_actions = self.device.type == "cpu"
         self._seed: int | None = None  # None until the first reset
@@ -157,14 +156,14 @@ class MiddlePointTorchEnv(BatchEnv):
 
         self._episodes = Episodes(self.parameters, self._zeros)
         self._plants = TorchPlants(self.parameters, self._episodes)
-        self._drawn = drawn_signals(self.parameters, self._episodes)
-        self._handed: dict[str, Handed] = {}  # signals and plant numbers
+        self._drawn = make_signals(self.parameters, self._episodes)
+        self._given: dict[str, Given] = {}  # signals and plant numbers
         self._last: int | None = None  # last sample that all given signals have
         self._signals: dict[str, Signal] = self._drawn
         # Blocks that fit in the processor's cache or, on other devices, are worth their calls.
         in_cache = max(1, _IN_CACHE // num_envs) if self.device.type == "cpu" else LONGEST
         self._block = min(self._plants.most_samples, LONGEST, in_cache)
-        # Precomputed returns of the steps ahead, the next one last.
+        # Precomputed returns of the steps ahead, the next one last, without past actions.
         self._ahead: list[tuple[Any, ...]] = []
         self._shown = _Window(self.parameters.windows, self._zeros, differentiable)
 
@@ -189,13 +188,11 @@ class MiddlePointTorchEnv(BatchEnv):
         ]
 
     def _advance(self, a: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
-        episodes = self._episodes
         command, applied = self._plants.apply(a)
         if not self._ahead:
             self._look_ahead()
-        rewards, terminations, truncations, infos = self._ahead.pop()
-        observations = self._shown.next(episodes.taken, a)
-        episodes.taken += 1
+        shown, rewards, terminations, truncations, infos = self._ahead.pop()
+        observations = self._shown.append(shown, a)
         if self._move_weight:
             rewards = rewards - self._move_weight * (a - self._action).abs()
             self._action = a.clone()  # the caller may overwrite it
@@ -205,15 +202,14 @@ class MiddlePointTorchEnv(BatchEnv):
     def _look_ahead(self) -> None:
         """Compute what the next steps return, except what depends on their actions."""
         samples = max(1, min(self._block, self._first_end - self._clock + 1))
-        self._episodes.clock = self._clock
-        made = {name: signal.next(samples) for name, signal in self._signals.items()}
+        made = {name: each.next(self._clock, samples) for name, each in self._signals.items()}
         setpoint, noise, load = made["setpoint"], made.get("noise"), made.get("disturbance")
-        output, factors = self._plants.outputs(samples, noise, load)
+        output, factors = self._plants.outputs(self._clock, samples, noise, load)
         error = setpoint - output
         measured = output + made["measurement_noise"] if "measurement_noise" in made else output
         span = self.parameters.temperature_span
         measured = measured.clamp(-span, span)
-        self._shown.add(self._episodes.taken, setpoint, setpoint - measured, measured)
+        shown = self._shown.stack(setpoint, setpoint - measured, measured)
 
         infos = {
             "output": output,
@@ -231,8 +227,9 @@ class MiddlePointTorchEnv(BatchEnv):
         names = (*infos, *self._factors)
         flags = self._zeros.new_zeros(2 * samples, self.num_envs, dtype=torch.bool).unbind()
         self._ahead = [
-            (reward, *both, {**dict(zip(names, values, strict=True)), **masks})
-            for reward, *both, values in zip(
+            (*returned, {**dict(zip(names, values, strict=True)), **masks})
+            for *returned, values in zip(
+                shown,
                 self._rewards(error).unbind(),
                 flags[:samples],
                 flags[samples:],
@@ -240,7 +237,6 @@ class MiddlePointTorchEnv(BatchEnv):
                 strict=True,
             )
         ][::-1]
-        self._episodes.taken = 0
 
     def _rewards(self, error: Tensor) -> Tensor:
         """Return the rewards of errors, without the cost of moves."""
@@ -252,15 +248,14 @@ class MiddlePointTorchEnv(BatchEnv):
 
     def _begin(self, mask: Mask) -> dict[str, Tensor]:
         which = None if mask.all() else self._flags(mask)
-        episodes = self._episodes
-        first = episodes.reset(which, self._starts, self._clock, self._handed)
-        self._plants.reset(which)
-        at_rest = {name: signal.reset(which) for name, signal in self._signals.items()}
-        numbers, setpoint = episodes.numbers, at_rest["setpoint"]
+        left, self._ahead = len(self._ahead), []  # samples computed, but not returned
+        first = self._episodes.reset(which, self._starts, self._clock, self._given)
+        self._plants.reset(which, left)
+        at_rest = {name: each.reset(which, left) for name, each in self._signals.items()}
+        numbers, setpoint = self._episodes.numbers, at_rest["setpoint"]
         rest_action = self._zeros + action_from_command(0.0, numbers["u_min"], numbers["u_max"])
-        self._action = replaced(self._action, which, rest_action)
-        self._shown.reset(episodes.taken, which, setpoint, rest_action)
-        self._ahead, episodes.taken = [], 0
+        self._action = select(which, rest_action, self._action)
+        self._shown.reset(which, left, setpoint, rest_action)
         first |= {"setpoint": setpoint, "error": setpoint}
         return first | {name: self._zeros + numbers[name] for name in self._factors}
 
@@ -282,10 +277,10 @@ class MiddlePointTorchEnv(BatchEnv):
             reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
         if "reset_mask" not in options:
             # Signals and plant numbers that replace draws, if any.
-            self._handed, self._last = handed_signals(
+            self._given, self._last = read_signals(
                 options.get("signals"), self.parameters, self._episodes
             )
-            of_signals = {name: each for name, each in self._handed.items() if name in SIGNALS}
+            of_signals = {name: each for name, each in self._given.items() if name in SIGNALS}
             self._signals = {**self._drawn, **of_signals}
         elif "signals" in options:
             raise ValueError("options['signals'] needs a reset of all plants, not of some")
@@ -329,64 +324,55 @@ class _Window:
         self._zeros, self._differentiable = zeros, differentiable
         self._actions: list[Tensor] = []  # those shown, newest first
         # Set points, errors and outputs, oldest first: those of one observation, then those of
-        # the block.
+        # the latest block.
         self._rows: list[list[Tensor]] = [[] for _ in self._windows]
-        self._samples = 0  # of the block
-        # Observations are stacked a few at a time.
-        numbers = max(1, sum(self._windows) * len(zeros))
-        self._at_once = max(1, _AT_ONCE // numbers) if zeros.is_cpu else LONGEST
-        self._together: list[Tensor] = []  # the next one last
 
     def reset(
-        self, taken: int, which: Tensor | None, setpoint: Tensor, rest_action: Tensor
+        self, which: Tensor | None, left: int, setpoint: Tensor, rest_action: Tensor
     ) -> None:
-        """Begin an episode of some plants at rest, after `taken` samples of a block."""
+        """Begin an episode of some plants at rest; drop the last samples of the block."""
         for rows, w, newest in zip(
             self._rows, self._windows, (setpoint, setpoint, self._zeros), strict=True
         ):
             at_rest = [*[self._zeros] * (w - 1), newest.clone()][:w]
-            past = rows[taken : taken + w] or at_rest
-            rows[:] = [replaced(*each) for each in zip(past, [which] * w, at_rest, strict=True)]
-        self._samples, self._together = 0, []
+            end = len(rows) - left
+            past = rows[end - w : end] or at_rest
+            rows[:] = [select(which, *each) for each in zip(at_rest, past, strict=True)]
         if self._past_actions:
             shown = rest_action.clamp(-1.0, 1.0).expand(self._past_actions, -1)
             if which is not None:
                 shown = torch.where(which, shown, torch.cat(self._actions))
             self._actions = [shown] if self._differentiable else [*shown.split(1)]
 
-    def add(self, taken: int, *blocks: Tensor) -> None:
-        """Add a block of set points, errors and outputs, after `taken` samples of the last."""
+    def stack(self, *blocks: Tensor) -> Sequence[Tensor]:
+        """Return the observations of a block of set points, errors and outputs, no actions."""
         for rows, w, block in zip(self._rows, self._windows, blocks, strict=True):
             if w:
-                rows[:] = [*rows[taken : taken + w], *block.unbind()]
-        self._samples = len(blocks[0])
+                rows[:] = [*rows[len(rows) - w :], *block.unbind()]
+        return self._stack(1, len(blocks[0]))
 
-    def next(self, taken: int, a: Tensor) -> Tensor:
-        """Return the observations of a sample of the block, given the action before it."""
-        if not self._together:
-            self._together = self._stacked(taken + 1, min(self._at_once, self._samples - taken))
-        rows = self._together.pop()
+    def append(self, shown: Tensor, a: Tensor) -> Tensor:
+        """Return observations with their past actions, of which a is the newest."""
         if self._past_actions:
             newest = a.clamp(-1.0, 1.0)[None]
             if self._differentiable:
                 self._actions = [torch.cat((newest, *self._actions))[:-1]]
             else:
                 self._actions = [newest, *self._actions[:-1]]
-            rows = torch.cat((rows, *self._actions))
-        return rows.t()
+            shown = torch.cat((shown, *self._actions))
+        return shown.t()
 
     def present(self) -> Tensor:
         """Return the observations after a reset."""
-        return torch.cat((*self._stacked(0, 1), *self._actions)).t()
+        return torch.cat((*self._stack(0, 1), *self._actions)).t()
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions."""
         self._rows = [[each.detach() for each in rows] for rows in self._rows]
-        self._together = [each.detach() for each in self._together]
         self._actions = [each.detach() for each in self._actions]
 
-    def _stacked(self, first: int, count: int) -> list[Tensor]:
-        """Return observations without actions, from index `first` of the rows, last first."""
+    def _stack(self, first: int, count: int) -> Sequence[Tensor]:
+        """Return observations without actions, from index `first` of the rows."""
         newest_first = [
             row
             for k in range(first, first + count)
@@ -395,5 +381,4 @@ class _Window:
         ]
         if not newest_first:
             return [self._zeros.new_empty(0, len(self._zeros))] * count
-        stacked = torch.stack(newest_first).view(count, -1, len(self._zeros))
-        return [*stacked.unbind()][::-1]
+        return torch.stack(newest_first).view(count, -1, len(self._zeros)).unbind()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
-from itertools import islice
+from itertools import islice, pairwise
 from typing import Any
 
 import torch
@@ -69,8 +69,11 @@ class TorchPlants:
         self.most_samples = shortest + 1
         self._order = len(parameters.a) - 1  # of A
 
-    def reset(self, which: Tensor | None) -> None:
-        """Bring some plants, or all, to rest, with the numbers of the current episodes."""
+    def reset(self, which: Tensor | None, left: int) -> None:
+        """Bring some plants, or all, to rest, with the numbers of the current episodes.
+
+        The last `left` outputs are dropped before.
+        """
         numbers, zeros = self._episodes.numbers, self._zeros
         self._now: tuple[Any, Any] | None = None  # factors and coefficients of (28)
         plants = PlantNumbers(**numbers)
@@ -82,14 +85,15 @@ class TorchPlants:
                 (zeros + begin, zeros + (end - begin))
                 for begin, end in zip(self._factors, last, strict=True)
             ]
-        # Flows that have yet to take effect, for all terms of B; and outputs, those that A
-        # needs from before the last block and those of the block. Both have the oldest first.
+        # Flows that have yet to take effect, for all terms of B; and outputs, those of the
+        # latest block and those that A needs from before it. Both have the oldest first.
         if which is None:
             flows = self._longest + len(self._beta)
             self._flows = deque([zeros] * flows, flows)
-            self._history = [zeros] * self._order
+            self._outputs = [zeros] * self._order
         else:
-            self._history = [each.masked_fill(which, 0.0) for each in self._past()]
+            past = self._outputs[: len(self._outputs) - left]
+            self._outputs = [each.masked_fill(which, 0.0) for each in past]
             self._flows.extend(torch.stack([*self._flows]).masked_fill_(which, 0.0).unbind())
         self._limits = u_min, u_max = numbers["u_min"], numbers["u_max"]
         self._middle = zeros.new_zeros(()) + (u_min + u_max) / 2.0
@@ -116,17 +120,19 @@ class TorchPlants:
         return command, applied
 
     def outputs(
-        self, samples: int, noise: Tensor | None, load: Tensor | None
+        self, clock: int, samples: int, noise: Tensor | None, load: Tensor | None
     ) -> tuple[Tensor, list[tuple[Number, Number]]]:
         """Compute the outputs of the next samples, after the action before them was applied.
 
-        n and w of these samples, if any, and y have the shape (samples, n), degC. Also return
-        gain and time constant at each sample, as multiples of those of A and B.
+        The first of them is at that time of the clock. n and w, if any, and y have the shape
+        (samples, n), degC. Also return gain and time constant at each sample, as multiples of
+        those of A and B.
         """
-        rows, all_factors = self._past(), []
+        rows, all_factors = self._outputs[len(self._outputs) - self._order :], []
         response = self._response(samples)
-        for first, last in self._stretches(samples):
-            factors, (alpha, scale, load_gain) = self._drifted(self._episodes.clock + first)
+        begins = [k for k in range(samples) if k == 0 or self._changes_at(clock + k)]
+        for first, last in pairwise([*begins, samples]):
+            factors, (alpha, scale, load_gain) = self._drifted(clock + first)
             forced = response[first:last]
             if noise is not None:
                 forced = _plus(noise[first:last], scale, forced)
@@ -136,12 +142,12 @@ class TorchPlants:
                 forced = _plus(forced, load_gain, load[first:last])
             all_factors += [factors] * (last - first)
             rows = _follow(rows, forced.unbind(), alpha)
-        self._history = rows
+        self._outputs = rows
         return torch.stack(rows[self._order :]), all_factors
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions."""
-        self._history = [each.detach() for each in self._history]
+        self._outputs = [each.detach() for each in self._outputs]
         self._flows.extend([each.detach() for each in self._flows])
 
     def _response(self, samples: int) -> Tensor:
@@ -159,19 +165,9 @@ class TorchPlants:
             response = response.add_(earlier, alpha=coefficient)
         return response
 
-    def _past(self) -> list[Tensor]:
-        """Return the outputs that A needs, oldest first."""
-        return self._history[self._episodes.taken :][: self._order]
-
-    def _stretches(self, samples: int) -> list[tuple[int, int]]:
-        """Return the first sample and the end of each stretch with constant dynamics."""
-        clock = self._episodes.clock
-        begins = [0, *(k for k in range(1, samples) if self._changes_at(clock + k))]
-        return list(zip(begins, [*begins[1:], samples], strict=True))
-
     def _changes_at(self, clock: int) -> bool:
         """Whether the drifting dynamics of any plant change at a sample."""
-        return self._drifts and clock % DRIFT_INTERVAL in self._episodes.phases
+        return self._drifts and self._episodes.any_changes(clock)
 
     def _drifted(self, clock: int) -> tuple[Any, Any]:
         """Return gain and time constant at a sample, and the coefficients of (28) for them."""
@@ -179,6 +175,8 @@ class TorchPlants:
             factors: tuple[Any, ...] = self._factors
             if self._drifts:
                 age = self._episodes.age(clock)
+                if isinstance(age, Tensor):
+                    age = age.to(self._zeros.dtype)
                 share = self._dynamics.share(age - age % DRIFT_INTERVAL)
                 factors = tuple(_plus(first, share, more) for first, more in self._drift)
             gain, time_constant = factors

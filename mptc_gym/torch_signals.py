@@ -1,10 +1,10 @@
 """Generate external signals in PyTorch, drawn from one generator, or pass on given ones.
 
-The signals have two methods of those in `mptc_gym.signals`, for many plants and a block of
-samples at a time, without a loop over plants. `reset(which)` begins an episode of some plants,
-or of all if `which` is None, and returns the signal at k = 0, shape (n,). `next(samples)`
-returns the samples that follow, degC, shape (samples, n). The rest of a block is dropped when
-an episode begins.
+The signals have two methods, for many plants and a block of samples at a time, without a loop
+over plants. `reset(which, left)` begins an episode of some plants, or of all if `which` is
+None, after the last `left` samples of the latest block have been dropped, and returns the
+signal at k = 0, shape (n,). `next(clock, samples)` returns the samples that follow, the first
+of them at that time of the environment's clock, degC, shape (samples, n).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
 Number = float | Tensor  # one for all plants, or one per plant, shape (n,)
 
 
-def replaced(old: Tensor, which: Tensor | None, new: Tensor) -> Tensor:
+def select(which: Tensor | None, new: Tensor, old: Tensor) -> Tensor:
     """Return new values for some plants, old ones for the others; None selects all plants."""
     return new if which is None else torch.where(which, new, old)
 
@@ -44,15 +44,15 @@ def as_tensor(values: Any, like: Tensor) -> Tensor | None:
 
 
 class Episodes:
-    """State of the current episodes, shared by signals and plants, and their generator.
+    """The current episodes: plant numbers and starts, shared by signals and plants.
 
-    `zeros`, shape (n,), have the device and type to use.
+    `zeros`, shape (n,), have the device and type to use, and `generator` is the one source of
+    all draws.
     """
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
         self.zeros, self.generator = zeros, torch.Generator(zeros.device)
         self._ranges = {name: parameters.range_of(name) for name in parameters.ranges}
-        self._changes = parameters.drifts or parameters.is_disturbed
         # If one limit is drawn, both are tensors: PyTorch clamps either between two numbers or
         # between two tensors.
         limits = {"u_min", "u_max"}
@@ -61,13 +61,11 @@ class Episodes:
         for name in PLANT_NUMBERS:
             low = float(parameters.range_of(name)[0])
             self.numbers[name] = zeros + low if name in tensors else low
-        # Samples since the plants were created, up to the first sample of the next block; and
-        # the number of samples of the last block that have passed.
-        self.clock = self.taken = 0
-        # The clock at the start of each plant's episode, and its remainders modulo
-        # `DRIFT_INTERVAL`, if anything changes that slowly.
-        self.starts = torch.zeros_like(zeros, dtype=torch.int64)
-        self.phases: set[int] = set()
+        # The clock at the start of each plant's episode, or of all. The host knows at which
+        # remainders of the clock one of them is a multiple of `DRIFT_INTERVAL` samples old.
+        self._changes = parameters.drifts or parameters.is_disturbed
+        self._starts: Tensor | int = 0
+        self._phases: set[int] = set()
         self._rows = torch.arange(LONGEST, device=zeros.device)[:, None]
 
     def reset(
@@ -75,7 +73,7 @@ class Episodes:
         which: Tensor | None,
         starts: NDArray[np.int64],
         clock: int,
-        handed: Mapping[str, Handed],
+        given: Mapping[str, Given],
     ) -> dict[str, Tensor]:
         """Begin an episode of some plants, and return the numbers that are drawn or given.
 
@@ -84,34 +82,36 @@ class Episodes:
         first = {}
         for name, (low, high) in self._ranges.items():
             whole = ARGUMENTS[name].is_integer
-            values = (
-                handed[name].reset(which) if name in handed else self.within(low, high, whole)
-            )
-            self.numbers[name] = replaced(self.zeros + self.numbers[name], which, values)
+            values = given[name].reset(which) if name in given else self.draw(low, high, whole)
+            self.numbers[name] = select(which, values, self.zeros + self.numbers[name])
             first[name] = values.to(torch.int64) if whole else values
-        begun = self.zeros.new_full((), clock, dtype=torch.int64)
-        self.starts = replaced(self.starts, which, begun.expand(len(starts)))
-        self._first = int(starts[0]) if (starts == starts[0]).all() else None
-        self.phases = {*np.unique(starts % DRIFT_INTERVAL).tolist()} if self._changes else set()
+        if (starts == clock).all():
+            self._starts = clock
+        else:
+            before = torch.zeros_like(self.zeros, dtype=torch.int64) + self._starts
+            self._starts = select(which, torch.full_like(before, clock), before)
+        if self._changes:
+            self._phases = {*np.unique(starts % DRIFT_INTERVAL).tolist()}
         return first
 
-    def ages(self, samples: int) -> Tensor:
-        """Return k at each sample of the next block, shape (samples, n), or (samples, 1)."""
-        starts = self.starts[:1] if self._first is not None else self.starts
-        return self._rows[:samples] + (self.clock - starts)
-
-    def age(self, clock: int) -> int | Tensor:
+    def age(self, clock: int) -> Tensor | int:
         """Return k at a time of the clock, shape (n,), or one number for all plants."""
-        if self._first is not None:
-            return clock - self._first
-        return (clock - self.starts).to(self.zeros.dtype)
+        return clock - self._starts
 
-    def within_one(self, rows: int) -> Tensor:
+    def ages(self, clock: int, samples: int) -> Tensor:
+        """Return k at each sample of a block, shape (samples, n), or (samples, 1)."""
+        return self._rows[:samples] + self.age(clock)
+
+    def any_changes(self, clock: int) -> bool:
+        """Whether the age of any plant is a multiple of `DRIFT_INTERVAL`."""
+        return clock % DRIFT_INTERVAL in self._phases
+
+    def draw_within_one(self, rows: int) -> Tensor:
         """Draw numbers from -1 to 1, 1 excluded, shape (rows, n)."""
         drawn = self.zeros.new_empty(rows, len(self.zeros))
         return drawn.uniform_(-1.0, 1.0, generator=self.generator)
 
-    def within(self, low: float, high: float, whole: bool) -> Tensor:
+    def draw(self, low: float, high: float, whole: bool) -> Tensor:
         """Draw numbers from a range, or whole numbers, both ends included; shape (n,)."""
         drawn = torch.empty_like(self.zeros)
         drawn.uniform_(low, high + whole, generator=self.generator)
@@ -123,24 +123,26 @@ class Noise:
 
     def __init__(self, name: str, parameters: Parameters, episodes: Episodes) -> None:
         self._variance, self._c = f"{name}_variance", tuple(colour_of(name, parameters))
+        self._order = len(self._c) - 1
         self._episodes = episodes
 
-    def reset(self, which: Tensor | None) -> Tensor:
+    def reset(self, which: Tensor | None, left: int) -> Tensor:
         """Begin an episode of some plants."""
         zeros = self._episodes.zeros
         self._deviation = self._episodes.numbers[self._variance] ** 0.5
         if which is None:
-            self._xi = zeros.expand(len(self._c) - 1, -1)
+            self._xi = zeros.expand(self._order, -1)  # those of the latest block last
         else:
-            self._xi = self._past().masked_fill(which, 0.0)
+            self._xi = self._xi[: len(self._xi) - left].masked_fill(which, 0.0)
         return zeros
 
-    def next(self, samples: int) -> Tensor:
+    def next(self, clock: int, samples: int) -> Tensor:
         """Draw the next samples."""
-        order, past = len(self._c) - 1, self._past()
+        order, generator = self._order, self._episodes.generator
+        past = self._xi[len(self._xi) - order :]
         self._xi = past.new_empty(order + samples, past.shape[1])
         self._xi[:order] = past
-        drawn, generator = self._xi[order:], self._episodes.generator
+        drawn = self._xi[order:]
         if isinstance(self._deviation, float):
             noise = drawn.normal_(0.0, self._deviation, generator=generator)
         else:
@@ -148,9 +150,6 @@ class Noise:
         for lag, coefficient in enumerate(self._c[1:], start=1):
             noise = noise.add(self._xi[order - lag : order - lag + samples], alpha=coefficient)
         return noise
-
-    def _past(self) -> Tensor:
-        return self._xi[self._episodes.taken :][: len(self._c) - 1]
 
 
 class RandomSetPoint:
@@ -163,48 +162,47 @@ class RandomSetPoint:
         # The current level and those to come, each with the sample where it ends: whole numbers
         # in floats, which are fastest.
         self._levels = [(zeros, zeros)]
-        # Number of known samples, and of those that have passed, from the same origin.
-        self._horizon = self._passed = 0
+        # Number of known samples, and of those that were returned, from the same origin.
+        self._known = self._returned = 0
 
-    def reset(self, which: Tensor | None) -> Tensor:
+    def reset(self, which: Tensor | None, left: int) -> Tensor:
         """Begin an episode of some plants."""
-        self._catch_up()
-        (end, level), (hold, first) = self._levels[0], self._drawn()
-        self._levels = [(replaced(end, which, hold), replaced(level, which, first))]
+        self._returned -= left
+        self._move_origin()
+        (end, level), (hold, first) = self._levels[0], self._draw_level()
+        self._levels = [(select(which, hold, end), select(which, first, level))]
         return self._levels[0][1]
 
-    def next(self, samples: int) -> Tensor:
+    def next(self, clock: int, samples: int) -> Tensor:
         """Return the next samples, drawn if they are not yet known."""
-        shortest, taken = self._law.shortest, self._episodes.taken
-        if self._passed + taken + samples > self._horizon:
-            self._catch_up()
-            self._horizon = max(samples, shortest)
-            for _ in range(1 + (self._horizon - 1) // shortest):
-                hold, level = self._drawn()
+        if self._returned + samples > self._known:
+            self._move_origin()
+            self._known = max(samples, self._law.shortest)
+            for _ in range(1 + (self._known - 1) // self._law.shortest):
+                hold, level = self._draw_level()
                 self._levels.append((self._levels[-1][0] + hold, level))
-        else:
-            self._passed += taken
-        rows = (self._rows[:samples] + (self._passed + 1))[:, None]
+        rows = (self._rows[:samples] + (self._returned + 1))[:, None]
+        self._returned += samples
         levels = self._levels[0][1].expand(samples, -1)
         for (change, _), (_, level) in pairwise(self._levels):
             levels = torch.lerp(levels, level, _reached(rows, change))
         return levels
 
-    def _drawn(self) -> tuple[Tensor, Tensor]:
+    def _draw_level(self) -> tuple[Tensor, Tensor]:
         """Draw the lengths of levels, in samples, and the levels, each of shape (n,)."""
-        level = self._episodes.within_one(1)[0] * self._law.amplitude
-        hold = self._episodes.within(self._law.shortest, self._law.longest, whole=True)
+        level = self._episodes.draw_within_one(1)[0] * self._law.amplitude
+        hold = self._episodes.draw(self._law.shortest, self._law.longest, whole=True)
         return hold, level
 
-    def _catch_up(self) -> None:
-        """Move the origin to the sample last taken, and keep only the level there."""
+    def _move_origin(self) -> None:
+        """Move the origin to the sample returned last, and keep only the level there."""
         end, level = self._levels[0]
-        passed = level.new_full((), self._passed + self._episodes.taken)
+        now = level.new_full((), self._returned)
         for (change, _), (later, following) in pairwise(self._levels):
-            reached = _reached(passed, change)
+            reached = _reached(now, change)
             end, level = torch.lerp(end, later, reached), torch.lerp(level, following, reached)
-        self._levels = [(end - passed, level)]
-        self._horizon = self._passed = 0
+        self._levels = [(end - now, level)]
+        self._known = self._returned = 0
 
 
 class RepeatedSetPoint:
@@ -216,15 +214,16 @@ class RepeatedSetPoint:
         self._ends = torch.tensor(levels.lengths, device=self._values.device).cumsum(0)
         self._period = sum(levels.lengths)
 
-    def reset(self, which: Tensor | None) -> Tensor:
+    def reset(self, which: Tensor | None, left: int) -> Tensor:
         """Begin an episode of some plants."""
         return self._values[0].expand(len(self._episodes.zeros))
 
-    def next(self, samples: int) -> Tensor:
+    def next(self, clock: int, samples: int) -> Tensor:
         """Return the next samples."""
-        ages, n = self._episodes.ages(samples), len(self._episodes.zeros)
+        n = len(self._episodes.zeros)
         if len(self._values) == 1:
             return self._values.expand(samples, n)
+        ages = self._episodes.ages(clock, samples)
         places = torch.bucketize(ages % self._period, self._ends, right=True)
         return self._values[places].expand(samples, n)
 
@@ -235,36 +234,32 @@ class Disturbance:
     def __init__(self, episodes: Episodes) -> None:
         self._episodes = episodes
 
-    def reset(self, which: Tensor | None) -> Tensor:
+    def reset(self, which: Tensor | None, left: int) -> Tensor:
         """Begin an episode of some plants."""
         zeros = self._episodes.zeros
-        # Steps and walk at the sample before the last block, and at those of the block.
+        # Steps and walk at the sample before the latest block, and at those of the block.
         if which is None:
             self._parts = [(zeros, zeros)]
         else:
-            step, walk = self._parts[self._episodes.taken]
+            step, walk = self._parts[-1 - left]
             self._parts = [(step.masked_fill(which, 0.0), walk.masked_fill(which, 0.0))]
         return zeros
 
-    def next(self, samples: int) -> Tensor:
+    def next(self, clock: int, samples: int) -> Tensor:
         """Draw the next samples."""
-        clock, phases = self._episodes.clock, self._episodes.phases
-        self._parts = [self._parts[self._episodes.taken]]
-        total = torch.add(*self._parts[0])
-        rows = []
+        parts = self._parts[-1]
+        self._parts, total, rows = [parts], torch.add(*parts), []
         for now in range(clock, clock + samples):
-            if now % LOAD_INTERVAL in phases:
-                self._parts.append(self._changed(now))
-                total = torch.add(*self._parts[-1])
-            else:
-                self._parts.append(self._parts[-1])
+            if self._episodes.any_changes(now):
+                parts = self._change(*parts, now)
+                total = torch.add(*parts)
+            self._parts.append(parts)
             rows.append(total)
         return torch.stack(rows)
 
-    def _changed(self, clock: int) -> tuple[Tensor, Tensor]:
+    def _change(self, step: Tensor, walk: Tensor, clock: int) -> tuple[Tensor, Tensor]:
         """Return steps and walk after the plants that are due have changed."""
-        numbers, (step, walk) = self._episodes.numbers, self._parts[-1]
-        drawn = self._episodes.within_one(2)
+        numbers, drawn = self._episodes.numbers, self._episodes.draw_within_one(2)
         interval = numbers["disturbance_interval"]
         if isinstance(interval, Tensor):
             interval = interval.clamp(min=LOAD_INTERVAL)
@@ -276,10 +271,10 @@ class Disturbance:
         level = place * numbers["disturbance_amplitude"]
         # Uniform within +-h, a step of the walk has the variance h^2 / 3.
         width = (3.0 * LOAD_INTERVAL * numbers["disturbance_walk_variance"]) ** 0.5
-        moved = walk + drawn[1] * width
-        if len(self._episodes.phases) > 1:
-            turn = ((clock - self._episodes.starts) % LOAD_INTERVAL == 0).to(place.dtype)
-            moved, jumps = torch.lerp(walk, moved, turn), jumps.mul_(turn)
+        moved, age = walk + drawn[1] * width, self._episodes.age(clock)
+        if isinstance(age, Tensor):
+            due = (age % LOAD_INTERVAL == 0).to(place.dtype)
+            moved, jumps = torch.lerp(walk, moved, due), jumps.mul_(due)
         return torch.lerp(step, level, jumps), moved
 
 
@@ -290,7 +285,7 @@ def _reached(now: Tensor, change: Tensor) -> Tensor:
     return past.ge_(past.new_zeros(()))
 
 
-class Handed:
+class Given:
     """A signal that is given instead of drawn; or a plant number, by `reset` alone.
 
     The values have the shape (episodes, samples, n). After the last episode, the first follows
@@ -299,16 +294,16 @@ class Handed:
 
     def __init__(self, values: Tensor, episodes: Episodes) -> None:
         self._values, self._episodes = values, episodes
-        self._episode = torch.zeros_like(episodes.starts) - 1  # of each plant, from 0 on
+        self._episode = torch.full_like(episodes.zeros, -1, dtype=torch.int64)  # of each plant
 
-    def reset(self, which: Tensor | None) -> Tensor:
+    def reset(self, which: Tensor | None, left: int = 0) -> Tensor:
         """Begin the next episode of some plants."""
         self._episode = self._episode + (1 if which is None else which)
         return self._at(torch.zeros_like(self._episode)[None])[0]
 
-    def next(self, samples: int) -> Tensor:
+    def next(self, clock: int, samples: int) -> Tensor:
         """Return the next samples."""
-        return self._at(self._episodes.ages(samples))
+        return self._at(self._episodes.ages(clock, samples))
 
     def _at(self, ages: Tensor) -> Tensor:
         count, length, _ = self._values.shape
@@ -316,10 +311,10 @@ class Handed:
         return self._values.flatten(0, 1).gather(0, rows)
 
 
-Signal = Noise | RandomSetPoint | RepeatedSetPoint | Disturbance | Handed
+Signal = Noise | RandomSetPoint | RepeatedSetPoint | Disturbance | Given
 
 
-def drawn_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal]:
+def make_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal]:
     """Return the signals of an environment by name, except noise that is always 0."""
     levels = Levels(parameters)
     setpoint = RandomSetPoint if levels.random else RepeatedSetPoint
@@ -332,9 +327,9 @@ def drawn_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signa
     return signals
 
 
-def handed_signals(
+def read_signals(
     signals: Any, parameters: Parameters, episodes: Episodes
-) -> tuple[dict[str, Handed], int | None]:
+) -> tuple[dict[str, Given], int | None]:
     """Check given signals and plant numbers, if any.
 
     Return them, and the last sample that all signals have, or None without signals.
@@ -342,18 +337,16 @@ def handed_signals(
     if signals is None:
         return {}, None
     n, ranges = len(episodes.zeros), parameters.ranges
-    names = {*SIGNALS, *ranges}
-    if not parameters.is_disturbed:
-        names.remove("disturbance")
+    names = {*SIGNALS, *ranges} - ({"disturbance"} if not parameters.is_disturbed else set())
     if not isinstance(signals, Mapping) or not signals or not names >= {*signals}:
-        given = [*signals] if isinstance(signals, Mapping) else signals
-        reject("options['signals']", given, f"a dict with some of {sorted(names)}")
-    handed, lengths = {}, []
-    for name, given in signals.items():
+        got = [*signals] if isinstance(signals, Mapping) else signals
+        reject("options['signals']", got, f"a dict with some of {sorted(names)}")
+    read, lengths = {}, []
+    for name, got in signals.items():
         path = f"options['signals'][{name!r}]"
-        values = as_tensor(given, episodes.zeros)
+        values = as_tensor(got, episodes.zeros)
         if values is None:
-            reject(path, given, "numbers")
+            reject(path, got, "numbers")
         shape, dimensions = (f"({n},)", 1) if name in ranges else (f"(samples, {n})", 2)
         if values.ndim == dimensions:
             values = values[None]
@@ -369,9 +362,9 @@ def handed_signals(
             low, high = values.new_tensor(ends)
             whole = not ARGUMENTS[name].is_integer or bool((values == values.round()).all())
             if not (whole and bool(((low <= values) & (values <= high)).all())):
-                reject(path, given, f"within its range, {list(ends)}")
+                reject(path, got, f"within its range, {list(ends)}")
             values = values[:, None]
         else:
             lengths.append(values.shape[1])
-        handed[name] = Handed(values, episodes)
-    return handed, min(lengths) - 1 if lengths else None
+        read[name] = Given(values, episodes)
+    return read, min(lengths) - 1 if lengths else None
