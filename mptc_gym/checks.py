@@ -40,6 +40,8 @@ def shortened(value: object) -> str:
         text = repr(value)
     except ValueError:  # Python refuses to print integers of over 4300 digits
         return "a number of thousands of digits"
+    except RecursionError:
+        return "a list of hundreds of levels"
     size = f" ({len(value)} elements)" if isinstance(value, list | tuple) else ""
     if hasattr(value, "shape"):  # an array or a tensor, printed in several lines
         text, size = " ".join(text.split()), f" (shape {tuple(value.shape)})"

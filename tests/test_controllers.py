@@ -10,7 +10,7 @@ import pytest
 from stable_baselines3 import PPO
 
 from benchmarks.compare.comparison import run_case
-from benchmarks.controllers import engineered, pretrained
+from benchmarks.controllers import engineered
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.own import own_factory
 from benchmarks.controllers.roster import ROSTER
@@ -30,7 +30,7 @@ ACTUATOR = {"u_min": -9.0, "u_max": 14.0, "dead_zone": 4.0}
 OTHER = {**ACTUATOR, "b": [0.0456, 0.00404], "delay": 9}
 IDLE = 5.0  # mean |e| of a valve that is left alone, degC
 # Those that are made for the paper's plant, and told no more than the actuator.
-UNTOLD = ("pi", "pi-searched", "ppo", "ppo-randomised")
+UNTOLD = ("pi", "pi-searched", "ppo")
 
 
 @pytest.fixture(params=ROSTER)
@@ -39,9 +39,7 @@ def entry(request):
 
 
 @pytest.fixture
-def factory(entry, tmp_path, monkeypatch):
-    # PPO for many plants does not come with the project: here it is that for the paper's.
-    monkeypatch.setattr(pretrained, "RANDOMISED", {})
+def factory(entry, tmp_path):
     return entry.members(PolicyRequest(folder=tmp_path, policies=1))[0]
 
 

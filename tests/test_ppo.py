@@ -11,7 +11,7 @@ import torch
 from benchmarks.controllers.pretrained import ppo_policies, trained
 from benchmarks.lib.fan_out import FanOut, TasksFailedError
 from benchmarks.loop.rollout import make_plants, rollout
-from benchmarks.train import ppo, ppo_arguments, ppo_training
+from benchmarks.train import ppo, ppo_training
 from benchmarks.train.ppo import PolicyRequest
 from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
@@ -91,13 +91,6 @@ class TestPPO:
             flows.append(plants.infos["applied"][0])
         # 0.2, 0.4 and 0.2 of the 5 t/h between dead zone and limit.
         assert flows == pytest.approx([6.0, 7.0, 6.0], abs=1e-4)
-
-    def test_a_policy_for_many_plants(self, tmp_path):
-        arguments = replace(SMALL, steps=256, **ppo_arguments.RANDOMISED)
-        network = train(tmp_path, arguments)
-        assert network.observation["action_window"] == 39
-        size = Parameters(**arguments.training).observation_size
-        assert network.act(np.zeros((5, size), np.float32)).shape == (5, 1)
 
     def test_set_points_of_validation_are_met_nowhere_else(self):
         flows = np.abs(ppo_training.HELD) * 0.07273 / 0.04964  # t/h, by the steady-state gain

@@ -66,6 +66,7 @@ def test_plant_without_a_new_steady_state_is_refused(arguments, name):
         ("{", "plant.json must be a JSON file"),
         ("[1, 2]", "plant.json must hold one object"),
         ('{"delay": -1}', "delay must be"),
+        ("[" * 100_000, "plant.json must be a JSON file"),
     ],
 )
 def test_bad_plant_file_is_named(tmp_path, text, complaint):
@@ -74,6 +75,12 @@ def test_bad_plant_file_is_named(tmp_path, text, complaint):
         path.write_text(text)
     with pytest.raises(UsageError, match=f"^--plant: .*{complaint}"):
         PlantOptions(plant=path).chosen()
+
+
+def test_lists_of_any_depth_are_refused_by_name():
+    for depth in range(600, 1000, 5):  # what JSON still reads may be too deep to be shown
+        with pytest.raises(UsageError, match=r"^--set: delay must be an integer"):
+            PlantOptions(set=("delay=" + "[" * depth + "]" * depth,)).chosen()
 
 
 def test_reversals_are_counted_across_stillness():

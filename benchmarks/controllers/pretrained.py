@@ -12,15 +12,14 @@ from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Cost, Factory, Members
 from benchmarks.loop.rollout import Agent
 from benchmarks.train import ppo
-from benchmarks.train.ppo_arguments import RANDOMISED, PPOArguments
+from benchmarks.train.ppo_arguments import PPOArguments
 from mptc_gym import Parameters
 
 
 def trained(network: PolicyNetwork, plant: Parameters, runs: int, seed: int) -> PolicyNetwork:
     """Return a controller with the network, told the actuator's limits.
 
-    In velocity form it is also told the dead zone, if that is a number; raise a ValueError if
-    it leaves no flow on one side.
+    In velocity form it is also told the dead zone, if that is a number.
     """
     increments = network.increments
     if increments and not isinstance(plant.dead_zone, Sequence):
@@ -38,17 +37,9 @@ def told_network(make: Callable[..., Agent], cost: Cost) -> Members:
     return members
 
 
-def ppo_policies(
-    request: ppo.PolicyRequest, arguments: PPOArguments | None = None
-) -> list[Factory]:
-    """Return PPO policies, those for the paper's plant unless `arguments` say otherwise."""
-    policies = ppo.members(request, arguments)
-    return [_factory(network, file.name) for file, network in policies.items()]
-
-
-def randomised_policies(request: ppo.PolicyRequest) -> list[Factory]:
-    """Return PPO policies for many plants."""
-    return ppo_policies(request, PPOArguments(**RANDOMISED))
+def ppo_policies(request: ppo.PolicyRequest) -> list[Factory]:
+    """Return PPO policies for the paper's plant."""
+    return [_factory(network, file.name) for file, network in ppo.members(request).items()]
 
 
 def tuned_policy(*, final: bool, member: int, **gains: Any) -> Factory:

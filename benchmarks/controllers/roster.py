@@ -123,14 +123,6 @@ _ENTRIES = (
         drawn=True,
     ),
     RosterEntry(
-        "ppo-randomised",
-        "PPO, randomised",
-        pretrained.randomised_policies,
-        trained=True,
-        compared=False,
-        swept=False,
-    ),
-    RosterEntry(
         "nn-smith",
         "NN, told",
         pretrained.told_network(

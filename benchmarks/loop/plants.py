@@ -56,7 +56,7 @@ class PlantOptions:
             names.append(text)
             try:
                 arguments[name] = json.loads(value)
-            except ValueError:
+            except (ValueError, RecursionError):
                 arguments[name] = value  # a bare word, such as random
         given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
         try:
@@ -77,7 +77,7 @@ def _read(path: Path) -> dict[str, Any]:
         arguments = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:  # not JSON, or not text
+    except (ValueError, RecursionError) as error:  # not JSON, not text, or too deep
         raise ValueError(f"{path} must be a JSON file: {error}") from error
     if not isinstance(arguments, dict):
         raise ValueError(

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from benchmarks.loop.designs import SPANS
-
 DELAY, DEAD_ZONE = 18, 5.0  # of the paper's plant, samples and t/h
 
 
@@ -95,10 +93,3 @@ class PPOArguments:
             (calm, {**self.training, "noise_variance": 0.0}),
         ]
         return [(count, arguments) for count, arguments in groups if count]
-
-
-# Arguments that make one policy serve many plants, those of a random design.
-RANDOMISED: dict[str, Any] = {
-    "plant": {name: list(span) for name, span in SPANS.items() if name != "noise_variance"},
-    "action_window": 39,
-}
