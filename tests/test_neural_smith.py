@@ -84,6 +84,15 @@ class TestScales:
 
 
 class TestLoop:
+    def test_the_right_model_leaves_nothing_to_explain(self):
+        pole = np.exp(-8.0 / 161.0)
+        plant = {"a": [1.0, -pole], "b": [-0.6825 * (1.0 - pole)], "c": [1.0], "delay": 18}
+        controller, residuals = told(dead_zone=5.0), [0.0]
+        watch = lambda k: k and residuals.append(np.abs(controller._residual).max())  # noqa: E731
+        runs = rollout(make_plants(1, 300, **plant), controller, 300, 0, before=watch)
+        assert np.abs(runs.output).max() > 4.0
+        assert max(residuals) < 1e-6
+
     def test_a_wrong_gain_leaves_no_offset(self):
         plant = {"setpoint": 5.0, "gain_factor": 1.2}
         assert error_of(told(dead_zone=5.0), 600, 500, **plant) < 0.05
