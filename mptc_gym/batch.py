@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mptc_gym.checks import MOST_NUMBERS, MOST_PLANTS, count, is_count, reject
-from mptc_gym.env import action_space, observation_space
+from mptc_gym.env import HasPlainSpec, action_space, observation_space
 from mptc_gym.parameters import Parameters
 from mptc_gym.signals import FOREVER
 
@@ -28,7 +28,7 @@ INFO = ("output", "setpoint", "error", "command", "applied", "noise")
 FACTORS = ("gain_factor", "time_constant_factor")
 
 
-class BatchEnv(VectorEnv[Array, Array, Array]):
+class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array]):
     """n plants that advance together, without what depends on the array library."""
 
     def __init__(

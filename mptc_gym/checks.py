@@ -94,7 +94,9 @@ def _faint(size: int) -> NDArray[np.float64]:
 
 
 def plain(value: Any) -> Any:
-    """Return a NumPy array or scalar as lists and numbers; anything else unchanged."""
+    """Return NumPy arrays and scalars, also those in a list, as lists and numbers."""
+    if isinstance(value, list | tuple):
+        return type(value)(v.tolist() if isinstance(v, np.generic) else v for v in value)
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 

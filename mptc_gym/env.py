@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import inspect
 import math
+from copy import copy
 from typing import Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym import rendering
-from mptc_gym.checks import one_action, reject_action
+from mptc_gym.checks import one_action, plain, reject_action
 from mptc_gym.parameters import Parameters, argument_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
@@ -46,7 +48,25 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
     return Box(-high, high, dtype=np.float32)
 
 
-class MiddlePointEnv(gymnasium.Env[Observation, Action]):
+class HasPlainSpec:
+    """An environment whose spec holds arrays as lists, as JSON does."""
+
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The specification, from which `gymnasium.make` makes the environment again."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            spec = copy(spec)
+            spec.kwargs = {name: plain(value) for name, value in spec.kwargs.items()}
+        self._spec = spec
+
+
+class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     """Control the temperature at the middle point of a once-through boiler by feedwater flow.
 
     At the middle point of a once-through boiler, water becomes steam. More feedwater lowers the

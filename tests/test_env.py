@@ -8,11 +8,12 @@ from functools import partial
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mptc_gym
-from mptc_gym import MiddlePointEnv
+from mptc_gym import MiddlePointEnv, Parameters
 from tests.arguments import WINDOWS, valid_arguments
 from tests.conftest import run
 
@@ -45,6 +46,17 @@ def test_observations_stay_in_their_space_whatever_the_actions(arguments, action
 def test_registration():
     env = gymnasium.make("mptc_gym:MiddlePoint-v0")
     assert env.spec.max_episode_steps == 1200
+
+
+@pytest.mark.parametrize("setpoint", [np.ones(5), [np.float32(1.5), 2], np.float32(3.0)])
+def test_the_spec_is_json_whatever_numpy_it_was_made_of(setpoint):
+    arguments = {"setpoint": setpoint, "delay": np.array([12, 24]), "noise_variance": 0.5}
+    env = gymnasium.make("MiddlePoint-v0", **arguments)
+    again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.parameters == env.unwrapped.parameters
+    envs = gymnasium.make_vec("MiddlePoint-v0", 2, **arguments)
+    kept = EnvSpec.from_json(envs.spec.to_json()).kwargs
+    assert Parameters(**{name: kept[name] for name in arguments}) == envs.unwrapped.parameters
     assert isinstance(env.unwrapped, MiddlePointEnv)
     assert env.action_space == gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     assert env.observation_space.shape == (6,)
