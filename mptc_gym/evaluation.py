@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
-import warnings
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
@@ -19,12 +18,13 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym.checks import MOST_PLANTS, count, reject
+from mptc_gym.checks import MOST_PLANTS, count, reject, shortened
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
-from mptc_gym.policies import acting, check_fit, trained_on
+from mptc_gym.policies import check_fit, start, training_of
 from mptc_gym.presets import IDS, PRESETS
+from mptc_gym.training import WINDOWS, entry_point, make_one, wrappers_of
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
@@ -40,12 +40,9 @@ EPISODES: Final = 100
 SAMPLES: Final = 1200
 """Length of an episode if its environment has no time limit, samples."""
 
-WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
 # Arguments that change observations or rewards, but not the least possible error.
 _NO_MATTER: Final = *WINDOWS, "reward", "error_scale", "move_weight"
-_BATCH: Final = 100  # episodes run side by side
 _RESAMPLES: Final = 2000  # bootstrap resamples
-_INCREMENTAL: Final = f"{IncrementalAction.__module__}:{IncrementalAction.__name__}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -102,7 +99,7 @@ class Evaluation:
 
 def evaluate(
     policy: Any,
-    env: str | EnvSpec | Callable[[], Env] = "MiddlePoint-v0",
+    env: str | EnvSpec | Callable[[], Env] | None = None,
     *,
     episodes: int = EPISODES,
     seed: int = SEED,
@@ -113,19 +110,27 @@ def evaluate(
     Parameters
     ----------
     policy
-        One of three kinds. It receives observations of shape (n, size), float32, one row per
-        episode, and returns actions of shape (n, 1). A batch has up to 100 episodes.
+        One of the following. It receives float32 observations of shape (episodes, size), one
+        row per episode, and returns actions of shape (episodes, 1). All episodes run side by
+        side, however many there are. If it has a method `reset`, that is called first, without
+        arguments; what a policy without one remembers is not forgotten.
 
-        - an object with `predict(observations, state, episode_start, deterministic)`, such as
-          a Stable-Baselines3 model. It acts without exploration; a recurrent state is reset
-          before every batch.
-        - an object with `act(observations)` and `reset()`, such as the controllers in `agents`.
-          `reset` is called before every batch.
-        - a function of the observations.
+        - a model of Stable-Baselines3, which acts without exploration. Its observations are
+          normalised and stacked as in its training, and `env` must have the windows and
+          wrappers of its training. It must still have its training environments, or come from
+          `mptc_gym.sb3.load`.
+        - another object with `predict(observations)`. If that takes them by name or by
+          `**kwargs`, it is also given `state`, `episode_start` and `deterministic=True`. It
+          returns actions, or actions and state.
+        - an object with `act(observations)`, such as the controllers in `agents`.
+        - a `torch.nn.Module`, which is called with tensors, in evaluation mode and without
+          gradients.
+        - a function of the observations. For what it reads and does, the caller vouches.
     env
-        An id, such as one of `IDS`; an `EnvSpec`, which may include wrappers; or a function
-        that makes an environment. A policy trained with a wrapper that changes its actions,
-        such as `IncrementalAction`, needs that wrapper here, from a spec or a function.
+        An id, such as one of `IDS`; an `EnvSpec`, which may include wrappers, such as that of
+        `mptc_gym.sb3.spec_of`; or a function that makes a new environment at each call, which
+        must run the episodes of its seeds. By default `MiddlePoint-v0`, for a model with the
+        windows and wrappers of its training.
     episodes
         Number of episodes, at least 2.
     seed
@@ -138,15 +143,11 @@ def evaluate(
     Raises
     ------
     ValueError
-        If the environment does not exist or is not one of this package, if the policy does not
-        fit it, or if the policy's actions have the wrong shape or are not finite.
+        If the environment does not exist, is not one of this package or runs other episodes
+        than those of its seeds; if the policy does not fit it, or is a model that does not say
+        how it was trained; or if the policy's actions have the wrong shape or are not finite.
     TypeError
         If an argument of the environment is unknown.
-
-    Warns
-    -----
-    UserWarning
-        If the policy is a model that does not record how it was trained, and `env` is an id.
 
     Examples
     --------
@@ -158,32 +159,28 @@ valve travel 0 t/h; 100 episodes, all alike
     episodes = count("episodes", episodes, 2, MOST_PLANTS)
     first = count("seed", seed, 0, 2**63)
     seeds = range(first, first + episodes)
-    make = _maker(env, arguments)
+    make = _maker(policy, env, arguments)
     single = make()
     parameters = _parameters(single)
     with closing(single):
-        check_fit(policy, single, parameters)
-        is_model = hasattr(policy, "observation_space")
-        if is_model and isinstance(env, str) and trained_on(policy) is None:
-            warnings.warn(
-                "policy does not say how it was trained: its actions are taken for flows, not "
-                "for changes of the flow. Save it by mptc_gym.sb3.save, or give env as an "
-                "EnvSpec with the wrappers of its training",
-                stacklevel=2,
-            )
-        name = single.spec.id if single.spec else type(single.unwrapped).__name__
-        samples = (single.spec and single.spec.max_episode_steps) or SAMPLES
-        batch = native_batch(single) or (lambda n: SyncVectorEnv([make] * n))
-    errors, travels, samples = _run(batch, policy, seeds, samples)
+        check_fit(policy, single, parameters, episodes)
+        spec = single.spec
+        name = spec.id if spec else type(single.unwrapped).__name__
+        samples = (spec and spec.max_episode_steps) or SAMPLES
+        native: Batch = partial(MiddlePointVectorEnv, **dataclasses.asdict(parameters))
+        batch = native_batch(single)
+    if batch is not None:
+        errors, travels = _run(batch, policy, seeds, samples)
+    else:
+        errors, travels = _run(_one_by_one(make), policy, seeds, samples, native)
     found = Evaluation(
         name, float(errors.mean()), float(travels.mean()), errors, travels, seeds
     )
     least = least_errors(parameters, samples, seeds)
     if least is None:
         return dataclasses.replace(found, missing=_missing(parameters, samples, seeds))
-    plants: Batch = partial(MiddlePointVectorEnv, **dataclasses.asdict(parameters))
     rest = action_from_command(0.0, parameters.u_min, parameters.u_max)
-    idle, _, _ = _run(plants, lambda seen: np.full((len(seen), 1), rest), seeds, samples)
+    idle, _ = _run(native, lambda seen: np.full((len(seen), 1), rest), seeds, samples)
     gained, possible = idle - errors, idle - least
     return dataclasses.replace(
         found,
@@ -254,8 +251,13 @@ def _interval(gained: Values, possible: Values) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _maker(env: Any, arguments: dict[str, Any]) -> Callable[[], Env]:
+def _maker(policy: Any, env: Any, arguments: dict[str, Any]) -> Callable[[], Env]:
     """Return a function that makes one environment."""
+    if env is None:
+        training = training_of(policy)
+        if training is not None:
+            return partial(make_one, training.spec(IDS["paper"], arguments), {})
+        env = IDS["paper"]
     if isinstance(env, str | EnvSpec):
         return partial(make_one, env, arguments)
     if not callable(env):
@@ -263,16 +265,6 @@ def _maker(env: Any, arguments: dict[str, Any]) -> Callable[[], Env]:
     if arguments:
         raise ValueError(f"{', '.join(arguments)} must be given in the function that is env")
     return cast("Callable[[], Env]", env)
-
-
-def make_one(env: str | EnvSpec, arguments: dict[str, Any]) -> Env:
-    """Make an environment from an id or a spec; ValueError if there is no such id."""
-    try:
-        return gymnasium.make(env, disable_env_checker=True, **arguments)
-    except (gymnasium.error.UnregisteredEnv, ModuleNotFoundError):
-        reject(
-            "env", env, f"the id of an environment, such as one of {', '.join(IDS.values())}"
-        )
 
 
 def _parameters(single: Env) -> Parameters:
@@ -305,54 +297,86 @@ def native_batch(single: Env) -> Batch | None:
     plants: Batch = partial(
         MiddlePointVectorEnv, max_episode_steps=spec.max_episode_steps, **arguments
     )
-    match spec.additional_wrappers:
+    match wrappers_of(single):
         case ():
             return plants
-        case (only,) if only.entry_point == _INCREMENTAL:
+        case (only,) if only.entry_point == entry_point(IncrementalAction):
             moves = only.kwargs or {}
             return lambda n, **modes: VectorIncrementalAction(plants(n, **modes), **moves)
     return None
 
 
-def _run(batch: Batch, policy: Any, seeds: range, samples: int) -> tuple[Values, Values, int]:
-    """Run one episode per seed, of N = `samples`, or fewer if the environments end earlier.
+def _one_by_one(make: Callable[[], Env]) -> Batch:
+    """Return a function that makes n environments, to be stepped one after the other."""
 
-    Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each episode;
-    and N. `batch(n)` makes n environments.
+    def batch(n: int) -> VectorEnv[Any, Any, Any]:
+        plants = SyncVectorEnv([make] * n)
+        if len({id(each) for each in plants.envs}) < n:
+            raise ValueError("env must be a function that makes a new environment at each call")
+        return plants
+
+    return batch
+
+
+def _run(
+    batch: Batch, policy: Any, seeds: range, samples: int, native: Batch | None = None
+) -> tuple[Values, Values]:
+    """Run one episode of N = `samples` per seed; `batch(n)` makes n environments.
+
+    With `native`, which makes the package's own plants, other episodes than theirs are refused.
+    Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each episode.
     """
-    errors, travels = np.empty(len(seeds)), np.empty(len(seeds))
-    for first in range(0, len(seeds), _BATCH):
-        which = slice(first, min(first + _BATCH, len(seeds)))
-        n = which.stop - first
-        with closing(batch(n)) as plants:
-            act = acting(policy)
-            observations, _ = plants.reset(seed=seeds[first])
-            error, travel, before = np.zeros(n), np.zeros(n), np.zeros(n)
-            for k in range(samples):
-                actions = _checked(act(observations), n, k)
-                observations, _, terminated, truncated, infos = plants.step(actions)
-                error += np.abs(infos["error"])
-                travel += np.abs(infos["applied"] - before)
-                before = infos["applied"]
-                ended = terminated | truncated
-                if ended.any():
-                    if not ended.all():
-                        raise ValueError("env must end all its episodes at the same sample")
-                    samples = k + 1
-                    break
-        errors[which], travels[which] = error / samples, travel
-    return errors, travels, samples
+    n = len(seeds)
+    with ExitStack() as stack:
+        plants = stack.enter_context(closing(batch(n)))
+        model = stack.enter_context(closing(native(n))) if native else None
+        act, rest = start(policy, n), np.zeros((n, 1))
+        observations, infos = plants.reset(seed=seeds[0])
+        if model:
+            _check_episodes(infos, model.reset(seed=seeds[0])[1], 0)
+        error, travel, before = np.zeros(n), np.zeros(n), np.zeros(n)
+        for k in range(1, samples + 1):
+            actions = _checked(act(observations), plants.action_space.shape, k - 1)
+            observations, _, terminated, truncated, infos = plants.step(actions)
+            if model:
+                _check_episodes(infos, model.step(rest)[-1], k)
+            error += np.abs(infos["error"])
+            travel += np.abs(infos["applied"] - before)
+            before = infos["applied"]
+            if k < samples and (terminated | truncated).any():
+                raise ValueError(f"env must run episodes of {samples} samples, got {k}")
+    return error / samples, travel
 
 
-def _checked(actions: Any, n: int, k: int) -> NDArray[Any]:
+def _check_episodes(infos: dict[str, Any], expected: dict[str, Any], k: int) -> None:
+    """Refuse episodes whose set points, noise, loads or drawn numbers are not those expected.
+
+    None of these depends on the actions.
+    """
+    for name in expected:
+        if name.startswith("_") or name in ("output", "error", "command", "applied"):
+            continue
+        own, other = infos.get(name), expected[name]
+        if own is None or not np.array_equal(own, other):
+            raise ValueError(
+                f"env must run the episodes of its seeds, whose {name} at sample {k} is "
+                f"{other[:3]} ..., got {None if own is None else own[:3]} ...: it must neither "
+                "reset with another seed, nor skip or repeat samples, nor change info"
+            )
+
+
+def _checked(actions: Any, shape: Any, k: int) -> NDArray[Any]:
     """Return a policy's actions at sample k as an array, if the environments can take them."""
     try:
         checked = np.asarray(actions)
         finite = np.isfinite(checked)
-    except (TypeError, ValueError, RuntimeError):  # the last: from tensors
-        reject("actions of policy", actions, "an array of numbers")
-    if checked.shape != (n, 1):
-        raise ValueError(f"policy must return actions of shape {(n, 1)}, got {checked.shape}")
+    except (TypeError, ValueError, RuntimeError) as error:  # the last: from tensors
+        hint = "its first element" if isinstance(actions, tuple) else f"an array ({error})"
+        raise ValueError(
+            f"policy must return an array of numbers, got {shortened(actions)}: return {hint}"
+        ) from error
+    if checked.shape != shape:
+        raise ValueError(f"policy must return actions of shape {shape}, got {checked.shape}")
     if not finite.all():
         wrong = checked[~finite][0]
         raise ValueError(f"policy must return finite actions, got {wrong} at sample {k}")

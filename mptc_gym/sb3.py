@@ -12,37 +12,31 @@ Requires `pip install "mptc_gym[sb3]"`.
 
 from __future__ import annotations
 
-import copy
+import functools
 import os
-import time
+import pkgutil
+import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
+import gymnasium
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, VectorEnv
-from numpy.typing import NDArray
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from mptc_gym.checks import MOST_PLANTS, count, plain, reject
-from mptc_gym.evaluation import (
-    EPISODES,
-    SEED,
-    WINDOWS,
-    Evaluation,
-    evaluate,
-    make_one,
-    native_batch,
-)
-from mptc_gym.policies import action_wrappers, trained_on
+from mptc_gym.evaluation import EPISODES, SEED, Evaluation, evaluate, native_batch
+from mptc_gym.sb3_training import restored, training_of
+from mptc_gym.sb3_vec_env import GymnasiumVecEnv
+from mptc_gym.training import MEMBER, Training, make_one
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
+
+__all__ = ["GymnasiumVecEnv", "ScoreCallback", "load", "make_vec_env", "save", "spec_of"]
 
 
 def make_vec_env(
@@ -101,183 +95,82 @@ def make_vec_env(
     return plants
 
 
-class GymnasiumVecEnv(VecEnv):
-    """Step whole batches at once, where `DummyVecEnv` steps one environment after another.
-
-    Observations, rewards, episode ends and terminal observations are bit for bit those of
-    `DummyVecEnv` with the same environments.
-
-    Parameters
-    ----------
-    batches
-        One or more vector environments of autoreset mode "SameStep" and with the same spaces;
-        their environments are numbered one batch after another.
-    spec
-        Spec of one environment with its wrappers, if all are alike: a model trained on them
-        records it.
-
-    Attributes
-    ----------
-    infos : dict
-        The latest infos in Gymnasium's form, as arrays; those that all batches have. The list
-        that `step` returns holds only what Stable-Baselines3 itself reads at the end of an
-        episode, as a dict for each environment and step would take longer than the step.
-
-    Raises
-    ------
-    ValueError
-        If a batch has another autoreset mode, or spaces differ.
-    """
-
-    def __init__(self, *batches: VectorEnv, spec: EnvSpec | None = None) -> None:
-        spaces = batches[0].single_observation_space, batches[0].single_action_space
-        for batch in batches:
-            mode = batch.metadata.get("autoreset_mode")
-            if mode is not AutoresetMode.SAME_STEP:
-                raise ValueError(f"batches must have autoreset_mode 'SameStep', got {mode}")
-            if (batch.single_observation_space, batch.single_action_space) != spaces:
-                raise ValueError(f"batches must have the same spaces, got {batches}")
-        self.batches, self.spec = batches, spec
-        self.infos: dict[str, Any] = {}
-        starts = np.cumsum([0, *(batch.num_envs for batch in batches)]).tolist()
-        self._parts = list(zip(batches, map(slice, starts, starts[1:]), strict=True))
-        super().__init__(starts[-1], *spaces)
-        if spec is not None:
-            self.observation_space.trained_on = spec.to_json()  # type: ignore[attr-defined]
-        self._began = time.time()
-        self._returns = np.zeros(self.num_envs)
-        self._lengths = np.zeros(self.num_envs, np.int64)
-
-    def reset(self) -> NDArray[Any]:
-        """Reset all environments, with the seeds set by `seed`."""
-        if any(self._options):
-            raise ValueError(f"options must be empty, got {self._options!r}")
-        resets = [
-            # It takes one seed per environment, despite its annotation.
-            batch.reset(seed=cast("int", list(self._seeds[part])))
-            for batch, part in self._parts
-        ]
-        self._reset_seeds()
-        self._returns[:], self._lengths[:] = 0.0, 0
-        return self._joined(resets)[0]
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions, shape (num_envs, action size)."""
-        self._actions = actions
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """Step with the stored actions."""
-        steps = [batch.step(self._actions[part]) for batch, part in self._parts]
-        observations, rewards, terminated, truncated = self._joined(steps)
-        ended = terminated | truncated
-        self._returns += rewards
-        self._lengths += 1
-        infos: list[dict[str, Any]] = [{} for _ in ended]
-        if ended.any():
-            last = np.concatenate(
-                [found.get("final_obs", [None] * len(flags)) for *_, flags, found in steps]
-            )
-            seconds = round(time.time() - self._began, 6)
-            for i in np.flatnonzero(ended).tolist():
-                episode = {"r": float(self._returns[i]), "l": int(self._lengths[i])}
-                infos[i] = {
-                    "terminal_observation": last[i],
-                    "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                    "episode": {**episode, "t": seconds},
-                }
-            self._returns[ended], self._lengths[ended] = 0.0, 0
-        return observations, rewards.astype(np.float32), ended, infos
-
-    def _joined(self, returned: list[tuple[Any, ...]]) -> list[NDArray[Any]]:
-        """Concatenate what the batches returned, and store the infos in `infos`."""
-        *arrays, infos = zip(*returned, strict=True)
-        self.infos = {
-            name: np.concatenate([each[name] for each in infos])
-            for name in set.intersection(*map(set, infos))
-            if isinstance(infos[0][name], np.ndarray)
-        }
-        return [np.concatenate(each) for each in arrays]
-
-    def get_images(self) -> list[NDArray[np.uint8]]:
-        """Return a picture of each environment, if the batch has the mode "rgb_array"."""
-        return [image for batch in self.batches for image in cast("Any", batch.render() or ())]
-
-    def close(self) -> None:
-        """Close the batches."""
-        for batch in self.batches:
-            batch.close()
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of each environment's batch."""
-        if attr_name == "render_mode":
-            # Asked by an outer wrapper, which may change what a model sees: the space then no
-            # longer tells how the model was trained, and only `save` records it.
-            vars(self.observation_space).pop("trained_on", None)
-        if attr_name == "spec" and self.spec is not None:
-            return [self.spec for _ in self._get_indices(indices)]
-        of_each = [batch for batch in self.batches for _ in range(batch.num_envs)]
-        return [getattr(of_each[i], attr_name) for i in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refuse: an environment of a batch has no attributes of its own."""
-        raise NotImplementedError(f"{attr_name} can be set on `batches` only, for all at once")
-
-    def env_method(
-        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
-    ) -> list[Any]:
-        """Refuse: an environment of a batch has no methods of its own."""
-        raise NotImplementedError(
-            f"{method_name} can be called on `batches` only, for all at once"
-        )
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Return False for each index: a batch holds no wrapped environments."""
-        return [False for _ in self._get_indices(indices)]
-
-
 def save(model: BaseAlgorithm, path: str | Path) -> None:
-    """Save a model atomically, with the spec of its training environment.
+    """Save a model atomically, with a record of how it was trained.
 
-    For a model trained on `make_vec_env` without further wrappers, `model.save` keeps the spec,
-    too. This function also saves the statistics of `VecNormalize`.
+    The zip is that of `model.save` with one more member, `mptc_gym.json`: the environment, its
+    arguments and wrappers, the statistics of `VecNormalize`, the number of frames of
+    `VecFrameStack`, and the spaces.
 
     Parameters
     ----------
     model
-        A model with its training environment.
+        A model with its training environments.
     path
         Path of the zip.
 
     Raises
     ------
     ValueError
-        If it is unknown how the model was trained, or its spec cannot be written as JSON.
+        If it is unknown how the model was trained, or if an argument of a wrapper cannot be
+        written as JSON.
     """
-    spec = trained_on(model)
-    if spec is None:
-        reject("model", model, "trained on make_vec_env or on environments that have a spec")
+    record = training_of(model).to_json()
     path = Path(path)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.zip")
-    # A model saves its space with all attributes.
-    space: Any = model.observation_space
-    kept: Any = copy.deepcopy(space)
-    kept.trained_on = spec.to_json()
-    normaliser = model.get_vec_normalize_env()
-    if normaliser is not None and normaliser.norm_obs:
-        statistics = cast("RunningMeanStd", normaliser.obs_rms)
-        kept.normalised = {
-            "mean": statistics.mean.tolist(),
-            "var": statistics.var.tolist(),
-            "epsilon": normaliser.epsilon,
-            "clip_obs": normaliser.clip_obs,
-        }
-    model.observation_space = kept
     try:
         model.save(partial)
+        with zipfile.ZipFile(partial, "a") as archive:
+            archive.writestr(MEMBER, record)
         partial.replace(path)
     finally:
-        model.observation_space = space
         partial.unlink(missing_ok=True)
+
+
+def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
+    """Load a model that `save` wrote, with environments like those of its training.
+
+    Loading runs code from the zip and from the modules that it names: load only what you trust.
+
+    Parameters
+    ----------
+    path
+        Path of the zip.
+    **arguments
+        Further arguments for the `load` of the algorithm, such as `device="cpu"`.
+
+    Returns
+    -------
+    model
+        The model, which `evaluate` can score and `learn` trains further. Its plants all have
+        the arguments of the first one in training.
+
+    Raises
+    ------
+    ValueError
+        If the zip cannot be read, if it has no record of its training, or if its algorithm or
+        its weights cannot be loaded.
+    """
+    record = Training.read(path)
+    spec = record.spec(record.env, record.arguments)
+    spec.max_episode_steps = record.max_episode_steps
+    with closing(make_one(spec, {})) as single:
+        batch = native_batch(single)
+    if batch is not None:
+        many = batch(record.n_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+        plants: VecEnv = GymnasiumVecEnv(many, spec=spec)
+    else:
+        plants = DummyVecEnv([functools.partial(gymnasium.make, spec)] * record.n_envs)
+    try:
+        for each in record.vec_wrappers:
+            plants = restored(plants, **each)
+        algorithm = pkgutil.resolve_name(record.algorithm)
+        if not issubclass(algorithm, BaseAlgorithm):
+            raise TypeError(f"{record.algorithm} is no algorithm of Stable-Baselines3")
+        return cast("BaseAlgorithm", algorithm.load(path, env=plants, **arguments))
+    except Exception as error:
+        text = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{path} cannot be loaded as {record.algorithm}: {text}") from error
 
 
 def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any) -> EnvSpec:
@@ -290,28 +183,20 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
     policy
         A model, or the path of a zip. No code from the zip is run.
     env
-        The environment to evaluate on: an id or an `EnvSpec`.
+        The environment to evaluate on: an id or an `EnvSpec`, whose own windows and wrappers
+        are replaced.
     **arguments
-        Further arguments for the environment.
+        Further arguments for the environment, other than windows.
 
     Raises
     ------
     ValueError
-        If it is unknown how the policy was trained.
+        If it is unknown how the policy was trained, or if an argument is another window than
+        that of the training.
     """
-    trained = trained_on(policy)
-    if trained is None:
-        allowed = (
-            "one that knows how it was trained: train it on mptc_gym.sb3.make_vec_env, or save "
-            "it by mptc_gym.sb3.save"
-        )
-        in_file = isinstance(policy, str | Path)
-        reject("policy", str(policy) if in_file else type(policy).__name__, allowed)
-    windows: dict[str, Any] = {n: trained.kwargs[n] for n in WINDOWS if n in trained.kwargs}
-    with closing(make_one(env, {**windows, **arguments})) as single:
-        spec = cast("EnvSpec", single.spec)
-    spec.additional_wrappers = tuple(action_wrappers(trained))
-    return spec
+    in_file = isinstance(policy, str | Path)
+    training = Training.read(policy) if in_file else training_of(policy)
+    return training.spec(env, arguments)
 
 
 class ScoreCallback(BaseCallback):

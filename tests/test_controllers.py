@@ -7,6 +7,8 @@ import re
 import gymnasium
 import numpy as np
 import pytest
+import torch
+from gymnasium.wrappers import DelayObservation
 from stable_baselines3 import PPO
 
 from benchmarks.compare.comparison import run_case
@@ -22,7 +24,7 @@ from benchmarks.train.ppo import PolicyRequest
 from benchmarks.watch import game
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
-from mptc_gym.sb3 import make_vec_env, spec_of
+from mptc_gym.sb3 import load, make_vec_env, save, spec_of
 from tests.verify_bounds import errors
 
 ACTUATOR = {"u_min": -9.0, "u_max": 14.0, "dead_zone": 4.0}
@@ -196,9 +198,15 @@ def zips(tmp_path_factory):
         windows = {"action_window": 20, "error_window": 2}
         plants = make_vec_env("MiddlePoint-v0", 2, wrapper=velocity, **windows)
         model = PPO("MlpPolicy", plants, n_steps=8, batch_size=16, seed=seed, device="cpu")
-        model.save(folder / f"velocity-{seed}.zip")
+        save(model, folder / f"velocity-{seed}.zip")
     bare = PPO("MlpPolicy", gymnasium.make("MiddlePoint-v0"), device="cpu")
     bare.save(folder / "bare.zip")
+    delayed = DelayObservation(gymnasium.make("MiddlePoint-v0"), 2)
+    save(PPO("MlpPolicy", delayed, device="cpu"), folder / "delayed.zip")
+    with torch.no_grad():
+        for weight in model.policy.parameters():
+            weight.fill_(torch.nan)
+    save(model, folder / "nan.zip")
     return folder
 
 
@@ -213,7 +221,7 @@ class TestSavedPolicies:
         assert factory.cost.samples == "0 M a policy"
         controller = factory(PRESETS[preset], 3, SEED)
         found = errors(factory, 3, 1200, **PRESETS[preset])
-        model = PPO.load(file, device="cpu")
+        model = load(file, device="cpu")
         expected = evaluate(model, spec_of(file, IDS[preset]), episodes=3)
         np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-12)
         # What it remembers, the flow, is forgotten at the beginning of an episode.
@@ -234,11 +242,15 @@ class TestSavedPolicies:
     @pytest.mark.parametrize(
         ("location", "complaint"),
         [
-            ("PPO:{}/bare.zip", "policy must be .* it was trained.* got '.*bare.zip'$"),
+            ("PPO:{}/bare.zip", "bare.zip does not say how its policy was trained: save it by"),
+            (
+                "PPO:{}/delayed.zip",
+                "trained in DelayObservation, and only IncrementalAction is",
+            ),
+            ("PPO:{}/nan.zip", "trying it raised ValueError: Expected parameter loc"),
             ("{}/velocity-0.zip", "must be ALGORITHM:FILE.zip, such as PPO:.*velocity-0.zip"),
             ("PPO:{}/none.zip", "there is no file .*none.zip"),
-            ("SAC:{}/velocity-0.zip", "cannot be loaded as SAC"),
-            ("PIO:{}/velocity-0.zip", "'PIO' is no algorithm of stable_baselines3"),
+            ("SAC:{}/velocity-0.zip", "holds a model of stable_baselines3.*PPO, not of SAC"),
         ],
     )
     def test_what_is_refused(self, location, complaint, zips):

@@ -19,7 +19,7 @@ import mptc_gym.sb3
 from benchmarks.datasets.history import arguments_of, record
 from benchmarks.examples import offline, sb3
 from mptc_gym import evaluate
-from mptc_gym.sb3 import spec_of
+from mptc_gym.sb3 import load
 from tests.conftest import ROOT, assert_the_seed_is_all_that_differs, python
 
 
@@ -39,8 +39,8 @@ class TestSB3:
         done = python("-c", quick)
         assert done.returncode == 0, done.stderr
         found = re.match(r"seed 3, \d+ s: MiddlePoint-v0: mean error ([\d.]+)", done.stdout)
-        kept = PPO.load(tmp_path / "ppo-3.zip", device="cpu")
-        assert f"{evaluate(kept, spec_of(kept)).mean_error:.3f}" == found[1]
+        kept = load(tmp_path / "ppo-3.zip", device="cpu")
+        assert f"{evaluate(kept).mean_error:.3f}" == found[1]
 
     def test_a_policy_rests_where_nothing_moves_and_there_alone(self):
         model = sb3.make_model(0).learn(1)

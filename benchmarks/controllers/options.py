@@ -28,7 +28,8 @@ class ControllerOptions:
 
     agent: Repeated = ()
     """A controller of your own in addition to those of --agents, NAME=MODULE:FACTORY or
-    NAME=PPO:FILE.zip; the same name again adds another training of it (repeatable)."""
+    NAME=PPO:FILE.zip, of mptc_gym.sb3.save; loading a zip runs the code in it. The same name
+    again adds another training of it (repeatable)."""
     training_steps: Count | None = None
     """Samples of experience to train each PPO policy with (default: use the policies that come
     with the project)."""

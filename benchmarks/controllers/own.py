@@ -31,22 +31,24 @@ def own_entry(name: str, locations: Sequence[str]) -> RosterEntry:
             if location.endswith(".zip"):
                 from benchmarks.controllers import saved  # here: PyTorch takes seconds to load
 
-                factories += saved.policies(location)
+                made = saved.policies(location)
             else:
-                factories.append(own_factory(location))
+                made = [own_factory(location)]
+            for factory in made:
+                _try_out(factory, location)
+            factories += made
     return RosterEntry(name, name, lambda request: factories, drawn=True)
 
 
 def own_factory(location: str) -> Factory:
-    """Import a user's factory, `module:factory`, and try its controller on two plants.
+    """Import a user's factory, `module:factory`.
 
     The README of `benchmarks.compare` lists the arguments and attributes it may have.
 
     Raises
     ------
     ValueError
-        If there is no such factory, or if it does not return a controller of a batch; the
-        message says what is expected.
+        If there is no such factory; the message says what is expected.
     """
     try:
         found: Any = pkgutil.resolve_name(location)
@@ -61,17 +63,20 @@ def own_factory(location: str) -> Factory:
             f"got {observation!r}"
         )
     cost = Cost(*(str(getattr(found, each.name, "")) for each in fields(Cost)))
-    factory = Factory(partial(_made, found), cost, dict(observation), code=found.__module__)
+    return Factory(partial(_made, found), cost, dict(observation), code=found.__module__)
+
+
+def _try_out(factory: Factory, location: str) -> None:
+    """Run a controller for two samples on two plants; raise a ValueError if it fails."""
     size = Parameters(**factory.arguments({})).observation_size
     try:
-        factory.run({}, samples=1, runs=2, seed=0)
-    except Exception as error:
+        factory.run({}, samples=2, runs=2, seed=0)
+    except (Exception, SystemExit) as error:
         raise ValueError(
-            f"{found!r} must return an object with reset() and act(observations), and act take "
-            f"observations of shape (2, {size}), one row a plant, and return actions of shape "
-            f"(2, 1); trying it raised {type(error).__name__}: {error}"
+            f"{location!r} must give an object with reset() and act(observations), and act "
+            f"take observations of shape (2, {size}), one row a plant, and return actions of "
+            f"shape (2, 1); trying it raised {type(error).__name__}: {error}"
         ) from error
-    return factory
 
 
 def _made(made_by: Callable[..., Agent], plant: Parameters, runs: int, seed: int) -> Agent:

@@ -1,12 +1,11 @@
-"""Make controllers from policies saved by Stable-Baselines3: `--agent mine=PPO:model.zip`."""
+"""Make controllers from policies saved by `mptc_gym.sb3`: `--agent mine=PPO:model.zip`."""
 
 from __future__ import annotations
 
 import glob
 import hashlib
+from dataclasses import asdict
 from functools import cache, partial
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,10 @@ from numpy.typing import NDArray
 from benchmarks.controllers.records import Cost, Factory
 from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
-from mptc_gym.evaluation import WINDOWS
-from mptc_gym.parameters import ARGUMENTS
-from mptc_gym.policies import acting
-from mptc_gym.sb3 import spec_of
-from mptc_gym.wrappers import NUMBERS, Actuator
-
-LIBRARIES = "stable_baselines3", "sb3_contrib"
+from mptc_gym.policies import start
+from mptc_gym.sb3 import load
+from mptc_gym.training import Training, entry_point
+from mptc_gym.wrappers import NUMBERS, Actuator, IncrementalAction
 
 
 def policies(location: str) -> list[Factory]:
@@ -33,8 +29,8 @@ def policies(location: str) -> list[Factory]:
     Raises
     ------
     ValueError
-        If there is no such algorithm or file, or a file does not say how its policy was
-        trained.
+        If there is no such file, if a file does not say how its policy was trained, or if that
+        was with another algorithm or with wrappers that a comparison cannot give.
     """
     algorithm, _, pattern = location.partition(":")
     if not pattern:
@@ -46,27 +42,33 @@ def policies(location: str) -> list[Factory]:
 
 
 def _policy(algorithm: str, file: Path) -> Factory:
-    spec = spec_of(file)
-    wrappers = [wrapper.name for wrapper in spec.additional_wrappers]
-    if wrappers not in ([], ["IncrementalAction"]):
-        raise ValueError(
-            f"{file} was trained in {', '.join(wrappers)}, and only IncrementalAction is known "
-            "here: mptc_gym.evaluate scores it"
-        )
-    increments = dict(spec.additional_wrappers[0].kwargs or {}) if wrappers else None
-    model = _loaded(algorithm, str(file))
+    training = Training.read(file)
+    if training.algorithm.rpartition(":")[2] != algorithm:
+        raise ValueError(f"{file} holds a model of {training.algorithm}, not of {algorithm}")
+    increments = None
+    match training.wrappers:
+        case ():
+            pass
+        case (only,) if only.entry_point == entry_point(IncrementalAction):
+            increments = dict(only.kwargs or {})
+        case several:
+            raise ValueError(
+                f"{file} was trained in {', '.join(each.name for each in several)}, and only "
+                "IncrementalAction is known here: mptc_gym.evaluate scores it"
+            )
+    model = _loaded(str(file))
     weights = sum(weight.numel() for weight in model.policy.parameters())
     return Factory(
-        partial(SavedPolicy, algorithm, str(file), increments),
+        partial(SavedPolicy, str(file), increments),
         Cost(
             parameters=f"{weights:,} weights a policy",
             samples=f"{model.num_timesteps / 1e6:.3g} M a policy",
         ),
-        {name: spec.kwargs.get(name, ARGUMENTS[name].default) for name in WINDOWS},
+        training.windows,
         provenance={
             "file": file.name,
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "trained_on": spec.to_json(),
+            "training": asdict(training),
         },
     )
 
@@ -80,14 +82,13 @@ class SavedPolicy:
 
     def __init__(
         self,
-        algorithm: str,
         file: str,
         increments: dict[str, Any] | None,
         plant: Parameters,
         runs: int,
         seed: int,
     ) -> None:
-        self._model = _loaded(algorithm, file)
+        self._model = _loaded(file)
         self._actuator = None
         if increments is not None:
             numbers = drawn_numbers(plant, runs, seed).chosen(NUMBERS)
@@ -97,7 +98,7 @@ class SavedPolicy:
 
     def reset(self) -> None:
         """Start an episode."""
-        self._act = acting(self._model)
+        self._act = start(self._model, self._runs)
         self._flows = np.zeros(self._runs)
 
     def act(self, observations: NDArray[np.float32]) -> NDArray[Any]:
@@ -111,17 +112,5 @@ class SavedPolicy:
 
 
 @cache
-def _loaded(algorithm: str, file: str) -> Any:
-    """Return the model; raise a ValueError if the zip holds none of this algorithm."""
-    there = [import_module(name) for name in LIBRARIES if find_spec(name)]
-    found: Any = next(
-        (vars(each)[algorithm] for each in there if algorithm in vars(each)), None
-    )
-    if not hasattr(found, "load"):
-        raise ValueError(f"{algorithm!r} is no algorithm of {' or '.join(LIBRARIES)}")
-    try:
-        return found.load(file, device="cpu")
-    except Exception as error:
-        raise ValueError(
-            f"{file} cannot be loaded as {algorithm}: {type(error).__name__}: {error}"
-        ) from error
+def _loaded(file: str) -> Any:
+    return load(file, device="cpu")

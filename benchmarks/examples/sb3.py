@@ -24,7 +24,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
 from mptc_gym import evaluate
-from mptc_gym.sb3 import make_vec_env, spec_of
+from mptc_gym.sb3 import make_vec_env, save
 
 SETPOINTS, ERRORS, ACTIONS = 3, 3, 20  # windows of the observation; actions: the delay plus two
 
@@ -86,8 +86,8 @@ def main(arguments: list[str] | None = None) -> None:
     began = time.process_time()
     model = make_model(options.seed).learn(options.steps)
     seconds = time.process_time() - began
-    model.save(options.out / f"ppo-{options.seed}.zip")
-    print(f"seed {options.seed}, {seconds:.0f} s: {evaluate(model, spec_of(model))}")
+    save(model, options.out / f"ppo-{options.seed}.zip")
+    print(f"seed {options.seed}, {seconds:.0f} s: {evaluate(model)}")
 
 
 if __name__ == "__main__":

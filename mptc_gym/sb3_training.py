@@ -1,0 +1,177 @@
+"""Read how a model of Stable-Baselines3 was trained from the environments that it has."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, Final, cast
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecCheckNan,
+    VecEnv,
+    VecEnvWrapper,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+    VecVideoRecorder,
+)
+from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
+
+from mptc_gym.checks import plain
+from mptc_gym.sb3_vec_env import GymnasiumVecEnv
+from mptc_gym.training import (
+    WAYS_OUT,
+    Training,
+    acting_wrappers,
+    describe,
+    entry_point,
+    wrappers_of,
+)
+from mptc_gym.vector_env import MiddlePointVectorEnv
+
+
+def training_of(model: Any) -> Training:
+    """Return how a model was trained, from the environments that it still has.
+
+    Raises
+    ------
+    ValueError
+        If the model has none, or if they hold anything that changes what the model sees or
+        does in a way that is not known here.
+    """
+    plants, vec_wrappers = _chain(model)
+    if isinstance(plants, GymnasiumVecEnv):
+        batches, spec = plants.batches, plants.spec
+        if spec is None and any(type(each) is not MiddlePointVectorEnv for each in batches):
+            raise ValueError(
+                "policy was trained on a batch whose wrappers are not known: make it by "
+                "mptc_gym.sb3.make_vec_env"
+            )
+        wrappers = acting_wrappers(spec.additional_wrappers if spec else ())
+        found = [Training.of_plant(each.unwrapped, spec, wrappers) for each in batches]
+    else:
+        specs, cores = plants.get_attr("spec"), plants.get_attr("unwrapped")
+        live = isinstance(plants, DummyVecEnv)  # not in another process
+        wrapped = [
+            wrappers_of(cast("DummyVecEnv", plants).envs[i])
+            if live
+            else acting_wrappers(spec.additional_wrappers)
+            for i, spec in enumerate(specs)
+        ]
+        found = [Training.of_plant(*each) for each in zip(cores, specs, wrapped, strict=True)]
+    if len({repr((each.plant, each.windows, each.wrappers)) for each in found}) > 1:
+        raise ValueError("policy was trained on plants of different windows or wrappers")
+    return dataclasses.replace(
+        found[0],
+        algorithm=entry_point(type(model)),
+        vec_wrappers=tuple(map(_recorded, vec_wrappers)),
+        observation_space=describe(plants.observation_space),
+        action_space=describe(plants.action_space),
+        n_envs=plants.num_envs,
+    )
+
+
+def preparation(model: Any, n: int) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    """Return the function from n observations to what a model sees, as in its training.
+
+    It belongs to one batch of episodes, whose observations it takes one after the other.
+    """
+    steps: list[Callable[[Any], Any]] = []
+    for each in _chain(model)[1]:
+        if isinstance(each, VecNormalize):
+            if each.norm_obs:
+                steps.append(each.normalize_obs)
+        else:
+            steps.append(_stack(cast("VecFrameStack", each), n))
+    return lambda seen: functools.reduce(lambda x, step: step(x), steps, seen)
+
+
+def _stack(wrapper: VecFrameStack, n: int) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    """Return the function that stacks the frames of n episodes."""
+    space = cast("Box", wrapper.venv.observation_space)
+    frames = StackedObservations[NDArray[Any]](n, wrapper.stacked_obs.n_stack, space, "last")
+    running = np.zeros(n, np.bool_)
+    begun = False
+
+    def stack(seen: NDArray[Any]) -> NDArray[Any]:
+        nonlocal begun
+        if begun:
+            return frames.update(seen, running, [{}] * n)[0]
+        begun = True
+        return frames.reset(seen)
+
+    return stack
+
+
+def _chain(model: Any) -> tuple[VecEnv, list[VecEnvWrapper]]:
+    """Return a model's environments and the wrappers that act on them, the innermost first."""
+    plants: Any = model.get_env() if isinstance(model, BaseAlgorithm) else None
+    if plants is None:
+        raise ValueError(f"policy does not say how it was trained: {WAYS_OUT}")
+    wrappers: list[VecEnvWrapper] = []
+    while type(plants) in (*_ACTING, *_WATCHING):
+        if type(plants) in _ACTING:
+            wrappers.insert(0, plants)
+        plants = plants.venv
+    if type(plants) not in (GymnasiumVecEnv, DummyVecEnv, SubprocVecEnv):
+        raise ValueError(
+            f"policy was trained in {type(plants).__name__}, and what that does is not known "
+            "here: put it into a gymnasium.Wrapper, or vouch for it by a function of the "
+            "observations"
+        )
+    for each in wrappers:
+        if isinstance(each, VecNormalize) and each.norm_obs:
+            seen = cast("RunningMeanStd", each.obs_rms).count
+            if seen < (max(model.num_timesteps, 1) if each.training else 1):
+                raise ValueError(
+                    f"policy has learnt from {model.num_timesteps:,} samples and its "
+                    f"VecNormalize has seen {seen:,.0f}, so these are not the statistics of "
+                    "its training: load them by VecNormalize.load, or all of it by "
+                    "mptc_gym.sb3.load"
+                )
+    return plants, wrappers
+
+
+_ACTING: Final = VecNormalize, VecFrameStack
+_WATCHING: Final = VecCheckNan, VecMonitor, VecVideoRecorder
+_OPTIONS: Final = (
+    "training",
+    "norm_obs",
+    "norm_reward",
+    "clip_obs",
+    "clip_reward",
+    "gamma",
+    "epsilon",
+)
+
+
+def _recorded(wrapper: VecEnvWrapper) -> dict[str, Any]:
+    """Return a `VecFrameStack` or a `VecNormalize` as JSON values."""
+    if isinstance(wrapper, VecFrameStack):
+        return {"name": "VecFrameStack", "n_stack": wrapper.stacked_obs.n_stack}
+    found = {"name": "VecNormalize", **{name: getattr(wrapper, name) for name in _OPTIONS}}
+    for name in ("obs_rms", "ret_rms"):
+        statistics = getattr(wrapper, name, None)
+        if statistics is not None:
+            found[name] = {part: plain(value) for part, value in vars(statistics).items()}
+    return found
+
+
+def restored(plants: VecEnv, name: str, **about: Any) -> VecEnvWrapper:
+    """Return environments in a wrapper that `_recorded` wrote down."""
+    if name == "VecFrameStack":
+        return VecFrameStack(plants, **about)
+    statistics = {each: about.pop(each) for each in ("obs_rms", "ret_rms") if each in about}
+    wrapper = VecNormalize(plants, **about)
+    for each, parts in statistics.items():
+        for part, value in parts.items():
+            setattr(getattr(wrapper, each), part, np.array(value)[()])
+    return wrapper

@@ -1,0 +1,254 @@
+"""Record how a policy was trained, and compare the record with an environment."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import pkgutil
+import zipfile
+from collections.abc import Iterable, Mapping
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec, WrapperSpec
+from gymnasium.spaces import Box, Space
+
+from mptc_gym.checks import plain, reject, shortened
+from mptc_gym.env import MiddlePointEnv
+from mptc_gym.parameters import Parameters
+from mptc_gym.presets import IDS
+from mptc_gym.vector_env import MiddlePointVectorEnv
+
+WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
+MEMBER: Final = "mptc_gym.json"  # of a zip
+LARGEST_MEMBER: Final = 2**29  # bytes, unpacked: far more than any policy here needs
+WAYS_OUT: Final = (
+    "save it by mptc_gym.sb3.save and load it by mptc_gym.sb3.load; or load it with the "
+    "environment of its training, PPO.load(path, env=...); or vouch for what it sees and does "
+    "by a function, lambda observations: model.predict(observations, deterministic=True)[0]"
+)
+# They change neither observations nor actions; a policy that is trained sees no rewards.
+_WATCHING: Final = {
+    "gymnasium.wrappers.common:OrderEnforcing",
+    "gymnasium.wrappers.common:PassiveEnvChecker",
+    "gymnasium.wrappers.common:RecordEpisodeStatistics",
+    "gymnasium.wrappers.common:TimeLimit",
+    "gymnasium.wrappers.rendering:HumanRendering",
+    "gymnasium.wrappers.rendering:RecordVideo",
+    "gymnasium.wrappers.rendering:RenderCollection",
+    "gymnasium.wrappers.stateful_reward:NormalizeReward",
+    "gymnasium.wrappers.transform_reward:ClipReward",
+    "gymnasium.wrappers.transform_reward:TransformReward",
+    "stable_baselines3.common.monitor:Monitor",
+}
+
+Wrappers = tuple[WrapperSpec, ...]  # the innermost first
+
+
+@dataclass(frozen=True)
+class Training:
+    """What stood between the plant and a policy while it was trained."""
+
+    env: str
+    """Id of the environment."""
+    plant: str
+    """Class of the environment, `module:name`."""
+    arguments: Mapping[str, Any]
+    """All arguments of the environment. Where plants differ in others than windows, those of
+    the first."""
+    max_episode_steps: int | None
+    """Length of an episode, samples."""
+    wrappers: Wrappers
+    """Gymnasium's wrappers that act, with their arguments."""
+    vec_wrappers: tuple[Mapping[str, Any], ...] = ()
+    """`VecFrameStack` and `VecNormalize` of Stable-Baselines3, with their numbers; the
+    innermost first."""
+    observation_space: Mapping[str, Any] = field(default_factory=dict)
+    """Observations of one environment, before `vec_wrappers`."""
+    action_space: Mapping[str, Any] = field(default_factory=dict)
+    """Actions of one environment."""
+    algorithm: str = ""
+    """Class of the model, `module:name`."""
+    n_envs: int = 1
+    """Number of environments."""
+
+    @classmethod
+    def of_plant(cls, core: Any, spec: EnvSpec | None, wrappers: Wrappers) -> Training:
+        """Record an environment, or one out of a batch, without its wrappers."""
+        if not isinstance(core, MiddlePointEnv | MiddlePointVectorEnv):
+            reject("policy", core, "trained on environments of this package")
+        batch = type(core) is MiddlePointVectorEnv
+        plant = entry_point(MiddlePointEnv if batch else type(core))
+        arguments = {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in dataclasses.asdict(core.parameters).items()
+        }
+        name, length = (spec.id, spec.max_episode_steps) if spec else (IDS["paper"], None)
+        return cls(name, plant, arguments, length, tuple(map(_with_arguments, wrappers)))
+
+    @property
+    def windows(self) -> dict[str, int]:
+        """The observation windows, by the environment's arguments."""
+        return {name: self.arguments[name] for name in WINDOWS}
+
+    def to_json(self) -> str:
+        """Return the record as JSON; ValueError if it would not make the same environment."""
+        if self.plant != entry_point(MiddlePointEnv):
+            raise ValueError(
+                f"policy was trained on {self.plant}, which cannot be recorded: put what it "
+                "changes into a gymnasium.Wrapper"
+            )
+        try:
+            return json.dumps(dataclasses.asdict(self), indent=1)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"an argument of a wrapper cannot be recorded: {error}") from error
+
+    @classmethod
+    def read(cls, path: str | Path) -> Training:
+        """Return the record in a zip. No code from the zip is run.
+
+        Raises
+        ------
+        ValueError
+            If the file cannot be read, or if it has no record.
+        """
+        try:
+            with zipfile.ZipFile(path) as archive:
+                for member in archive.infolist():
+                    if member.file_size > LARGEST_MEMBER:
+                        raise ValueError(
+                            f"{path} cannot be read: {member.filename} in it has "
+                            f"{member.file_size:,} bytes, and {LARGEST_MEMBER:,} are allowed"
+                        )
+                text = archive.read(MEMBER) if MEMBER in archive.namelist() else None
+        except OSError as error:
+            raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+        except zipfile.BadZipFile as error:
+            raise ValueError(f"{path} must be a zip that Stable-Baselines3 saved") from error
+        if text is None:
+            raise ValueError(f"{path} does not say how its policy was trained: {WAYS_OUT}")
+        try:
+            about = json.loads(text)
+            about["wrappers"] = tuple(WrapperSpec(**each) for each in about["wrappers"])
+            Parameters(**about["arguments"])
+            return cls(**about)
+        except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"{path} has a damaged record of its training: {error}") from error
+
+    def spec(self, env: str | EnvSpec, arguments: Mapping[str, Any]) -> EnvSpec:
+        """Return the spec of an environment with the windows and wrappers of the training.
+
+        Raises
+        ------
+        ValueError
+            If there is no such environment, or if `arguments` name another window.
+        """
+        for name, value in self.windows.items():
+            if arguments.get(name, value) != value:
+                raise ValueError(
+                    f"{name} must be that of policy's training, {value}, got {arguments[name]}"
+                )
+        if isinstance(env, EnvSpec):
+            env = dataclasses.replace(env, additional_wrappers=())
+        with closing(make_one(env, {**arguments, **self.windows})) as single:
+            spec = single.spec
+        assert spec is not None  # gymnasium.make sets it
+        return dataclasses.replace(spec, additional_wrappers=self.wrappers)
+
+    def check(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Refuse an environment other than that of the training with a ValueError.
+
+        Its other arguments may differ, and with the set point the bounds of observations.
+        """
+        there = Training.of_plant(env.unwrapped, env.spec, wrappers_of(env))
+        seen, taken = describe(env.observation_space), describe(env.action_space)
+        way_out = f"take mptc_gym.sb3.spec_of(policy, {there.env!r})"
+        if self.plant != there.plant:
+            way_out = f"give a function that makes a {self.plant}"
+        read = [
+            {name: each.get(name) for name in ("shape", "dtype")}
+            for each in (self.observation_space, seen)
+        ]
+        pairs: dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
+            "class": ({"env": self.plant}, {"env": there.plant}),
+            "windows": (self.windows, there.windows),
+            "wrappers": (_named(self.wrappers), _named(there.wrappers)),
+            "observations": (read[0], read[1]),
+            "action space": (self.action_space, taken),
+        }
+        for what, (own, other) in pairs.items():
+            if own != other:
+                raise ValueError(
+                    f"env must have the {what} of policy's training, {_listed(own, other)}, "
+                    f"got {_listed(other, own)}: {way_out}"
+                )
+
+
+def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
+    """Make an environment from an id or a spec; ValueError if there is no such id."""
+    try:
+        return gymnasium.make(env, disable_env_checker=True, **arguments)
+    except (gymnasium.error.UnregisteredEnv, ModuleNotFoundError):
+        reject(
+            "env", env, f"the id of an environment, such as one of {', '.join(IDS.values())}"
+        )
+
+
+def entry_point(kind: type) -> str:
+    """Return `module:name` of a class, as Gymnasium writes it."""
+    return f"{kind.__module__}:{kind.__name__}"
+
+
+def wrappers_of(env: gymnasium.Env[Any, Any]) -> Wrappers:
+    """Return the wrappers of an environment that act, with those arguments that are known."""
+    if env.spec is not None:
+        return acting_wrappers(env.spec.additional_wrappers)
+    found: Wrappers = ()
+    while isinstance(env, gymnasium.Wrapper):
+        found = (WrapperSpec(type(env).__name__, entry_point(type(env)), None), *found)
+        env = env.env
+    return acting_wrappers(found)
+
+
+def acting_wrappers(wrappers: Iterable[WrapperSpec]) -> Wrappers:
+    """Return the wrappers that change observations or actions."""
+    return tuple(each for each in wrappers if each.entry_point not in _WATCHING)
+
+
+def _with_arguments(wrapper: WrapperSpec) -> WrapperSpec:
+    """Return a wrapper with its arguments; refuse one that does not record them."""
+    if wrapper.kwargs is not None:
+        known = {name: plain(value) for name, value in wrapper.kwargs.items()}
+        return dataclasses.replace(wrapper, kwargs=known)
+    try:
+        (_,) = inspect.signature(pkgutil.resolve_name(wrapper.entry_point)).parameters
+    except (ImportError, AttributeError, TypeError, ValueError):
+        raise ValueError(
+            f"the wrapper {wrapper.entry_point} does not record its arguments: let it inherit "
+            "from gymnasium.utils.RecordConstructorArgs, and make the environment inside it by "
+            "gymnasium.make"
+        ) from None
+    return dataclasses.replace(wrapper, kwargs={})
+
+
+def describe(space: Space[Any]) -> dict[str, Any]:
+    """Return a space as JSON values."""
+    if not isinstance(space, Box):
+        return {"space": repr(space)}
+    bounds = {"low": space.low.tolist(), "high": space.high.tolist()}
+    return {"shape": list(space.shape), "dtype": str(space.dtype), **bounds}
+
+
+def _named(wrappers: Wrappers) -> dict[str, Any]:
+    """Return the arguments of wrappers by their places and entry points."""
+    return {f"{i + 1}. {each.entry_point}": each.kwargs for i, each in enumerate(wrappers)}
+
+
+def _listed(named: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+    """Return what is not the same in another mapping as text."""
+    differ = {name: value for name, value in named.items() if other.get(name) != value}
+    return ", ".join(f"{name}={shortened(value)}" for name, value in differ.items()) or "none"
