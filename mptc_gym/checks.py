@@ -31,10 +31,10 @@ Check = Callable[[str, Any], Any]
 
 def reject(name: str, value: object, allowed: str) -> NoReturn:
     """Raise a ValueError that says what an argument must be and what it is."""
-    raise ValueError(f"{name} must be {allowed}, got {shortened(value)}") from None
+    raise ValueError(f"{name} must be {allowed}, got {shorten(value)}") from None
 
 
-def shortened(value: object) -> str:
+def shorten(value: object) -> str:
     """Return the repr of a value; for a long one, its beginning and its length."""
     try:
         text = repr(value)
@@ -146,7 +146,7 @@ def numbers(name: str, value: Any, allowed: str) -> tuple[float, ...]:
         reject(name, value, allowed)
     for i, element in enumerate(value):
         if not is_number(element):
-            where = f"{shortened(value)}, where element {i} is {shortened(element)}"
+            where = f"{shorten(value)}, where element {i} is {shorten(element)}"
             raise ValueError(f"{name} must be {allowed}, got {where}")
     return tuple(float(element) for element in value)
 

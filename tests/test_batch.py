@@ -412,6 +412,7 @@ class TestDraws:
         ages, setpoint, noise, load = np.swapaxes(rows, 0, 1)
         assert_mean(noise[ages == 1] ** 2, variance)
         assert_mean(noise[ages == 2] ** 2, variance * (1 + 3**2))
+        assert_mean((noise[1:] * noise[:-1])[ages[1:] == 2], variance * 3)
         assert not load[ages < 10].any()
         assert_mean(load[ages == 10] ** 2, 10 * walk + jump**2 / 3)
         assert_mean(load[ages == 45] ** 2, 40 * walk + jump**2 / 3)

@@ -15,7 +15,7 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import gymnasium
@@ -38,7 +38,7 @@ SINGLE_STEPS = 20_000
 FRAMES = 400  # the chart is full for half of them
 EPISODE = 1200
 BATCHES = (8, 64, 1024, 16384)
-LOOPS = (64, 1000)
+LOOPS = (1, 64, 1000)
 MEMORY_PLANTS = 100
 DEVICE_BATCHES = tuple(4**power for power in range(5, 12))  # 1,024 to 4,194,304 plants
 DEVICE_STEPS = 200
@@ -89,7 +89,7 @@ def execute(options: Options, console: Console) -> str:
     show('Steps with a picture of each, render_mode="rgb_array"', compare(drawn, rounds))
     for n in BATCHES:
         show(f"Vector environments, n = {n}", compare(list(_vector(n)), rounds))
-    show(learners, compare([_alone(), *(_closed_loop(n) for n in LOOPS)], rounds))
+    show(learners, compare([_closed_loop(n) for n in LOOPS], rounds))
     show(policy, compare([_through_the_plant(GRADIENTS)], rounds))
     show("Memory of a plant, 20 past actions", memory())
 
@@ -204,31 +204,27 @@ def _gymnax(n: int) -> Iterable[Timed]:
     env, parameters = gymnax.make(REFERENCE)
     step_all = jax.vmap(env.step, (0, 0, 0, None))
     actions = jax.random.randint(jax.random.key(1), (PEER_STEPS, n), 0, 2)
+    keys = jax.random.split(jax.random.key(0), n)
+    start = jax.random.key(2), jax.vmap(env.reset, (0, None))(keys, parameters)[1]
 
-    def advance(carry: tuple[Any, Any], action: Any) -> tuple[tuple[Any, Any], Any]:
+    @jax.jit
+    def step(carry: tuple[Any, Any], action: Any) -> tuple[tuple[Any, Any], Any]:
         keys = jax.random.split(carry[0], n + 1)
         observations, state, *others = step_all(keys[1:], carry[1], action, parameters)
         return (keys[0], state), (observations, others)
 
-    step, one_by_one = jax.jit(advance), list(actions)
-    scan = jax.jit(lambda carry: jax.lax.scan(advance, carry, actions))
-    _, states = jax.vmap(env.reset, (0, None))(
-        jax.random.split(jax.random.key(0), n), parameters
-    )
-    start = jax.random.key(2), states
+    one_by_one, scan = list(actions), jax.jit(partial(jax.lax.scan, step))
 
-    def stepped() -> None:
-        carry = start
-        for action in one_by_one:
-            carry, returned = step(carry, action)
-        jax.block_until_ready(returned)
+    def wait_for(loop: Callable[[], object]) -> None:
+        jax.block_until_ready(loop())
 
-    def compiled() -> None:
-        jax.block_until_ready(scan(start))
-
-    for name, run in {"": stepped, ", one compiled loop": compiled}.items():
-        run()  # the first call compiles
-        yield Timed(f"{REFERENCE} of gymnax{name}", run, n * PEER_STEPS)
+    loops = {
+        "": lambda: reduce(lambda made, a: step(made[0], a), one_by_one, (start, None)),
+        ", one compiled loop": lambda: scan(start, actions),
+    }
+    for name, loop in loops.items():
+        wait_for(loop)  # the first call compiles
+        yield Timed(f"{REFERENCE} of gymnax{name}", partial(wait_for, loop), n * PEER_STEPS)
 
 
 PEERS: dict[str, Callable[[int], Iterable[Timed]]] = {"envpool": _envpool, "gymnax": _gymnax}
@@ -291,20 +287,6 @@ def _stepping(
         wait()
 
     return Timed(name, run, steps * len(actions[0]))
-
-
-def _alone() -> Timed:
-    """Return the case of one plant and its network, without a batch."""
-    env = gymnasium.make("MiddlePoint-v0", **NOISE)
-    controller = DirectNNController()
-
-    def step() -> None:
-        controller.reset()
-        observation, _ = env.reset(seed=0)
-        for _ in range(EPISODE):
-            observation, *_ = env.step(controller.act(observation))
-
-    return Timed("one, no batch", step, EPISODE)
 
 
 def _closed_loop(n: int) -> Timed:
