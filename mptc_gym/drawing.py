@@ -106,13 +106,13 @@ def draw(record: Record) -> pygame.Surface:
     """Return a picture; the next call draws over it."""
     surface = _paper()
     surface.fill(_PAGE)
-    _header(surface, record)
+    _draw_header(surface, record)
     top = Panel(86, 304, record, record.temperatures)
     bottom = Panel(*_FLOW_PANEL, record, record.flows)
-    _temperatures(surface, top)
-    _flows(surface, bottom)
-    _time_axis(surface, bottom)
-    _legend(surface, record.plant.dead_zone > 0.0)
+    _draw_temperatures(surface, top)
+    _draw_flows(surface, bottom)
+    _draw_time_axis(surface, bottom)
+    _draw_legend(surface, record.plant.dead_zone > 0.0)
     return surface
 
 
@@ -130,7 +130,7 @@ def _paper() -> pygame.Surface:
     return pygame.Surface(SIZE, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
 
 
-def _header(surface: pygame.Surface, record: Record) -> None:
+def _draw_header(surface: pygame.Surface, record: Record) -> None:
     colours = {"set point": SETPOINT, "temperature": TEMPERATURE}
     colours |= {"command": COMMAND, "applied": APPLIED}
     pygame.draw.rect(surface, _PANEL, (0, 0, SIZE[0], 66))
@@ -144,26 +144,26 @@ def _header(surface: pygame.Surface, record: Record) -> None:
             x += image.get_width()
 
 
-def _temperatures(surface: pygame.Surface, panel: Panel) -> None:
-    _ground(surface, panel, "temperature, °C")
+def _draw_temperatures(surface: pygame.Surface, panel: Panel) -> None:
+    _draw_ground(surface, panel, "temperature, °C")
     record = panel.record
     setpoints, outputs, _, _ = map(panel.ys, zip(*record.samples, strict=True))
     surface.set_clip(panel.rect)
-    _dashes(surface, SETPOINT, panel, setpoints[:-1])
-    _curve(surface, TEMPERATURE, list(zip(panel.xs, outputs, strict=False)))
+    _draw_dashes(surface, SETPOINT, panel, setpoints[:-1])
+    _draw_curve(surface, TEMPERATURE, list(zip(panel.xs, outputs, strict=False)))
     surface.set_clip(None)
-    _edge(surface, panel)
+    _draw_edge(surface, panel)
     dot = _dot(TEMPERATURE)
     surface.blit(dot, dot.get_rect(center=_pixel((panel.x(record.k), outputs[-1]))))
     ends = ("set point", SETPOINT, setpoints[-1]), ("temperature", TEMPERATURE, outputs[-1])
-    _names(surface, panel, *ends)
+    _write_names(surface, panel, *ends)
 
 
-def _flows(surface: pygame.Surface, panel: Panel) -> None:
+def _draw_flows(surface: pygame.Surface, panel: Panel) -> None:
     record, plant = panel.record, panel.record.plant
     now, departed = panel.x(record.k), max(_LEFT, panel.x(record.k - record.in_transit))
     zero = panel.y(0.0)
-    _ground(surface, panel, "feedwater, t/h")
+    _draw_ground(surface, panel, "feedwater, t/h")
     surface.set_clip(panel.rect)
     if plant.dead_zone > 0.0:
         upper, lower = panel.y(plant.dead_zone), panel.y(-plant.dead_zone)
@@ -175,7 +175,7 @@ def _flows(surface: pygame.Surface, panel: Panel) -> None:
             pygame.BLEND_RGB_MULT,
         )
     for limit in (plant.u_max, plant.u_min):
-        _dotted(surface, _LEFT, _RIGHT, panel.y(limit))
+        _draw_limit(surface, _LEFT, _RIGHT, panel.y(limit))
     pygame.draw.line(surface, _FRAME, (_LEFT, zero), (_RIGHT, zero))
 
     # An input is held from its sample to the next. The first entry is from before the episode.
@@ -189,15 +189,15 @@ def _flows(surface: pygame.Surface, panel: Panel) -> None:
         pygame.draw.lines(surface, APPLIED, False, _steps(panel, applied), 3)
         pygame.draw.lines(surface, COMMAND, False, _steps(panel, commands))
     surface.set_clip(None)
-    _edge(surface, panel)
+    _draw_edge(surface, panel)
     if record.in_transit:
-        _bracket(surface, panel, departed, now)
+        _draw_bracket(surface, panel, departed, now)
     if applied:
         ends = ("command", COMMAND, commands[-1]), ("applied", APPLIED, applied[-1])
-        _names(surface, panel, *ends)
+        _write_names(surface, panel, *ends)
 
 
-def _ground(surface: pygame.Surface, panel: Panel, title: str) -> None:
+def _draw_ground(surface: pygame.Surface, panel: Panel, title: str) -> None:
     """Draw the background of the lines: the panel, its grid and its tick labels."""
     surface.fill(_PANEL, panel.rect)
     for _, x in panel.minutes():
@@ -210,14 +210,14 @@ def _ground(surface: pygame.Surface, panel: Panel, title: str) -> None:
     surface.blit(upright, upright.get_rect(center=(13, (panel.top + panel.bottom) // 2)))
 
 
-def _edge(surface: pygame.Surface, panel: Panel) -> None:
+def _draw_edge(surface: pygame.Surface, panel: Panel) -> None:
     """Draw the panel's frame, and a line at the present sample."""
     now = panel.x(panel.record.k)
     pygame.draw.line(surface, _FRAME, (now, panel.top), (now, panel.bottom))
     pygame.draw.rect(surface, _FRAME, panel.rect, 1)
 
 
-def _bracket(surface: pygame.Surface, panel: Panel, left: float, right: float) -> None:
+def _draw_bracket(surface: pygame.Surface, panel: Panel, left: float, right: float) -> None:
     """Mark the flow in transit above the panel."""
     y = panel.top - 5
     pygame.draw.line(surface, FAINT, (left, y), (right, y))
@@ -228,7 +228,7 @@ def _bracket(surface: pygame.Surface, panel: Panel, left: float, right: float) -
     surface.blit(words, place.clamp(pygame.Rect(_LEFT, 0, SIZE[0] - _LEFT, SIZE[1])))
 
 
-def _time_axis(surface: pygame.Surface, panel: Panel) -> None:
+def _draw_time_axis(surface: pygame.Surface, panel: Panel) -> None:
     y = panel.bottom
     for minute, x in panel.minutes():
         pygame.draw.line(surface, _FRAME, (x, y), (x, y + 5))
@@ -236,10 +236,10 @@ def _time_axis(surface: pygame.Surface, panel: Panel) -> None:
     _write(surface, "time, min", _SMALL, _INK, topleft=(_RIGHT + 24, y + 9))
 
 
-def _legend(surface: pygame.Surface, has_dead_zone: bool) -> None:
+def _draw_legend(surface: pygame.Surface, has_dead_zone: bool) -> None:
     """Explain shade and dots below the panels, where no line crosses the text."""
     x, y = _LEFT, SIZE[1] - 10
-    _dotted(surface, x, x + 28, y)
+    _draw_limit(surface, x, x + 28, y)
     _write(surface, "limits", _SMALL, FAINT, midleft=(x + 36, y))
     if has_dead_zone:
         x += 104
@@ -248,13 +248,13 @@ def _legend(surface: pygame.Surface, has_dead_zone: bool) -> None:
         _write(surface, "dead zone", _SMALL, FAINT, midleft=(x + 36, y))
 
 
-def _dotted(surface: pygame.Surface, left: int, right: int, y: float) -> None:
+def _draw_limit(surface: pygame.Surface, left: int, right: int, y: float) -> None:
     """Draw the dotted line of a limit."""
     for x in range(left, right, 8):
         pygame.draw.line(surface, LIMIT, (x, y), (x + 3, y))
 
 
-def _curve(surface: pygame.Surface, colour: Colour, points: Sequence[Point]) -> None:
+def _draw_curve(surface: pygame.Surface, colour: Colour, points: Sequence[Point]) -> None:
     """Draw an antialiased line about three pixels wide, from lines of pygame's only width."""
     if len(points) < 2:
         return
@@ -262,7 +262,7 @@ def _curve(surface: pygame.Surface, colour: Colour, points: Sequence[Point]) -> 
         pygame.draw.aalines(surface, colour, False, [(x + dx, y + dy) for x, y in points])
 
 
-def _dashes(
+def _draw_dashes(
     surface: pygame.Surface, colour: Colour, panel: Panel, heights: Sequence[float]
 ) -> None:
     """Draw a value held from sample to sample, in dashes that move with the samples."""
@@ -283,7 +283,9 @@ def _steps(panel: Panel, heights: Sequence[float]) -> list[Point]:
     return points
 
 
-def _names(surface: pygame.Surface, panel: Panel, *lines: tuple[str, Colour, float]) -> None:
+def _write_names(
+    surface: pygame.Surface, panel: Panel, *lines: tuple[str, Colour, float]
+) -> None:
     """Write the names of two lines beside their ends, one above the other."""
     x = panel.x(panel.record.k) + 10
     (_, _, upper), (_, _, lower) = lines = tuple(sorted(lines, key=lambda line: line[2]))
@@ -315,7 +317,7 @@ def _words(words: str, size: int, colour: Colour) -> pygame.Surface:
     # aligned to whole pixels, unevenly spaced.
     pygame.font.init()
     font = pygame.font.Font(None, size * _FINER)
-    return _reduced(font.render(words.replace("-", "\N{MINUS SIGN}"), True, colour))
+    return _reduce(font.render(words.replace("-", "\N{MINUS SIGN}"), True, colour))
 
 
 @cache
@@ -324,10 +326,10 @@ def _dot(colour: Colour) -> pygame.Surface:
     image = pygame.Surface((size, size), pygame.SRCALPHA)
     image.fill((*colour, 0))
     pygame.draw.circle(image, colour, (size / 2, size / 2), size / 2)
-    return _reduced(image)
+    return _reduce(image)
 
 
-def _reduced(image: pygame.Surface) -> pygame.Surface:
+def _reduce(image: pygame.Surface) -> pygame.Surface:
     width, height = image.get_size()
     return pygame.transform.smoothscale(
         image, (math.ceil(width / _FINER), math.ceil(height / _FINER))

@@ -132,7 +132,7 @@ class TorchPlants:
         response = self._response(samples)
         begins = [k for k in range(samples) if k == 0 or self._changes_at(clock + k)]
         for first, last in pairwise([*begins, samples]):
-            factors, (alpha, scale, load_gain) = self._drifted(clock + first)
+            factors, (alpha, scale, load_gain) = self._dynamics_at(clock + first)
             forced = response[first:last]
             if noise is not None:
                 forced = _plus(noise[first:last], scale, forced)
@@ -169,7 +169,7 @@ class TorchPlants:
         """Whether the drifting dynamics of any plant change at a sample."""
         return self._drifts and self._episodes.any_changes(clock)
 
-    def _drifted(self, clock: int) -> tuple[Any, Any]:
+    def _dynamics_at(self, clock: int) -> tuple[Any, Any]:
         """Return gain and time constant at a sample, and the coefficients of (28) for them."""
         if self._now is None or self._changes_at(clock):
             factors: tuple[Any, ...] = self._factors

@@ -185,7 +185,7 @@ class RandomSetPoint:
         self._returned += samples
         levels = self._levels[0][1].expand(samples, -1)
         for (change, _), (_, level) in pairwise(self._levels):
-            levels = torch.lerp(levels, level, _reached(rows, change))
+            levels = torch.lerp(levels, level, _is_past(rows, change))
         return levels
 
     def _draw_level(self) -> tuple[Tensor, Tensor]:
@@ -199,7 +199,7 @@ class RandomSetPoint:
         end, level = self._levels[0]
         now = level.new_full((), self._returned)
         for (change, _), (later, following) in pairwise(self._levels):
-            reached = _reached(now, change)
+            reached = _is_past(now, change)
             end, level = torch.lerp(end, later, reached), torch.lerp(level, following, reached)
         self._levels = [(end - now, level)]
         self._known = self._returned = 0
@@ -267,7 +267,7 @@ class Disturbance:
             interval = max(interval, LOAD_INTERVAL)
         # A step occurs if this is within +-1, and is then uniform there.
         place = drawn[0] * (interval / LOAD_INTERVAL)
-        jumps = _reached(place.new_ones(()), place.abs())
+        jumps = _is_past(place.new_ones(()), place.abs())
         level = place * numbers["disturbance_amplitude"]
         # Uniform within +-h, a step of the walk has the variance h^2 / 3.
         width = (3.0 * LOAD_INTERVAL * numbers["disturbance_walk_variance"]) ** 0.5
@@ -278,7 +278,7 @@ class Disturbance:
         return torch.lerp(step, level, jumps), moved
 
 
-def _reached(now: Tensor, change: Tensor) -> Tensor:
+def _is_past(now: Tensor, change: Tensor) -> Tensor:
     """Return 1 where a change has been reached, and 0 elsewhere."""
     # Of the same type, as factors of type bool are many times slower.
     past = now - change

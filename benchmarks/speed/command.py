@@ -15,7 +15,7 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -72,7 +72,7 @@ def execute(options: Options, console: Console) -> str:
     if options.device is not None:
         with blame("--device"):
             MiddlePointTorchEnv(1, device=options.device)
-        show(f"Steps a second on {options.device}", on_device(options.device, rounds))
+        show(f"Steps a second on {options.device}", measure_on(options.device, rounds))
         return f"Medians of {rounds} rounds."
     plant = "MiddlePoint-v0"
     single = [
@@ -91,14 +91,14 @@ def execute(options: Options, console: Console) -> str:
         show(f"Vector environments, n = {n}", compare(list(_vector(n)), rounds))
     show(learners, compare([_closed_loop(n) for n in LOOPS], rounds))
     show(policy, compare([_through_the_plant(GRADIENTS)], rounds))
-    show("Memory of a plant, 20 past actions", memory())
+    show("Memory of a plant, 20 past actions", measure_memory())
 
     python = [sys.executable, "-c"]
     imports = [
         Timed(module, partial(subprocess.run, [*python, f"import {module}"], check=True), 1)
         for module in ("gymnasium", "mptc_gym")
     ]
-    taken = 1000 * _alternately(imports, rounds)
+    taken = 1000 * _time_in_turns(imports, rounds)
     more = taken["mptc_gym"] - taken["gymnasium"]
     missing = " and ".join(peer for peer in PEERS if not importlib.util.find_spec(peer))
     left_out = (
@@ -116,7 +116,7 @@ def compare(cases: list[Timed], rounds: int) -> pd.DataFrame:
 
     The ratio compares a case's steps a second with those of the first case in the same round.
     """
-    seconds = _alternately(cases, rounds)
+    seconds = _time_in_turns(cases, rounds)
     rates = seconds.rdiv([case.steps for case in cases], axis="columns")
     first = cases[0].name
     return pd.DataFrame(
@@ -128,7 +128,7 @@ def compare(cases: list[Timed], rounds: int) -> pd.DataFrame:
     ).reset_index(names="case")
 
 
-def memory() -> pd.DataFrame:
+def measure_memory() -> pd.DataFrame:
     """Measure the memory per plant, in a batch and alone."""
     rows = []
     random = {**NOISE, "setpoint": "random"}
@@ -178,7 +178,7 @@ def _vector(n: int) -> Iterable[Timed]:
         envs.reset(seed=0)
         envs.action_space.seed(0)
         actions = [envs.action_space.sample() for _ in range(20)]
-        yield _stepping(name + special, envs, actions, EPISODE + 1)
+        yield _steps(name + special, envs, actions, EPISODE + 1)
     yield from _in_torch(n, "cpu", EPISODE + 1)
     for peer in filter(importlib.util.find_spec, PEERS):
         yield from PEERS[peer](n)
@@ -191,7 +191,7 @@ def _envpool(n: int) -> Iterable[Timed]:
     envs = envpool.make_gymnasium(REFERENCE, num_envs=n, num_threads=1, seed=0)
     envs.reset()
     actions = list(np.random.default_rng(0).integers(0, 2, (20, n), dtype=np.int32))
-    yield _stepping(f"{REFERENCE} of envpool", envs, actions, PEER_STEPS)
+    yield _steps(f"{REFERENCE} of envpool", envs, actions, PEER_STEPS)
 
 
 def _gymnax(n: int) -> Iterable[Timed]:
@@ -207,24 +207,26 @@ def _gymnax(n: int) -> Iterable[Timed]:
     keys = jax.random.split(jax.random.key(0), n)
     start = jax.random.key(2), jax.vmap(env.reset, (0, None))(keys, parameters)[1]
 
-    @jax.jit
-    def step(carry: tuple[Any, Any], action: Any) -> tuple[tuple[Any, Any], Any]:
+    def advance(carry: tuple[Any, Any], action: Any) -> tuple[tuple[Any, Any], Any]:
         keys = jax.random.split(carry[0], n + 1)
         observations, state, *others = step_all(keys[1:], carry[1], action, parameters)
         return (keys[0], state), (observations, others)
 
-    one_by_one, scan = list(actions), jax.jit(partial(jax.lax.scan, step))
+    one_by_one, step = list(actions), jax.jit(advance)
+    scan = jax.jit(partial(jax.lax.scan, advance))
 
-    def wait_for(loop: Callable[[], object]) -> None:
-        jax.block_until_ready(loop())
+    def run_steps() -> None:
+        carry = start
+        for action in one_by_one:
+            carry, returned = step(carry, action)
+        jax.block_until_ready(returned)
 
-    loops = {
-        "": lambda: reduce(lambda made, a: step(made[0], a), one_by_one, (start, None)),
-        ", one compiled loop": lambda: scan(start, actions),
-    }
-    for name, loop in loops.items():
-        wait_for(loop)  # the first call compiles
-        yield Timed(f"{REFERENCE} of gymnax{name}", partial(wait_for, loop), n * PEER_STEPS)
+    def run_scan() -> None:
+        jax.block_until_ready(scan(start, actions))
+
+    for name, run in {"": run_steps, ", one compiled loop": run_scan}.items():
+        run()  # the first call compiles
+        yield Timed(f"{REFERENCE} of gymnax{name}", run, n * PEER_STEPS)
 
 
 PEERS: dict[str, Callable[[int], Iterable[Timed]]] = {"envpool": _envpool, "gymnax": _gymnax}
@@ -237,17 +239,17 @@ def _in_torch(n: int, device: str, steps: int) -> Iterable[Timed]:
         envs.reset(seed=0)
         actions = [2.0 * torch.rand(n, 1, device=device) - 1.0 for _ in range(20)]
         wait = (lambda: None) if device == "cpu" else torch.accelerator.synchronize
-        yield _stepping(f"in PyTorch{special}", envs, actions, steps, wait)
+        yield _steps(f"in PyTorch{special}", envs, actions, steps, wait)
 
 
-def on_device(device: str, rounds: int) -> pd.DataFrame:
+def measure_on(device: str, rounds: int) -> pd.DataFrame:
     """Return the PyTorch environment's steps a second on a device, one row per batch size."""
     rows = []
     for n in DEVICE_BATCHES:
         row = {"n": f"{n:,}"}
         for case in _in_torch(n, device, DEVICE_STEPS):
             case.run()  # warm-up
-            rates = case.steps / _alternately([case], rounds)[case.name]
+            rates = case.steps / _time_in_turns([case], rounds)[case.name]
             row[case.name] = f"{rates.median():.3g}"
         rows.append(row)
     return pd.DataFrame(rows)
@@ -272,7 +274,7 @@ def _through_the_plant(n: int) -> Timed:
     return Timed(f"gradient through {n:,} plants and {BACKWARD} samples", train, n * BACKWARD)
 
 
-def _stepping(
+def _steps(
     name: str,
     envs: Any,
     actions: list[Any],
@@ -296,7 +298,7 @@ def _closed_loop(n: int) -> Timed:
     return Timed(f"batch of {n:,}", run, n * EPISODE)
 
 
-def _alternately(cases: list[Timed], rounds: int) -> pd.DataFrame:
+def _time_in_turns(cases: list[Timed], rounds: int) -> pd.DataFrame:
     """Time the cases in turns, and return seconds: one row per round, one column per case."""
     rows = []
     for _ in tqdm(range(rounds), leave=False):

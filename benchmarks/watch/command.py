@@ -53,7 +53,7 @@ def execute(options: Options, console: Console) -> str:
         path = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.gif"
         console.print(f"There is no screen to open a window on: writing a film, {path}")
     if factory and path:
-        trajectory = film(factory, scenario, options.seed, options.speed, path)
+        trajectory = write_film(factory, scenario, options.seed, options.speed, path)
     else:
         console.print(game.HELP)
         try:
@@ -68,7 +68,9 @@ def execute(options: Options, console: Console) -> str:
     return f"{label} on {scenario.title}: mean absolute error {found}"
 
 
-def film(factory: Factory, scenario: Scenario, seed: int, speed: int, path: Path) -> Trajectory:
+def write_film(
+    factory: Factory, scenario: Scenario, seed: int, speed: int, path: Path
+) -> Trajectory:
     """Run a controller, and write what a window would show as an animated GIF.
 
     It shows every n-th sample, as viewers play at most some 10 pictures a second.
