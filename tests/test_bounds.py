@@ -276,13 +276,19 @@ class TestUnknown:
 
 class TestCausal:
     @pytest.mark.parametrize(
-        "past", [[5.0], [5.0] * 4, [-4.0] * 3 + [2.0] * 3, [-4.0] * 4 + [1.0] * 7], ids=str
-    )
-    def test_the_penalty_is_0_in_the_mean_over_the_future(self, past, rng):
+        ("pole", "past"),
+        [
+            (0.6, [5.0]), (0.9, [5.0] * 4), (0.6, [-4.0] * 3 + [2.0] * 3),
+            (0.6, [-4.0] * 4 + [1.0] * 7),
+        ],
+        ids=str,
+    )  # fmt: skip
+    def test_the_penalty_is_0_in_the_mean_over_the_future(self, pole, past, rng):
         # A level is held for 3 to 7 samples. The futures of the past have the next two holds in
         # all lengths and the next level on a grid, and each comes with its mirror image.
-        samples, plant = 16, {"a": (1.0, -0.6), "b": (-0.24,), "c": (1.0,), "delay": 0}
+        plant = {"a": (1.0, -pole), "b": (0.6 * pole - 0.6,), "c": (1.0,), "delay": 0}
         case = {"setpoint": "random", "setpoint_period": 15, "noise_variance": 0.1, **plant}
+        samples = 16
         of_plant = course_of(samples, **case)
         law = SetPointLaw(Parameters(**case), of_plant, unknown(of_plant))
         now = len(past) - 1
