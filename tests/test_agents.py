@@ -2,6 +2,7 @@
 
 import inspect
 import pickle
+from dataclasses import replace
 from functools import partial
 
 import gymnasium
@@ -341,7 +342,9 @@ class Harm:
 SAVED = {
     "weights": DirectNNController().weights,
     "told network": LawNetwork.load(),
-    "policy network": PolicyNetwork.load(PRETRAINED / "ppo-10000.npz"),
+    "policy network": replace(
+        PolicyNetwork.load(PRETRAINED / "ppo-10000.npz"), u_min=-10.0, u_max=10.0
+    ),
 }
 
 

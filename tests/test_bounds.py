@@ -360,6 +360,7 @@ class TestLeastPossible:
         plant = {"u_min": -12.0, "u_max": 6.0, "dead_zone": 0.0, "setpoint": 4.0}
         least = least_possible(samples=100, folder=None, **plant)
         assert least.idle == least.idle_low == pytest.approx(4.0, abs=1e-12)
+        assert (least.runs, len(least.episodes)) == (1, 1)  # nothing is drawn
 
     def test_score(self):
         least = least_possible(samples=600, folder=None, setpoint=5.0)
