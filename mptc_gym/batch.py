@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mptc_gym.checks import MOST_NUMBERS, MOST_PLANTS, count, is_count, reject
-from mptc_gym.env import HasPlainSpec, action_space, observation_space
+from mptc_gym.env import INFO, HasPlainSpec, action_space, observation_space
 from mptc_gym.parameters import Parameters
 from mptc_gym.signals import FOREVER
 
@@ -24,7 +24,6 @@ Array = Any  # of NumPy or PyTorch, depending on the environment
 Infos = dict[str, Any]
 Mask = NDArray[np.bool_]  # of plants, shape (num_envs,)
 
-INFO = ("output", "setpoint", "error", "command", "applied", "noise")
 FACTORS = ("gain_factor", "time_constant_factor")
 
 

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from mptc_gym import rendering
 from mptc_gym.checks import one_action, plain, reject_action
-from mptc_gym.parameters import Parameters, argument_table, spelt_out
+from mptc_gym.parameters import Parameters, insert_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
 from mptc_gym.record import Record
 from mptc_gym.signals import ONE, Signals, Streams
 
+INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys, see `reset`
 _FLOAT32 = np.dtype(np.float32)  # faster to pass than the type
 
 Observation = NDArray[np.float32]
@@ -41,10 +42,8 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
     """
     span = parameters.temperature_span
     setpoint_limit = max(span, parameters.largest_setpoint)
-    high = np.repeat(
-        np.array([setpoint_limit, setpoint_limit + span, span, 1.0]),
-        parameters.windows,
-    ).astype(np.float32)
+    limits = np.array([setpoint_limit, setpoint_limit + span, span, 1.0], np.float32)
+    high = np.repeat(limits, parameters.windows)
     return Box(-high, high, dtype=np.float32)
 
 
@@ -222,11 +221,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             parameters.reward == "quadratic",
             parameters.move_weight,
         )
-        self._layout = (
-            parameters.temperature_span,
-            *parameters.heads,
-            parameters.observation_size,
-        )
+        size = parameters.observation_size
+        self._layout = parameters.temperature_span, *parameters.heads, size
         self._ranges = Ranges(parameters)
         self._signals = Signals.of(parameters)
         self._has_more_info = parameters.is_disturbed or parameters.drifts
@@ -285,19 +281,12 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         if self.render_mode is not None:
             self._record = Record(numbers, parameters.sampling_interval, setpoint)
             self._show()
-        info = {
-            "output": 0.0,
-            "setpoint": setpoint,
-            "error": setpoint,
-            "command": 0.0,
-            "applied": 0.0,
-            "noise": 0.0,
-        }
+        info = dict.fromkeys(INFO, 0.0)
+        info["setpoint"] = info["error"] = setpoint
         if self._has_more_info:
             self._add_more_info(info, 0.0)
-        return np.fromiter(self._window, _FLOAT32, size), info | numbers.chosen(
-            self._ranges.names
-        )
+        info |= numbers.chosen(self._ranges.names)
+        return np.fromiter(self._window, _FLOAT32, size), info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
         """Apply a normalised action for one sample.
@@ -418,16 +407,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             info["gain_factor"], info["time_constant_factor"] = self._plant.factors
 
 
-def _with_table(docstring: str | None) -> str | None:
-    """Insert the table of arguments at its placeholder in a docstring."""
-    if docstring is None:  # under `python -OO`
-        return None
-    before = docstring.partition("<arguments>")[0]
-    indentation = before[before.rfind("\n") + 1 :]  # none from Python 3.13 on
-    return docstring.replace("<arguments>", argument_table().replace("\n", f"\n{indentation}"))
-
-
-MiddlePointEnv.__doc__ = _with_table(MiddlePointEnv.__doc__)
+MiddlePointEnv.__doc__ = insert_table(MiddlePointEnv.__doc__)
 
 
 def _limited(value: float, limit: float) -> float:

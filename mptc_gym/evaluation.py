@@ -18,7 +18,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym.checks import MOST_PLANTS, count, reject, shortened
+from mptc_gym.checks import MOST_PLANTS, count, reject, shorten
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
@@ -373,7 +373,7 @@ def _checked(actions: Any, shape: Any, k: int) -> NDArray[Any]:
     except (TypeError, ValueError, RuntimeError) as error:  # the last: from tensors
         hint = "its first element" if isinstance(actions, tuple) else f"an array ({error})"
         raise ValueError(
-            f"policy must return an array of numbers, got {shortened(actions)}: return {hint}"
+            f"policy must return an array of numbers, got {shorten(actions)}: return {hint}"
         ) from error
     if checked.shape != shape:
         raise ValueError(f"policy must return actions of shape {shape}, got {checked.shape}")

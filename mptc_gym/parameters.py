@@ -366,6 +366,15 @@ def argument_table() -> str:
     return "\n".join(["| Argument | Default | Meaning, unit |", "|---|---|---|", *rows])
 
 
+def insert_table(docstring: str | None) -> str | None:
+    """Insert the table of arguments at its placeholder in a docstring."""
+    if docstring is None:  # under `python -OO`
+        return None
+    before = docstring.partition("<arguments>")[0]
+    indentation = before[before.rfind("\n") + 1 :]  # none from Python 3.13 on
+    return docstring.replace("<arguments>", argument_table().replace("\n", f"\n{indentation}"))
+
+
 def spelt_out(function: Callable[..., Any]) -> inspect.Signature:
     """Return a method's signature for help(), with each argument in place of **arguments."""
     own = [*inspect.signature(function).parameters.values()]

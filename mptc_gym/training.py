@@ -17,7 +17,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from gymnasium.spaces import Box, Space
 
-from mptc_gym.checks import plain, reject, shortened
+from mptc_gym.checks import plain, reject, shorten
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import Parameters
 from mptc_gym.presets import IDS
@@ -251,4 +251,4 @@ def _named(wrappers: Wrappers) -> dict[str, Any]:
 def _listed(named: Mapping[str, Any], other: Mapping[str, Any]) -> str:
     """Return what is not the same in another mapping as text."""
     differ = {name: value for name, value in named.items() if other.get(name) != value}
-    return ", ".join(f"{name}={shortened(value)}" for name, value in differ.items()) or "none"
+    return ", ".join(f"{name}={shorten(value)}" for name, value in differ.items()) or "none"
