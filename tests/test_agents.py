@@ -62,6 +62,12 @@ class TestPI:
             commands.append(controller.command)
         assert commands == [-3.0, -1.5, 4.0, 2.5]
 
+    def test_anti_windup_does_not_hold_what_leads_back_to_the_limits(self):
+        # Kp 1, Ki 0.5, at least 2 t/h: e = -1 gives 1 + 0.5, which is below, then more.
+        controller = PIController(1.0, 0.5, anti_windup=True, error_index=0, u_min=2, u_max=6)
+        commands = [float(controller.act([-1.0])[0]) * 2.0 + 4.0 for _ in range(3)]
+        assert commands == [1.5, 2.0, 2.5]
+
 
 # Of first order, nearly. Each controller is told what it has to be told.
 PLANT = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}

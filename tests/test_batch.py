@@ -374,6 +374,14 @@ class TestDraws:
         assert_mean(levels, 0.0)
         assert_mean(levels**2, 1 / 3)
 
+    def test_a_walk_gains_its_variance_per_sample(self, library):
+        n, steps, variance = 2000, 400, 0.02
+        env = library.make(n, disturbance_walk_variance=variance)
+        env.reset(seed=4)
+        moves = np.diff(collected(env, steps, "disturbance")[9::10], axis=0)
+        assert_mean(moves**2, 10 * variance)
+        assert_mean(moves[1:] * moves[:-1], 0.0)
+
     def test_ranges_have_both_ends(self, library):
         n = 20_000
         for type_ in library.types:

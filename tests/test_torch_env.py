@@ -384,6 +384,14 @@ def test_signals_end_with_an_error_and_with_a_reset_without():
     assert env.step(torch.zeros(2, 1))[-1]["noise"].tolist() != [1.0, 1.0]
 
 
+def test_after_the_last_given_episode_the_first_follows_again():
+    env = make(1, max_episode_steps=2)
+    levels = torch.tensor([1.0, 2.0])[:, None, None].expand(2, 3, 1)  # episodes, samples, n
+    found = [env.reset(options={"signals": {"setpoint": levels}})[1]["setpoint"].item()]
+    found += [env.step(torch.zeros(1, 1))[-1]["setpoint"].item() for _ in range(11)]
+    assert found == [1.0] * 3 + [2.0] * 3 + [1.0] * 3 + [2.0] * 3
+
+
 def test_without_torch_the_import_says_what_to_install():
     program = """
 import sys
