@@ -96,14 +96,6 @@ class TestSetPointChanges:
         # A time as long as the delay leaves no choice.
         assert change(0.0, 5.0, 19) == pytest.approx(95.0)
 
-    def test_with_preview_a_plant_of_first_order_by_hand(self):
-        # From 0 to 1.5 at k = 3, known beforehand. On the way up by full input are 1 and 1.5.
-        # Going up one sample before leaves the errors 1 at k = 2 and 0 from then on; going up
-        # at the change leaves 1.5 and 0.5; half of 1 before, and 1.25 after, 0.5 and 0.25.
-        setpoint = [0.0] * 3 + [1.5] * 9
-        # y(2) = v, y(3) = v / 2 + 1, so the errors are v and 0.5 - v / 2: least for v = 0.
-        assert best_plan(setpoint, **FIRST_ORDER).value == pytest.approx(0.5)
-
     @pytest.mark.parametrize(
         ("name", "mae"),
         # As a linear program gave them that has nothing of this one but the solver.
