@@ -29,10 +29,9 @@ from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.lib.storage import ROOT, seal, unseal, write_text
 from benchmarks.loop.linear import Course, course
-from benchmarks.loop.rollout import drawn_numbers, make_plants, rollout
+from benchmarks.loop.rollout import IdleValve, drawn_numbers, make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
-from mptc_gym.plant import action_from_command
 from mptc_gym.ranges import numbers_of_plant
 
 Array = NDArray[np.float64]
@@ -222,19 +221,6 @@ def frontier(
     return [*points, (0.0, float(np.mean(idle)))]
 
 
-class _Idle:
-    """A controller that leaves the valve at 0 t/h."""
-
-    def __init__(self, u_min: Array, u_max: Array) -> None:
-        self._actions = np.asarray(action_from_command(0.0, u_min, u_max))[:, np.newaxis]
-
-    def reset(self) -> None:
-        """Do nothing."""
-
-    def act(self, observation: Any) -> Array:
-        return self._actions
-
-
 def _is_drawn(parameters: Parameters) -> bool:
     return bool(parameters.ranges) or parameters.setpoint == "random"
 
@@ -254,7 +240,7 @@ def _draw(
     runs = episodes if is_random(parameters) else 1
     numbers = drawn_numbers(parameters, runs, seed)
     plants = make_plants(runs, samples + 1, **asdict(parameters))
-    trajectory = rollout(plants, _Idle(numbers.u_min, numbers.u_max), samples + 1, seed)
+    trajectory = rollout(plants, IdleValve(numbers.u_min, numbers.u_max), samples + 1, seed)
     plants.close()
     cases: list[Callable[..., Plan]] = []
     for i in range(count):

@@ -7,9 +7,6 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from agents import (
     DirectNNController,
     NeuralSelfTuningController,
@@ -23,27 +20,10 @@ from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.step_test import step_test
 from benchmarks.loop.linear import nominal
+from benchmarks.loop.rollout import IdleValve
 from mptc_gym import Parameters
-from mptc_gym.plant import action_from_command
 
 Made = TypeVar("Made")
-
-
-class Nothing:
-    """Leave the valve where it is, initially at 0 t/h; the actuator's limits are in t/h."""
-
-    def __init__(self, u_min: float = -10.0, u_max: float = 10.0) -> None:
-        self.u_min, self.u_max = u_min, u_max
-        self.flow = 0.0  # t/h
-
-    def reset(self) -> None:
-        """Return the valve to 0 t/h."""
-        self.flow = 0.0
-
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the action that keeps the flow, shape (runs, 1)."""
-        action = action_from_command(self.flow, self.u_min, self.u_max)
-        return np.full((len(observation), 1), action, np.float32)
 
 
 def limits(plant: Parameters) -> dict[str, Any]:
@@ -74,7 +54,7 @@ def with_step_test(
     return make(**step_test_and_data_sheet(plant))
 
 
-nothing = partial(with_limits, Nothing)
+nothing = partial(with_limits, IdleValve)
 paper_pi = partial(with_limits, PIController)
 searched_pi = partial(paper_pi, **SEARCHED_GAINS)
 self_tuning = partial(with_step_test, SelfTuningController)

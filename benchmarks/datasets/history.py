@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.controllers.engineered import Nothing
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.datasets.options import EPISODES, SAMPLES
-from benchmarks.loop.rollout import Agent, make_plants, rollout
+from benchmarks.loop.rollout import Agent, IdleValve, make_plants, rollout
 from mptc_gym import PRESETS, Evaluation, Parameters, evaluate
 
 PLANTS = ("paper", "disturbed", "fouling")  # presets
@@ -108,7 +107,7 @@ def scale(plant: str, episodes: int = EVALUATIONS) -> Evaluation:
     Its `mean_error` scores 0 and its `least_possible` scores 1, as in `mptc_gym.evaluate` of
     any policy on the same environment.
     """
-    return evaluate(Nothing(), episodes=episodes, **arguments_of(plant))
+    return evaluate(IdleValve(), episodes=episodes, **arguments_of(plant))
 
 
 class _Recorder:

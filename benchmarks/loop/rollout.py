@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
+from mptc_gym.plant import action_from_command
 from mptc_gym.ranges import Ranges
 
 Array = NDArray[np.float64]
@@ -25,6 +26,27 @@ class Agent(Protocol):
 
     def act(self, observation: Any) -> Any:
         """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
+
+
+class IdleValve:
+    """Leave the valve where it is, initially at 0 t/h.
+
+    The actuator's limits are in t/h, the same for all runs or of shape (runs,).
+    """
+
+    def __init__(self, u_min: Any = -10.0, u_max: Any = 10.0) -> None:
+        self.u_min, self.u_max = u_min, u_max
+        self.flow = 0.0  # t/h
+
+    def reset(self) -> None:
+        """Return the valve to 0 t/h."""
+        self.flow = 0.0
+
+    def act(self, observation: NDArray[np.float32]) -> Array:
+        """Return the actions that keep the flow, shape (runs, 1)."""
+        actions = np.empty((len(observation), 1))
+        actions[:, 0] = action_from_command(self.flow, self.u_min, self.u_max)
+        return actions
 
 
 @dataclass(frozen=True)

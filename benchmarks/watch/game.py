@@ -11,11 +11,11 @@ import pygame
 from gymnasium.vector import SyncVectorEnv
 
 from benchmarks.bounds import least_possible
-from benchmarks.controllers.engineered import Nothing, limits
+from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop.metrics import mean_error, travel
-from benchmarks.loop.rollout import Agent, Trajectory, rollout
+from benchmarks.loop.rollout import Agent, IdleValve, Trajectory, rollout
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import MiddlePointEnv, Parameters, drawing
 
@@ -41,7 +41,7 @@ class Closed(Exception):  # noqa: N818 (no error)
     """The window has been closed."""
 
 
-class Hands(Nothing):
+class Hands(IdleValve):
     """A controller whose flow, and what else a viewer can change, is set by keys and mouse."""
 
     def __init__(self, u_min: float, u_max: float, speed: float) -> None:
