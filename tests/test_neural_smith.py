@@ -38,12 +38,18 @@ def seen(rng):
     return setpoint, 0.7 * setpoint + np.cumsum(rng.normal(size=200)) * 0.1
 
 
-@pytest.mark.parametrize("make", [NeuralSmithPredictor, NeuralSelfTuningController])
-def test_the_sign_of_the_gain_is_the_sign_of_the_flow(make, seen):
+@pytest.mark.parametrize(
+    ("make", "commands"),
+    [
+        (NeuralSmithPredictor, [5.045, 21.073, 26.834, 39.262, 23.213]),
+        (NeuralSelfTuningController, [11.968, 66.968, 41.517, 97.214, 51.076]),
+    ],
+)
+def test_the_law_is_that_of_the_training_whatever_the_sign_of_the_gain(make, commands, seen):
     down = response(make(**SHOWN, dead_zone=5.0, u_min=-8.0, u_max=10.0), *seen)
     rising = {**SHOWN, "gain": 0.6825}
     up = response(make(**rising, dead_zone=5.0, u_min=-10.0, u_max=8.0), *seen)
-    assert np.ptp(up) > 5.0
+    assert up[39::40].ravel() == pytest.approx(commands, abs=1e-3)
     np.testing.assert_allclose(down, -up, atol=1e-9)
 
 
@@ -84,15 +90,6 @@ class TestScales:
 
 
 class TestLoop:
-    def test_the_right_model_leaves_nothing_to_explain(self):
-        pole = np.exp(-8.0 / 161.0)
-        plant = {"a": [1.0, -pole], "b": [-0.6825 * (1.0 - pole)], "c": [1.0], "delay": 18}
-        controller, residuals = told(dead_zone=5.0), [0.0]
-        watch = lambda k: k and residuals.append(np.abs(controller._residual).max())  # noqa: E731
-        runs = rollout(make_plants(1, 300, **plant), controller, 300, 0, before=watch)
-        assert np.abs(runs.output).max() > 4.0
-        assert max(residuals) < 1e-6
-
     def test_a_wrong_gain_leaves_no_offset(self):
         plant = {"setpoint": 5.0, "gain_factor": 1.2}
         assert error_of(told(dead_zone=5.0), 600, 500, **plant) < 0.05
