@@ -21,19 +21,10 @@ def applied_flow(command: Any, dead_zone: Any, u_min: Any, u_max: Any) -> Array:
 def float32_action(
     command: Any, u_min: Any, u_max: Any, dead_zone: Any = 0.0
 ) -> NDArray[np.float32]:
-    """Scale commands to normalised float32 actions, -1 at `u_min` and 1 at `u_max`.
+    """Scale commands (t/h) to normalised float32 actions: -1 at `u_min` and 1 at `u_max`.
 
     Rounding can move a command from the edge of the dead zone to its inside, where it has no
-    effect. Such an action is moved outwards by one float.
-
-    Parameters
-    ----------
-    command
-        u, t/h, any shape. Commands beyond the limits become actions beyond +-1.
-    u_min, u_max
-        The actuator's limits, t/h.
-    dead_zone
-        The actuator's dead zone, t/h; a command outside it stays outside. 0 if unknown.
+    effect. Such an action is moved outwards by one float. Arguments broadcast.
     """
     action = np.asarray(2.0 * (command - u_min) / (u_max - u_min) - 1.0, dtype=np.float32)
     if np.any(np.asarray(dead_zone) > 0.0):
