@@ -385,6 +385,11 @@ class TestFiles:
                 refused += 1
         assert refused > len(places) / 2
 
+    def test_one_of_absurd_size_is_not_read(self, tmp_path, kind):
+        np.savez_compressed(tmp_path / "large.npz", W0=np.zeros(2**23))
+        with pytest.raises(ValueError, match=r"large\.npz holds no .* 67,108,992 bytes, over"):
+            SAVED[kind].load(tmp_path / "large.npz")
+
     def test_nothing_in_one_of_something_else_is_executed(self, tmp_path, capsys, kind):
         np.savez(tmp_path / "other.npz", A=np.zeros(3))
         np.save(tmp_path / "array.npy", np.zeros(3))

@@ -210,7 +210,7 @@ class TestFindings:
 
     def test_differences(self):
         table = report.differences(self.runs(), [("nn", "pi-simc")], "late").set_index("plants")
-        pair = "NN - PI, SIMC"
+        pair = "NN (1992) - PI (SIMC)"
         assert table.loc["no drift", pair] == "-0.500; 100 %"
         assert table.loc["gain falls to less than 0.8 times", pair].startswith("-0.500")
         assert table.loc["gain rises to more than 1.25 times", pair].startswith("+1.500")
@@ -221,5 +221,5 @@ class TestFindings:
 
     def test_overview(self):
         table = report.overview(self.runs()).set_index("controller")
-        assert table.loc["NN, frozen", "ratio, median"] == "2.000"
-        assert table.loc["NN", "oscillates (%)"] == "5.0"
+        assert table.loc["NN (1992), frozen", "ratio, median"] == "2.000"
+        assert table.loc["NN (1992)", "oscillates (%)"] == "5.0"

@@ -25,7 +25,7 @@ _ENTRIES = (
     ),
     RosterEntry(
         "nn",
-        "NN",
+        "NN (1992)",
         Factory(
             engineered.direct_nn,
             Cost(f"direction; {_SEARCHED}", "25 weights, 6 gains", _SEARCH),
@@ -45,7 +45,7 @@ _ENTRIES = (
     ),
     RosterEntry(
         "nn-frozen",
-        "NN, frozen",
+        "NN (1992), frozen",
         Factory(
             engineered.frozen_nn,
             Cost(
@@ -56,7 +56,7 @@ _ENTRIES = (
     ),
     RosterEntry(
         "pi",
-        "PI",
+        "PI (1992)",
         Factory(
             engineered.paper_pi, Cost("gains of the paper", "2", "not stated"), code="agents.pi"
         ),
@@ -65,12 +65,12 @@ _ENTRIES = (
     ),
     RosterEntry(
         "pi-simc",
-        "PI, SIMC",
+        "PI (SIMC)",
         Factory(engineered.simc_pi, Cost(_STEP_TEST, "2", "one step test")),
     ),
     RosterEntry(
         "pi-searched",
-        "PI, searched",
+        "PI (searched)",
         Factory(engineered.searched_pi, Cost(_SEARCHED, "2", _SEARCH)),
         swept=False,
     ),
@@ -124,7 +124,7 @@ _ENTRIES = (
     ),
     RosterEntry(
         "nn-smith",
-        "NN, told",
+        "neural Smith",
         pretrained.told_network(
             engineered.nn_smith, Cost(_DATA_SHEET, _NETWORK, "one step test; 46 M, once")
         ),
@@ -132,7 +132,7 @@ _ENTRIES = (
     ),
     RosterEntry(
         "nn-self-tuning",
-        "NN, self-tuning",
+        "neural self-tuning",
         pretrained.told_network(
             engineered.nn_self_tuning,
             Cost(
