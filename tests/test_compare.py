@@ -299,7 +299,7 @@ class TestCompare:
         assert "not settled" in page
         # Who is best, and at what travel of the valve, comes first.
         assert page.splitlines()[2].startswith("NN (1992) is best, with a score of 0.")
-        assert "t/h of valve travel a run; PI follows with 0." in page.splitlines()[2]
+        assert "t/h of valve travel a run; PI (1992) follows with 0." in page.splitlines()[2]
 
         provenance = json.loads((out / "provenance.json").read_text())
         assert provenance["complete"] is True
