@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 from gymnasium.error import DependencyNotInstalled
@@ -163,7 +163,7 @@ class MiddlePointTorchEnv(BatchEnv):
         # Blocks that fit in the processor's cache or, on other devices, are worth their calls.
         in_cache = max(1, _IN_CACHE // num_envs) if self.device.type == "cpu" else LONGEST
         self._block = min(self._plants.most_samples, LONGEST, in_cache)
-        # Precomputed returns of the steps ahead, the next one last, without past actions.
+        # Precomputed returns of the steps ahead, the next one last.
         self._ahead: list[tuple[Any, ...]] = []
         self._shown = _Window(self.parameters.windows, self._zeros, differentiable)
 
@@ -191,8 +191,8 @@ class MiddlePointTorchEnv(BatchEnv):
         command, applied = self._plants.apply(a)
         if not self._ahead:
             self._look_ahead()
-        shown, rewards, terminations, truncations, infos = self._ahead.pop()
-        observations = self._shown.append(shown, a)
+        rewards, terminations, truncations, infos = self._ahead.pop()
+        observations = self._shown.next(a)
         if self._move_weight:
             rewards = rewards - self._move_weight * (a - self._action).abs()
             self._action = a.clone()  # the caller may overwrite it
@@ -209,7 +209,7 @@ class MiddlePointTorchEnv(BatchEnv):
         measured = output + made["measurement_noise"] if "measurement_noise" in made else output
         span = self.parameters.temperature_span
         measured = measured.clamp(-span, span)
-        shown = self._shown.stack(setpoint, setpoint - measured, measured)
+        self._shown.add(setpoint, setpoint - measured, measured)
 
         infos = {
             "output": output,
@@ -227,9 +227,8 @@ class MiddlePointTorchEnv(BatchEnv):
         names = (*infos, *self._factors)
         flags = self._zeros.new_zeros(2 * samples, self.num_envs, dtype=torch.bool).unbind()
         self._ahead = [
-            (*returned, {**dict(zip(names, values, strict=True)), **masks})
-            for *returned, values in zip(
-                shown,
+            (reward, *both, {**dict(zip(names, values, strict=True)), **masks})
+            for reward, *both, values in zip(
                 self._rewards(error).unbind(),
                 flags[:samples],
                 flags[samples:],
@@ -326,6 +325,10 @@ class _Window:
         # Set points, errors and outputs, oldest first: those of one observation, then those of
         # the latest block.
         self._rows: list[list[Tensor]] = [[] for _ in self._windows]
+        self._ahead: Iterator[Tensor] = iter(())  # observations of the block, without actions
+        # Observations are stacked while they fit in the cache.
+        numbers = max(1, sum(self._windows) * len(zeros))
+        self._at_once = max(1, _IN_CACHE // numbers) if zeros.is_cpu else LONGEST
 
     def reset(
         self, which: Tensor | None, left: int, setpoint: Tensor, rest_action: Tensor
@@ -344,15 +347,16 @@ class _Window:
                 shown = torch.where(which, shown, torch.cat(self._actions))
             self._actions = [shown] if self._differentiable else [*shown.split(1)]
 
-    def stack(self, *blocks: Tensor) -> Sequence[Tensor]:
-        """Return the observations of a block of set points, errors and outputs, no actions."""
+    def add(self, *blocks: Tensor) -> None:
+        """Add a block of set points, errors and outputs."""
         for rows, w, block in zip(self._rows, self._windows, blocks, strict=True):
             if w:
                 rows[:] = [*rows[len(rows) - w :], *block.unbind()]
-        return self._stack(1, len(blocks[0]))
+        self._ahead = self._stack(1, len(blocks[0]))
 
-    def append(self, shown: Tensor, a: Tensor) -> Tensor:
-        """Return observations with their past actions, of which a is the newest."""
+    def next(self, a: Tensor) -> Tensor:
+        """Return the observations of the next sample of the block, given the action before."""
+        shown = next(self._ahead)
         if self._past_actions:
             newest = a.clamp(-1.0, 1.0)[None]
             if self._differentiable:
@@ -368,17 +372,22 @@ class _Window:
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions."""
+        self._ahead = iter([each.detach() for each in self._ahead])
         self._rows = [[each.detach() for each in rows] for rows in self._rows]
         self._actions = [each.detach() for each in self._actions]
 
-    def _stack(self, first: int, count: int) -> Sequence[Tensor]:
-        """Return observations without actions, from index `first` of the rows."""
-        newest_first = [
-            row
-            for k in range(first, first + count)
-            for rows, w in zip(self._rows, self._windows, strict=True)
-            for row in rows[k : k + w][::-1]
-        ]
-        if not newest_first:
-            return [self._zeros.new_empty(0, len(self._zeros))] * count
-        return torch.stack(newest_first).view(count, -1, len(self._zeros)).unbind()
+    def _stack(self, first: int, count: int) -> Iterator[Tensor]:
+        """Yield observations without actions, from index `first` of the rows."""
+        n = len(self._zeros)
+        for begin in range(first, first + count, self._at_once):
+            places = range(begin, min(begin + self._at_once, first + count))
+            newest_first = [
+                row
+                for k in places
+                for rows, w in zip(self._rows, self._windows, strict=True)
+                for row in rows[k : k + w][::-1]
+            ]
+            if newest_first:
+                yield from torch.stack(newest_first).view(len(places), -1, n).unbind()
+            else:
+                yield from [self._zeros.new_empty(0, n)] * len(places)
