@@ -147,8 +147,8 @@ class TestSearch:
         assert tune._proposed(tuning, rows) != tune._proposed(tuning, turned)
 
     def test_defaults_are_the_best_of_the_published_searches(self):
-        # Up to rounding; the page of the PI controller says how its search differs. Those of PPO
-        # are not from its search.
+        # Up to rounding; the page of the PI controller says how its search differs. Those of
+        # PPO are not from its search.
         defaults = {"nn": DirectNNController(), "pi": PIController(**SEARCHED_GAINS)}
         for controller, default in defaults.items():
             text = (ROOT / f"benchmarks/published/tune_{controller}.md").read_text("utf-8")
