@@ -21,7 +21,7 @@ from benchmarks.identify.armax import Orders, Rows
 from benchmarks.identify.cleaning import without_noise_of_held_flow, without_standstill
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log, read_log
-from benchmarks.identify.margins import Loop
+from benchmarks.loop.margins import Loop
 from benchmarks.identify.model import CannotTellError, HeldOut, Interval
 from benchmarks.identify.options import Columns, Knowledge
 from benchmarks.identify.plant import plant_arguments, plant_ranges

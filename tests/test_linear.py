@@ -12,9 +12,9 @@ from benchmarks.bounds import frontier, least_possible
 from benchmarks.controllers import engineered
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.step_test import step_test
-from benchmarks.identify.margins import Loop
 from benchmarks.loop import linear
 from benchmarks.loop.linear import Coefficients, LinearModel, course, nominal
+from benchmarks.loop.margins import Loop
 from mptc_gym import MiddlePointEnv, Parameters
 from mptc_gym.parameters import ARGUMENTS
 from mptc_gym.ranges import Ranges, numbers_of_plant
@@ -85,7 +85,7 @@ ANALYSES = {
     "Smith": lambda **p: engineered.smith(Parameters(**p), 1, 0),
     "self-tuning": lambda **p: engineered.self_tuning(Parameters(**p), 1, 0),
     "MPC": lambda **p: PredictiveController(Parameters(**p), 1),
-    "margins": lambda **p: Loop(PIController(), Parameters(**p)),
+    "margins": lambda **p: Loop(PIController(), nominal(Parameters(**p))),
 }
 
 

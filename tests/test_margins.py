@@ -9,7 +9,7 @@ from scipy import signal
 
 from agents import PIController, SmithPredictor
 from agents.pi import SEARCHED_GAINS
-from benchmarks.identify.margins import Loop
+from benchmarks.loop.margins import Loop
 from mptc_gym import Parameters
 
 STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of the paper's plant

@@ -11,12 +11,14 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
+from agents import PIController
 from agents.pi import SEARCHED_GAINS
 from benchmarks.claims.runs import Array, Batch, converged_at, fail_node, flat
 from benchmarks.claims.verdicts import OFTEN, Claim
 from benchmarks.lib.statistics import Estimate, exact, median
 from benchmarks.lib.tables import groups
 from benchmarks.loop.linear import nominal
+from benchmarks.loop.margins import Loop
 from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.scenarios import SETPOINTS as CASES
 from mptc_gym import PRESETS, Parameters
@@ -168,16 +170,8 @@ def pi_gains(batch: Batch, claim: Claim) -> None:
 
 
 def largest_pole(kp: float, ki: float) -> float:
-    """Return the largest pole modulus of the closed loop of PI controller and linear plant.
-
-    With e = y_d - y and u = -(Kp + Ki / (1 - z^-1)) e, (28) gives the characteristic polynomial
-    A(z^-1) (1 - z^-1) - z^-d B(z^-1) (Kp (1 - z^-1) + Ki).
-    """
-    numerator, denominator = nominal(Parameters()).transfer()
-    characteristic = -np.convolve(numerator, [kp + ki, -kp])
-    open_loop = np.convolve(denominator, [1.0, -1.0])
-    characteristic[: len(open_loop)] += open_loop
-    return float(np.abs(np.roots(characteristic)).max())
+    """Return the largest pole modulus of the loop of a PI controller and the linear plant."""
+    return Loop(PIController(kp, ki), nominal(Parameters())).largest_pole
 
 
 def versus_pi(gains: tuple[float, float], batch: Batch, claim: Claim) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.loop.linear import nominal
+from benchmarks.loop.linear import LinearModel, nominal
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
@@ -45,15 +45,18 @@ def step_test(parameters: Parameters) -> StepTest:
     ValueError
         If the plant is not stable and so reaches no new steady state, or if its gain is 0.
     """
-    tested = nominal(parameters)
-    response = tested.step_response()
-    interval = tested.sampling_interval
+    return read_off(nominal(parameters))
+
+
+def read_off(plant: LinearModel) -> StepTest:
+    """Return what `step_test` returns, of a linear model."""
+    response, interval = plant.step_response(), plant.sampling_interval
     early, late = (_first_reached(response / response[-1], level) for level in LEVELS)
     time_constant = 1.5 * (late - early)
     # In samples, u(k) shows at y(k + 1) at the earliest.
     delay = max(1, round(late - time_constant + 1.0))
     return StepTest(
-        gain=float(f"{tested.gain:.4g}"),
+        gain=float(f"{plant.gain:.4g}"),
         time_constant=float(f"{time_constant * interval:.3g}"),
         delay=delay * interval,
         sampling_interval=interval,

@@ -1,10 +1,9 @@
-"""Repair faults of a log: two rates, a stuck sensor, noise on a held flow, spikes and jumps."""
+"""Repair faults of a log: two rates, a stuck sensor, noise on a held flow, and spikes."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -25,17 +24,12 @@ RATES = range(2, 61)  # rows per temperature
 TO_FORESEE = Orders(2, 6, 2)  # B is long, so that a fast response does not look like a spike
 OUTLYING = 6.0  # robust deviations of prediction errors beyond which a suspect is a spike
 PLAIN = 24.0  # deviations beyond which a suspect without a prediction is a spike
-JUMP, MOST_JUMPS = 24.0, 3  # least jump of the sensor, robust deviations; most jumps repaired
 
 
-def cleaned(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
-    """Return the log ready to be fitted, with a note on each repair.
-
-    `given` has the orders, if they are known.
-    """
+def cleaned(log: Log, knowledge: Knowledge) -> Log:
+    """Return the log ready to be fitted, with a note on each repair."""
     log = without_noise_of_held_flow(_at_one_rate(without_standstill(log)))
-    log = _without_spikes(log, knowledge, given or TO_FORESEE)
-    return _without_jumps(log, knowledge, given)
+    return _without_spikes(log, knowledge)
 
 
 def _at_one_rate(log: Log) -> Log:
@@ -88,8 +82,8 @@ def without_noise_of_held_flow(log: Log) -> Log:
     if abs(together) > 0.2 or noise > 0.25 * np.nanstd(flow):
         return log
     return log.mended(
-        f"The flow is held for stretches and has noise of {noise:.2g} t/h, which is "
-        "taken as the flow meter's: the means of the stretches are used.",
+        f"The flow is held for stretches and has noise of {noise:.2g} {log.flow_unit}, which "
+        "is taken as the flow meter's: the means of the stretches are used.",
         flow=means,
         flow_error=noise / math.sqrt(float(np.median(long))),
     )
@@ -148,14 +142,14 @@ def _protrusion(log: Log) -> Array:
     return np.where(found >= max(least, SPIKE), found, 0.0)
 
 
-def _without_spikes(log: Log, knowledge: Knowledge, orders: Orders) -> Log:
+def _without_spikes(log: Log, knowledge: Knowledge) -> Log:
     """Return the log without its spikes: suspects that no response to the flow explains."""
     apart = _protrusion(log)
     found = apart > 0.0
     if not found.any():
         return log
-    likelihood = Likelihood(log, knowledge, orders)
-    errors = np.abs(likelihood.errors(likelihood.first_fits([orders])[0]))
+    likelihood = Likelihood(log, knowledge)
+    errors = np.abs(likelihood.errors(likelihood.first_fits([TO_FORESEE])[0]))
     # The first rows have no prediction: they count as spikes if all other suspects do. The
     # second sample of a spike may be predicted from the first.
     outlying, known = errors > OUTLYING * deviation(errors), np.isfinite(errors)
@@ -171,32 +165,3 @@ def _without_spikes(log: Log, knowledge: Knowledge, orders: Orders) -> Log:
         f"{len(rows)} {what} left out (samples {shown}).",
         temperature=np.where(spikes, np.nan, log.temperature),
     )
-
-
-def _without_jumps(log: Log, knowledge: Knowledge, given: Orders | None) -> Log:
-    """Return the log without sensor jumps: moves that neither flow nor noise explains."""
-    orders = replace(given or TO_FORESEE, walk=True)
-    for _ in range(MOST_JUMPS):
-        moves = np.diff(log.temperature, prepend=np.nan)
-        scale = deviation(moves) if np.isfinite(moves).any() else 0.0
-        if scale == 0.0 or not np.nanmax(np.abs(moves)) > JUMP * scale:
-            return log
-        likelihood = Likelihood(log, knowledge, given or replace(orders, a=3))
-        place = likelihood.scan(replace(orders, c=0), np.zeros(0), likelihood.gaps())[0]
-        errors = likelihood.errors(likelihood.fit(place, orders))
-        if not np.isfinite(errors).any():
-            return log
-        row = int(np.nanargmax(np.abs(errors)))
-        height, least = float(errors[row]), JUMP * deviation(errors)
-        large = np.flatnonzero(np.abs(errors) > least)
-        # Many large errors come from the plant: its gain is not the same everywhere.
-        many = np.sum(np.diff(large) > TO_FORESEE.b) >= MOST_JUMPS
-        if many or not min(abs(height), abs(moves[row])) > least:
-            return log
-        later = np.arange(len(log.flow)) >= row
-        log = log.mended(
-            f"At sample {row + 1} the temperature jumps by {height:.3g} °C, which no flow "
-            "explains: it is subtracted from there on. See whether the sensor was changed.",
-            temperature=log.temperature - np.where(later, height, 0.0),
-        )
-    return log

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 from scipy import stats
 
-from benchmarks.identify.armax import Orders
+from benchmarks.identify.armax import Array, Orders
 from benchmarks.identify.cleaning import cleaned
+from benchmarks.identify.guards import doubts
 from benchmarks.identify.likelihood import Fit, Likelihood
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError, HeldOut, Model
@@ -17,17 +19,17 @@ from benchmarks.identify.options import Knowledge
 from benchmarks.identify.plant import noise_of
 from benchmarks.identify.posterior import posterior
 from benchmarks.identify.simulation import explained, of_impulse_response
+from benchmarks.identify.valve import valve_fault
 
-OWN_LAGS = 0.6, 0.75, 0.85, 0.92, 0.96  # poles of the plant that are not poles of the noise
 FIRST_ORDERS = Orders(2, 1, 2)  # orders of the first search for the delay
-OF_A, OF_B, OF_C = (1, 2, 3), (1, 2, 3, 6, 12), (0, 1, 3)
+OF_A, OF_B, OF_C = (1, 2, 3), (1, 2, 3, 6, 12), (0, 1, 3)  # up to `likelihood.LONGEST`
 LONG = 3  # coefficients of B beyond which the response may have any shape
 WORTH_A_FIT = 7  # orders that are fitted: the best with a common C
-WORTH_A_TRIAL = 4  # fits that are tried on the last third: the best
-CLOSE = 12.0  # difference in the criterion beyond which orders are dropped
+WORTH_A_TRIAL = 4  # fits that are tried on the last part: the best
 WORSE = 1.2  # multiple of the least unexplained share beyond which orders are dropped
 WEAK = 100.0  # gain in twice the log likelihood below which the columns may be swapped
 CHANCE = 0.01  # probability that a flow without effect is accepted
+HELPFUL = 0.05  # share of the variance from which on another column is worth a mention
 SLOW = 3.0  # time constants that a log should cover
 
 
@@ -36,8 +38,9 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
 
     Models with several orders of A, B and C, with and without a random walk of the base line,
     are fitted by maximum likelihood. The best by information criteria are refitted to the first
-    two thirds of the log and simulate the last third; clearly worse ones are dropped. The
-    intervals of delay, dead zone, gain and time constant come from the posterior over the rest.
+    part of the log and simulate the rest; clearly worse ones are dropped. The intervals of
+    delay, dead zone, gain and time constant come from the posterior over the rest. If a fault
+    of the valve explains the log clearly better, the flow that it passes is fitted.
 
     Raises
     ------
@@ -47,25 +50,23 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
         If the knowledge is invalid or does not fit the log.
     """
     knowledge = knowledge or Knowledge()
-    given = Orders(*knowledge.orders) if knowledge.orders else None
-    if given and min(given.a, given.b) < 1:
-        raise ValueError(
-            f"--orders: A and B must have at least 1 coefficient, got {(given.a, given.b)}"
-        )
-    log = cleaned(log, knowledge, given)
-    likelihood = Likelihood(log, knowledge, given or Orders(max(OF_A), max(OF_B), 0))
-    fits = likelihood.first_fits([given]) if given else _fits(likelihood)
+    log = cleaned(log, knowledge)
+    likelihood = Likelihood(log, knowledge)
+    fits = _fits(likelihood)
     _check_answer(likelihood, fits[0])
-    fits, held_out = _tried(likelihood, fits)
-    chosen, possible, estimates = posterior(likelihood, fits)
-    plant, *known = likelihood.models(chosen)
-    largest = float(np.max(np.abs(plant.poles), initial=0.0))
-    if largest >= 1.0 - 1e-4:
-        raise CannotTellError(
-            "the log does not show where the temperature settles: the best model has a "
-            f"pole at {largest:.4f}, and one below 1 is asked for. Hold the flow longer, "
-            "and see whether the temperature drifts"
-        )
+    tried = _tried(likelihood, fits)
+    fault = valve_fault(likelihood, fits[0])
+    if fault:
+        passed = replace(log, flow=fault.passed + likelihood.operating_flow)
+        other = Likelihood(passed, replace(knowledge, operating_flow=likelihood.operating_flow))
+        with_fault = _tried(other, _fits(other))
+        if max(with_fault.values()) > max(tried.values()):
+            log, likelihood, tried = passed, other, with_fault
+        else:  # the last part of the log does not bear it out
+            fault = None
+    chosen, possible, estimates = posterior(likelihood, list(tried))
+    share = next(share for fit, share in tried.items() if fit.orders == chosen.orders)
+    plant, *of_known = likelihood.models(chosen)
     noise, c = noise_of(
         replace(plant, c=(1.0, *chosen.c)), chosen.orders, estimates["noise_variance"].value
     )
@@ -73,19 +74,18 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
     level = float(np.nanmean(log.temperature - simulated))
     model = Model(
         plant=replace(plant, c=c), noise=noise,
-        known=dict(zip(log.disturbances, known, strict=True)),
+        known=dict(zip(log.disturbances, of_known, strict=True)),
         estimates=estimates, possible=possible,
         u_min=likelihood.u_min, u_max=likelihood.u_max,
         operating_flow=likelihood.operating_flow, operating_temperature=level,
         orders=chosen.orders, errors=likelihood.errors(chosen, bridged=False),
-        held_out=held_out, log=log, simulated=level + simulated, notes=list(log.notes),
+        held_out=HeldOut(share, _of_impulse_response(likelihood)), log=log, simulated=level + simulated, fault=fault,
     )  # fmt: skip
-    model.notes.extend(_notes(model, likelihood))
-    return model
+    return replace(model, warnings=doubts(model), notes=_notes(model, likelihood))
 
 
 def _fits(likelihood: Likelihood) -> list[Fit]:
-    """Return fits of promising orders, the best first, then two with a lag of their own."""
+    """Return fits of promising orders, the best first."""
     scanned = []
     for base in likelihood.first_fits([FIRST_ORDERS, replace(FIRST_ORDERS, walk=True)]):
         for a, b in itertools.product(OF_A, OF_B):
@@ -108,49 +108,54 @@ def _fits(likelihood: Likelihood) -> list[Fit]:
             if orders not in fits:
                 fits[orders] = likelihood.best_fit(fit.place, orders, fit.c)
     found = likelihood.ranked(fits.values())
-    # A second time constant that the noise does not share has its own peak of the likelihood.
-    lags = []
-    for orders in (Orders(2, 1, 1), Orders(2, 2, 1)):
-        tried = []
-        for pole in OWN_LAGS:
-            c = np.array([-pole])
-            place = likelihood.scan(orders, c, [found[0].place.gap])[0]
-            tried.append(likelihood.with_c(place, orders, c))
-        lags.append(min(tried, key=lambda fit: fit.place.deviance))
-    return [*([fit for fit in found if not fit.walks_nowhere] or found), *lags]
+    return [fit for fit in found if not fit.walks_nowhere] or found
 
 
-def _tried(likelihood: Likelihood, fits: list[Fit]) -> tuple[list[Fit], HeldOut]:
-    """Return the fits that simulate the last third well, and the shares explained there."""
-    cut = int(likelihood.rows.index[len(likelihood.rows.index) * 2 // 3])
-    last, start = np.arange(len(likelihood.output)) >= cut, likelihood.first(cut)
+def _from_impulse_response(likelihood: Likelihood, best: Fit) -> list[Fit]:
+    """Return fits that start from an impulse response.
+
+    What it simulates has no noise, so that least squares find A. The search for C starts at A,
+    where the noise is white, as that of a transmitter, and at each single pole of A, which the
+    plant then does not share with the noise. The likelihood has peaks there that a search
+    from the noise of other orders may miss.
+    """
+    inputs = [likelihood.applied(best.place.gap), *likelihood.known]
+    smooth = copy(likelihood)
+    smooth.smooth(of_impulse_response(inputs, likelihood.output, likelihood.known_rows)[0])
+    found = []
+    for b in (1, 2, 3):
+        orders = Orders(2, b, 0)
+        place = smooth.scan(orders, np.zeros(0), [best.place.gap])[0]
+        a = smooth.fit(place, orders).linear[:2]
+        starts = [a, *([-pole] for pole in np.roots([1.0, *a]).real)]
+        for c in map(np.array, starts):
+            orders = Orders(2, b, len(c))
+            place = likelihood.scan(orders, c, [best.place.gap])[0]
+            found.append(likelihood.fit(place, orders, c))
+    return found
+
+
+def _tried(likelihood: Likelihood, fits: list[Fit]) -> dict[Fit, float]:
+    """Return the fits that simulate the last part well, and the shares explained there."""
+    last, start = likelihood.last, likelihood.first()
     mild = likelihood.ranked(fits, mild=True)
     long = [fit for fit in fits if fit.orders.b > LONG]
-    own_lag = [fit for fit in fits if fit.has_own_lag]
-    shares = {}
-    for fit in dict.fromkeys([*fits[:WORTH_A_TRIAL], *mild[:2], *long[:1], *own_lag]):
+    shares, others = {}, _from_impulse_response(likelihood, fits[0])
+    for fit in dict.fromkeys([*fits[:WORTH_A_TRIAL], *mild[:2], *long[:1], *others]):
         simulated = start.simulated(start.fit(fit.place, fit.orders, fit.c))
         shares[fit] = explained(likelihood.output, simulated, last)
     # The share that the best simulation leaves unexplained, with a margin for the noise.
     left = 1.0 - max(shares.values())
-    least = max(WORSE * left, left + 0.005)
-    good = [
-        fit for fit, share in shares.items()
-        if 1.0 - share <= least * (2.0 if fit.has_own_lag else 1.0)
-    ] or list(shares)[:1]  # fmt: skip
-    criteria = [likelihood.criterion(fit.orders, fit.place.deviance, mild=True) for fit in good]
-    # Keep one of each kind: with and without a walk; with one, few or many coefficients of B;
-    # with and without a time constant that the noise does not share.
-    kinds: dict[tuple[bool, ...], Fit] = {}
-    for fit, each in zip(good, criteria, strict=True):
-        if each < min(criteria) + CLOSE:
-            orders = fit.orders
-            kind = orders.walk, orders.b > LONG, fit.has_own_lag, orders.b > 1
-            kinds.setdefault(kind, fit)
-    inputs = [likelihood.command, *likelihood.known]
-    impulse, _ = of_impulse_response(inputs, likelihood.output, ~last)
-    rival = explained(likelihood.output, impulse, last)
-    return list(dict.fromkeys([good[0], *kinds.values()])), HeldOut(shares[good[0]], rival)
+    most = max(WORSE * left, left + 0.005)
+    good = {fit: share for fit, share in shares.items() if 1.0 - share <= most}
+    return good or dict(list(shares.items())[:1])
+
+
+def _of_impulse_response(likelihood: Likelihood, *more: Array) -> float:
+    """Return the share of the last part that an impulse response explains, of more inputs."""
+    inputs = [likelihood.command, *likelihood.known, *more]
+    impulse, _ = of_impulse_response(inputs, likelihood.output, ~likelihood.last)
+    return explained(likelihood.output, impulse, likelihood.last)
 
 
 def _check_answer(likelihood: Likelihood, best: Fit) -> None:
@@ -171,7 +176,7 @@ def _check_answer(likelihood: Likelihood, best: Fit) -> None:
             "the temperature does not answer the flow in this log: a model without the "
             f"flow explains it as well (twice the log likelihood differs by {gained:.1f}, "
             f"and {least:.1f} are asked for). Move the flow further or longer, or look for "
-            "a longer delay with --longest-delay"
+            f"a longer delay with --longest-delay. {_of_other_columns(likelihood)}"
         )
 
 
@@ -180,38 +185,46 @@ def _gained_when_swapped(likelihood: Likelihood) -> float:
     log, longest_delay = likelihood.log, likelihood.knowledge.longest_delay
     mirrored = Log(log.temperature, log.flow, log.sampling_interval)
     try:
-        swapped = Likelihood(mirrored, Knowledge(longest_delay=longest_delay), FIRST_ORDERS)
+        swapped = Likelihood(mirrored, Knowledge(longest_delay=longest_delay))
         return swapped.gained(swapped.first_fits([FIRST_ORDERS])[0])
     except ValueError:
         return 0.0
 
 
+def _of_other_columns(likelihood: Likelihood) -> str:
+    """Return advice on columns that are held in steps and help to explain the temperature."""
+    alone = max(_of_impulse_response(likelihood), 0.0)
+    names = [
+        f"--disturbance {name}"
+        for name, each in likelihood.log.others.items()
+        if np.isfinite(each).all() and np.mean(np.diff(each) == 0.0) > 0.5 and np.ptp(each)
+        and _of_impulse_response(likelihood, each) > alone + HELPFUL
+    ]  # fmt: skip
+    return f"More is explained with {' or '.join(names)}: try that." if names else ""
+
+
 def _notes(model: Model, likelihood: Likelihood) -> list[str]:
-    """Return remarks for the user about the fit."""
+    """Return remarks for the user about the log and the fit."""
     longest, log = likelihood.knowledge.longest_delay, model.log
-    gain, constant = model.estimates["gain"], model.estimates["time_constant"]
     walk = model.noise["disturbance_walk_variance"]
-    endless = not np.isfinite([gain.low, gain.high, constant.high]).all()
-    short = SLOW * constant.value > len(log.flow) * log.sampling_interval
-    at_first_flow = likelihood.knowledge.operating_flow is None and model.operating_flow != 0.0
+    short = (
+        SLOW * model.estimates["time_constant"].value > len(log.flow) * log.sampling_interval
+    )
     notes = [
-        (gain.value > 0.0,
-         "The direction is unusual for a boiler: the temperature rises with the flow. If it "
-         "should not, see whether the columns are swapped."),
-        (model.plant.delay >= longest - 1,
-         f"The delay is as long as was looked for, {longest} samples: try a longer "
+        (model.estimates["delay"].high >= longest - 1,
+         f"The delay may be as long as was looked for, {longest} samples: try a longer "
          "--longest-delay, or a longer sampling interval."),
-        (at_first_flow,
-         f"The operating point is taken at the log's first flow, {model.operating_flow:g} "
-         "t/h, and a dead zone would lie around it: say --operating-flow if it is elsewhere."),
         (walk > likelihood.resolution,
-         f"The base line wanders by {np.sqrt(walk):.2g} °C a sample, as a random walk: "
-         "`disturbance_walk_variance`. What the plant settles at is known less well."),
-        (endless,
-         "The plant may be integrating: an interval has no end, as the log does not show "
-         "where the temperature settles. Hold the flow longer."),
-        (short and not endless,
+         f"The base line wanders by {np.sqrt(walk):.2g} {log.temperature_unit} a sample, as a "
+         "random walk: `disturbance_walk_variance`. What the plant settles at is known less "
+         "well."),
+        (short,
          f"The log holds less than {SLOW:g} time constants of the plant. Its gain rests on "
          "how the response goes on, which no one has seen."),
     ]  # fmt: skip
-    return [note for holds, note in notes if holds]
+    others = _of_other_columns(likelihood)
+    return [
+        *log.notes,
+        *(note for holds, note in notes if holds),
+        *([others] if others else []),
+    ]

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,17 +18,21 @@ from benchmarks.identify.armax import Array, Flags, Orders, Rows
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError
 from benchmarks.identify.options import Knowledge
-from benchmarks.identify.simulation import from_rest
+from benchmarks.identify.simulation import from_rest, held
 from benchmarks.loop.linear import LinearModel
 
+SEEN = 4  # longest delays for which the response to a move is watched
+QUIET = 8 / 9  # share of the moves in two thirds of a log from which on the rest is quiet
 LEAST_SAMPLES = 100  # not counting those that the longest delay takes
 FOLLOWS = 0.98  # explained share of the flow's moves above which feedback alone moves it
 COARSE = 40  # edges of the gaps that are tried first
 FINEST = 1e-6  # resolution of the temperature, as a share of its standard deviation
+MIDDLE = 0.25  # of the range of the flow, by which an operating point may be off its middle
 BRIDGE = 10  # longest run of missing temperatures that is filled in, for xi to go on
 SHORTEST = 30  # rows of a stretch without a gap
-OWN_LAG = -0.3  # coefficient of a first-order C below which it cancels a time constant
 STILL = 0.99  # root of C' above which it cancels the random walk
+NEARBY = 8  # samples by which a fault of the valve may move the delay
+LONGEST = Orders(3, 12, 3)  # orders that are tried
 OF_KNOWN = 4  # coefficients of B for a known disturbance
 
 
@@ -65,11 +70,6 @@ class Fit:
     """Sum of their squares over the counted rows."""
 
     @property
-    def has_own_lag(self) -> bool:
-        """Whether the plant has a second time constant that the noise does not share."""
-        return self.orders == Orders(2, self.orders.b, 1) and float(self.c[0]) < OWN_LAG
-
-    @property
     def walks_nowhere(self) -> bool:
         """Whether the variance of the random walk is (nearly) 0."""
         roots = np.roots([1.0, *self.c])
@@ -79,8 +79,6 @@ class Fit:
 class Likelihood:
     """The likelihood of a log, in deviations from its operating point.
 
-    `longest` has the longest A and B to be tried.
-
     Raises
     ------
     CannotTellError
@@ -89,7 +87,7 @@ class Likelihood:
         If the knowledge does not fit the log.
     """
 
-    def __init__(self, log: Log, knowledge: Knowledge, longest: Orders) -> None:
+    def __init__(self, log: Log, knowledge: Knowledge) -> None:
         self.log, self.knowledge = log, knowledge
         self.operating_flow = _operating_flow(log.flow, knowledge)
         command = log.flow - self.operating_flow
@@ -105,7 +103,7 @@ class Likelihood:
         self.resolution = FINEST**2 * float(np.nanvar(self.output))
         magnitudes = np.unique(np.abs(self.command[np.isfinite(self.command)]))
         self.magnitudes = magnitudes[magnitudes > 0.0]
-        self._find_rows(longest)
+        self._find_rows()
         if len(self.rows) < LEAST_SAMPLES:
             raise CannotTellError(
                 f"the log is too short: {len(self.output)} rows leave {len(self.rows)} without "
@@ -114,24 +112,51 @@ class Likelihood:
                 "many temperatures are missing, resample the log to longer steps"
             )
 
-    def _find_rows(self, longest: Orders) -> None:
+    def _find_rows(self) -> None:
         """Find the rows in which every term of (28) is known, for all delays and orders."""
-        reach = self.knowledge.longest_delay + longest.b
+        reach = self.knowledge.longest_delay + LONGEST.b
         missing = ~np.isfinite(self.output)
         filled = pd.Series(self.output).interpolate(limit_direction="both")
         self._filled = np.asarray(filled, np.float64)
         bridged = missing & ~_runs(missing, BRIDGE + 1)
-        self._usable = _all_of_last(~missing | bridged, longest.a + 1)
+        self._usable = _all_of_last(~missing | bridged, LONGEST.a + 1)
         for each, lags in [(self.command, reach), *((d, reach + OF_KNOWN) for d in self.known)]:
             self._usable[1:] &= _all_of_last(np.isfinite(each), lags)[:-1]
             self._usable[:lags] = False
-        self._usable[: longest.a] = False
-        self._counted = _all_of_last(~missing, longest.a + 1)
+        self._usable[: LONGEST.a] = False
+        self._counted = _all_of_last(~missing, LONGEST.a + 1)
         self.rows = Rows(_runs(self._usable, SHORTEST), self._counted)
 
-    def first(self, samples: int) -> Likelihood:
-        """Return the likelihood of the first samples alone."""
-        part, usable = copy(self), self._usable & (np.arange(len(self.output)) < samples)
+    @property
+    def known_rows(self) -> Flags:
+        """Where the temperature is known."""
+        return np.isfinite(self.output)
+
+    def smooth(self, output: Array) -> None:
+        """Put a simulated output in the place of the temperature."""
+        self._filled = output
+
+    @cached_property
+    def last(self) -> Flags:
+        """Where models are judged that were fitted before: from two thirds of the log on.
+
+        If little moves there, it is from two thirds of the moves on; and it ends where the
+        response to the last move has long been seen.
+        """
+        rows, flow = self.rows.index, held(self.command)
+        moves = np.abs(np.diff(flow, prepend=flow[:1]))
+        shares = np.cumsum(moves[rows]) / max(float(moves[rows].sum()), 1e-300)
+        place = 2 * len(rows) // 3
+        if shares[place] > QUIET:
+            place = max(int(np.searchsorted(shares, 2.0 / 3.0)), LEAST_SAMPLES)
+        end = np.flatnonzero(moves)[-1] + SEEN * len(self.delays)
+        samples = np.arange(len(flow))
+        return np.asarray((samples >= rows[min(place, len(rows) - 1)]) & (samples <= end))
+
+    def first(self) -> Likelihood:
+        """Return the likelihood of what is before the last part alone."""
+        samples = np.arange(len(self.output))
+        part, usable = copy(self), self._usable & (samples < np.argmax(self.last))
         part.rows = Rows(_runs(usable, SHORTEST), self._counted)
         return part
 
@@ -246,6 +271,14 @@ class Likelihood:
             key=lambda place: place.deviance,
         )
 
+    def of_flows(self, flows: list[Array], fit: Fit) -> float:
+        """Return the least deviance with flows in place of the command, near a fit's delay."""
+        start = max(fit.place.delay - NEARBY, 0)
+        delays = range(start, min(fit.place.delay + NEARBY, self.delays[-1]) + 1)
+        table = self.table(fit.orders)
+        found = self._profile(table, fit.orders, fit.c, flows, delays)
+        return min(float(np.min(deviances)) for deviances in found)
+
     def _profile(
         self, table: Array, orders: Orders, c: Array, inputs: list[Array], delays: range
     ) -> Iterator[Array]:
@@ -317,9 +350,13 @@ def _operating_flow(flow: Array, knowledge: Knowledge) -> float:
                 f"got {knowledge.operating_flow:g}"
             )
         return knowledge.operating_flow
-    if not len(known) or known.min() < 0.0 < known.max():
+    if not len(known):
         return 0.0
-    return float(known[0])
+    low, high = float(known.min()), float(known.max())
+    for guess in (0.0, float(known[0])):
+        if abs(guess - (low + high) / 2.0) <= MIDDLE * (high - low):
+            return guess
+    return float(f"{(low + high) / 2.0:.4g}")
 
 
 def _limits(command: Array, knowledge: Knowledge) -> tuple[float, float]:

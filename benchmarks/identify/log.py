@@ -1,11 +1,10 @@
-"""Read a recorded log, and report what is wrong with it."""
+"""Read a recorded log, and say what was read and what is wrong with it."""
 
 from __future__ import annotations
 
 import itertools
 import re
 import warnings
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from benchmarks.identify.options import UNITS, Columns
+from benchmarks.identify.options import Columns
 
 Array = NDArray[np.float64]
 
-DAY_FIRST = r"^(\d\d)\.(\d\d)\.(\d{4})\b"
-CHUNK = 200_000  # rows read at once
-MOST_ROWS = 20_000  # latest rows kept by default
-PROGRESS_AFTER = 1.0  # s
-UNEVEN = 0.1  # tolerance of a time step, as a share of the sampling interval
+JITTER = 0.35  # tolerance of a time, samples: a quarter, and a margin for its rounding
+GAP = 5  # samples from which on a gap may be of any length
 LONGEST_GAP = 2_000  # most rows that a gap is filled with: the past is forgotten by then
 LARGEST = 1e30  # bound of a number, so that its square is finite
 LEAST_KNOWN = 0.5  # least share of flows that must be known
@@ -34,24 +29,26 @@ LEAST_TEMPERATURES = 100
 class Log:
     """A recorded log, one row per sample. NaN stands for what is unknown."""
 
-    flow: Array  # from the time of its row on, t/h
-    temperature: Array  # at the time of its row, degC
+    flow: Array  # from the time of its row on
+    temperature: Array  # at the time of its row
     sampling_interval: float  # s
     notes: list[str] = field(default_factory=list)  # remarks for the user about the log
     # Other measured inputs, by column, from the times of their rows on.
     disturbances: dict[str, Array] = field(default_factory=dict)
-    flow_error: float = 0.0  # standard error of the flow, t/h
+    others: dict[str, Array] = field(default_factory=dict)  # all other columns of numbers
+    flow_error: float = 0.0  # standard error of the flow
+    flow_unit: str = "t/h"
+    temperature_unit: str = "°C"
 
     def mended(self, note: str, **changes: Any) -> Log:
         """Return the log with changes, and a note that describes them."""
         return replace(self, notes=[*self.notes, note], **changes)
 
 
-def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) -> Log:
+def read_log(path: Path, columns: Columns | None = None, rows: int = 20_000) -> Log:
     """Read a table with a heading, and keep its latest rows.
 
-    The separator (comma, semicolon or tab) and the decimal mark are detected. The file is read
-    in pieces, so that it may be larger than the memory, and all rows are checked.
+    The separator (comma, semicolon or tab) and the decimal mark are detected.
 
     Raises
     ------
@@ -59,12 +56,68 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) 
         If the table cannot be read; the message names the column, and the line if there is one.
     """
     columns = columns or Columns()
-    if columns.sampling_interval is not None and not columns.sampling_interval > 0:
-        raise ValueError(f"sampling_interval must be above 0, got {columns.sampling_interval}")
+    interval = columns.sampling_interval
+    if interval is not None and not interval > 0:
+        raise ValueError(f"sampling_interval must be above 0, got {interval}")
+    table, decimal = _table(path)
+    flow, temperature = (_find(table, o, getattr(columns, o)) for o in ("flow", "temperature"))
+    disturbances = [_find(table, "disturbance", each) for each in columns.disturbance]
+    time = None if interval else _find(table, "time", columns.time)
+    used = [name for name in (time, flow, temperature, *disturbances) if name]
+    if len(set(used)) < len(used):
+        raise ValueError(f"each column can be one thing only, got {', '.join(used)}")
+    others = table.drop(columns=used).select_dtypes("number").astype(np.float64)
+    kept = pd.DataFrame({name: _numbers(table[name], decimal) for name in used if name != time})
+    kept, notes = pd.concat([kept, others], axis=1), list[str]()
+    if time:
+        times, unit = _times(table[time], decimal, columns.time_unit)
+        interval, places = _sampled(times, notes)
+        kept = kept.set_index(places).reindex(range(places[-1] + 1))
+        notes.insert(0, f"The times are in {unit}.")
+    if len(kept) > rows:
+        notes.append(f"Of the {len(kept):,} rows, the last {rows:,} are used (--rows).")
+        kept = kept[-rows:]
+    units = {
+        "flow_unit": columns.flow_unit or _unit(flow) or "t/h",
+        "temperature_unit": columns.temperature_unit or _unit(temperature) or "°C",
+    }
+    log = Log(
+        _held(kept[flow]),
+        kept[temperature].to_numpy(),
+        float(interval or 1.0),
+        disturbances={name: _held(kept[name]) for name in disturbances},
+        others={str(name): _held(kept[name]) for name in others},
+        **units,
+    )
+    notes.insert(0, (
+        f"Read {len(table):,} rows: the flow from {flow!r}, {units['flow_unit']}; the "
+        f"temperature from {temperature!r}, {units['temperature_unit']}; a row every "
+        f"{log.sampling_interval:g} s."
+    ))  # fmt: skip
+    missing = _missing({"flow": log.flow, "temperature": log.temperature, **log.disturbances})
+    return replace(log, notes=notes + missing)
+
+
+def _table(path: Path) -> tuple[pd.DataFrame, str]:
+    """Return a file's table and its decimal mark."""
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            heading, *lines = itertools.islice(file, 50)
+    except ValueError as error:
+        raise ValueError(f"{path} is empty") from error
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    separator = next((mark for mark in ";\t" if mark in heading), ",")
+    comma = r'"-?\d+,\d+"' if separator == "," else r"\d,\d"
+    decimal = "," if any(re.search(comma, line) for line in lines) else "."
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
-            return _read(_File(path, columns), columns.sampling_interval, rows)
+            table = pd.read_csv(
+                path, sep=separator, decimal=decimal, encoding="utf-8-sig",
+                encoding_errors="replace", skipinitialspace=True, skip_blank_lines=False,
+                index_col=False, low_memory=False,
+            )  # fmt: skip
     except (pd.errors.EmptyDataError, pd.errors.ParserError, pd.errors.ParserWarning) as error:
         long = isinstance(error, pd.errors.ParserWarning)
         reason = "lines longer than the heading" if long else str(error).strip()
@@ -72,181 +125,108 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = MOST_ROWS) 
             f"{path} is not a table: {reason}. With decimal commas, the separator must be a "
             "semicolon or a tab, or the numbers in quotes"
         ) from error
+    if not len(table):
+        raise ValueError(f"{path} is too short: it has no rows, and hundreds are needed")
+    return table.set_axis([str(name) for name in table.columns], axis=1), decimal
 
 
-def _read(file: _File, interval: float | None, rows: int) -> Log:
-    clock, kept, read = _Clock(interval), pd.DataFrame(), 0
-    with tqdm(unit="row", unit_scale=True, desc="reading", delay=PROGRESS_AFTER) as progress:
-        for table in file.pieces():
-            times = table.pop(file.time) if file.time else None
-            spread = table if times is None else clock.spread(times, table)
-            kept = pd.concat([kept, spread[-rows:]])[-rows:] if read else spread[-rows:]
-            read += len(table)
-            progress.update(len(table))
-    if clock.interval is None or not read:
+def _find(table: pd.DataFrame, option: str, name: str) -> str:
+    """Return the column with a name; if none matches, ignore case and units in brackets."""
+    names = list(table.columns)
+    if name in names:
+        return name
+    alike = [n for n in names if re.sub(r"[\[(].*", "", n).strip().lower() == name.lower()]
+    if len(alike) != 1:
+        what = "no column" if not alike else "several columns"
         raise ValueError(
-            f"{file.path} is too short: {read} rows, and hundreds are needed, while the flow "
-            "moves"
+            f"the log has {what} {name!r}; it has {', '.join(map(repr, names))}. Name the right "
+            f"one with --{option}"
+            + (
+                ", or give --sampling-interval if there are no times"
+                if option == "time"
+                else ""
+            )
         )
-    notes = ["The flow is in %: read % wherever t/h is said."] if file.in_percent else []
-    notes += clock.notes
-    if read > rows:
-        notes.append(f"Of the {read:,} rows, the last {rows:,} are used (--rows).")
-    flow, temperature, *others = kept.columns
-    log = Log(
-        _held(kept[flow]),
-        kept[temperature].to_numpy(),
-        clock.interval,
-        notes,
-        {name: _held(kept[name]) for name in others},
-    )
-    notes += _missing({"flow": log.flow, "temperature": log.temperature, **log.disturbances})
-    return log
+    return alike[0]
 
 
-class _File:
-    """A file with a heading: its separator, decimal mark, columns and units."""
-
-    def __init__(self, path: Path, columns: Columns) -> None:
-        self.path = path
-        try:
-            with path.open(encoding="utf-8-sig", errors="replace") as file:
-                heading, *lines = itertools.islice(file, 50)
-        except ValueError as error:
-            raise ValueError(f"{path} is empty") from error
-        except OSError as error:
-            raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-        separator = next((mark for mark in ";\t" if mark in heading), ",")
-        comma = r'"-?\d+,\d+"' if separator == "," else r"\d,\d"
-        self._format: dict[str, Any] = {
-            "sep": separator,
-            "decimal": "," if any(re.search(comma, line) for line in lines) else ".",
-            "encoding": "utf-8-sig",
-            "encoding_errors": "replace",
-            "skipinitialspace": True,
-            "skip_blank_lines": False,
-            "index_col": False,  # pandas warns of fields beyond the heading
-        }
-        wanted = [("flow", columns.flow), ("temperature", columns.temperature)]
-        wanted += [("disturbance", each) for each in columns.disturbance]
-        if columns.sampling_interval is None:
-            wanted.append(("time", columns.time))
-        names = [str(name) for name in pd.read_csv(path, nrows=0, **self._format).columns]
-        found = [self._find(name, names, option) for option, name in wanted]
-        if len(set(found)) < len(found):
-            raise ValueError(f"each column can be one thing only, got {', '.join(found)}")
-        self._scales = {
-            name: UNITS[option][_unit(name, option, columns)] if option in UNITS else (1.0, 0.0)
-            for name, (option, _) in zip(found, wanted, strict=True)
-        }
-        self.in_percent = _unit(found[0], "flow", columns) == "%"
-        self.time = found[-1] if wanted[-1][0] == "time" else None
-
-    def _find(self, name: str, names: Sequence[str], option: str) -> str:
-        """Return the column with a name; if none matches, ignore case and units in brackets."""
-        if name in names:
-            return name
-        alike = [n for n in names if re.sub(r"[\[(].*", "", n).strip().lower() == name.lower()]
-        if len(alike) != 1:
-            what = "no column" if not alike else "several columns"
-            raise ValueError(
-                f"{self.path} has {what} {name!r}; it has {', '.join(map(repr, names))}. Name "
-                f"the right one with --{option}"
-                + (", or give --sampling-interval" if option == "time" else "")
-            )
-        return alike[0]
-
-    def pieces(self) -> Iterator[pd.DataFrame]:
-        """Yield the file piece by piece: flow, temperature, disturbances and time, if any."""
-        with pd.read_csv(self.path, chunksize=CHUNK, **self._format) as chunks:
-            for chunk in chunks:
-                yield pd.DataFrame({name: self._numbers(chunk[name]) for name in self._scales})
-
-    def _numbers(self, column: Any) -> Any:
-        """Return a column in the units of the plant."""
-        is_time = column.name == self.time
-        factor, offset = self._scales[column.name]
-        texts = column
-        if not pd.api.types.is_numeric_dtype(column) and self._format["decimal"] == ",":
-            texts = column.astype(str).str.replace(",", ".")  # pandas has left it all as text
-        values = pd.to_numeric(texts, errors="coerce").astype(np.float64)
-        if is_time and values.isna().any():
-            # In dates with points, the day comes first.
-            iso = column.astype(str).str.replace(DAY_FIRST, r"\3-\2-\1", regex=True)
-            dates = pd.to_datetime(iso, errors="coerce", format="ISO8601", utc=True)
-            if dates.notna().all():
-                return (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
-        bad = ~(values.abs() < LARGEST) & (column.notna() | is_time)
-        if bad.any():
-            number, advice = "a number", ". Leave the cell empty where it is not known"
-            if is_time:
-                number += ", or a date such as 2026-01-31T12:00:00 or 31.01.2026 12:00:00"
-                advice = ""
-            raise ValueError(
-                f"{self.path}, line {bad.idxmax() + 2}: {column.name} must be {number}, got "
-                f"{str(column[bad.idxmax()])!r}{advice}"
-            )
-        return factor * values + offset
+def _unit(name: str) -> str:
+    """Return the unit that stands in brackets at the end of a heading, if any."""
+    bracket = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", name)
+    return bracket.group(1) if bracket else ""
 
 
-class _Clock:
-    """Spreads rows over equal time steps, with empty rows in the gaps."""
-
-    def __init__(self, interval: float | None) -> None:
-        self.interval = interval
-        self.notes: list[str] = []
-        self._last = pd.Series(dtype=np.float64)
-
-    def spread(self, times: pd.Series[float], table: pd.DataFrame) -> pd.DataFrame:
-        """Return the values of a piece, one row per sample."""
-        known = pd.concat([self._last, times])
-        self._last = known.iloc[-1:]
-        steps = known.diff().iloc[1:]
-        if not len(steps):
-            return table
-        if (steps <= 0).any():
-            row = (steps <= 0).idxmax()
-            raise ValueError(
-                f"line {row + 2}: the time must increase, and goes from {known[row - 1]:g} s "
-                f"by {steps[row]:g} s. Sort the rows, and leave out those that are there "
-                "twice; or give --sampling-interval if the times are wrong"
-            )
-        if self.interval is None:
-            self.interval = float(f"{steps.median():.6g}")
-        ratio = steps / self.interval
-        whole = ratio.round().clip(lower=1.0)
-        uneven = (ratio - whole).abs() > UNEVEN
-        if uneven.any():
-            row = uneven.idxmax()
-            raise ValueError(
-                f"line {row + 2}: the time steps are unequal, {steps[row]:g} s here where most "
-                f"are {self.interval:g} s. Resample the log to equal steps, or give "
-                "--sampling-interval if the times are wrong"
-            )
-        for row, count in whole[whole > 1].items():
-            rows = f"{count - 1:.0f} rows are" if count > 2 else "1 row is"
-            if len(self.notes) < 3:
-                self.notes.append(f"Before line {row + 2}, {rows} missing.")
-            elif len(self.notes) == 3:
-                self.notes.append("More rows are missing later.")
-        # The first row of the file has no step before it.
-        counts = whole.clip(upper=LONGEST_GAP).reindex(table.index, fill_value=1.0)
-        places = counts.cumsum().astype(int) - 1
-        return table.set_axis(places).reindex(range(places.iloc[-1] + 1))
-
-
-def _unit(name: str, quantity: str, columns: Columns) -> str:
-    """Return the unit given by an option or by brackets in the heading."""
-    units = UNITS[quantity]
-    bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", name)
-    said = bracket.group(1) if bracket else next(iter(units))
-    unit: str = getattr(columns, f"{quantity}_unit") or said
-    if unit not in units:
+def _numbers(column: pd.Series[Any], decimal: str, *, is_time: bool = False) -> Any:
+    texts = column
+    if not pd.api.types.is_numeric_dtype(column) and decimal == ",":
+        texts = column.astype(str).str.replace(",", ".")  # pandas has left it all as text
+    values = pd.to_numeric(texts, errors="coerce").astype(np.float64)
+    bad = ~(values.abs() < LARGEST) & (column.notna() | is_time)
+    if bad.any():
+        number, advice = "a number", ". Leave the cell empty where it is not known"
+        if is_time:
+            number, advice = "a number or a date such as 2026-01-31T12:00:00", ""
         raise ValueError(
-            f"the unit of {name!r} must be one of {', '.join(units)}, got {unit!r}. Say it "
-            f"with --{quantity}-unit"
+            f"line {bad.to_numpy().argmax() + 2}: {column.name} must be {number}, got "
+            f"{str(column[bad].iloc[0])!r}{advice}"
         )
-    return unit
+    return values
+
+
+def _times(column: pd.Series[Any], decimal: str, unit: str | None) -> tuple[Array, str]:
+    """Return times in seconds, and their unit."""
+    if not pd.api.types.is_numeric_dtype(column):
+        dates = pd.to_datetime(column, errors="coerce", format="ISO8601", utc=True)
+        if dates.isna().any():
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of a format that is not known
+                dates = pd.to_datetime(column, errors="coerce", dayfirst=True, utc=True)
+        if dates.notna().all():
+            seconds = (dates - dates.iloc[0]) / pd.Timedelta(seconds=1)
+            return seconds.to_numpy(np.float64), "dates"
+    unit = unit or _unit(str(column.name)) or "s"
+    try:
+        factor = pd.Timedelta(1, unit=unit).total_seconds()  # type: ignore[arg-type]
+    except ValueError as error:
+        raise ValueError(
+            f"the unit of the times must be ms, s, min or h, got {unit!r}: say --time-unit"
+        ) from error
+    return factor * _numbers(column, decimal, is_time=True).to_numpy(), unit
+
+
+def _sampled(times: Array, notes: list[str]) -> tuple[float, NDArray[np.intp]]:
+    """Return the sampling interval, and the number of the sample of each row."""
+    steps = np.diff(times)
+    if not len(steps):
+        raise ValueError("the log is too short: it has 1 row, and hundreds are needed")
+    if (steps <= 0).any():
+        row = int(np.argmax(steps <= 0))
+        raise ValueError(
+            f"line {row + 3}: the time must increase, and goes from {times[row]:g} s by "
+            f"{steps[row]:g} s. Sort the rows, and leave out those that are there twice"
+        )
+    usual = float(np.median(steps))
+    interval = float(f"{np.mean(steps[np.abs(steps / usual - 1.0) < 0.5]):.6g}")
+    ratio = steps / interval
+    whole = np.maximum(np.round(ratio), 1.0)
+    # How early or late the rows are, beside those around them: an interval that is not exact,
+    # and the length of a long gap, do not count.
+    late = pd.Series(np.cumsum(np.where(whole >= GAP, 0.0, ratio - whole)))
+    late -= late.rolling(25, center=True, min_periods=1).median()
+    if late.abs().max() > JITTER:
+        row = int(np.argmax(late.abs() > JITTER))
+        raise ValueError(
+            f"line {row + 3}: the time steps are unequal, {steps[row]:g} s here where most are "
+            f"{interval:g} s. Resample the log to equal steps"
+        )
+    gaps = np.flatnonzero(whole > 1)
+    notes += [
+        f"Before line {row + 3}, {whole[row] - 1:.0f} rows are missing." for row in gaps[:3]
+    ]
+    if len(gaps) > 3:
+        notes.append("More rows are missing later.")
+    places = np.cumsum(np.minimum(whole, LONGEST_GAP)).astype(np.intp)
+    return interval, np.concatenate([[0], places])
 
 
 def _missing(columns: dict[str, Array]) -> list[str]:

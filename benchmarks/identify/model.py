@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from benchmarks.identify.armax import Array, Orders
@@ -22,8 +22,19 @@ class Interval(NamedTuple):
     high: float
 
 
+class Fault(NamedTuple):
+    """A fault of a valve, as far as a log shows it."""
+
+    what: str
+    """Description, with its size."""
+    advice: str
+    """What to do."""
+    passed: Array
+    """The flow that such a valve passes, from the operating point."""
+
+
 class HeldOut(NamedTuple):
-    """Shares of variance in the last third of a log, explained by models fitted to the rest.
+    """Shares of variance in the last part of a log, explained by models fitted to the rest.
 
     The models simulate the temperature: they are given the flow and the known disturbances, but
     no temperature. A straight line is removed from their errors to account for the slow
@@ -47,10 +58,9 @@ class Model:
     """Model of the response to each known disturbance, by its column of the log."""
     estimates: dict[str, Interval]
     """`delay` (samples), `dead_zone` (t/h), `gain` (degC per t/h), `time_constant` (s, of the
-    slowest pole), `noise_variance` (degC^2, of the prediction errors), and the coefficients
-    `a1`, `b1` and so on."""
+    slowest pole) and `noise_variance` (degC^2, of the prediction errors)."""
     possible: list[LinearModel]
-    """Plants drawn from the posterior."""
+    """Stable plants drawn from the posterior."""
     u_min: float
     u_max: float
     """t/h."""
@@ -65,5 +75,9 @@ class Model:
     """The cleaned log that was fitted."""
     simulated: Array
     """Temperature simulated from the flow and the known disturbances alone, degC."""
-    notes: list[str]
+    fault: Fault | None = None
+    """The fault of the valve that explains the log; the flow of `log` is what it passes."""
+    notes: list[str] = field(default_factory=list)
     """Remarks for the user about the log and the fit."""
+    warnings: list[str] = field(default_factory=list)
+    """Why no controller should be tuned on the model; empty if it may be used."""

@@ -4,39 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import Parameter
-
-from benchmarks.lib.options import (
-    Count,
-    Finite,
-    Folder,
-    Orders,
-    Positive,
-    Repeated,
-    choice,
-    options,
-)
-
-# Conversion to the units of the plant, s, t/h and degC: factor, then offset, by quantity and
-# unit. The default unit comes first.
-UNITS: dict[str, dict[str, tuple[float, float]]] = {
-    "time": {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)},
-    "flow": {"t/h": (1.0, 0.0), "kg/s": (3.6, 0.0), "kg/h": (1e-3, 0.0), "%": (1.0, 0.0)},
-    "temperature": {
-        **dict.fromkeys(("degC", "°C", "C"), (1.0, 0.0)),
-        "K": (1.0, -273.15),
-        **dict.fromkeys(("degF", "°F", "F"), (5 / 9, -160 / 9)),
-    },
-}
-
-
-def _unit(quantity: str) -> Parameter:
-    names = list(UNITS[quantity])
-    return choice(
-        names, f"Unit of the {quantity} (default: that in the heading, else {names[0]})"
-    )
+from benchmarks.lib.options import Count, Finite, Folder, Positive, Repeated, options
 
 
 @options
@@ -54,9 +23,12 @@ class Columns:
     """Column of a measured disturbance (repeatable)."""
     sampling_interval: Positive | None = None
     """Time from one row to the next, s; the column of the times is then not read."""
-    time_unit: Annotated[str | None, _unit("time")] = None
-    flow_unit: Annotated[str | None, _unit("flow")] = None
-    temperature_unit: Annotated[str | None, _unit("temperature")] = None
+    time_unit: str | None = None
+    """Unit of the times: ms, s, min or h (default: that in the heading, else s)."""
+    flow_unit: str | None = None
+    """Unit of the flow, for the report (default: that in the heading, else t/h)."""
+    temperature_unit: str | None = None
+    """Unit of the temperature, for the report (default: that in the heading, else °C)."""
 
 
 @options
@@ -69,17 +41,14 @@ class Knowledge:
     applied: bool = False
     """The flow was measured after the actuator, so no dead zone is looked for."""
     u_min: Finite | None = None
-    """Smallest flow that the actuator can apply, t/h from the operating point (default: the
+    """Smallest flow that the actuator can apply, from the operating point (default: the
     log's smallest)."""
     u_max: Finite | None = None
-    """Largest flow that the actuator can apply, t/h from the operating point (default: the
+    """Largest flow that the actuator can apply, from the operating point (default: the
     log's largest)."""
     operating_flow: Finite | None = None
-    """Flow at the operating point, t/h (default: 0 if the log has flows of both signs, else its
-    first flow)."""
-    orders: Orders | None = None
-    """Number of coefficients of the polynomials A, B and C, without the leading 1 of A and C
-    (default: chosen by a criterion)."""
+    """Flow at the operating point, around which a dead zone lies (default: 0 or the first flow
+    if it is well inside the range of the flows, else the middle of the range)."""
 
 
 @options

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.controllers.step_test import StepTest
-from benchmarks.identify.margins import Loop
+from benchmarks.identify.guards import LAGS, autocorrelation, band, chance
 from benchmarks.identify.model import Model
+from benchmarks.identify.plant import settling
 from benchmarks.lib.drawing import COLOURS, colours, drawn
-from benchmarks.lib.statistics import ENDS
+from benchmarks.loop.margins import Loop
 
-LAGS = 40  # largest lag of the autocorrelation, samples
 LONGEST = 5_000  # longest step response that is drawn, samples
 SHOWN = 3_000  # rows of a log that are drawn: more would blur
 
@@ -28,7 +27,7 @@ def plot_log(model: Model, path: Path) -> None:
         above.plot(minutes, log.temperature[:stop], color="0.5", linewidth=1, label="recorded")
         simulated = model.simulated[:stop]
         above.plot(minutes, simulated, color=COLOURS[1], label="model, without noise")
-        above.set_ylabel("temperature (°C)")
+        above.set_ylabel(f"temperature ({log.temperature_unit})")
         above.margins(y=0.15)  # room for the legend
         above.legend(loc="upper right", ncols=2)
         below.step(minutes, log.flow[:stop], where="post", color=COLOURS[0], linewidth=1)
@@ -40,63 +39,41 @@ def plot_log(model: Model, path: Path) -> None:
             )  # fmt: skip
             below.margins(y=0.2)
             below.legend(loc="upper right")
-        below.set_ylabel("flow (t/h)")
+        below.set_ylabel(f"flow ({log.flow_unit})")
         below.set_xlabel("time (min)")
 
 
-def plot_residuals(model: Model, path: Path) -> float:
-    """Draw the prediction errors and their autocorrelation up to `LAGS`.
-
-    Returns
-    -------
-    float
-        The share of autocorrelations outside the 95 % band of white noise.
-    """
-    known = np.isfinite(model.errors)
-    centred = np.where(known, model.errors - np.mean(model.errors[known]), 0.0)
-    pairs = [np.sum(centred[lag:] * centred[: len(centred) - lag]) for lag in range(LAGS + 1)]
-    correlation = np.array(pairs[1:]) / pairs[0]
-    chance = 1.96 / np.sqrt(known.sum())
+def plot_residuals(model: Model, path: Path) -> None:
+    """Draw the prediction errors and their autocorrelation."""
+    correlation, limit = autocorrelation(model.errors), chance(model.errors)
     errors = model.errors[:SHOWN]
     minutes = np.arange(len(errors)) * model.plant.sampling_interval / 60.0
     with drawn(path, 10, 3.6) as figure:
         left, right = figure.subplots(1, 2)
         left.plot(minutes, errors, color=COLOURS[0], linewidth=0.6)
-        left.set(xlabel="time (min)", ylabel="prediction error (°C)")
+        left.set(xlabel="time (min)", ylabel=f"prediction error ({model.log.temperature_unit})")
         right.bar(np.arange(1, LAGS + 1), correlation, width=0.5, color=COLOURS[0])
         right.axhspan(
-            -chance, chance, color="0.5", alpha=0.2, linewidth=0, label="by chance, 95 %"
+            -limit, limit, color="0.5", alpha=0.2, linewidth=0, label="by chance, 95 %"
         )
         right.set(xlabel="lag (samples)", ylabel="autocorrelation")
         right.legend(loc="upper right")
-    return float(np.mean(np.abs(correlation) > chance))
 
 
-def plot_step(model: Model, tested: StepTest, path: Path) -> None:
-    """Draw the step response with its 95 % band, and its first-order model."""
-    length = tested.delay + 6.0 * tested.time_constant
-    samples = min(int(np.ceil(length / model.plant.sampling_interval)), LONGEST) + 1
-    response = model.plant.step_response(samples)
-    with np.errstate(over="ignore", invalid="ignore"):  # from unstable plants
-        possible = np.array([plant.step_response(samples) for plant in model.possible])
-    low, high = np.nanquantile(possible, ENDS, axis=0, method="nearest")
-    times = np.arange(samples) * model.plant.sampling_interval
-    since = np.maximum(times - tested.delay + model.plant.sampling_interval, 0.0)
-    first_order = np.where(
-        times >= tested.delay, -tested.gain * np.expm1(-since / tested.time_constant), 0.0
-    )
+def plot_step(model: Model, path: Path) -> None:
+    """Draw the step response with its 95 % band, until it has settled."""
+    samples = min(round(1.2 * settling(model.plant)), LONGEST) + 1
+    low, high = band(model, samples)
+    minutes = np.arange(samples) * model.plant.sampling_interval / 60.0
     with drawn(path, 8, 4) as figure:
         axes = figure.subplots()
         axes.fill_between(
-            times / 60, low, high, color=COLOURS[0], alpha=0.25, linewidth=0,
+            minutes, low, high, color=COLOURS[0], alpha=0.25, linewidth=0,
             label="95 % of what the log leaves open",
         )  # fmt: skip
-        axes.plot(times / 60, response, color=COLOURS[0], label="model")
-        axes.plot(
-            times / 60, first_order, "--", color=COLOURS[1],
-            label="first order with delay",
-        )  # fmt: skip
-        axes.set(xlabel="time after the step (min)", ylabel="temperature (°C per t/h)")
+        axes.plot(minutes, model.plant.step_response(samples), color=COLOURS[0], label="model")
+        unit = f"{model.log.temperature_unit} per {model.log.flow_unit}"
+        axes.set(xlabel="time after the step (min)", ylabel=f"temperature ({unit})")
         axes.legend()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -11,39 +10,23 @@ import pandas as pd
 from benchmarks.bounds import least_possible
 from benchmarks.bounds.linear_program import NotSolvedError
 from benchmarks.identify import plots
+from benchmarks.identify.guards import LAGS, autocorrelation, chance
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import plant_arguments
-from benchmarks.identify.tuning import Recommended, recommended, reduced
+from benchmarks.identify.tuning import Recommended
 from benchmarks.lib.report import Section
-from benchmarks.loop.metrics import mean_error, reversals, travel
-from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 
-UNITS = {
-    "delay": "samples",
-    "dead_zone": "t/h",
-    "gain": "°C per t/h",
-    "time_constant": "s",
-    "noise_variance": "°C²",
-}
-RUNS, SAMPLES, SEED = 20, 1200, 0  # for the controllers on the identified plant
 LONGEST = 6_000  # longest run for which the bounds are computed, samples
-POOR, BEHIND = 0.5, 0.1  # least share a model should explain; most that its rival may lead by
+LABELS = {"pi-simc": "PI, SIMC", "smith": "Smith"}
 
 
-def report(model: Model, out: Path) -> list[Section]:
+def report(model: Model, found: list[Recommended], out: Path) -> list[Section]:
     """Draw the figures into a folder, and return the sections of the report."""
-    step = reduced(model.plant)
     plots.plot_log(model, out / "log.png")
-    beyond = plots.plot_residuals(model, out / "residuals.png")
-    plots.plot_step(model, step, out / "step.png")
-    verdict = (
-        "no more than chance would have"
-        if beyond <= 0.15
-        else "more than chance would have: the noise or the dynamics are not of this form"
-    )
-    tuned = {} if fault(model) else recommended(model)
-    found = {name: each for name, each in tuned.items() if each}
+    plots.plot_residuals(model, out / "residuals.png")
+    plots.plot_step(model, out / "step.png")
+    beyond = 100 * (abs(autocorrelation(model.errors)) > chance(model.errors)).mean()
     sections = [
         _found(model, found),
         Section(
@@ -55,179 +38,168 @@ def report(model: Model, out: Path) -> list[Section]:
             "What the model leaves",
             [
                 "The errors of predictions one sample ahead would be white noise if the model "
-                f"were right. Of their first {plots.LAGS} autocorrelations, {100 * beyond:.0f} "
-                f"% are beyond the band of chance (5 % expected): {verdict}."
+                f"were right. Of their first {LAGS} autocorrelations, {beyond:.0f} % are "
+                "beyond the band of chance (5 % expected)."
             ],
             pictures=["residuals.png"],
         ),
-        Section(
-            "Step response",
-            [
-                f"Of first order with delay, the plant would have a gain of {step.gain:g} °C "
-                f"per t/h, a time constant of {step.time_constant:g} s and a delay of "
-                f"{step.delay:g} s, the sample that any input takes to show included. These "
-                "come from the areas of the whole response: shorter lags and an inverse "
-                "response count as delay."
-            ],
-            pictures=["step.png"],
-        ),
+        Section("Step response", pictures=["step.png"]),
     ]
-    if tuned:
-        sections.append(_controllers(tuned, out))
     if found:
-        sections.append(_on_the_plant(found, plant_arguments(model)))
+        sections += [_controllers(model, found, out), _on_the_plant(model, found)]
     return sections
 
 
-def fault(model: Model) -> str:
-    """Return why a model should not be used; empty if it may be used."""
-    share, rival = model.held_out
-    if share < rival - BEHIND:
-        return "it explains clearly less than an impulse response does: its form does not fit"
-    gain = model.estimates["gain"]
-    if gain.low < 0.0 < gain.high:
-        return "not even the direction is known in which the temperature answers the flow"
-    if share < POOR:
-        return "it leaves more than half open: the noise hides the response, or it changes"
-    return ""
+def recommendations(model: Model, found: list[Recommended]) -> dict[str, Any]:
+    """Return the content of `controllers.json`."""
+    listed = [
+        {
+            "controller": each.name,
+            "kp": each.kp,
+            "ti": each.ti,
+            "action": _action(each),
+            "sampling_interval": each.told.sampling_interval,
+            **({"model": vars(each.told)} if each.name == "smith" else {}),
+        }
+        for each in found
+    ]
+    return {"recommended": listed, "warnings": model.warnings}
 
 
-def headline(model: Model) -> str:
-    """Return how much the model explains, and whether it should be used."""
+def _action(each: Recommended) -> str:
+    return "reverse" if each.kp > 0.0 else "direct"
+
+
+def headline(model: Model) -> list[str]:
+    """Return whether a model may be used, and how much it explains."""
     share, rival = (f"{100 * max(each, 0.0):.1f} %" for each in model.held_out)
-    known, why = ", ".join(model.known), fault(model)
-    verdict = f"**The model should not be used:** {why}. Nothing is recommended." if why else ""
+    known = "".join(f" and {name}" for name in model.known)
+    warned = [f"**Nothing is recommended.** {' '.join(model.warnings)}"] * bool(model.warnings)
+    return [
+        *warned,
+        "Fitted to the first two thirds of the moves, the model explains "
+        f"{share} of the temperature's variance in the rest of the log, by simulation from the "
+        f"flow{known}; a finite impulse response explains {rival}. A straight line, for the "
+        "slow disturbance, is taken from both.",
+    ]
+
+
+def _typed(model: Model, each: Recommended) -> str:
+    """Return a controller as it is typed into a control system."""
+    flow, temperature = model.log.flow_unit, model.log.temperature_unit
+    told = each.told
+    inside = (
+        f" It acts on the error minus what its model foresees: {told.gain:g} {temperature} per "
+        f"{flow}, {told.time_constant:g} s, a delay of {told.delay:g} s."
+    ) * (each.name == "smith")
     return (
-        f"Fitted to the first two thirds of the log, the model explains {share} of the "
-        f"temperature's variance in the last third, by simulation from the flow"
-        f"{' and ' + known if known else ''}; a finite impulse response explains {rival}. A "
-        f"straight line, for the slow disturbance, is taken from both. {verdict}"
-    ).strip()
+        f"Recommended: {LABELS[each.name]} with Kp = {each.kp:.4g} {flow} per {temperature} "
+        f"and Ti = {each.ti:.3g} s, {_action(each)} acting.{inside}"
+    )
 
 
-def _found(model: Model, found: dict[str, Recommended]) -> Section:
-    interval, rest, orders = model.plant.sampling_interval, model.operating_flow, model.orders
+def _found(model: Model, found: list[Recommended]) -> Section:
+    flow, temperature = model.log.flow_unit, model.log.temperature_unit
+    units = {
+        "delay": "samples", "dead_zone": flow, "gain": f"{temperature} per {flow}",
+        "time_constant": "s", "noise_variance": f"{temperature}²",
+    }  # fmt: skip
+    rest, orders = model.operating_flow, model.orders
     rows = [
-        (name, f"{each.value:.4g}", f"[{each.low:.4g}, {each.high:.4g}]", UNITS.get(name, ""))
+        (name, f"{each.value:.4g}", f"[{each.low:.4g}, {each.high:.4g}]", units[name])
         for name, each in model.estimates.items()
     ]
-    parts = [
-        (name, f"{variance:.4g}", "", "°C²")
-        for name, variance in model.noise.items()
-        if variance and name != "noise_variance"
-    ]
     text = [
-        headline(model),
-        *(
-            f"Recommended: {name} with Kp = {each.controller.kp:.4g} t/h per °C and an "
-            f"integral time of {each.controller.kp / each.controller.ki * interval:.3g} s."
-            for name, each in found.items()
-        ),
+        *headline(model),
+        *(_typed(model, each) for each in found),
         *model.notes,
-        f"All numbers are deviations from the operating point: a flow of {rest:g} t/h, at "
-        f"which the temperature is {model.operating_temperature:.4g} °C. The flow was between "
-        f"{rest + model.u_min:g} and {rest + model.u_max:g} t/h.",
+        f"All numbers are deviations from the operating point: a flow of {rest:g} {flow}, at "
+        f"which the temperature is {model.operating_temperature:.4g} {temperature}. The flow "
+        f"was between {rest + model.u_min:g} and {rest + model.u_max:g} {flow}.",
         f"A, B and C have the orders {orders.a}, {orders.b} and {orders.c}"
-        f"{', with a random walk' if orders.walk else ''}. Brackets are 95 % intervals.",
+        f"{', with a random walk' if orders.walk else ''}. Brackets are 95 % intervals. The "
+        "noise variance is that of all noise together; `plant.json` splits it.",
         *(
-            f"{name} is a known disturbance with a gain of {each.gain:.4g} °C a unit and a "
-            f"delay of {each.delay} samples. `plant.json` does not have it."
+            f"{name} is a known disturbance with a gain of {each.gain:.4g} {temperature} a unit "
+            f"and a delay of {each.delay} samples. `plant.json` does not have it."
             for name, each in model.known.items()
         ),
     ]
-    if parts:
-        text.append(
-            "Noise variance and C are those of all noise together; `plant.json` splits it."
-        )
-    table = pd.DataFrame([*rows, *parts], columns=["", "value", "95 %", "unit"])
+    table = pd.DataFrame(rows, columns=["", "value", "95 %", "unit"])
     return Section("What the log shows", text, table.replace("_", " ", regex=True))
 
 
-def _controllers(tuned: dict[str, Recommended | None], out: Path) -> Section:
-    text, rows, loops = [], [], {}
-    for name, each in tuned.items():
-        if each is None:
-            text.append(
-                f"{name}: not recommended. However slow it is made, Ms is above 2 with one in "
-                "twenty of the plants that the log leaves possible."
-            )
-            continue
-        if each.slowed > 1.0:
-            text.append(
-                f"{name} is de-tuned: its closed loop is {each.slowed:.2g} times slower than "
-                "by the rule, for Ms to be at most 2 with 95 % of the plants that the log "
-                "leaves possible."
-            )
-        loops[name], found = each.loop, each.loop.margins
+def _controllers(model: Model, found: list[Recommended], out: Path) -> Section:
+    flow, temperature = model.log.flow_unit, model.log.temperature_unit
+    text = [
+        f"u = Kp ((r - y) + (1 / Ti) ∫ (r - y) dt), where u is the flow, {flow}, r the set point "
+        f"and y the temperature, {temperature}, all from the operating point. Reverse acting: "
+        "the flow falls when the temperature rises; direct acting: it rises.",
+        *(
+            f"{LABELS[each.name]} is de-tuned: its closed loop is {each.slowed:.2g} times slower "
+            "than by the rule, for Ms to be at most 2 with 95 % of the plants that the log "
+            "leaves possible."
+            for each in found if each.slowed > 1.0
+        ),
+        "By rule, SIMC's PI has its closed-loop time constant at the delay, the Smith predictor "
+        "at half the plant's time constant. The margins are those of the loop while no limit "
+        "and no dead zone is met: by which factor the gain may rise, and by how much phase and "
+        "delay may shift, before it is unstable. Ms is the most that the loop amplifies a "
+        "disturbance; the last column has what 95 % of the possible plants stay below.",
+    ]  # fmt: skip
+    rows = []
+    for each in found:
+        margins = each.loop.margins
         rows.append({
-            "controller": name,
-            "Kp (t/h per °C)": f"{each.controller.kp:.4g}",
-            "Ki (t/h per °C and sample)": f"{each.controller.ki:.4g}",
-            "gain margin": f"{found.gain:.2f}",
-            "phase margin (°)": f"{found.phase:.1f}",
-            "delay margin (s)": f"{found.delay:.0f}",
-            "Ms": f"{found.sensitivity:.2f}",
+            "controller": LABELS[each.name],
+            f"Kp ({flow} per {temperature})": f"{each.kp:.4g}",
+            "Ti (s)": f"{each.ti:.4g}",
+            "action": _action(each),
+            "gain margin": f"{margins.gain:.2f}",
+            "phase margin (°)": f"{margins.phase:.1f}",
+            "delay margin (s)": f"{margins.delay:.0f}",
+            "Ms": f"{margins.sensitivity:.2f}",
             "Ms, 95 %": f"{each.worst:.2f}",
         })  # fmt: skip
-    text.append(
-        "u = -Kp e - Ki (sum of e). By rule, SIMC's PI has its closed-loop time constant at "
-        "the delay, the Smith predictor at half the plant's time constant. The margins are "
-        "those of the loop while no limit and no dead zone is met: by which factor the gain "
-        "may rise, and by how much phase and delay may shift, before it is unstable. Ms is the "
-        "most that the loop amplifies a disturbance; the last column has what 95 % of the "
-        "possible plants stay below."
-    )
-    if not loops:
-        return Section("Recommended controllers", text)
-    plots.plot_margins(loops, out / "margins.png")
+    plots.plot_margins({LABELS[each.name]: each.loop for each in found}, out / "margins.png")
     return Section("Recommended controllers", text, pd.DataFrame(rows), ["margins.png"])
 
 
-def _on_the_plant(found: dict[str, Recommended], arguments: dict[str, Any]) -> Section:
-    parameters = Parameters(**arguments)
-    samples = max(SAMPLES, 2 * parameters.setpoint_period)
-    unaware, bound = _bounds(arguments, samples)
-    rows = []
-    for name, each in found.items():
-        run = rollout(make_plants(RUNS, samples, **arguments), each.controller, samples, SEED)
-        mean = float(mean_error(run).mean())
-        turns = reversals(run.applied, parameters.sampling_interval).mean()
-        rows.append({
-            "controller": name,
-            "mean |e| (°C)": f"{mean:.4g}",
-            "of the least possible": f"{mean / unaware:.2f}" if unaware > 0.0 else "",
-            "valve travel (t/h)": f"{travel(run).mean():.0f}",
-            "reversals a minute": f"{turns:.2f}",
-        })  # fmt: skip
+def _on_the_plant(model: Model, found: list[Recommended]) -> Section:
+    flow, temperature = model.log.flow_unit, model.log.temperature_unit
+    arguments = plant_arguments(model)
+    amplitude = Parameters(**arguments).setpoint_amplitude
+    samples, runs = found[0].samples, found[0].error.runs
+    least, bound = _bound(arguments, samples, temperature)
+    rows = [
+        {
+            "controller": LABELS[each.name],
+            f"mean |e| ({temperature})": f"{each.error:.4g}",
+            "of the least possible": (
+                f"{Estimate(*(end / least for end in each.error[:3]), runs):.2f}" if least else ""
+            ),
+            f"valve travel ({flow})": f"{each.travel:.0f}",
+        }
+        for each in found
+    ]  # fmt: skip
     return Section(
         "On the identified plant",
         [
-            f"A square wave of ±{parameters.setpoint_amplitude:g} °C over {samples} samples, "
-            f"with the noise of the log, {RUNS} runs. {bound} More controllers: `python -m "
-            "benchmarks.compare --plant plant.json`. It sets these two by two points of the "
-            "step response in place of areas, so that its numbers differ a little."
+            f"A square wave of ±{amplitude:g} {temperature} over {samples} samples, with the "
+            f"noise of the log, the same for all controllers, {runs} runs; brackets are 95 % "
+            f"intervals. {bound} More controllers: `python -m benchmarks.compare --plant "
+            "plant.json`."
         ],
         pd.DataFrame(rows),
     )
 
 
-def _bounds(arguments: dict[str, Any], samples: int) -> tuple[float, str]:
-    """Return the least possible mean error, degC, NaN if unknown, and a sentence about it."""
-    values: list[float] = []
-    why = f"{samples} samples are many"
+def _bound(arguments: dict[str, Any], samples: int, unit: str) -> tuple[float, str]:
+    """Return the least possible mean error, 0 if unknown, and a sentence about it."""
+    if samples > LONGEST:
+        return 0.0, f"For {samples} samples, the least possible mean error is not computed."
     try:
-        for kind in ("preview", "reference") if samples <= LONGEST else ():
-            bound = least_possible(samples=samples, kind=kind, folder=None, **arguments)
-            values.append(bound.value)
-    except (NotSolvedError, ValueError) as error:  # the set point changes too soon
-        why = str(error)
-    if not values:
-        return math.nan, f"The least possible mean error is not known: {why}."
-    least = f"{values[-1]:.4g} °C"
-    if len(values) > 1:
-        least += " for one that learns of a change when it happens, with the plant settled, "
-        least += f"and {values[0]:.4g} °C"
-    return values[-1], (
-        f"The least possible mean error is {least} for a controller that knows the set point "
-        "beforehand."
-    )
+        bound = least_possible(samples=samples, folder=None, **arguments)
+    except (NotSolvedError, ValueError) as error:
+        return 0.0, f"The least possible mean error is not known: {error}."
+    return bound.value, f"The least possible mean error is {bound.value:.4g} {unit}."

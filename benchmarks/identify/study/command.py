@@ -1,8 +1,8 @@
 """Count how often plants are identified correctly, and try recommended loops on true plants.
 
 Logs of several kinds are recorded in the environment, with plants of the random sweep that do
-not drift and with second-order plants. SysIdentPy and a regularised impulse response get the
-same logs. The recommended loops are tried on random plants, no two of them alike.
+not drift and with second-order plants. The recommended loops are tried on random plants, no two
+of them alike, and on the plants with faulty valves of `faults`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ from scipy import signal
 from benchmarks.controllers.engineered import simc_pi
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
-from benchmarks.identify.margins import Loop
 from benchmarks.identify.model import CannotTellError
 from benchmarks.identify.options import Knowledge
-from benchmarks.identify.simulation import explained, of_impulse_response
+from benchmarks.identify.study.faults import FAULTS, HARMFUL, faulty
 from benchmarks.identify.study.options import Options
 from benchmarks.identify.tuning import MOST_SENSITIVE, recommended
 from benchmarks.lib.command_line import out_folder
@@ -34,7 +33,8 @@ from benchmarks.lib.statistics import share
 from benchmarks.lib.storage import write_text
 from benchmarks.lib.tables import groups, on_screen, write_csv
 from benchmarks.loop.designs import Arguments, random_design
-from benchmarks.loop.linear import nominal
+from benchmarks.loop.linear import LinearModel, nominal
+from benchmarks.loop.margins import Loop
 from mptc_gym import Parameters
 
 NOISE = 0.02, 0.5  # range of R in the logs, degC^2
@@ -45,8 +45,8 @@ DATA_SHEET = Knowledge(operating_flow=0.0, u_min=LEVELS[0], u_max=LEVELS[1])  # 
 METER = 0.1  # standard deviation of a flow meter's noise, t/h
 DRIFT = 0.05  # standard deviation of a step of the base line's random walk, degC
 KINDS = ("steps", "loop", "meter", "drift", "second order")  # of logs
-RIVALS = ("this one", "SysIdentPy", "impulse response")
 TELLING = 2.0  # smallest dead zone that is counted, t/h
+EXPLAINED = "explained by the model, median", "explained by an impulse response, median"
 PARTS = ("true", "found", "low", "high")  # of each estimate
 # Random plants for the loops: magnitude of the slowest pole, by kind.
 POLES = {
@@ -133,8 +133,8 @@ def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict
     -------
     dict
         `kind`, the plant, `seconds` of processor time, and `refused`, the reason if the log is
-        refused. If it is not, also the true value, estimate and interval of each quantity, by
-        `PARTS`, and the share explained, the delay and the gain of each of `RIVALS`.
+        refused. If it is not, also its `warnings`, the true value, estimate and interval of each
+        quantity, by `PARTS`, and the shares explained.
     """
     true = nominal(Parameters(**plant))
     truths = {
@@ -156,51 +156,8 @@ def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict
     for name, truth in truths.items():
         for part, value in zip(PARTS, (truth, *model.estimates[name]), strict=True):
             result[f"{name}_{part}"] = value
-    last = np.arange(samples) >= samples * 2 // 3
-    _, gain = of_impulse_response([log.flow], log.temperature, ~last)
-    found = model.estimates
-    answers = (
-        (model.held_out.model, found["delay"].value, found["gain"].value),
-        narmax(log),
-        (model.held_out.impulse_response, math.nan, gain),
-    )
-    for rival, answer in zip(RIVALS, answers, strict=True):
-        for what, value in zip(("explained", "delay", "gain"), answer, strict=True):
-            result[f"{what}, {rival}"] = value
-    return result
-
-
-def narmax(log: Log) -> tuple[float, float, float]:
-    """Return the share of the last third that SysIdentPy explains, its delay and its gain.
-
-    Its linear NARX model selects among three past outputs and 61 past flows by orthogonal least
-    squares and the Bayesian information criterion (W. R. Lacerda Junior et al., Journal of Open
-    Source Software 5, 2020, 2384). All are NaN if the package is not installed.
-    """
-    try:
-        from sysidentpy.basis_function import Polynomial
-        from sysidentpy.model_structure_selection import FROLS
-        from sysidentpy.parameter_estimation import LeastSquares
-    except ModuleNotFoundError:
-        return math.nan, math.nan, math.nan
-    cut, lags = len(log.flow) * 2 // 3, 61
-    x, y = log.flow[:, np.newaxis], log.temperature[:, np.newaxis]
-    narx = FROLS(
-        order_selection=True, n_info_values=10, ylag=3, xlag=lags, info_criteria="bic",
-        estimator=LeastSquares(), basis_function=Polynomial(degree=1),
-    )  # fmt: skip
-    narx.fit(X=x[:cut], y=y[:cut])
-    simulated = np.full(len(y), np.nan)
-    simulated[cut - lags :] = narx.predict(X=x[cut - lags :], y=y[cut - lags :])[:, 0]
-    share_of_last = explained(log.temperature, simulated, np.arange(len(y)) >= cut)
-    # Regressors are coded as 1000 + lag of the output and 2000 + lag of the flow.
-    codes, values = narx.final_model[:, 0], narx.theta[:, 0]
-    flows = codes > 2000
-    if not flows.any():
-        return share_of_last, math.nan, 0.0
-    past = float(values[(codes > 1000) & (codes < 2000)].sum())
-    gain = float(values[flows].sum()) / (1.0 - past)
-    return share_of_last, float(codes[flows].min() - 2001), gain
+    shares = dict(zip(EXPLAINED, model.held_out, strict=True))
+    return {**result, **shares, "warnings": " ".join(model.warnings)}
 
 
 def random_plant(number: int, seed: int) -> dict[str, Any]:
@@ -222,14 +179,7 @@ def random_plant(number: int, seed: int) -> dict[str, Any]:
 
 
 def task_of_loops(number: int, seed: int) -> dict[str, Any]:
-    """Identify a random plant, and return Ms of the recommended loops on it.
-
-    Returns
-    -------
-    dict
-        `refused`, the reason if the log is refused, and `peaks`, each Ms, infinite for a loop
-        that is not stable.
-    """
+    """Try the loops that are recommended from a log of a random plant; see `tried`."""
     plant = random_plant(number, seed)
     generator = np.random.default_rng([seed, number, 1])
     flow: list[float] = []
@@ -240,27 +190,65 @@ def task_of_loops(number: int, seed: int) -> dict[str, Any]:
     driven = signal.lfilter([0.0] * (plant["delay"] + 1) + plant["b"], plant["a"], u)
     xi = signal.lfilter([1.0], plant["a"], generator.normal(size=OF_LOOPS))
     noise = generator.uniform(*SHARES) * np.std(driven) * xi / np.std(xi)
+    return tried(Log(u, driven + noise, 1.0), nominal(Parameters(**plant)))
+
+
+def task_of_faults(kind: str, number: int, seed: int) -> dict[str, Any]:
+    """Try the loops that are recommended from a log of a faulty valve; see `tried`."""
+    log, size, plant = faulty(kind, number, seed)
+    return {"kind": kind, "harmful": size >= HARMFUL[kind], **tried(log, plant)}
+
+
+def tried(log: Log, plant: LinearModel) -> dict[str, Any]:
+    """Try the loops that are recommended from a log on the true plant.
+
+    Returns
+    -------
+    dict
+        `refused`, the reason if none is recommended, and `peaks`, Ms of each loop, infinite for
+        one that is not stable.
+    """
     try:
-        model = identify(Log(u, driven + noise, 1.0))
+        model = identify(log)
+        found = recommended(model)
+        reason = " ".join(model.warnings) or "none is robust"
     except ValueError as error:
-        return {"refused": str(error), "peaks": []}
-    margins = [
-        Loop(each.controller, Parameters(**plant)).margins
-        for each in recommended(model).values() if each
-    ]  # fmt: skip
-    return {"refused": "", "peaks": [m.sensitivity if m.stable else math.inf for m in margins]}
+        found, reason = [], str(error)
+    margins = [Loop(each.controller, plant).margins for each in found]
+    return {
+        "refused": "" if found else reason,
+        "peaks": [m.sensitivity if m.stable else math.inf for m in margins],
+    }
 
 
-def counted(found: list[dict[str, Any]]) -> str:
+def counted(found: list[dict[str, Any]], what: str) -> str:
     """Return in words how many loops were recommended and how well they do."""
     peaks = np.concatenate([each["peaks"] for each in found])
     refused = sum(bool(each["refused"]) for each in found)
     return (
-        f"Of {len(found)} random plants ({', '.join(POLES)}), {refused} are refused, and "
-        f"{len(peaks)} loops are recommended. On the true plants, "
-        f"{np.sum(peaks > MOST_SENSITIVE)} of them have Ms above {MOST_SENSITIVE:g}, and "
-        f"{np.sum(np.isinf(peaks))} are unstable."
+        f"Of {len(found)} {what}, {refused} are refused, and {len(peaks)} loops are "
+        f"recommended. On the true plants, {np.sum(peaks > MOST_SENSITIVE)} of them have Ms "
+        f"above {MOST_SENSITIVE:g}, and {np.sum(np.isinf(peaks))} are unstable."
     )
+
+
+def table_of_faults(found: list[dict[str, Any]]) -> pd.DataFrame:
+    """Return by kind of valve how many logs are refused, and the Ms of the recommended loops."""
+    rows = []
+    for kind, logs in groups(pd.DataFrame(found), "kind"):
+        peaks = np.concatenate(logs["peaks"].to_list())
+        refused, harmful = logs["refused"] != "", logs["harmful"]
+        rows.append({
+            "plant or valve": kind,
+            "logs": str(len(logs)),
+            "refused": str(refused.sum()),
+            "with a harmful fault": str(harmful.sum()),
+            "of these refused": str((refused & harmful).sum()),
+            "loops": str(len(peaks)),
+            "Ms above 2": str(np.sum(peaks > MOST_SENSITIVE)),
+            "largest Ms": f"{peaks.max():.2f}" if len(peaks) else "",
+        })  # fmt: skip
+    return pd.DataFrame(rows)
 
 
 def execute(options: Options, console: Console) -> str:
@@ -276,6 +264,9 @@ def execute(options: Options, console: Console) -> str:
     logs = list(tasks)
     for i in range(options.plants or 0):
         tasks[f"plant {i}"] = partial(task_of_loops, i, options.seed)
+    for kind in FAULTS:
+        for i in range(options.faults or 0):
+            tasks[f"{kind} valve {i}"] = partial(task_of_faults, kind, i, options.seed)
     shaped_by = {name: getattr(options, name) for name in ("samples", "seed", "logs")}
     key = fingerprint("benchmarks.identify.study.command", **shaped_by)
     results = options.fan_out.open().run(tasks, out / "tasks" / key, title="logs")
@@ -286,9 +277,15 @@ def execute(options: Options, console: Console) -> str:
         "that are refused are wrong estimates. Processor time of a log: median "
         f"{found['seconds'].median():.1f} s, longest {found['seconds'].max():.1f} s."
     )
-    if results:
-        closing = f"{counted(list(results.values()))}\n\n{closing}"
-    tables = [table(found), beside_rivals(found)]
+    tables = [table(found)]
+    with_faults = [each for each in results.values() if "kind" in each]
+    random = [each for each in results.values() if "kind" not in each]
+    if with_faults:
+        tables.append(table_of_faults(with_faults))
+        closing = f"{counted(with_faults, 'logs of valves')}\n\n{closing}"
+    if random:
+        kinds = f"random plants ({', '.join(POLES)})"
+        closing = f"{counted(random, kinds)}\n\n{closing}"
     text = [each.to_markdown(index=False, disable_numparse=True) for each in tables]
     write_text(out / "identify_study.md", "\n\n".join([*text, f"{closing}\n"]))
     for each in tables:
@@ -298,8 +295,8 @@ def execute(options: Options, console: Console) -> str:
 
 def _rounded(found: pd.DataFrame) -> pd.DataFrame:
     """Return the columns that are kept, rounded to meaningful digits."""
-    kept = found.drop(columns=found.filter(regex="^([abc]|(delay|gain), .*)$").columns)
-    for digits, names in ((6, f"_({'|'.join(PARTS)})$"), (4, "^explained, ")):
+    kept = found.drop(columns=["a", "b", "c"], errors="ignore")
+    for digits, names in ((6, f"_({'|'.join(PARTS)})$"), (4, "^explained ")):
         for name, values in kept.filter(regex=names).items():
             kept[name] = [float(f"{value:.{digits}g}") for value in values]
     return kept
@@ -314,11 +311,14 @@ def table(found: pd.DataFrame) -> pd.DataFrame:
     shown = {
         kind: [
             *(_share(*question, logs) for question in QUESTIONS.values()),
+            *(f"{100 * logs[each].median():.0f} %" for each in EXPLAINED),
             str((logs["refused"] != "").sum()),
+            str((logs["warnings"].fillna("") != "").sum()),
         ]
         for kind, logs in groups(found, "kind")
     }
-    return pd.DataFrame({"how often": [*QUESTIONS, "refused"], **shown})
+    rows = [*QUESTIONS, *EXPLAINED, "refused", "nothing recommended"]
+    return pd.DataFrame({"how often": rows, **shown})
 
 
 def _share(name: str, limit: float | None, found: pd.DataFrame) -> str:
@@ -336,21 +336,3 @@ def _share(name: str, limit: float | None, found: pd.DataFrame) -> str:
         return ""
     ends = share(right[counted].to_numpy(np.bool_))
     return f"{100 * ends.value:.0f} % [{100 * ends.low:.0f}, {100 * ends.high:.0f}]"
-
-
-def beside_rivals(found: pd.DataFrame) -> pd.DataFrame:
-    """Compare with rivals: median share explained, and how often gain and delay are right."""
-    rows = []
-    for kind, logs in groups(found[found["refused"] == ""], "kind"):
-        for rival in RIVALS:
-            near = (logs[f"gain, {rival}"] / logs["gain_true"] - 1.0).abs() <= 0.1
-            delays = logs[f"delay, {rival}"] - logs["delay_true"]
-            within = f"{100 * (delays.abs() <= 1.0).mean():.0f} %"
-            rows.append({
-                "log": kind,
-                "method": rival,
-                "explained, median": f"{100 * np.median(logs[f'explained, {rival}']):.1f} %",
-                "gain within 10 %": f"{100 * near.mean():.0f} %",
-                "delay within one sample": "" if rival == "impulse response" else within,
-            })  # fmt: skip
-    return pd.DataFrame(rows)

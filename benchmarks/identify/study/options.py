@@ -17,6 +17,8 @@ class Options:
     """Number of logs of each kind, each from a plant of its own."""
     plants: Runs | None = None
     """Number of additional random plants on which recommended loops are tried."""
+    faults: Runs | None = None
+    """Number of additional logs of each kind of faulty valve, by a simulator of its own."""
     samples: Runs = 1200
     """Number of rows of a log."""
     seed: Seed = 1

@@ -1,8 +1,9 @@
-"""Compute a loop's stability margins from its frequency response."""
+"""Compute the stability margins of loops from their frequency responses."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,13 +13,13 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from agents import PIController
-from benchmarks.loop.linear import nominal
-from mptc_gym import Parameters
+from benchmarks.loop.linear import LinearModel
 
 Array = NDArray[np.float64]
 
 SLOWEST = 1e-5  # lowest frequency, as a share of the Nyquist frequency
 POINTS = 20_000  # frequencies, of logarithmic and of linear spacing each
+COARSE = 0.003  # lowest frequency of the coarse grid, as a share of the first plant's rate
 
 
 @dataclass(frozen=True)
@@ -44,21 +45,15 @@ class Margins:
 class Loop:
     """The loop of a controller and a plant, (28) without the actuator, opened at the error.
 
-    L is its transfer function from e to y.
-
-    Parameters
-    ----------
-    controller
-        Linear between the limits of the flow, with the transfer function that `transfer` gives.
-    parameters
-        The plant's. A range stands for its middle, and a plant that drifts is taken at k = 0.
+    L is its transfer function from e to y. The controller is taken as linear, with the transfer
+    function that its `transfer` gives.
     """
 
-    def __init__(self, controller: PIController, parameters: Parameters) -> None:
+    def __init__(self, controller: PIController, plant: LinearModel) -> None:
         # G_u from e to u, and G from u to y: L = G_u G, in powers of z^-1.
-        (up, down), (b, a) = controller.transfer(), nominal(parameters).transfer()
+        (up, down), (b, a) = controller.transfer(), plant.transfer()
         self.numerator, self.denominator = np.convolve(up, b), np.convolve(down, a)
-        self._interval = parameters.sampling_interval
+        self._interval = plant.sampling_interval
         nyquist = math.pi / self._interval
         # rad/s, dense enough to see every crossing
         self.frequency = np.union1d(
@@ -77,10 +72,14 @@ class Loop:
         return self.response_at(self.frequency)
 
     @cached_property
+    def largest_pole(self) -> float:
+        """Modulus of the closed loop's largest pole: it is stable if this is below 1."""
+        return float(np.abs(np.roots(polyadd(self.denominator, self.numerator))).max())
+
+    @cached_property
     def margins(self) -> Margins:
         """Margins while no limit and no dead zone is met."""
-        closed = polyadd(self.denominator, self.numerator)
-        if not np.all(np.abs(np.roots(closed)) < 1.0):
+        if self.largest_pole >= 1.0:
             return Margins()
         values = self.response
         at = self.response_at(self._crossings(values.imag)).real
@@ -102,3 +101,32 @@ class Loop:
         share = values[i] / (values[i] - values[i + 1])
         result: Array = self.frequency[i] + share * (self.frequency[i + 1] - self.frequency[i])
         return result
+
+
+def sensitivities(plants: Sequence[LinearModel]) -> Callable[[PIController], Array]:
+    """Return a function from a controller to its Ms with each of many stable plants.
+
+    The grid of frequencies is coarser than that of `Loop`, and set by the first plant. Ms is infinite for an unstable loop:
+    1 + L begins at -90 degrees, because of the integrator, and ends real. By Nyquist's
+    criterion the loop is stable if 1 + L does not encircle 0 and no controller pole is outside
+    the unit circle.
+    """
+    slowest = COARSE * (1.0 - float(np.abs(plants[0].poles).max(initial=0.0)))
+    turns = 8 * (max(plant.delay + len(plant.b) for plant in plants) + 50)
+    at = np.union1d(np.geomspace(slowest, np.pi, 400), np.linspace(np.pi / turns, np.pi, turns))
+    back = np.exp(-1j * at)
+    responses = np.array([
+        signal.freqz(plant.b, plant.a, at)[1] * back ** (plant.delay + 1) for plant in plants
+    ])  # fmt: skip
+
+    def sensitivity(controller: PIController) -> Array:
+        numerator, denominator = controller.transfer()
+        if np.any(np.abs(np.roots(denominator)) > 1.0 + 1e-6):
+            return np.full(len(plants), np.inf)
+        difference = 1.0 + responses * signal.freqz(numerator, denominator, at)[1]
+        steps = np.angle(difference[:, 1:] / difference[:, :-1])
+        start = np.angle(difference[:, 0])
+        stable = (start < 0.0) & (np.abs(start + steps.sum(axis=1)) < 1.0)
+        return np.where(stable, 1.0 / np.abs(difference).min(axis=1), np.inf)
+
+    return sensitivity

@@ -1,0 +1,82 @@
+"""Say why no controller should be tuned on a model."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.identify.armax import Array
+from benchmarks.identify.model import Model
+from benchmarks.identify.plant import settling
+from benchmarks.lib.statistics import ENDS
+
+POOR = 0.5  # least share that a model should explain: of less, noise is the larger part
+# Most that an impulse response may leave less unexplained: as a share of what the model leaves,
+# and of the variance. The impulse response has fewer assumptions and more noise.
+BEHIND, SLACK = 0.5, 0.02
+OUTSIDE = 0.1  # largest share of a step response outside its own band
+LAGS = 40  # largest lag of the autocorrelation, samples
+COLOURED, STRONG = (
+    0.25,
+    0.1,
+)  # share of autocorrelations that may be larger than chance and this
+
+
+def doubts(model: Model) -> list[str]:
+    """Return why no controller should be tuned on a model, a sentence each; none if it may."""
+    share, rival = model.held_out
+    gain, constant = model.estimates["gain"], model.estimates["time_constant"]
+    outside = [name for name, (value, low, high) in model.estimates.items()
+               if not low <= value <= high]  # fmt: skip
+    large = np.mean(np.abs(autocorrelation(model.errors)) > max(STRONG, chance(model.errors)))
+    found = [
+        (bool(model.fault), model.fault and f"{model.fault.what} {model.fault.advice}"),
+        (gain.low < 0.0 < gain.high,
+         "Not even the direction is known in which the temperature answers the flow. Move the "
+         "flow further and hold it longer."),
+        (share < POOR,
+         "The model leaves more than half open: the noise hides the response, or it changes. "
+         "Move the flow further, and look for other inputs (--disturbance)."),
+        (1.0 - rival < (1.0 - BEHIND) * (1.0 - share) - SLACK,
+         "The model explains clearly less than an impulse response does: its form does not fit. "
+         "Make a test with steps that are held until the temperature has settled."),
+        (bool(outside) or not constant.low <= constant.high < np.inf,
+         f"The most likely {' and '.join(outside).replace('_', ' ')} lies outside its own "
+         "interval: the log supports several models that differ. Record a longer log."),
+        (outside_band(model) > OUTSIDE,
+         "The step response of the model leaves its own band: the log supports several models "
+         "that differ. Record a longer log."),
+        (large > COLOURED,
+         f"The prediction errors are far from white ({100 * large:.0f} % of their "
+         "autocorrelations are large): the plant or its disturbances are not of the model's "
+         "form."),
+    ]  # fmt: skip
+    return [str(sentence) for holds, sentence in found if holds]
+
+
+def chance(errors: Array) -> float:
+    """Return what 95 % of the autocorrelations of white noise stay below."""
+    return 1.96 / float(np.sqrt(np.isfinite(errors).sum()))
+
+
+def autocorrelation(errors: Array) -> Array:
+    """Return the autocorrelation of prediction errors at lags 1 to `LAGS`."""
+    known = np.isfinite(errors)
+    centred = np.where(known, errors - np.mean(errors[known]), 0.0)
+    pairs = [np.sum(centred[lag:] * centred[: len(centred) - lag]) for lag in range(LAGS + 1)]
+    return np.array(pairs[1:]) / pairs[0]
+
+
+def band(model: Model, samples: int) -> tuple[Array, Array]:
+    """Return the ends of the step response's 95 % band."""
+    possible = np.array([plant.step_response(samples) for plant in model.possible])
+    low, high = np.quantile(possible, ENDS, axis=0)
+    return low, high
+
+
+def outside_band(model: Model) -> float:
+    """Return the share of the step response that lies outside its own band."""
+    samples = settling(model.plant)
+    response = model.plant.step_response(samples)
+    low, high = band(model, samples)
+    slack = 0.01 * np.max(np.abs(response))
+    return float(np.mean((response < low - slack) | (response > high + slack)))

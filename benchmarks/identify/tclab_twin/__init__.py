@@ -1,1 +1,0 @@
-"""Does it work on someone else's plant? `python -m benchmarks.identify.tclab_twin`."""

@@ -1,0 +1,83 @@
+"""Find out whether something other than a dead zone lies between the command and the flow.
+
+Whatever the valve, the plant behind it is linear. So the flows that faulty valves of several
+kinds and sizes would pass are put in the place of the command, and the likelihoods of the log
+are compared. The fault that explains the log best is the one that is found.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+
+from benchmarks.identify.armax import Array
+from benchmarks.identify.likelihood import Fit, Gap, Likelihood
+from benchmarks.identify.model import Fault
+from benchmarks.identify.simulation import held
+
+# Sizes that are tried, as shares of the range of the flow: smaller ones do no harm, and larger
+# ones leave too little of the log.
+WIDTHS = np.geomspace(0.08, 0.6, 16)
+CENTRES, ZONES = (-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (0.05, 0.1, 0.15, 0.2, 0.25)
+RATIOS = (0.5, 0.625, 0.8, 1.25, 1.6, 2.0)  # of the gain above the operating point and below
+# Least gain in twice the log likelihood: by chance, the best of so many faults gains up to five.
+EVIDENT = 12.0
+
+
+def valve_fault(likelihood: Likelihood, best: Fit) -> Fault | None:
+    """Return the fault that explains a log clearly better than a valve without one."""
+    gaps = dict.fromkeys([Gap(0.0, 0.0), best.place.gap])
+    found, least = None, best.place.deviance - EVIDENT
+    for fault in _faults(likelihood):
+        with_gaps = [
+            np.where(np.abs(fault.passed) <= gap.low, 0.0, fault.passed) for gap in gaps
+        ]
+        deviance = likelihood.of_flows(with_gaps, best)
+        if deviance < least:
+            found, least = fault, deviance
+    return found
+
+
+def _faults(likelihood: Likelihood) -> Iterator[Fault]:
+    """Yield faults of all kinds and sizes."""
+    flow, unit = held(likelihood.command), likelihood.log.flow_unit
+    span, rest = float(np.ptp(flow)), likelihood.operating_flow
+    repair = (
+        "Have the valve or its positioner repaired; to see more, move the flow up and down in "
+        "small steps, twice in each direction."
+    )
+    for width, passed in zip(span * WIDTHS, _backlash(flow, span * WIDTHS), strict=True):
+        what = f"The flow depends on the direction of the last move: backlash of {width:.2g}"
+        yield Fault(f"{what} {unit} explains the log better.", repair, passed)
+    for width, passed in zip(span * WIDTHS, _stiction(flow, span * WIDTHS / 2.0), strict=True):
+        what = f"The valve seems to stick: stiction of ±{width / 2.0:.2g}"
+        yield Fault(f"{what} {unit} explains the log better.", repair, passed)
+    for ratio in RATIOS:
+        what = f"The gain above {rest:g} {unit} is {ratio:.2g} times that below"
+        advice = "Identify both sides from logs of their own."
+        above, below = min(ratio, 1.0), min(1.0 / ratio, 1.0)  # so that the gain is the larger
+        yield Fault(f"{what}, roughly.", advice, np.where(flow > 0.0, above, below) * flow)
+    for centre, zone in itertools.product(span * np.array(CENTRES), span * np.array(ZONES)):
+        within = np.abs(flow - centre) < zone
+        what = f"There is a dead zone around {rest + centre:.4g} {unit}, not around {rest:g}"
+        advice = f"If that is the operating point, say --operating-flow {rest + centre:.4g}."
+        for inside in (0.0, centre):
+            yield Fault(f"{what} {unit}.", advice, np.where(within, inside, flow))
+
+
+def _backlash(flow: Array, widths: Array) -> Array:
+    """Return the flow past a backlash of each width, shape (widths, rows)."""
+    passed, at = np.empty((len(widths), len(flow))), flow[0] + 0.0 * widths
+    for k, u in enumerate(flow):
+        at = passed[:, k] = np.clip(at, u - widths / 2.0, u + widths / 2.0)
+    return passed
+
+
+def _stiction(flow: Array, least: Array) -> Array:
+    """Return the flow of a valve that does not make a move of less than each of some steps."""
+    passed, at = np.empty((len(least), len(flow))), flow[0] + 0.0 * least
+    for k, u in enumerate(flow):
+        at = passed[:, k] = np.where(np.abs(u - at) > least, u, at)
+    return passed
