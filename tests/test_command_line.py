@@ -22,7 +22,7 @@ COMMANDS = sorted(
 )
 HEAVY = {
     "joblib", "matplotlib", "optuna", "pandas", "pygame", "ray", "scipy", "stable_baselines3",
-    "tclab", "torch",
+    "torch",
 }  # fmt: skip
 
 
@@ -143,7 +143,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_run_or_written(
         ("claims", "cyclopts", "compare"), ("compare", "pandas", "compare"),
         ("datasets", "minari", "data"), ("watch", "pygame", "render"),
         ("train nn-smith", "torch", "torch"), ("tune pi", "optuna", "bench"),
-        ("identify.tclab_twin", "tclab", "test"), ("speed", "torch", "torch"),
+        ("speed", "torch", "torch"),
         ("claims --backend ray", "ray", "ray"),
         ("compare --agent mine=benchmarks.train.through_plant:train", "torch", "torch"),
     ],

@@ -9,7 +9,8 @@ from scipy import signal
 
 from agents import PIController, SmithPredictor
 from agents.pi import SEARCHED_GAINS
-from benchmarks.loop.margins import Loop
+from benchmarks.loop.linear import nominal
+from benchmarks.loop.margins import Loop, sensitivities
 from mptc_gym import Parameters
 
 STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of the paper's plant
@@ -36,7 +37,7 @@ def controllers():
 def test_agreement_with_python_control(plant, name):
     parameters = Parameters(**PLANTS[plant])
     controller = controllers()[name]
-    loop = Loop(controller, parameters)
+    loop = Loop(controller, nominal(parameters))
     found, interval = loop.margins, parameters.sampling_interval
     size = max(len(loop.numerator), len(loop.denominator))
     system = control.tf(
@@ -80,5 +81,16 @@ def test_other_direction_has_the_same_margins():
     shown = {**STEP_TEST, "gain": -STEP_TEST["gain"]}
     for make in (PIController.simc, SmithPredictor):
         more = {"closed_loop_time_constant": 80.0}
-        ours = Loop(make(**STEP_TEST, **more), Parameters()).margins
-        assert Loop(make(**shown, **more), mirrored).margins == ours
+        ours = Loop(make(**STEP_TEST, **more), nominal(Parameters())).margins
+        assert Loop(make(**shown, **more), nominal(mirrored)).margins == ours
+
+
+def test_coarse_grid_finds_the_same_sensitivities():
+    plants = [nominal(Parameters(**plant)) for plant in PLANTS.values()]
+    peaks = sensitivities(plants)
+    for controller in controllers().values():
+        for plant, peak in zip(plants, peaks(controller), strict=True):
+            margins = Loop(controller, plant).margins
+            assert np.isinf(peak) == (not margins.stable)
+            if margins.stable:
+                assert peak == pytest.approx(margins.sensitivity, rel=0.01)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from copy import copy
 from dataclasses import replace
 
@@ -27,6 +28,9 @@ LONG = 3  # coefficients of B beyond which the response may have any shape
 WORTH_A_FIT = 7  # orders that are fitted: the best with a common C
 WORTH_A_TRIAL = 4  # fits that are tried on the last part: the best
 WORSE = 1.2  # multiple of the least unexplained share beyond which orders are dropped
+BORNE_OUT = 0.95  # most that a fault of the valve may leave unexplained, as a share
+FAR = 1.5  # multiple of what an impulse response leaves unexplained that is far behind it
+CLOSE = 25.0  # difference of the Bayesian criterion beyond which orders are improbable, e^-12
 WEAK = 100.0  # gain in twice the log likelihood below which the columns may be swapped
 CHANCE = 0.01  # probability that a flow without effect is accepted
 HELPFUL = 0.05  # share of the variance from which on another column is worth a mention
@@ -54,13 +58,14 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
     likelihood = Likelihood(log, knowledge)
     fits = _fits(likelihood)
     _check_answer(likelihood, fits[0])
-    tried = _tried(likelihood, fits)
+    rival = _of_impulse_response(likelihood)
+    tried = _tried(likelihood, fits, rival)
     fault = valve_fault(likelihood, fits[0])
     if fault:
         passed = replace(log, flow=fault.passed + likelihood.operating_flow)
         other = Likelihood(passed, replace(knowledge, operating_flow=likelihood.operating_flow))
-        with_fault = _tried(other, _fits(other))
-        if max(with_fault.values()) > max(tried.values()):
+        with_fault = _tried(other, _fits(other), rival)
+        if 1.0 - max(with_fault.values()) < BORNE_OUT * (1.0 - max(tried.values())):
             log, likelihood, tried = passed, other, with_fault
         else:  # the last part of the log does not bear it out
             fault = None
@@ -79,7 +84,8 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
         u_min=likelihood.u_min, u_max=likelihood.u_max,
         operating_flow=likelihood.operating_flow, operating_temperature=level,
         orders=chosen.orders, errors=likelihood.errors(chosen, bridged=False),
-        held_out=HeldOut(share, _of_impulse_response(likelihood)), log=log, simulated=level + simulated, fault=fault,
+        held_out=HeldOut(share, rival),
+        log=log, simulated=level + simulated, fault=fault,
     )  # fmt: skip
     return replace(model, warnings=doubts(model), notes=_notes(model, likelihood))
 
@@ -135,15 +141,29 @@ def _from_impulse_response(likelihood: Likelihood, best: Fit) -> list[Fit]:
     return found
 
 
-def _tried(likelihood: Likelihood, fits: list[Fit]) -> dict[Fit, float]:
-    """Return the fits that simulate the last part well, and the shares explained there."""
+def _tried(likelihood: Likelihood, fits: list[Fit], rival: float) -> dict[Fit, float]:
+    """Return the fits that simulate the last part well, and the shares explained there.
+
+    `rival` is the share that an impulse response explains. If it is far larger, the fits that
+    start from an impulse response are tried, however likely they are.
+    """
     last, start = likelihood.last, likelihood.first()
     mild = likelihood.ranked(fits, mild=True)
     long = [fit for fit in fits if fit.orders.b > LONG]
-    shares, others = {}, _from_impulse_response(likelihood, fits[0])
-    for fit in dict.fromkeys([*fits[:WORTH_A_TRIAL], *mild[:2], *long[:1], *others]):
-        simulated = start.simulated(start.fit(fit.place, fit.orders, fit.c))
-        shares[fit] = explained(likelihood.output, simulated, last)
+    shares: dict[Fit, float] = {}
+
+    def simulate(tried: Iterable[Fit]) -> None:
+        for fit in tried:
+            simulated = start.simulated(start.fit(fit.place, fit.orders, fit.c))
+            shares[fit] = explained(likelihood.output, simulated, last)
+
+    simulate(dict.fromkeys([*fits[:WORTH_A_TRIAL], *mild[:2], *long[:1]]))
+    far_behind = 1.0 - max(shares.values()) > FAR * (1.0 - rival)
+    least = likelihood.criterion(fits[0].orders, fits[0].place.deviance)
+    simulate(
+        fit for fit in _from_impulse_response(likelihood, fits[0])
+        if far_behind or likelihood.criterion(fit.orders, fit.place.deviance) < least + CLOSE
+    )  # fmt: skip
     # The share that the best simulation leaves unexplained, with a margin for the noise.
     left = 1.0 - max(shares.values())
     most = max(WORSE * left, left + 0.005)
@@ -207,9 +227,7 @@ def _notes(model: Model, likelihood: Likelihood) -> list[str]:
     """Return remarks for the user about the log and the fit."""
     longest, log = likelihood.knowledge.longest_delay, model.log
     walk = model.noise["disturbance_walk_variance"]
-    short = (
-        SLOW * model.estimates["time_constant"].value > len(log.flow) * log.sampling_interval
-    )
+    constants = len(log.flow) * log.sampling_interval / model.estimates["time_constant"].value
     notes = [
         (model.estimates["delay"].high >= longest - 1,
          f"The delay may be as long as was looked for, {longest} samples: try a longer "
@@ -218,7 +236,7 @@ def _notes(model: Model, likelihood: Likelihood) -> list[str]:
          f"The base line wanders by {np.sqrt(walk):.2g} {log.temperature_unit} a sample, as a "
          "random walk: `disturbance_walk_variance`. What the plant settles at is known less "
          "well."),
-        (short,
+        (constants < SLOW,
          f"The log holds less than {SLOW:g} time constants of the plant. Its gain rests on "
          "how the response goes on, which no one has seen."),
     ]  # fmt: skip

@@ -37,7 +37,7 @@ def doubts(model: Model) -> list[str]:
          "The model leaves more than half open: the noise hides the response, or it changes. "
          "Move the flow further, and look for other inputs (--disturbance)."),
         (1.0 - rival < (1.0 - BEHIND) * (1.0 - share) - SLACK,
-         "The model explains clearly less than an impulse response does: its form does not fit. "
+         "The model explains clearly less than an impulse response: its form does not fit. "
          "Make a test with steps that are held until the temperature has settled."),
         (bool(outside) or not constant.low <= constant.high < np.inf,
          f"The most likely {' and '.join(outside).replace('_', ' ')} lies outside its own "
@@ -62,8 +62,8 @@ def autocorrelation(errors: Array) -> Array:
     """Return the autocorrelation of prediction errors at lags 1 to `LAGS`."""
     known = np.isfinite(errors)
     centred = np.where(known, errors - np.mean(errors[known]), 0.0)
-    pairs = [np.sum(centred[lag:] * centred[: len(centred) - lag]) for lag in range(LAGS + 1)]
-    return np.array(pairs[1:]) / pairs[0]
+    whole: Array = np.correlate(centred, centred, "full")[len(centred) - 1 :]
+    return whole[1 : LAGS + 1] / max(whole[0], 1e-300)
 
 
 def band(model: Model, samples: int) -> tuple[Array, Array]:

@@ -77,21 +77,18 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = 20_000) -> 
     if len(kept) > rows:
         notes.append(f"Of the {len(kept):,} rows, the last {rows:,} are used (--rows).")
         kept = kept[-rows:]
-    units = {
-        "flow_unit": columns.flow_unit or _unit(flow) or "t/h",
-        "temperature_unit": columns.temperature_unit or _unit(temperature) or "°C",
-    }
     log = Log(
         _held(kept[flow]),
         kept[temperature].to_numpy(),
         float(interval or 1.0),
         disturbances={name: _held(kept[name]) for name in disturbances},
         others={str(name): _held(kept[name]) for name in others},
-        **units,
+        flow_unit=columns.flow_unit or _unit(flow) or "t/h",
+        temperature_unit=columns.temperature_unit or _unit(temperature) or "°C",
     )
     notes.insert(0, (
-        f"Read {len(table):,} rows: the flow from {flow!r}, {units['flow_unit']}; the "
-        f"temperature from {temperature!r}, {units['temperature_unit']}; a row every "
+        f"Read {len(table):,} rows: the flow from {flow!r}, {log.flow_unit}; the "
+        f"temperature from {temperature!r}, {log.temperature_unit}; a row every "
         f"{log.sampling_interval:g} s."
     ))  # fmt: skip
     missing = _missing({"flow": log.flow, "temperature": log.temperature, **log.disturbances})
@@ -139,8 +136,8 @@ def _find(table: pd.DataFrame, option: str, name: str) -> str:
     if len(alike) != 1:
         what = "no column" if not alike else "several columns"
         raise ValueError(
-            f"the log has {what} {name!r}; it has {', '.join(map(repr, names))}. Name the right "
-            f"one with --{option}"
+            f"the log has {what} {name!r}; it has {', '.join(map(repr, names))}. Name the "
+            f"right one with --{option}"
             + (
                 ", or give --sampling-interval if there are no times"
                 if option == "time"
@@ -183,7 +180,7 @@ def _times(column: pd.Series[Any], decimal: str, unit: str | None) -> tuple[Arra
                 dates = pd.to_datetime(column, errors="coerce", dayfirst=True, utc=True)
         if dates.notna().all():
             seconds = (dates - dates.iloc[0]) / pd.Timedelta(seconds=1)
-            return seconds.to_numpy(np.float64), "dates"
+            return np.asarray(seconds, np.float64), "dates"
     unit = unit or _unit(str(column.name)) or "s"
     try:
         factor = pd.Timedelta(1, unit=unit).total_seconds()  # type: ignore[arg-type]

@@ -122,7 +122,8 @@ def _weights(likelihood: Likelihood, entries: list[Entry], *, mild: bool) -> Arr
     ])  # fmt: skip
     power = TEMPER if mild else 1.0
     weights: Array = prior * np.exp(power * (criteria.min() - criteria) / 2.0)
-    return weights / weights.sum()
+    weights /= weights.sum()
+    return weights
 
 
 def _choose(
@@ -170,8 +171,8 @@ def _draw(likelihood: Likelihood, entries: list[Entry], weights: Array) -> list[
     if len(stable) <= len(draws) / 2:
         raise CannotTellError(
             "the log does not show where the temperature settles: most of the plants that it "
-            "leaves possible are integrating or unstable. Hold the flow longer, and see whether "
-            "the temperature drifts"
+            "leaves possible are integrating or unstable. Hold the flow longer, and see "
+            "whether the temperature drifts"
         )
     return stable
 

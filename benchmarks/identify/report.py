@@ -120,8 +120,8 @@ def _found(model: Model, found: list[Recommended]) -> Section:
         f"{', with a random walk' if orders.walk else ''}. Brackets are 95 % intervals. The "
         "noise variance is that of all noise together; `plant.json` splits it.",
         *(
-            f"{name} is a known disturbance with a gain of {each.gain:.4g} {temperature} a unit "
-            f"and a delay of {each.delay} samples. `plant.json` does not have it."
+            f"{name} is a known disturbance with a gain of {each.gain:.4g} {temperature} a "
+            f"unit and a delay of {each.delay} samples. `plant.json` does not have it."
             for name, each in model.known.items()
         ),
     ]
@@ -132,20 +132,20 @@ def _found(model: Model, found: list[Recommended]) -> Section:
 def _controllers(model: Model, found: list[Recommended], out: Path) -> Section:
     flow, temperature = model.log.flow_unit, model.log.temperature_unit
     text = [
-        f"u = Kp ((r - y) + (1 / Ti) ∫ (r - y) dt), where u is the flow, {flow}, r the set point "
-        f"and y the temperature, {temperature}, all from the operating point. Reverse acting: "
-        "the flow falls when the temperature rises; direct acting: it rises.",
+        f"u = Kp ((r - y) + (1 / Ti) ∫ (r - y) dt), where u is the flow, {flow}, r the set "
+        f"point and y the temperature, {temperature}, all from the operating point. Reverse "
+        "acting: the flow falls when the temperature rises; direct acting: it rises.",
         *(
-            f"{LABELS[each.name]} is de-tuned: its closed loop is {each.slowed:.2g} times slower "
-            "than by the rule, for Ms to be at most 2 with 95 % of the plants that the log "
-            "leaves possible."
+            f"{LABELS[each.name]} is de-tuned: its closed loop is {each.slowed:.2g} times "
+            "slower than by the rule, for Ms to be at most 2 with 95 % of the plants that the "
+            "log leaves possible."
             for each in found if each.slowed > 1.0
         ),
-        "By rule, SIMC's PI has its closed-loop time constant at the delay, the Smith predictor "
-        "at half the plant's time constant. The margins are those of the loop while no limit "
-        "and no dead zone is met: by which factor the gain may rise, and by how much phase and "
-        "delay may shift, before it is unstable. Ms is the most that the loop amplifies a "
-        "disturbance; the last column has what 95 % of the possible plants stay below.",
+        "By rule, SIMC's PI has its closed-loop time constant at the delay, Smith's predictor "
+        "at half the plant's. The margins hold while no limit and no dead zone is met: by what "
+        "factor the gain may rise, and by how much phase and delay may shift, until the loop "
+        "is unstable. Ms is the most that the loop amplifies a disturbance; the last column "
+        "has what 95 % of the possible plants stay below.",
     ]  # fmt: skip
     rows = []
     for each in found:
@@ -176,7 +176,7 @@ def _on_the_plant(model: Model, found: list[Recommended]) -> Section:
             "controller": LABELS[each.name],
             f"mean |e| ({temperature})": f"{each.error:.4g}",
             "of the least possible": (
-                f"{Estimate(*(end / least for end in each.error[:3]), runs):.2f}" if least else ""
+                f"{each.error.scaled(1.0 / least):.2f}" if least else ""
             ),
             f"valve travel ({flow})": f"{each.travel:.0f}",
         }

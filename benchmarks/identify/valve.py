@@ -22,7 +22,7 @@ from benchmarks.identify.simulation import held
 WIDTHS = np.geomspace(0.08, 0.6, 16)
 CENTRES, ZONES = (-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (0.05, 0.1, 0.15, 0.2, 0.25)
 RATIOS = (0.5, 0.625, 0.8, 1.25, 1.6, 2.0)  # of the gain above the operating point and below
-# Least gain in twice the log likelihood: by chance, the best of so many faults gains up to five.
+# Least gain in twice the log likelihood: by chance, the best of so many gains up to five.
 EVIDENT = 12.0
 
 

@@ -20,7 +20,6 @@ EXTRAS = {
     "data": "h5py minari",
     "bench": "optuna PIL stable_baselines3",
     "ray": "ray",
-    "test": "tclab",
     "torch": "torch",
 }
 

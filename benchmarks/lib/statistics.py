@@ -25,6 +25,10 @@ class Estimate:
     high: float
     runs: int
 
+    def scaled(self, factor: float) -> Estimate:
+        """Return the estimate of a positive multiple."""
+        return Estimate(factor * self.value, factor * self.low, factor * self.high, self.runs)
+
     def __format__(self, form: str) -> str:
         """Return `value (low to high)`; the value alone if nothing was random.
 

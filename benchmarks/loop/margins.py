@@ -106,10 +106,10 @@ class Loop:
 def sensitivities(plants: Sequence[LinearModel]) -> Callable[[PIController], Array]:
     """Return a function from a controller to its Ms with each of many stable plants.
 
-    The grid of frequencies is coarser than that of `Loop`, and set by the first plant. Ms is infinite for an unstable loop:
-    1 + L begins at -90 degrees, because of the integrator, and ends real. By Nyquist's
-    criterion the loop is stable if 1 + L does not encircle 0 and no controller pole is outside
-    the unit circle.
+    The grid of frequencies is coarser than that of `Loop`, and set by the first plant. Ms is
+    infinite for an unstable loop: 1 + L begins at -90 degrees, because of the integrator, and
+    ends real. By Nyquist's criterion the loop is stable if 1 + L does not encircle 0 and no
+    controller pole is outside the unit circle.
     """
     slowest = COARSE * (1.0 - float(np.abs(plants[0].poles).max(initial=0.0)))
     turns = 8 * (max(plant.delay + len(plant.b) for plant in plants) + 50)

@@ -133,8 +133,8 @@ def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict
     -------
     dict
         `kind`, the plant, `seconds` of processor time, and `refused`, the reason if the log is
-        refused. If it is not, also its `warnings`, the true value, estimate and interval of each
-        quantity, by `PARTS`, and the shares explained.
+        refused. If it is not, also its `warnings`, the true value, estimate and interval of
+        each quantity, by `PARTS`, and the shares explained.
     """
     true = nominal(Parameters(**plant))
     truths = {
@@ -233,7 +233,7 @@ def counted(found: list[dict[str, Any]], what: str) -> str:
 
 
 def table_of_faults(found: list[dict[str, Any]]) -> pd.DataFrame:
-    """Return by kind of valve how many logs are refused, and the Ms of the recommended loops."""
+    """Return how many logs of each kind are refused, and the Ms of the recommended loops."""
     rows = []
     for kind, logs in groups(pd.DataFrame(found), "kind"):
         peaks = np.concatenate(logs["peaks"].to_list())
