@@ -90,8 +90,6 @@ REFUSED = {
     ],
     "identify": [
         (["none.csv"], "none.csv cannot be read: No such file"),
-        ([LOG, "--orders", "0", "1", "0"], "--orders: A and B must have at least 1"),
-        ([LOG, "--orders", "2", "0", "2"], "--orders: A and B must have at least 1"),
         ([LOG, "--u-min", "nan"], 'value "nan" for --u-min. Must be < inf'),
         ([LOG, "--u-max", "full"], '--u-max: unable to convert "full" into float'),
         ([LOG, "--operating-flow", "inf"], 'value "inf" for --operating-flow. Must be < inf'),

@@ -63,7 +63,8 @@ def autocorrelation(errors: Array) -> Array:
     known = np.isfinite(errors)
     centred = np.where(known, errors - np.mean(errors[known]), 0.0)
     whole: Array = np.correlate(centred, centred, "full")[len(centred) - 1 :]
-    return whole[1 : LAGS + 1] / max(whole[0], 1e-300)
+    lags: Array = whole[1 : LAGS + 1] / max(whole[0], 1e-300)
+    return lags
 
 
 def band(model: Model, samples: int) -> tuple[Array, Array]:

@@ -79,7 +79,6 @@ def choice(names: Collection[str], text: str) -> Parameter:
 Count = Annotated[int, integer(1, 1_000_000_000)]
 Runs = Annotated[int, integer(1, 100_000)]
 Seed = Annotated[int, integer(0, 2**63)]
-Orders = Annotated[tuple[int, int, int], integer(0, 1000, many=3)]
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 Positive = Annotated[float, Parameter(validator=Number(gt=0.0, lt=math.inf))]
 Names = Annotated[tuple[str, ...], Parameter(converter=_latest, consume_multiple=True)]
