@@ -18,9 +18,7 @@ def applied_flow(command: Any, dead_zone: Any, u_min: Any, u_max: Any) -> Array:
     return np.where(np.abs(command) < dead_zone, 0.0, np.clip(command, u_min, u_max))
 
 
-def float32_action(
-    command: Any, u_min: Any, u_max: Any, dead_zone: Any = 0.0
-) -> NDArray[np.float32]:
+def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
     """Scale commands (t/h) to normalised float32 actions: -1 at `u_min` and 1 at `u_max`.
 
     Rounding can move a command from the edge of the dead zone to its inside, where it has no
