@@ -166,8 +166,8 @@ def test_your_hands_are_on_the_valve(window, quick_bound, capsys):
     assert mine.split()[1:] == [f"{np.mean(errors):.3f}", f"{travel:.0f}"]
     # Beside the controllers, on the same plant, and the bound.
     errors = np.abs(run_closed(MiddlePointEnv(), PIController(), SAMPLES)["error"][1:])
-    pi = next(line for line in shown.splitlines() if line.split()[:1] == ["PI"])
-    assert pi.split()[1] == f"{np.mean(errors):.3f}"
+    (pi,) = (line for line in shown.splitlines() if "PI (1992)" in line)
+    assert pi.split()[2] == f"{np.mean(errors):.3f}"
     assert "0.123" in shown
     assert "you on square wave" in shown
     assert "setpoint" not in quick_bound.call_args.kwargs
