@@ -132,8 +132,9 @@ def _found(model: Model, found: list[Recommended]) -> Section:
 def _controllers(model: Model, found: list[Recommended], out: Path) -> Section:
     flow, temperature = model.log.flow_unit, model.log.temperature_unit
     text = [
-        f"u = Kp ((r - y) + (1 / Ti) ∫ (r - y) dt), where u is the flow, {flow}, r the set "
-        f"point and y the temperature, {temperature}, all from the operating point. Reverse "
+        "u is Kp times the sum of r - y and its integral over time divided by Ti, where u is "
+        f"the flow, {flow}, r the set point and y the temperature, {temperature}, all from "
+        "the operating point. Reverse "
         "acting: the flow falls when the temperature rises; direct acting: it rises.",
         *(
             f"{LABELS[each.name]} is de-tuned: its closed loop is {each.slowed:.2g} times "
