@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import cache, partial
@@ -24,6 +25,7 @@ from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.policies import check_fit, start, training_of
 from mptc_gym.presets import IDS, PRESETS
+from mptc_gym.rollout import Step, rollout
 from mptc_gym.training import WINDOWS, entry_point, make_one, wrappers_of
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
@@ -327,57 +329,38 @@ def _run(
     Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each episode.
     """
     n = len(seeds)
+    error, travel, rest = np.zeros(n), np.zeros(n), np.zeros((n, 1))
     with ExitStack() as stack:
         plants = stack.enter_context(closing(batch(n)))
-        model = stack.enter_context(closing(native(n))) if native else None
-        act, rest = start(policy, n), np.zeros((n, 1))
-        observations, infos = plants.reset(seed=seeds[0])
-        if model:
-            _check_episodes(infos, model.reset(seed=seeds[0])[1], 0)
-        error, travel, before = np.zeros(n), np.zeros(n), np.zeros(n)
-        for k in range(1, samples + 1):
-            actions = _checked(act(observations), plants.action_space.shape, k - 1)
-            observations, _, terminated, truncated, infos = plants.step(actions)
-            if model:
-                _check_episodes(infos, model.step(rest)[-1], k)
-            error += np.abs(infos["error"])
-            travel += np.abs(infos["applied"] - before)
-            before = infos["applied"]
-            if k < samples and (terminated | truncated).any():
+        steps: Iterable[Step] = rollout(plants, start(policy, n), samples, seeds[0])
+        if native:
+            expected = stack.enter_context(closing(native(n)))
+            theirs = rollout(expected, lambda seen: rest, samples, seeds[0])
+            steps = map(_same_episodes, steps, theirs, itertools.count(1))
+        for k, (before, after, ended) in enumerate(steps, 1):
+            error += np.abs(after["error"])
+            travel += np.abs(after["applied"] - before["applied"])
+            if k < samples and ended.any():
                 raise ValueError(f"env must run episodes of {samples} samples, got {k}")
     return error / samples, travel
 
 
-def _check_episodes(infos: dict[str, Any], expected: dict[str, Any], k: int) -> None:
-    """Refuse episodes whose set points, noise, loads or drawn numbers are not those expected.
+def _same_episodes(own: Step, other: Step, k: int) -> Step:
+    """Return a step to sample k if its set points, noise, loads and plants are the other's.
 
     None of these depends on the actions.
     """
-    for name in expected:
-        if name.startswith("_") or name in ("output", "error", "command", "applied"):
-            continue
-        own, other = infos.get(name), expected[name]
-        if own is None or not np.array_equal(own, other):
-            raise ValueError(
-                f"env must run the episodes of its seeds, whose {name} at sample {k} is "
-                f"{other[:3]} ..., got {None if own is None else own[:3]} ...: it must neither "
-                "reset with another seed, nor skip or repeat samples, nor change info"
-            )
-
-
-def _checked(actions: Any, shape: Any, k: int) -> NDArray[Any]:
-    """Return a policy's actions at sample k as an array, if the environments can take them."""
-    try:
-        checked = np.asarray(actions)
-        finite = np.isfinite(checked)
-    except (TypeError, ValueError, RuntimeError) as error:  # the last: from tensors
-        hint = "its first element" if isinstance(actions, tuple) else f"an array ({error})"
-        raise ValueError(
-            f"policy must return an array of numbers, got {shorten(actions)}: return {hint}"
-        ) from error
-    if checked.shape != shape:
-        raise ValueError(f"policy must return actions of shape {shape}, got {checked.shape}")
-    if not finite.all():
-        wrong = checked[~finite][0]
-        raise ValueError(f"policy must return finite actions, got {wrong} at sample {k}")
-    return checked
+    pairs = [(own.after, other.after)]
+    if k == 1:
+        pairs.append((own.before, other.before))
+    for infos, expected in pairs:
+        for name in expected:
+            if name.startswith("_") or name in ("output", "error", "command", "applied"):
+                continue
+            if not np.array_equal(infos.get(name, ()), expected[name]):
+                raise ValueError(
+                    f"env must run the episodes of its seeds, whose {name} by sample {k} is "
+                    f"{shorten(expected[name])}, got {shorten(infos.get(name))}: it must not "
+                    "reset with another seed, skip or repeat samples, or change info"
+                )
+    return own

@@ -483,17 +483,17 @@ class TestEpisodes:
     @pytest.mark.parametrize(
         ("make", "message"),
         [
-            (lambda: Reseeded(made()), "episodes of its seeds, whose noise at sample 1"),
+            (lambda: Reseeded(made()), "episodes of its seeds, whose noise by sample 1"),
             (
                 lambda: Reseeded(made(noise_variance=0.0, delay=[3, 9])),
-                "whose delay at sample 0",
+                "whose delay by sample 1",
             ),
-            (lambda: Skipping(made()), "whose noise at sample 1 is"),
+            (lambda: Skipping(made()), "whose noise by sample 1 is"),
             (
                 lambda: TimeLimit(
                     Skipping(gymnasium.make("MiddlePoint-v0", max_episode_steps=4800)), 1200
                 ),
-                "whose setpoint at sample 75 is",
+                "whose setpoint by sample 75 is",
             ),
             (
                 lambda: Ends(gymnasium.make("MiddlePoint-v0", max_episode_steps=60)),

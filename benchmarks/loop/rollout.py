@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol
@@ -14,6 +15,7 @@ from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import action_from_command
 from mptc_gym.ranges import Ranges
+from mptc_gym.rollout import rollout as run_batch
 
 Array = NDArray[np.float64]
 
@@ -110,21 +112,19 @@ def rollout(
     shape = samples, plants.num_envs
     trajectory = Trajectory(*(np.empty(shape) for _ in fields(Trajectory)))
     agent.reset()
-    observation, info = plants.reset(seed=seed)
-    for k in range(samples):
-        trajectory.setpoint[k] = info["setpoint"]
-        trajectory.output[k] = info["output"]
-        trajectory.noise[k] = info["noise"]
+    clock = itertools.count()
+
+    def act(observations: Any) -> Any:
         if before is not None:
-            before(k)
-        actions = np.asarray(agent.act(observation))
-        if actions.shape != (plants.num_envs, 1):
-            raise ValueError(
-                f"act must return actions of shape {(plants.num_envs, 1)}, got {actions.shape}"
-            )
-        observation, _, _, _, info = plants.step(actions)
+            before(next(clock))
+        return agent.act(observations)
+
+    for k, (at, after, _) in enumerate(run_batch(plants, act, samples, seed)):
+        trajectory.setpoint[k] = at["setpoint"]
+        trajectory.output[k] = at["output"]
+        trajectory.noise[k] = at["noise"]
         # A step reports the command and the applied input of the sample that it starts at.
-        trajectory.command[k] = info["command"]
-        trajectory.applied[k] = info["applied"]
-        trajectory.error[k] = info["error"]
+        trajectory.command[k] = after["command"]
+        trajectory.applied[k] = after["applied"]
+        trajectory.error[k] = after["error"]
     return trajectory
