@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import difflib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.lib.commands import sentence
+from benchmarks.lib.command import stop
 
-MAP = Path(__file__).with_name("README.md")
+FOLDER = Path(__file__).parent
+COMMANDS = sorted(
+    ".".join(path.parent.relative_to(FOLDER).parts) for path in FOLDER.glob("*/**/__main__.py")
+)
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table of questions from README.md in this folder."""
+    for name in sys.argv[1:] if arguments is None else arguments:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        meant = f"did you mean benchmarks.{close[0]}?" if close else "none is like it"
+        stop(ValueError(f"no command {name!r}; {meant}"))
     try:
         from rich.console import Console
         from rich.markdown import Markdown
     except ImportError as error:
-        print(f"python -m benchmarks: error: {sentence(error)}", file=sys.stderr)
-        return 2
-    page = MAP.read_text(encoding="utf-8")
+        stop(error)
+    page = FOLDER.joinpath("README.md").read_text(encoding="utf-8")
     table = "\n".join(line for line in page.splitlines() if line.startswith("|"))
     console = Console(width=None if sys.stdout.isatty() else 150, highlight=False)
     console.print(Markdown(table), "Each command has --help.")

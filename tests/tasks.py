@@ -23,25 +23,14 @@ def draw(seed: int, calls: Path | None = None, seconds: float = 0.0) -> Rows:
     return [{"seed": seed, "sum": float(product.sum())}]
 
 
-def die_once(seed: int, flag: Path, calls: Path | None = None) -> Rows:
-    """Kill the own process, but not a second time."""
-    if not flag.exists():
-        flag.touch()
-        # The result before is on its way: it would be lost with the worker that sends it.
-        time.sleep(1.0)
-        os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # as Windows has it
-    return draw(seed, calls)
-
-
 def die(seed: int) -> Rows:
     """Kill the own process, each time."""
     os._exit(seed + 1)
 
 
-def hold(pipe: str, seconds: float) -> None:
-    """Write to a pipe, and keep it open as long as the process lives."""
-    os.write(os.open(pipe, os.O_WRONLY), b"x")
-    time.sleep(seconds)
+def die_of_memory(seed: int) -> None:
+    """Kill the own process as the system does if memory runs out."""
+    os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # as Windows has it
 
 
 def until(condition: Callable[[], object], seconds: float = 30.0) -> bool:

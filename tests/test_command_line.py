@@ -12,8 +12,8 @@ import pytest
 pytest.importorskip("cyclopts", reason="the commands need the extra compare")
 
 from benchmarks.__main__ import main as show_map
-from benchmarks.compare.options import Options
-from benchmarks.lib.options import read
+from benchmarks.compare.__main__ import Options
+from benchmarks.lib.command import read
 from tests.conftest import ROOT, python
 
 COMMANDS = sorted(
@@ -159,7 +159,7 @@ def test_a_missing_package_is_named_with_its_extra(given, package, extra):
 
 
 def test_the_map_shows_questions_and_commands_as_text(capsys):
-    assert show_map() == 0
+    assert show_map([]) == 0
     shown = capsys.readouterr().out
     assert "Which gains are best?" in shown
     assert {name for name in COMMANDS if f"benchmarks.{name} " in shown} >= {"tune", "bounds"}
@@ -167,10 +167,14 @@ def test_the_map_shows_questions_and_commands_as_text(capsys):
     assert "](" not in shown
 
 
-def test_the_map_names_a_missing_package(monkeypatch, capsys):
+def test_the_map_names_a_missing_package_and_the_command_that_was_meant(monkeypatch, refused):
+    assert "no command 'comprae'; did you mean benchmarks.compare?" in refused(
+        show_map, ["comprae"]
+    )
     monkeypatch.setitem(sys.modules, "rich.markdown", None)
-    assert show_map() == 2
-    assert capsys.readouterr().err.startswith("python -m benchmarks: error: rich is not inst")
+    assert refused(show_map, []).startswith(
+        "python -m benchmarks: error: rich is not installed"
+    )
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT to another process")

@@ -8,7 +8,11 @@ import json
 import math
 import os
 import re
+import signal
+import subprocess
+import sys
 import tempfile
+import time
 from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import DEFAULT, Mock
@@ -18,9 +22,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from agents import DirectNNController, PIController
+from agents import PIController
 from benchmarks.bounds import least_possible
-from benchmarks.compare import command, plots, report
+from benchmarks.compare import plots, report
 from benchmarks.compare import tables as compare_tables
 from benchmarks.compare.__main__ import main
 from benchmarks.compare.estimates import estimate, scale_of, score, standing, verdict
@@ -38,6 +42,7 @@ from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from tests.conftest import ROOT, python, trajectory
 from tests.small_training import SMALL
+from tests.tasks import until
 
 # Those that are compared without any training before.
 FIXED = [name for name, each in ROSTER.items() if each.compared and not each.trained]
@@ -373,17 +378,6 @@ class TestCompare:
             assert against["limit"] == pytest.approx(found.least_possible, abs=1e-12)
             assert against["ratio"] == pytest.approx(found.multiple, abs=1e-12)
 
-    def test_the_second_run_goes_on_with_what_was_learnt(self, compared):
-        out = compared("--agents nn --scenarios square --runs 3")
-        network, plants = DirectNNController(num_envs=3, seed=SEED), make_plants(3, 1200)
-        while_learning, after = (
-            np.abs(run.error).mean()
-            for run in (rollout(plants, network, 1200, seed=SEED) for _ in range(2))
-        )
-        assert after < 0.95 * while_learning
-        row = f"{while_learning:.3f} | {after:.3f} |"
-        assert row in re.sub(" +", " ", (out / "report.md").read_text())
-
     def test_ppo_is_trained_once(self, compared, monkeypatch, capsys):
         monkeypatch.setattr(ppo, "PPOArguments", lambda: SMALL)
         monkeypatch.setattr(ppo, "POLICIES", 2)
@@ -450,18 +444,47 @@ class TestCompare:
         assert (tmp_path / "out/report.md").exists()
         assert (tmp_path / "out/square.png").exists()
 
-    def test_every_case_is_saved_before_the_next_begins(self, compared, tmp_path, monkeypatch):
-        saved = []
+    def test_the_same_command_goes_on_to_the_same_bytes(self, compared, stopped, tmp_path):
+        given = "--agents pi nn --scenarios constant square --runs 1"
+        whole = compared(given, into="whole")
+        stopped(KeyboardInterrupt, after=3)
+        runs = Mock(wraps=rollout)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(records, "rollout", runs)
+            out = compared(given)
+        assert runs.call_count == 1  # nn on the square wave
+        for name in ("runs.csv", "summary.csv", "estimates.csv"):
+            assert (out / name).read_bytes() == (whole / name).read_bytes()
 
-        def watched(*arguments):
-            runs = tmp_path / "out" / "runs.csv"
-            saved.append(len(pd.read_csv(runs)) if runs.exists() else 0)
-            return rollout(*arguments)
-
-        monkeypatch.setattr(records, "rollout", watched)
-        monkeypatch.setattr(command, "PAUSE", 0.0)
-        compared("--agents pi --runs 2 --scenarios constant square constant-noise")
-        assert saved == [0, 2, 4]
+    @pytest.mark.skipif(sys.platform == "win32", reason="no SIGTERM to another process")
+    @pytest.mark.parametrize("jobs", ["1", "2"])
+    def test_a_termination_leaves_what_has_finished(self, jobs, tmp_path):
+        (tmp_path / "endless.py").write_text(
+            "import pathlib, time\nfrom agents import PIController\n\n\n"
+            "class Endless(PIController):\n"
+            "    def act(self, seen):\n"
+            "        if len(seen) == 3:\n"
+            "            pathlib.Path(__file__).with_name('begun').touch()\n"
+            "            time.sleep(300)\n"
+            "        return super().act(seen)\n"
+        )
+        given = (
+            "benchmarks.compare --agents pi --agent own=endless:Endless --scenarios constant "
+            "--runs 3 --jobs"
+        )
+        with subprocess.Popen(
+            [sys.executable, "-m", *given.split(), jobs, "--out", tmp_path],
+            cwd=ROOT, env=os.environ | {"PYTHONPATH": str(tmp_path)}, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        ) as run:  # fmt: skip
+            until((tmp_path / "begun").exists, 60.0)
+            time.sleep(0.5)  # while the process before it is heard
+            run.send_signal(signal.SIGTERM)
+            said, _ = run.communicate(timeout=60)
+        assert run.returncode == 128 + signal.SIGTERM
+        assert "Interrupted: what has finished is kept" in said
+        assert pd.read_csv(tmp_path / "runs.csv")["agent"].tolist() == ["pi"] * 3
+        assert "PI" in (tmp_path / "report.md").read_text()
 
     def test_a_second_interruption_while_the_report_is_written(
         self, stopped, tmp_path, monkeypatch

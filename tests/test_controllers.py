@@ -15,7 +15,7 @@ from benchmarks.compare.comparison import run_case
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.own import own_factory
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import UsageError
+from benchmarks.lib.command import UsageError
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import IdleValve
 from benchmarks.loop.scenarios import Scenario
@@ -50,7 +50,7 @@ def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, mo
     monkeypatch.setattr(type(entry), "members", lambda *_: [factory])
     scenario = Scenario("other", "", 900, plant)
     ways = {
-        "compare": run_case(scenario, entry.name, [factory], 2).runs["mae"],
+        "compare": run_case(scenario, entry.name, [factory], 2)["runs"]["mae"],
         "sweep": agent_task(factory, plant, plant, 900, 2)["mae"],
         "watch": mean_error(game.replay(factory, scenario, 0, {})),
     }

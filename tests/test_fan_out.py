@@ -1,9 +1,7 @@
 """Fan-out: nothing depends on where and when tasks run, and nothing that is done is lost."""
 
-import json
+import importlib
 import os
-import select
-import subprocess
 import sys
 from collections import Counter
 from functools import partial
@@ -11,10 +9,10 @@ from unittest.mock import Mock
 
 import pytest
 
-from benchmarks.lib import cluster, fan_out, storage
+from benchmarks.lib import fan_out, storage
 from benchmarks.lib.fan_out import FanOut, TasksFailedError
+from benchmarks.lib.storage import Kept
 from tests import tasks
-from tests.conftest import ROOT
 
 
 def work(n, calls=None, seconds=0.0):
@@ -22,7 +20,7 @@ def work(n, calls=None, seconds=0.0):
 
 
 def run(given, folder=None, jobs=2):
-    return FanOut(jobs).run(given, folder)
+    return FanOut(jobs=jobs).run(given, kept=folder and Kept(folder))
 
 
 def counted(calls):
@@ -51,16 +49,12 @@ class TestNumbers:
         assert run({"pid": os.getpid}, jobs=1) == {"pid": os.getpid()}
         assert run({"pid": os.getpid}) != {"pid": os.getpid()}
 
-    def test_what_is_read_is_what_was_returned(self, tmp_path):
-        values = {"numbers": (1, 0.1, float("inf")), "text": "°C"}
-        fresh = run({"a/b: c": partial(dict, values)}, tmp_path)
-        assert fresh == run({"a/b: c": partial(dict, values)}, tmp_path)
-        assert [path.name for path in tmp_path.iterdir()] == ["a%2Fb%3A c.json"]
-        assert fresh["a/b: c"] == {"numbers": [1, 0.1, float("inf")], "text": "°C"}
-
-    def test_a_result_that_json_cannot_hold_costs_no_other(self, tmp_path):
-        with pytest.raises(TasksFailedError, match="a set: TypeError") as raised:
-            run({"a set": partial(set, "a"), **work(2)}, tmp_path, jobs=1)
+    @pytest.mark.parametrize("jobs", [1, 2])
+    def test_a_result_that_json_cannot_hold_costs_no_other(self, tmp_path, jobs):
+        with pytest.raises(
+            TasksFailedError, match="a set: Its result cannot be kept"
+        ) as raised:
+            run({"a set": partial(set, "a"), **work(2)}, tmp_path, jobs)
         assert [*raised.value.errors] == ["a set"]
         assert run(work(2), tmp_path) == run(work(2))
 
@@ -70,90 +64,76 @@ class TestResume:
         first = run(work(4, calls), tmp_path / "out")
         again = run(work(6, calls), tmp_path / "out")
         assert counted(calls) == Counter(range(6))
-        assert {key: again[key] for key in first} == first
+        assert {name: again[name] for name in first} == first
 
-    @pytest.mark.parametrize(
-        "damage",
-        [
-            lambda text: "[]",
-            lambda text: "null",
-            lambda text: '{"mae": null}',
-            lambda text: json.dumps(json.loads(text)["value"]),  # without its checksum
-            lambda text: text.replace('"seed": 1', '"seed": 3'),
-            lambda text: text[: len(text) // 2],
-            lambda text: "",
-            lambda text: "\0" * len(text),
-        ],
-    )
-    def test_a_damaged_result_is_made_again(self, tmp_path, calls, damage):
-        whole = run(work(3), tmp_path / "out")
-        file = tmp_path / "out" / "plant 1.json"
-        text = file.read_text()
-        damaged = damage(text)
-        assert damaged != text
-        file.write_text(damaged)
-        assert run(work(3, calls), tmp_path / "out") == whole
-        assert counted(calls) == Counter([1])
-        assert file.read_text() == text
+    @pytest.mark.parametrize("damage", [lambda kept: kept[: len(kept) // 2], lambda _: b"\xff"])
+    def test_a_damaged_result_is_made_again(self, tmp_path, damage):
+        whole = run(work(3), tmp_path)
+        file = sorted(tmp_path.iterdir())[1]
+        kept = file.read_bytes()
+        file.write_bytes(damage(kept))
+        assert run(work(3), tmp_path) == whole
+        assert file.read_bytes() == kept
 
     @pytest.mark.parametrize("jobs", [1, 2])
     def test_a_result_is_saved_before_the_run_has_ended(self, tmp_path, jobs):
         # So that a run that is killed goes on with what is missing.
-        there = partial(tasks.until, (tmp_path / "plant 0.json").exists, 10.0)
+        there = partial(tasks.until, partial(os.listdir, tmp_path), 10.0)
         assert run({**work(1), "the last": there}, tmp_path, jobs)["the last"]
 
-    @pytest.mark.skipif(sys.platform == "win32", reason="Windows tells no child of its parent")
-    def test_workers_end_when_their_parent_is_killed(self, tmp_path):
-        # As long as a worker lives, one end of this pipe is open; here one waits, one works.
-        pipe = tmp_path / "pipe"
-        os.mkfifo(pipe)
-        program = (
-            "import sys; from functools import partial\n"
-            "from benchmarks.lib.fan_out import FanOut; from tests import tasks\n"
-            "work = {str(i): partial(tasks.hold, sys.argv[1], 60.0 * i) for i in range(2)}\n"
-            "FanOut(2).run(work)"
-        )
-        command = [sys.executable, "-c", program, str(pipe)]
-        with subprocess.Popen(command, cwd=ROOT) as process, pipe.open("rb", 0) as held:
-            assert held.read(1) + held.read(1) == b"xx"
-            process.kill()
-            select.select([held], [], [], 15.0)
-            os.set_blocking(held.fileno(), False)
-            assert held.read(1) == b""  # None as long as there is a worker
+    def test_other_arguments_versions_or_code_are_other_results(self, monkeypatch, tmp_path):
+        keys = [storage.key(partial(tasks.draw, seed)) for seed in (1, 1, 2)]
+        assert keys[0] == keys[1] != keys[2]
+        for name, other in (("versions", {"numpy": "0.1"}), ("code", "edited")):
+            with monkeypatch.context() as patch:
+                patch.setattr(storage, name, lambda other=other: other)
+                assert storage.key(partial(tasks.draw, 1)) != keys[0]
+        assert storage.key(lambda: 1) is None  # it has no name by which to tell it from others
+        assert run({"a lambda": lambda: 1}, tmp_path) == {"a lambda": 1}
+        assert not list(tmp_path.iterdir())
+
+    def test_edited_code_is_other_code(self, tmp_path, monkeypatch):
+        own = tmp_path / "own_controllers.py"
+        own.write_text("def made():\n    return 1\n")
+        monkeypatch.syspath_prepend(tmp_path)
+        of_own = partial(tasks.until, importlib.import_module("own_controllers").made)
+        keys = [storage.key(of_own)]
+        (tmp_path / "agents").mkdir()
+        with monkeypatch.context() as patch:
+            patch.setattr(storage, "ROOT", tmp_path)
+            patch.setattr(storage, "code", storage.code.__wrapped__)
+            for text in ("1", "2"):
+                (tmp_path / "agents/pi.py").write_text(text)
+                keys.append(storage.key(of_own))
+        own.write_text("def made():\n    return 2\n")
+        storage._digest.cache_clear()
+        keys.append(storage.key(of_own))
+        assert len(set(keys)) == 4
 
 
 class TestFailures:
-    def test_a_lost_worker_costs_what_it_was_at(self, tmp_path, calls):
-        lossy = work(20, calls, 0.05)
-        lossy["plant 8"] = partial(tasks.die_once, 8, tmp_path / "died", calls)
-        assert run(lossy, tmp_path / "out") == run(work(20))
-        assert (tmp_path / "died").exists()
-        times = counted(calls)
-        assert set(times) == set(range(20))
-        # At most two tasks were handed out for each of the two workers.
-        assert sum(times.values()) - 20 <= 4
-
-    def test_a_task_that_always_loses_its_worker_is_named(self, tmp_path):
-        lossy = {**work(8), "the killer": partial(tasks.die, 0)}
-        with pytest.raises(TasksFailedError, match="the killer") as error:
-            run(lossy, tmp_path)
-        assert list(error.value.errors) == ["the killer"]
-        assert len(list(tmp_path.glob("plant *.json"))) == 8
-
-    def test_a_fault_of_all_tasks_is_soon_given_up(self, monkeypatch):
-        monkeypatch.setattr(fan_out, "GIVE_UP", 2)
-        with pytest.raises(TasksFailedError, match="Not run") as error:
-            run({f"plant {seed}": partial(tasks.die, seed) for seed in range(8)})
-        assert len(error.value.errors) == 8
+    @pytest.mark.parametrize("killed", [tasks.die, tasks.die_of_memory])
+    def test_a_killed_process_costs_the_tasks_under_way(self, tmp_path, calls, killed):
+        lossy = {**work(6, calls, 0.05), "the killer": partial(killed, 0)}
+        lossy |= {f"later {seed}": partial(tasks.draw, seed, calls, 0.05) for seed in (7, 8, 9)}
+        with pytest.raises(TasksFailedError, match="the same command tries again") as error:
+            run(lossy, tmp_path / "out")
+        # Of two processes, the other had one task in hand, and perhaps the next one.
+        assert "the killer" in error.value.errors
+        assert len(error.value.errors) <= 3
+        assert len(list((tmp_path / "out").iterdir())) == 10 - len(error.value.errors)
+        mended = {**lossy, "the killer": partial(tasks.draw, 10)}
+        assert run(mended, tmp_path / "out")["later 9"] == tasks.draw(9)
 
     @pytest.mark.parametrize("jobs", [1, 2])
     def test_an_exception_names_its_task_and_spares_the_others(self, tmp_path, calls, jobs):
-        faulty = {"the fault": partial(tasks.fail, 3), **work(4, calls)}
+        faulty = {"the fault": partial(tasks.fail, 3), "left": partial(sys.exit, 3)}
         with pytest.raises(TasksFailedError, match="no such plant as 3") as error:
-            run(faulty, tmp_path / "out", jobs)
-        assert list(error.value.errors) == ["the fault"]
-        assert "1 of 5 tasks failed" in str(error.value)
-        mended = {**faulty, "the fault": partial(tasks.draw, 3)}
+            run({**faulty, **work(4, calls)}, tmp_path / "out", jobs)
+        assert set(error.value.errors) == {"the fault", "left"}
+        assert "2 of 6 tasks failed" in str(error.value)
+        assert "left: A controller called sys.exit(3)" in str(error.value)
+        mended = {"the fault": partial(tasks.draw, 3), **work(4, calls)}
         assert run(mended, tmp_path / "out", jobs)["the fault"] == tasks.draw(3)
         assert counted(calls) == Counter(range(4))
 
@@ -166,10 +146,9 @@ class TestFailures:
 
 def test_a_node_with_other_versions_computes_nothing():
     here = storage.versions()
-    assert cluster._answer(partial(tasks.draw, 1), here) == (tasks.draw(1), "", False)
+    answer = fan_out._attempt_there("one", partial(tasks.draw, 1), here)
+    assert answer == ("one", tasks.draw(1), "")
     other = {**here, "numpy": "0.1", "more": "1.0"}
-    result, error, lost = cluster._answer(partial(tasks.draw, 1), other)
-    assert result is None
-    assert lost
+    _, _, error = fan_out._attempt_there("one", partial(tasks.draw, 1), other)
     assert f"it has {{'numpy': '{here['numpy']}'}}, and not" in error
     assert "'more': '1.0'" in error

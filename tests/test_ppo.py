@@ -26,7 +26,7 @@ def small(monkeypatch):
 
 
 def members(folder, arguments=SMALL, *, jobs=1, policies=2, **request):
-    request = PolicyRequest(FanOut(jobs), folder, policies=policies, **request)
+    request = PolicyRequest(FanOut(jobs=jobs), folder, policies=policies, **request)
     return ppo.members(request, arguments)
 
 

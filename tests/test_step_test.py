@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.controllers.step_test import StepTest, step_test
-from benchmarks.lib.command_line import UsageError
+from benchmarks.lib.command import UsageError
 from benchmarks.loop.linear import nominal
 from benchmarks.loop.metrics import reversals
 from benchmarks.loop.plants import PlantOptions

@@ -136,7 +136,8 @@ class TestSweep:
     def test_tasks_of_other_options_are_not_taken(self, tmp_path, monkeypatch):
         monkeypatch.setattr(command, "report", lambda *_: [])  # which takes its time to draw
         given = "--design random --plants 2 --agents pi-simc --samples 60"
-        changes = [  # and how many folders are new: of the limit, of nothing, of the controller
+        changes = [  # and how many tasks are new, for each of two plants: of the limit, of
+            # nothing, of the controller
             ("", 3), ("--runs 3", 2), ("--samples 50", 3), ("--design-seed 1", 3),
             ("--design wide", 3), ("--told each", 2), ("--agents pi", 1),
             ("--set dead_zone=7", 2), ("", 0),
@@ -144,12 +145,12 @@ class TestSweep:
         for options, anew in changes:
             kept = len(list(tmp_path.glob("tasks/*")))
             run_sweep(tmp_path, f"{given} {options}")
-            assert len(list(tmp_path.glob("tasks/*"))) == kept + anew
+            assert len(list(tmp_path.glob("tasks/*"))) == kept + 2 * anew
         # Neither are those of another training.
         trained = Factory(simc_pi, provenance={"file": "b"})
         monkeypatch.setitem(ROSTER, "pi-simc", replace(ROSTER["pi-simc"], made_by=trained))
         run_sweep(tmp_path, given)
-        assert len(list(tmp_path.glob("tasks/*"))) == kept + anew + 1
+        assert len(list(tmp_path.glob("tasks/*"))) == kept + 2
 
     def test_told_each_plant_a_controller_does_better(self, tmp_path, monkeypatch):
         monkeypatch.setattr(command, "report", lambda *_: [])
@@ -188,8 +189,9 @@ class TestSweep:
         failing = replace(ROSTER["pi-simc"], made_by=fails)
         monkeypatch.setitem(ROSTER, "pi-simc", failing)
         assert run_sweep(tmp_path, "--design random --plants 2") == 1
-        assert "pi-simc 0" in capsys.readouterr().out
-        assert len(list((tmp_path / "tasks").rglob("nn *.json"))) == 2
+        assert "plant 0, pi-simc: RuntimeError: no luck" in capsys.readouterr().out
+        # Of two plants each: the limit, nothing, nn and nn-frozen.
+        assert len(list((tmp_path / "tasks").iterdir())) == 8
 
 
 class TestFindings:

@@ -21,7 +21,6 @@ from benchmarks.train.through_plant import (  # noqa: E402
     Training,
     loss_of,
     train,
-    training_key,
     validate,
 )
 from mptc_gym import Parameters  # noqa: E402
@@ -34,7 +33,6 @@ SMALL = Training(steps=4, plants=4, samples=60, stretches=2, choosing=4, adding=
 def small(monkeypatch):
     monkeypatch.setattr(through_plant, "VALIDATION_PLANTS", 4)
     monkeypatch.setattr(through_plant, "VALIDATION_SAMPLES", 40)
-    monkeypatch.setattr(through_plant, "SAVED_EVERY", 2)
 
 
 def weights(network):
@@ -172,32 +170,11 @@ class TestGradient:
         assert paid.item() == pytest.approx(np.log(0.03 - 0.0015 + 0.1 * 0.25))
 
 
-class TestKept:
-    def test_one_that_was_stopped_goes_on_to_the_same_network(self, tmp_path, monkeypatch):
-        whole = train(SMALL)
-        advance = through_plant._advance
-
-        def stop(*arguments):
-            if arguments[-1] == 2:
-                raise KeyboardInterrupt
-            advance(*arguments)
-
-        state = tmp_path / "state.pt"
-        with monkeypatch.context() as patch:
-            patch.setattr(through_plant, "_advance", stop)
-            with pytest.raises(KeyboardInterrupt):
-                train(SMALL, state)
-        assert state.exists()
-        assert np.array_equal(weights(train(SMALL, state)), weights(whole))
-
+class TestNetworks:
     def test_seed_is_honoured(self):
         assert_the_seed_is_all_that_differs(
             lambda seed: weights(train(replace(SMALL, steps=2, seed=seed)))
         )
-
-    def test_key_names_all_that_shapes_a_network(self):
-        assert training_key(SMALL) == training_key(replace(SMALL))
-        assert training_key(SMALL) != training_key(replace(SMALL, seed=1))
 
     def test_the_one_of_the_project_is_that_of_the_defaults(self):
         network = LawNetwork.load(PRETRAINED / "nn-smith.npz")

@@ -11,14 +11,13 @@ from typing import Any
 import pandas as pd
 from rich.console import Console
 
+from benchmarks.bounds.__main__ import Options
 from benchmarks.bounds.least import CACHE, least_possible
-from benchmarks.bounds.options import Options
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import blame, out_folder
+from benchmarks.lib.command import blame, out_folder
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import Estimate, bootstrap
-from benchmarks.lib.storage import ROOT, commit, versions, write_json
+from benchmarks.lib.storage import ROOT, code, commit, versions, write_json
 from benchmarks.lib.tables import on_screen
 from benchmarks.loop.linear import check_linear
 from benchmarks.loop.metrics import mean_error
@@ -48,7 +47,7 @@ def execute(options: Options, console: Console) -> str:
     """Print the bounds of the scenarios and of the presets, or of another plant."""
     plant, one = options.plant.chosen(), options.plant != PlantOptions()
     cache = out_folder(options.cache or CACHE, "--cache")
-    fan_out = options.fan_out.open()
+    fan_out = options.fan_out
     if options.package:
         write_package(cache, fan_out)
         return f"Written to {PACKAGE}"
@@ -58,10 +57,12 @@ def execute(options: Options, console: Console) -> str:
             check_linear(Parameters(**plant.arguments))
         scenarios = scenarios_of(plant.name, plant.arguments)
         cases = {name: scenario.arguments for name, scenario in scenarios.items()}
+    episodes = {each: getattr(options, each) for each in ("samples", "episodes", "seed")}
+    episodes["folder"] = cache
     # Cases with drawn plants take longest, and start first.
     first = sorted(cases, key=lambda name: not Parameters(**cases[name]).ranges)
     tasks: dict[str, Callable[[], Any]] = {
-        name: partial(row, name, cases[name], cache, options) for name in first
+        name: partial(row, name, cases[name], episodes, options.mpc) for name in first
     }
     compared = [] if one or options.samples != SAMPLES else list(SCENARIOS.values())
     tasks |= {
@@ -87,11 +88,13 @@ def row_of_scenario(scenario: Scenario, cache: Path) -> dict[str, str]:
 
 
 def row(
-    name: str, arguments: Mapping[str, Any], cache: Path, options: Options
+    name: str, arguments: Mapping[str, Any], episodes: Mapping[str, Any], mpc: int | None
 ) -> dict[str, str]:
-    """Return a row of the table of plants."""
-    numbers = {each: getattr(options, each) for each in ("samples", "episodes", "seed")}
-    case = {**numbers, "folder": cache, **arguments}
+    """Return a row of the table of plants, with the error of `mpc` runs of MPC, if any.
+
+    `episodes` holds their length, number and first seed, and the folder of kept bounds.
+    """
+    case = {**episodes, **arguments}
     of = least_possible(kind="preview", **case)
     idle = Estimate(of.idle, of.idle_low, of.idle_high, of.runs)
     cells = {"plant": name, "valve left alone": f"{idle:.3f}"}
@@ -100,9 +103,9 @@ def row(
         # "causal" needs random set points, "reference" those that are held long enough.
         with suppress(ValueError):
             cells[heading] = f"{least_possible(kind=kind, **case):.3f}"
-    if options.mpc:
+    if mpc:
         (predictive,) = ROSTER["mpc"].members()
-        runs = predictive.run(arguments, options.samples, options.mpc, options.seed)
+        runs = predictive.run(arguments, episodes["samples"], mpc, episodes["seed"])
         cells["MPC"] = f"{bootstrap(mean_error(runs), seed=0):.3f}"
     return cells
 
@@ -122,7 +125,7 @@ def write_package(cache: Path, fan_out: FanOut) -> None:
     about = {
         "command": "python -m benchmarks.bounds --package",
         "commit": commit(),
-        "code": fingerprint("benchmarks.bounds.least"),
+        "code": code(),
         "versions": versions(),
         "unit": "degC, mean of |e(k)| over k = 1 to samples",
     }

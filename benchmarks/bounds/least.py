@@ -19,15 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.linear_program import SMOOTH, TAIL, Plan, plan, reference
 from benchmarks.bounds.unknown import Unknown, unknown
-from benchmarks.lib.fingerprint import fingerprint
 from benchmarks.lib.statistics import Estimate, student
-from benchmarks.lib.storage import ROOT, seal, unseal, write_text
+from benchmarks.lib.storage import ROOT, Kept
 from benchmarks.loop.linear import Course, course
 from benchmarks.loop.rollout import IdleValve, drawn_numbers, make_plants, rollout
 from mptc_gym import Parameters
@@ -119,8 +117,8 @@ def least_possible(
         Episode i is the one that the environment draws with seed `seed + i`. The defaults are
         the episodes of `mptc_gym.evaluate`.
     folder
-        Folder in which the result is kept, under a name made from the arguments and the code
-        that computes it. None: it is computed anew.
+        Folder in which the result is kept, under a name made from the arguments and the code.
+        None: it is computed anew.
     **arguments
         Arguments of the environment.
 
@@ -138,39 +136,37 @@ def least_possible(
         case = {**arguments, "samples": samples, "episodes": episodes, "seed": seed}
         preview = least_possible(kind="preview", folder=folder, **case)
         with suppress(ValueError):  # the plant does not settle between changes
-            found = least_possible(kind="reference", folder=folder, **case)
+            unaware = least_possible(kind="reference", folder=folder, **case)
             # Foresight makes no difference where nothing changes.
-            return found if abs(found.value - preview.value) >= SAME else preview
+            return unaware if abs(unaware.value - preview.value) >= SAME else preview
         return preview
     kind = kind or "causal"
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
     if kind == "causal" and theorem(parameters) != "causal":
         raise ValueError(f'kind must not be "causal" for the set point {parameters.setpoint!r}')
-    file = None
-    if folder is not None:
-        shaped_by = [repr(parameters), samples, kind, episodes, seed]
-        code = "benchmarks.bounds.least"
-        file = folder / f"{fingerprint(code, case=shaped_by, scipy=scipy.__version__)}.json"
-        with suppress(OSError, ValueError, TypeError):  # missing or damaged: computed again
-            kept = unseal(file.read_text(encoding="utf-8"))
-            return LeastPossible(**{**kept, "episodes": tuple(kept["episodes"])})
+    task = partial(_least_possible, parameters, samples, kind, episodes, seed)
+    if folder is None:
+        found = task()
+    else:
+        try:
+            found = Kept(folder).load(task)
+        except LookupError:
+            found = Kept(folder).save(task, task())
+    return LeastPossible(**{**found, "episodes": tuple(found["episodes"])})
+
+
+def _least_possible(
+    parameters: Parameters, samples: int, kind: str, episodes: int, seed: int
+) -> dict[str, Any]:
+    """Return the fields of `LeastPossible`."""
     cases, idle = _draw(parameters, samples, episodes, seed)
     # Rounded to be the same on every machine, as solvers differ in later digits.
     values = [round(best(kind).cost / samples, DIGITS) for best in cases]
     least, left_alone = student(values), student(idle)
-    found = LeastPossible(
-        **vars(least),
-        kind=kind,
-        idle=left_alone.value,
-        idle_low=left_alone.low,
-        idle_high=left_alone.high,
-        episodes=tuple(values),
-        seed=seed,
-    )
-    if file is not None:
-        write_text(file, seal(asdict(found)))
-    return found
+    alone = {"": left_alone.value, "_low": left_alone.low, "_high": left_alone.high}
+    found = {**vars(least), **{f"idle{end}": value for end, value in alone.items()}}
+    return {**found, "kind": kind, "episodes": values, "seed": seed}
 
 
 def theorem(parameters: Parameters) -> str:

@@ -6,12 +6,12 @@ from functools import partial
 
 from rich.console import Console
 
+from benchmarks.claims.__main__ import Options
 from benchmarks.claims.claims import CLAIMS
-from benchmarks.claims.options import Options
 from benchmarks.claims.plots import PLOTS
 from benchmarks.claims.runs import Batch
 from benchmarks.claims.verdicts import Claim, markdown, overview, table
-from benchmarks.lib.command_line import known, out_folder
+from benchmarks.lib.command import known, out_folder
 from benchmarks.lib.report import provenance_line
 from benchmarks.lib.storage import origin, write_text
 from benchmarks.lib.tables import on_screen, write_csv
@@ -28,7 +28,7 @@ def execute(options: Options, console: Console) -> str:
     tasks = {name: partial(CLAIMS[name].examined, Batch(options.runs)) for name in first}
     done: dict[str, Claim] = {}
     try:
-        for name, claim in options.fan_out.open().stream(tasks, "claims"):
+        for name, claim in options.fan_out.stream(tasks, "claims"):
             done[name] = claim
             claims = [done[each] for each in chosen if each in done]
             write_csv(out / "claims.csv", table(claims))

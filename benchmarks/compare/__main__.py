@@ -1,8 +1,49 @@
 """Compare controllers in the same noise: `python -m benchmarks.compare --help`."""
 
-from benchmarks.lib.commands import command
+from __future__ import annotations
 
-main = command("compare", width=190)
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from benchmarks.controllers.options import AgentNames, ControllerOptions
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.command import Names, Runs, command, options
+from benchmarks.loop.plants import PlantOptions
+from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS
+
+COMPARED = tuple(name for name, controller in ROSTER.items() if controller.compared)
+RUNS = 100
+_CASES = (
+    f"Cases to run, out of {', '.join(SCENARIOS)}; with --presets the presets, on a plant of "
+    f"your own {', '.join(name for name, *_ in SETPOINTS)} (default: all)."
+)
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Run controllers on the same cases in the same noise, and write a report.
+
+    The report has tables, data and pictures.
+    """
+
+    agents: AgentNames = COMPARED
+    controllers: ControllerOptions = field(default_factory=ControllerOptions)
+    scenarios: Annotated[Names | None, Parameter(help=_CASES)] = None
+    plant: PlantOptions = field(default_factory=PlantOptions)
+    presets: bool = False
+    """Run the environment's presets instead of the paper's cases."""
+    runs: Runs = RUNS
+    """Runs of each controller in each case."""
+    out: Path | None = None
+    """Folder to write to (default: results/compare, or for other controllers or cases a folder
+    beside it that is named after them)."""
+
+
+main = command(Options, "benchmarks.compare.command", width=190)
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

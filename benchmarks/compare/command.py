@@ -4,30 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import math
 import time
 from collections.abc import Collection, Mapping
+from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
 
 from benchmarks.compare import report, tables
+from benchmarks.compare.__main__ import COMPARED, RUNS, Options
 from benchmarks.compare.comparison import Comparison
 from benchmarks.compare.estimates import scale_of
-from benchmarks.compare.options import COMPARED, RUNS, Options
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.records import Factory, provenances
-from benchmarks.lib.command_line import UsageError, blame, known, out_folder
+from benchmarks.lib.command import UsageError, blame, known, out_folder
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.options import flat
 from benchmarks.lib.report import Section, provenance_line, show
-from benchmarks.lib.storage import origin, write_json
+from benchmarks.lib.storage import Kept, origin, write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
 from mptc_gym.evaluation import SEED
 
 OUT = Path("results/compare")
 LONGEST = 60  # characters at which a folder's name is cut
-PAUSE = 2.0  # s between saves of the runs so far
 
 
 def execute(options: Options, console: Console) -> str:
@@ -56,7 +54,7 @@ def execute(options: Options, console: Console) -> str:
     )
     folder, made = out_folder(out), origin()
     about = {
-        "options": {**flat(options), "agents": list(members)},
+        "options": {**asdict(options), "agents": list(members)},
         "seeds": list(range(SEED, SEED + options.runs)),
         "scenarios": {
             name: {"samples": each.samples, "arguments": each.arguments}
@@ -65,7 +63,7 @@ def execute(options: Options, console: Console) -> str:
         "policies": provenances(members),
     }
     comparison = Comparison(scenarios, members, options.runs)
-    began, saved = time.perf_counter(), -math.inf
+    began = time.perf_counter()
 
     def save(*, complete: bool = False) -> None:
         tables.write(folder / "runs.csv", comparison.runs)
@@ -78,15 +76,12 @@ def execute(options: Options, console: Console) -> str:
         return report.write(comparison, folder, provenance_line("compare", made), fan_out)
 
     try:
-        for _ in comparison.run(training.fan_out):
-            if time.perf_counter() - saved >= PAUSE:
-                save()
-                saved = time.perf_counter()
+        comparison.run(training.fan_out, Kept(folder / "tasks"))
     except BaseException:  # including Ctrl-C
         if comparison.cases:
             write(FanOut(jobs=1))
         raise
-    sections = write(FanOut(options.controllers.fan_out.jobs))
+    sections = write(FanOut(jobs=options.controllers.fan_out.jobs))
     save(complete=True)
     show(sections[:3], console)
     return f"The report, tables, data and plots are in {out}/"

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import pandas as pd
 
 from benchmarks.compare.estimates import Scale, bounds
 from benchmarks.compare.tables import summarise_responses
 from benchmarks.controllers.records import Factory
-from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.loop.metrics import join, mean_error, measure
+from benchmarks.lib.storage import Kept
+from benchmarks.loop.metrics import join, measure
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import SEED
 
-TWICE = "square"  # controllers that learn run this scenario again, keeping what they learnt
 # Slow controllers start first, so that no core is idle at the end.
 LONG = {"mpc", "nn-self-tuning", "ppo", "self-tuning", "nn-smith"}
 
@@ -34,39 +34,30 @@ class CaseResult:
     """Measures, one row for each run of each member."""
     responses: pd.DataFrame
     """Percentiles over the runs, one row for each sample."""
-    again: float | None
-    """Mean |e| of a second run that keeps what was learnt, degC, if there was one."""
     seconds: float
     """Duration of the runs, s."""
 
 
 def run_case(
     scenario: Scenario, agent: str, members: Sequence[Factory], runs: int
-) -> CaseResult:
-    """Run all members of a controller on a scenario."""
+) -> dict[str, Any]:
+    """Run all members of a controller on a scenario; return a `CaseResult` as JSON values."""
     began = time.perf_counter()
-    trajectories, rows, again = [], [], []
+    trajectories, rows = [], []
     for number, member in enumerate(members):
-        controller = member(scenario.arguments, runs, SEED)
-        given = scenario.arguments, scenario.samples, runs, SEED, controller
-        trajectory = member.run(*given)
-        if scenario.name == TWICE:
-            # Without learning a second run is the same; a user's own controller may learn.
-            learns = member.learns or agent not in ROSTER
-            second = member.run(*given) if learns else trajectory
-            again.append(float(mean_error(second).mean()))
+        trajectory = member.run(scenario.arguments, scenario.samples, runs, SEED)
         trajectories.append(trajectory)
         about = {"scenario": scenario.name, "agent": agent, "policy": number}
         seeds = {**about, "seed": range(SEED, SEED + runs)}
         rows.append(pd.DataFrame({**seeds, **measure(trajectory, scenario.parameters)}))
-    return CaseResult(
-        scenario.name,
-        agent,
-        pd.concat(rows, ignore_index=True),
-        summarise_responses(join(trajectories), scenario, agent),
-        sum(each / len(members) for each in again) if again else None,
-        time.perf_counter() - began,
-    )
+    responses = summarise_responses(join(trajectories), scenario, agent)
+    return {
+        "scenario": scenario.name,
+        "agent": agent,
+        "runs": pd.concat(rows, ignore_index=True).to_dict("list"),
+        "responses": responses.to_dict("list"),
+        "seconds": time.perf_counter() - began,
+    }
 
 
 @dataclass
@@ -83,24 +74,25 @@ class Comparison:
     scales: dict[str, Scale] = field(default_factory=dict)
     """The bounds that errors are measured against, by scenario."""
 
-    def run(self, fan_out: FanOut) -> Iterator[CaseResult]:
-        """Run everything and yield each case as it finishes; raise at the end if any failed."""
+    def run(self, fan_out: FanOut, kept: Kept | None = None) -> None:
+        """Run everything, and raise at the end if any case failed; see `FanOut.stream`."""
         scenarios = self.scenarios.values()
         # The bounds of drawn plants are the longest tasks of all.
-        tasks: dict[str, Callable[[], CaseResult | Scale]] = {
+        tasks: dict[str, Callable[[], dict[str, Any]]] = {
             f"{each.name}: bounds": partial(bounds, each, self.count)
             for each in sorted(scenarios, key=lambda each: not each.parameters.ranges)
         }
         agents = sorted(self.controllers, key=lambda agent: agent not in LONG)
         for agent, each in itertools.product(agents, scenarios):
-            case = partial(run_case, each, agent, self.controllers[agent], self.count)
-            tasks[f"{agent}, {each.name}"] = case
-        for _, result in fan_out.stream(tasks, "compare"):
-            if isinstance(result, CaseResult):
-                self.cases[result.agent, result.scenario] = result
-                yield result
+            members = self.controllers[agent]
+            tasks[f"{agent}, {each.name}"] = partial(run_case, each, agent, members, self.count)
+        for _, result in fan_out.stream(tasks, "compare", kept):
+            if "agent" in result:
+                frames = {each: pd.DataFrame(result[each]) for each in ("runs", "responses")}
+                case = CaseResult(**{**result, **frames})
+                self.cases[case.agent, case.scenario] = case
             else:
-                self.scales[result.scenario] = result
+                self.scales[result["scenario"]] = Scale.of(result)
 
     @property
     def finished(self) -> list[CaseResult]:

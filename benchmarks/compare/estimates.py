@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,6 +48,15 @@ class Scale:
     frontier: tuple[tuple[float, float], ...] = ()
     """Points of valve travel, t/h, and least error for it, degC, if known; see `bounds`."""
 
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> Scale:
+        """Return a scale from the values that `asdict` gives, in JSON or not."""
+        from benchmarks.bounds import LeastPossible
+
+        least, preview = (LeastPossible(**values[name]) for name in ("least", "preview"))
+        frontier = tuple((travel, error) for travel, error in values["frontier"])
+        return cls(**{**values, "least": least, "preview": preview, "frontier": frontier})
+
 
 def scale_of(scenario: Scenario, runs: int) -> Scale:
     """Return the bounds on the errors of a scenario, without the frontier.
@@ -65,8 +74,8 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
     return Scale(scenario.name, least, preview, is_random(scenario.parameters))
 
 
-def bounds(scenario: Scenario, runs: int) -> Scale:
-    """Return the bounds on the errors of a scenario, with the frontier.
+def bounds(scenario: Scenario, runs: int) -> dict[str, Any]:
+    """Return the bounds on the errors of a scenario, with the frontier; see `Scale.of`.
 
     The frontier is sorted by descending travel; between two of its points the bound is the
     straight line. Drawn plants and set points have no frontier: it would take linear programs
@@ -76,14 +85,14 @@ def bounds(scenario: Scenario, runs: int) -> Scale:
 
     scale, parameters = scale_of(scenario, runs), scenario.parameters
     if parameters.ranges or parameters.setpoint == "random":
-        return scale
+        return asdict(scale)
     case: dict[str, Any] = {"samples": scenario.samples, **scenario.arguments}
     try:
         points = frontier(kind="reference", **case)
     except ValueError:  # the plant does not settle between changes
         points = frontier(**case)
     travels = tuple((travel * scenario.samples, error) for travel, error in points)
-    return replace(scale, frontier=travels)
+    return asdict(replace(scale, frontier=travels))
 
 
 def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.compare import tables
-from benchmarks.compare.comparison import TWICE, Comparison
+from benchmarks.compare.comparison import Comparison
 from benchmarks.compare.estimates import (
     Scale,
     Score,
@@ -161,10 +161,8 @@ def _sections(
         Section(
             "What each controller costs",
             [
-                "First and second run: mean error on the square wave, the second time with "
-                "what was learnt the first time. Most controllers learn nothing in a run, and "
-                "do the same twice. Training: of one policy, the median. Runs: all scenarios, "
-                "including what is measured."
+                "Training: of one policy, the median. Runs: all scenarios, including what is "
+                "measured."
             ],
             _costs(comparison),
         ),
@@ -203,7 +201,6 @@ def _costs(comparison: Comparison) -> pd.DataFrame:
         cost = members[0].cost
         training = [member.curve[-1]["seconds"] for member in members if member.curve]
         runs = [case.seconds for case in comparison.finished if case.agent == name]
-        twice = comparison.cases.get((name, TWICE))
         rows.append(
             {
                 "agent": label(name),
@@ -212,8 +209,6 @@ def _costs(comparison: Comparison) -> pd.DataFrame:
                 "samples before": cost.samples,
                 "training (s)": f"{np.median(training):.0f}" if training else "",
                 "runs (s)": f"{sum(runs):.1f}",
-                "first run": f"{twice.runs['mae'].mean():.3f}" if twice else "",
-                "second run": f"{twice.again:.3f}" if twice else "",
             }
         )
     return pd.DataFrame(rows)

@@ -12,8 +12,16 @@ from cyclopts import Parameter
 from benchmarks.controllers.own import own_entry
 from benchmarks.controllers.records import RosterEntry
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import UsageError, known, out_folder
-from benchmarks.lib.options import Count, FanOutOptions, Names, Repeated, options
+from benchmarks.lib.command import (
+    Count,
+    Names,
+    Repeated,
+    UsageError,
+    known,
+    options,
+    out_folder,
+)
+from benchmarks.lib.fan_out import FanOut
 from benchmarks.train.ppo import KEPT, PolicyRequest
 
 AgentNames = Annotated[
@@ -37,7 +45,7 @@ class ControllerOptions:
     """Number of PPO policies to run, each from its own seed (default: 5)."""
     kept: Path = KEPT
     """Folder of locally trained policies; no code in its files is executed."""
-    fan_out: FanOutOptions = field(default_factory=FanOutOptions)
+    fan_out: FanOut = field(default_factory=FanOut)
     retrain: bool = False
     """Train PPO policies again, which takes many minutes."""
 
@@ -47,7 +55,7 @@ class ControllerOptions:
         if self.retrain or self.training_steps or self.policies or not is_folder:
             out_folder(self.kept, "--kept")
         return PolicyRequest(
-            self.fan_out.open(), self.kept, self.training_steps, self.policies, self.retrain
+            self.fan_out, self.kept, self.training_steps, self.policies, self.retrain
         )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from agents.policy_network import WINDOWS
 from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Cost, Factory, RosterEntry
-from benchmarks.lib.command_line import blame
+from benchmarks.lib.command import blame
 from benchmarks.loop.rollout import Agent
 from mptc_gym import Parameters
 

@@ -14,9 +14,9 @@ import pandas as pd
 from rich.console import Console
 
 import mptc_gym
+from benchmarks.datasets.__main__ import SAMPLES, Options
 from benchmarks.datasets.history import BEHAVIOURS, PLANTS, History, arguments_of, record, scale
-from benchmarks.datasets.options import SAMPLES, Options
-from benchmarks.lib.command_line import UsageError, known, out_folder
+from benchmarks.lib.command import UsageError, known, out_folder
 from benchmarks.lib.tables import on_screen
 from mptc_gym import Evaluation
 

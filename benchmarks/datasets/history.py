@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.datasets.options import EPISODES, SAMPLES
+from benchmarks.datasets.__main__ import EPISODES, SAMPLES
 from benchmarks.loop.rollout import Agent, IdleValve, make_plants, rollout
 from mptc_gym import PRESETS, Evaluation, Parameters, evaluate
 

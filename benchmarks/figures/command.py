@@ -12,9 +12,9 @@ from tqdm import tqdm
 
 from agents import PIController
 from benchmarks.claims.runs import Batch
-from benchmarks.figures.options import Options
+from benchmarks.figures.__main__ import Options
 from benchmarks.figures.plots import Panel, plot
-from benchmarks.lib.command_line import out_folder
+from benchmarks.lib.command import out_folder
 from benchmarks.lib.tables import percentiles, write_csv
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import Trajectory

@@ -5,9 +5,10 @@ import os
 # NumPy reads it when it is imported. Threads for small matrices only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from benchmarks.lib.commands import command
+from benchmarks.identify.options import Options
+from benchmarks.lib.command import command
 
-main = command("identify", interrupted="nothing is written.")
+main = command(Options, "benchmarks.identify.command", interrupted="nothing is written.")
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

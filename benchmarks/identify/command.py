@@ -12,7 +12,7 @@ from benchmarks.identify.options import Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import recommendations, report
 from benchmarks.identify.tuning import recommended
-from benchmarks.lib.command_line import UsageError, out_folder
+from benchmarks.lib.command import UsageError, out_folder
 from benchmarks.lib.report import provenance_line, show, write_report
 from benchmarks.lib.storage import origin, write_json
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.lib.options import Count, Finite, Folder, Positive, Repeated, options
+from benchmarks.lib.command import Count, Finite, Folder, Positive, Repeated, options
 
 
 @options

@@ -1,37 +1,47 @@
 """Run independent tasks in parallel, on this machine or on a Ray cluster.
 
-joblib schedules them on this machine, Ray on a cluster. Each result is saved as soon as it
-arrives, so an interrupted run resumes with the missing tasks. A result does not depend on which
-process runs the task, or when, as long as all its randomness comes from its arguments.
+joblib schedules them on this machine, Ray on a cluster. A result does not depend on which
+process runs the task, or when, as long as all its randomness comes from its arguments. A
+finished task is kept, so that an interrupted run goes on with the missing ones.
+
+The nodes of a cluster need Ray and the packages that a task imports. They need no shared folder
+and no checkout: Ray unpacks the code where its workers run.
 """
 
 from __future__ import annotations
 
-import json
+import logging
 import os
-import threading
-import time
-from collections import Counter
+import socket
+import tempfile
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from contextlib import suppress
-from functools import cache, partial
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
-from urllib.parse import quote
 
-from benchmarks.lib import cluster
-from benchmarks.lib.storage import seal, unseal, write_text
+from benchmarks.lib.command import Count, blame, options
+from benchmarks.lib.storage import ROOT, Kept, UnfinishedError, versions
 
-LOSSES = 3  # lost workers before a task is run alone, to see whether it is to blame
-GIVE_UP = 10  # tasks to blame before all stop, as the cause must lie elsewhere
 NAMED = 10  # failed tasks listed in a message
-PATIENCE = 0.5  # s between checks that the parent is still running
+QUEUED = 4  # tasks submitted per core of a cluster, enough to occupy nodes that join later
+LOST = "The process that ran it ended, perhaps for lack of memory: the same command tries again"
+# Files that are not uploaded, in .gitignore syntax: the whole checkout except its packages and
+# the modules beside them, such as a user's own controllers.
+STAYS = [
+    *("/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py"),
+    *("__pycache__", "published", "*.md"),
+]
 
-Tasks = Mapping[str, Callable[[], Any]]
+Task = Callable[[], Any]
+Tasks = Mapping[str, Task]
+Answer = tuple[str, Any, str]  # the name of a task, its result, and its error or ""
 
 
-class TasksFailedError(RuntimeError):
+class TasksFailedError(UnfinishedError):
     """Some of `tasks` tasks failed; the results of the others are kept.
 
     `errors` maps the name of each failed task to a traceback or a sentence.
@@ -39,7 +49,7 @@ class TasksFailedError(RuntimeError):
 
     def __init__(self, errors: Mapping[str, str], tasks: int) -> None:
         self.errors = dict(errors)
-        lines = [f"{key}: {text.strip().splitlines()[-1]}" for key, text in errors.items()]
+        lines = [f"{name}: {text.strip().splitlines()[-1]}" for name, text in errors.items()]
         super().__init__(
             f"{len(errors)} of {tasks} tasks failed; the results of the others are kept\n"
             + "\n".join(lines[:NAMED])
@@ -47,141 +57,121 @@ class TasksFailedError(RuntimeError):
         )
 
 
+@options
+@dataclass(frozen=True, kw_only=True)
 class FanOut:
-    """Run tasks on the cores of this machine or of a Ray cluster.
+    """Where tasks run, and how many at once. With one job they run in this process."""
 
-    Parameters
-    ----------
-    jobs
-        Number of tasks run at once; None means one per core. On this machine, 1 runs them in
-        this process. A cluster never runs more at once than it has cores.
-    backend
-        "loky" for processes on this machine, "ray" for a Ray cluster that is already running.
+    jobs: Count | None = None
+    """Number of tasks run at once (default: one per core)."""
+    backend: Literal["loky", "ray"] = "loky"
+    """Where tasks run: loky for this machine, ray for a Ray cluster."""
 
-    Raises
-    ------
-    ValueError
-        If no cluster is found.
-    """
+    def run(self, tasks: Tasks, title: str = "", kept: Kept | None = None) -> dict[str, Any]:
+        """Run tasks, and return their results in the order of `tasks`; see `stream`."""
+        results = dict(self.stream(tasks, title, kept))
+        return {name: results[name] for name in tasks}
 
-    def __init__(
-        self, jobs: int | None = None, backend: Literal["loky", "ray"] = "loky"
-    ) -> None:
-        self._jobs, self._backend = jobs, backend
-        if backend == "ray":
-            cluster.connect()
-
-    def run(self, tasks: Tasks, folder: Path | None = None, title: str = "") -> dict[str, Any]:
-        """Run the tasks that have no saved result; return all results, in the order of `tasks`.
+    def stream(
+        self, tasks: Tasks, title: str = "", kept: Kept | None = None
+    ) -> Iterator[tuple[str, Any]]:
+        """Run tasks, and yield the name and result of each as it finishes.
 
         Parameters
         ----------
         tasks
             Functions without arguments, by name, such as a `functools.partial` of a function of
-            a module. They return JSON values; the results are as read back from JSON.
-        folder
-            Folder for the results, one file per task; None saves nothing. A file named after a
-            task counts as its result, so tasks with other arguments or code need a folder of
-            their own. A damaged file is ignored.
+            a module. Those that cannot be pickled run in this process, last.
         title
             Label of the progress bar; "" for no bar.
+        kept
+            Where results are kept; those that are there already are yielded first. None:
+            nothing is kept.
 
         Raises
         ------
         TasksFailedError
-            At the end, if tasks raised an exception or lost their worker repeatedly.
-        """
-        results: dict[str, Any] = {}
-        files = {key: folder / f"{quote(key, safe=' ,=+')}.json" for key in tasks if folder}
-        for key, file in files.items():
-            with suppress(FileNotFoundError, ValueError):  # not there, or damaged
-                results[key] = unseal(file.read_text(encoding="utf-8"))
-        missing = {key: partial(_as_json, tasks[key]) for key in tasks if key not in results}
-        for key, text in self.stream(missing, title, len(results)):
-            results[key] = json.loads(text)
-            if folder:
-                write_text(files[key], seal(results[key]))
-        return {key: results[key] for key in tasks}
-
-    def stream(self, tasks: Tasks, title: str = "", done: int = 0) -> Iterator[tuple[str, Any]]:
-        """Run tasks, and yield the name and result of each as it finishes.
-
-        Like `run`, but a task may return anything that can be pickled. On this machine, tasks
-        that cannot be pickled run in this process, last. `done` tasks have finished before.
+            At the end, if tasks raised an exception or lost their process.
+        UsageError
+            If there is no cluster.
         """
         from tqdm import tqdm
 
-        bar = tqdm(total=done + len(tasks), initial=done, desc=title, disable=not title)
-        errors = dict.fromkeys(tasks, "Not run: too many lost their worker.")
-        blamed = 0
-        if self._backend == "ray":
-            answers = cluster.answers(tasks, self._jobs, LOSSES)
-        else:
-            answers = _local(tasks, self._jobs)
-        with bar:
-            for key, result, error, lost in answers:
-                if not error:
-                    del errors[key]
-                    bar.update()
-                    yield key, result
-                    continue
-                errors[key] = error
-                blamed += lost
-                if blamed == GIVE_UP:
-                    break
+        missing, errors = dict(tasks), {}
+        with tqdm(total=len(tasks), desc=title, disable=not title) as bar:
+            if kept:
+                for name, task in tasks.items():
+                    with suppress(LookupError):
+                        result = kept.load(task)
+                        del missing[name]
+                        bar.update()
+                        yield name, result
+            run = _on_cluster if self.backend == "ray" else _on_this_machine
+            for name, result, error in run(missing, self.jobs):
+                bar.update()
+                if kept and not error:
+                    try:
+                        result = kept.save(tasks[name], result)
+                    except (TypeError, ValueError) as fault:
+                        error = f"Its result cannot be kept: {fault}"
+                if error:
+                    errors[name] = error
+                else:
+                    yield name, result
         if errors:
-            raise TasksFailedError(errors, done + len(tasks))
+            raise TasksFailedError(errors, len(tasks))
 
 
-def _local(tasks: Tasks, jobs: int | None) -> Iterator[cluster.Answer]:
-    """Run tasks on this machine, and rerun those that lose their worker."""
+def _attempt(name: str, task: Task) -> Answer:
+    try:
+        return name, task(), ""
+    except SystemExit as left:
+        return name, None, f"A controller called sys.exit({left.code!r})"
+    except Exception:  # as text, since not every exception can be pickled
+        return name, None, traceback.format_exc()
+
+
+def _on_this_machine(tasks: Tasks, jobs: int | None) -> Iterator[Answer]:
+    """Run tasks with joblib. If a process is killed, the tasks under way fail."""
     import joblib  # here: slow to import
 
     jobs = jobs or joblib.cpu_count()
-    away = {key: task for key, task in tasks.items() if jobs > 1 and _travels(task)}
-    here = [key for key in tasks if key not in away]
-    losses: Counter[str] = Counter()
+    away = {name: task for name, task in tasks.items() if jobs > 1 and _travels(task)}
+    here = {name: task for name, task in tasks.items() if name not in away}
     while away:
-        suspects = [key for key in away if losses[key] >= LOSSES][:1]
-        started: list[str] = []
+        under_way: list[str] = []
         try:
-            tried = {key: away[key] for key in suspects or away}
-            for key, result, error in _in_processes(tried, jobs, started):
-                del away[key]
-                yield key, result, error, False
-        except BrokenExecutor as lost:
-            # Any of the tasks under way may have killed the worker.
-            under_way = [key for key in started if key in away]
-            if not under_way:
-                raise
-            losses.update(under_way)
-            for key in suspects:
-                del away[key]
-                yield key, None, f"{lost}\nIts worker was lost each time.", True
-    for key in here:
-        yield key, *cluster.attempt(tasks[key]), False
+            for answer in _in_processes(dict(away), jobs, under_way):
+                del away[answer[0]]
+                yield answer
+        except BrokenExecutor:
+            for name in [name for name in under_way if name in away]:
+                del away[name]
+                yield name, None, LOST
+    for name, task in here.items():
+        yield _attempt(name, task)
 
 
-def _in_processes(
-    tasks: Tasks, jobs: int, started: list[str]
-) -> Iterator[tuple[str, Any, str]]:
-    """Run tasks in other processes, yield their answers, and list in `started` which began."""
+def _in_processes(tasks: Tasks, jobs: int, under_way: list[str]) -> Iterator[Answer]:
+    """Run tasks in other processes, and list in `under_way` which have begun."""
     import joblib
 
     def handed_out() -> Iterator[Any]:
-        for key, task in tasks.items():
-            started.append(key)
-            yield joblib.delayed(_answer)(key, task, os.getpid())
+        for name, task in tasks.items():
+            under_way.append(name)
+            yield joblib.delayed(_attempt)(name, task)
 
-    # With one process joblib would use this one, which no task may bring down.
-    processes = max(2, min(jobs, len(tasks)))
     with joblib.parallel_config("loky", inner_max_num_threads=1):
-        # Batches of one, so that a lost worker takes as few tasks with it as possible.
-        parallel = joblib.Parallel(processes, return_as="generator_unordered", batch_size=1)
+        # With one process joblib would use this one, which no task may bring down. Nothing is
+        # handed out in advance, so that a killed process takes few tasks with it.
+        processes = max(2, min(jobs, len(tasks)))
+        parallel = joblib.Parallel(
+            processes, return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs"
+        )
     yield from parallel(handed_out())
 
 
-def _travels(task: Callable[[], Any]) -> bool:
+def _travels(task: Task) -> bool:
     """Return whether a task can be pickled: one with a user's own controller may not be."""
     from joblib.externals.loky.backend.reduction import dumps
 
@@ -192,27 +182,64 @@ def _travels(task: Callable[[], Any]) -> bool:
     return True
 
 
-def _as_json(task: Callable[[], Any]) -> str:
-    """Run a task; a result that JSON cannot hold is then an error of that task alone."""
-    return json.dumps(task())
+def _on_cluster(tasks: Tasks, jobs: int | None) -> Iterator[Answer]:
+    """Run tasks on the cluster at RAY_ADDRESS or on this machine; Ray replaces lost nodes."""
+    import ray  # here: an optional package that takes a second to import
+
+    if not ray.is_initialized():
+        _connect()
+    remote = ray.remote(num_cpus=1, max_retries=2)(_attempt_there)
+    at_once = jobs or QUEUED * int(ray.cluster_resources().get("CPU", 1))
+    here, waiting = versions(), iter(tasks.items())
+    running: dict[Any, str] = {}
+    try:
+        while True:
+            for name, task in islice(waiting, at_once - len(running)):
+                running[remote.remote(name, task, here)] = name
+            if not running:
+                return
+            for done in ray.wait(list(running))[0]:
+                name = running.pop(done)
+                try:
+                    yield ray.get(done)
+                except ray.exceptions.RayError as lost:
+                    yield name, None, f"{lost}\n{LOST}"
+    finally:
+        for left in running:
+            ray.cancel(left, force=True)
 
 
-def _answer(key: str, task: Callable[[], Any], parent: int) -> tuple[str, Any, str]:
-    _end_with(parent)
-    return key, *cluster.attempt(task)
+def _attempt_there(name: str, task: Task, here: dict[str, str]) -> Answer:
+    """Run a task if this node has the versions of packages that the driver has."""
+    there = versions()
+    if there != here:
+        has, wanted = dict(there.items() - here.items()), dict(here.items() - there.items())
+        return name, None, f"A node computes other numbers: it has {has}, and not {wanted}"
+    return _attempt(name, task)
 
 
-@cache
-def _end_with(parent: int) -> None:
-    """End this process when its parent ends, even if the parent was killed.
+def _connect() -> None:
+    import ray
 
-    An orphaned worker would otherwise wait for work for some minutes. On Windows it still does,
-    since it cannot tell.
-    """
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(PATIENCE)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    # `ray job submit` has uploaded the same code.
+    os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
+    folder = os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
+    latest = Path(folder, "ray", "ray_current_cluster")  # of `ray start`; may be stale
+    found = latest.read_text().strip() if latest.exists() else ""
+    address = os.environ.get("RAY_ADDRESS") or found
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    with blame("--backend"):
+        try:
+            if host and port.isdecimal():  # Ray itself would wait for minutes
+                socket.create_connection((host, int(port)), timeout=10).close()
+            ray.init(
+                address="auto",
+                runtime_env={"working_dir": str(ROOT), "excludes": STAYS},
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+            )
+        except OSError as error:
+            raise ValueError(
+                "No Ray cluster can be reached: start one with `ray start --head`, or set "
+                f"RAY_ADDRESS ({error})"
+            ) from error

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from benchmarks.lib.command_line import UsageError, blame
-from benchmarks.lib.options import Repeated, choice, options
+from benchmarks.lib.command import Repeated, UsageError, blame, choice, options
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.parameters import slowest_pole
 

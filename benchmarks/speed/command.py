@@ -27,10 +27,10 @@ from torch import nn
 from tqdm import tqdm
 
 from agents import DirectNNController
-from benchmarks.lib.command_line import blame
+from benchmarks.lib.command import blame
 from benchmarks.lib.tables import on_screen
 from benchmarks.loop.rollout import make_plants, rollout
-from benchmarks.speed.options import Options
+from benchmarks.speed.__main__ import Options
 from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv
 from mptc_gym.torch_env import MiddlePointTorchEnv
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -14,14 +15,12 @@ from rich.console import Console
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.records import provenances
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import blame, out_folder
-from benchmarks.lib.fingerprint import fingerprint
-from benchmarks.lib.options import flat
+from benchmarks.lib.command import blame, out_folder
 from benchmarks.lib.report import provenance_line, show, write_report
-from benchmarks.lib.storage import origin, write_json
+from benchmarks.lib.storage import Kept, origin, write_json
 from benchmarks.lib.tables import write_csv
 from benchmarks.loop.designs import SPANS, WIDE, grid, random_design
-from benchmarks.sweep.options import Options
+from benchmarks.sweep.__main__ import Options
 from benchmarks.sweep.report import report, table
 from benchmarks.sweep.tasks import agent_task, limit_task
 from mptc_gym import Parameters
@@ -50,36 +49,30 @@ def execute(options: Options, console: Console) -> str:
     members = {name: entry.members(training) for name, entry in known.items()}
     began = time.perf_counter()
 
-    def run(
-        name: str, tasks: Iterable[Callable[[], Any]], *modules: str, **shaped_by: Any
-    ) -> list[Any]:
-        """Run a task for each plant, or load the kept result of exactly this task."""
-        numbers = {"plants": plants, "samples": options.samples, **shaped_by}
-        kept = out / "tasks" / fingerprint(limit_task.__module__, *modules, **numbers)
-        named = {f"{name} {i}": task for i, task in enumerate(tasks)}
-        return list(training.fan_out.run(named, kept, title=name).values())
-
-    limits = run("limit", (partial(limit_task, plant, options.samples) for plant in plants))
-    results = {}
+    tasks: dict[str, Callable[[], Any]] = {
+        f"plant {i}": partial(limit_task, plant, options.samples)
+        for i, plant in enumerate(plants)
+    }
     for name, factories in members.items():
         # The plants take the members in turn, so that the maps show how much they differ.
-        tasks = (
-            partial(agent_task, *given, options.samples, options.runs)
-            for given in zip(cycle(factories), told, plants, strict=False)
-        )
-        about = {"told": told, "runs": options.runs, "controller": name}
-        policies = provenances({name: factories})
-        results[name] = run(name, tasks, factories[0].module, **about, policies=policies)
+        for i, given in enumerate(zip(cycle(factories), told, plants, strict=False)):
+            tasks[f"plant {i}, {name}"] = partial(
+                agent_task, *given, options.samples, options.runs
+            )
+    found = training.fan_out.run(tasks, "sweep", Kept(out / "tasks"))
+    limits = [found[f"plant {i}"] for i in range(len(plants))]
+    results = {
+        name: [found[f"plant {i}, {name}"] for i in range(len(plants))] for name in members
+    }
     seconds = time.perf_counter() - began
 
     runs = table(differing, list(controllers), limits, results)
     sections = report(runs, out, options.design, options.told)
     write_csv(out / "runs.csv", runs)
-    about = {"seconds": round(seconds, 1), "options": flat(options)}
+    about = {"seconds": round(seconds, 1), "options": asdict(options)}
     write_json(out / "provenance.json", {**made, **about, "policies": provenances(members)})
     knowing = "are told" if options.told == "each" else "were not made for"
     title = f"Controllers on plants that they {knowing}"
     write_report(out, title, sections, provenance_line("sweep", made))
     show(sections, console)
-    count = len(plants) * (1 + len(results))
-    return f"{count} tasks in {seconds:.0f} s. The report, data and maps are in {out}/"
+    return f"{len(tasks)} tasks in {seconds:.0f} s. The report, data and maps are in {out}/"

@@ -1,8 +1,38 @@
 """Train the neural controllers: `python -m benchmarks.train --help`."""
 
-from benchmarks.lib.commands import command
+from __future__ import annotations
 
-main = command("train", interrupted="the same command trains what is missing.")
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from benchmarks.lib.command import Count, Folder, choice, command, options
+from benchmarks.lib.fan_out import FanOut
+
+OUT = Path("results/networks")
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Train the neural controllers: by the gradient through the plant, or by PPO.
+
+    Finished networks are kept: the same command, run again, trains only the missing ones.
+    """
+
+    network: Annotated[str, choice(("nn-smith", "ppo"), "What to train")] = field(kw_only=False)
+    networks: Count | None = None
+    """Number of networks to train, each from its own seed (default: 1 for nn-smith, where
+    validation chooses the best of several; 5 for PPO, which are all compared)."""
+    steps: Count | None = None
+    """Optimiser steps or, for PPO, samples of experience (default: as published)."""
+    keep: bool = False
+    """Save the result to agents/pretrained."""
+    out: Folder = OUT
+    fan_out: FanOut = field(default_factory=FanOut)
+
+
+main = command(Options, "benchmarks.train.command")
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

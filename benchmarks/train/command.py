@@ -14,13 +14,13 @@ from rich.console import Console
 
 from agents import LawNetwork, PolicyNetwork
 from agents.archive import PRETRAINED
-from benchmarks.lib import command_line
+from benchmarks.lib.command import out_folder
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.storage import commit, replacing
+from benchmarks.lib.storage import Kept, commit, replacing
 from benchmarks.lib.tables import on_screen
-from benchmarks.train import kept, ppo
-from benchmarks.train.options import Options
-from benchmarks.train.through_plant import KINDS, Training, train, training_key
+from benchmarks.train import ppo
+from benchmarks.train.__main__ import Options
+from benchmarks.train.through_plant import KINDS, Training, train
 
 # Networks to save, by file name; a table row per trained network; and the closing message.
 Made = tuple[Mapping[str, LawNetwork | PolicyNetwork], list[dict[str, Any]], str]
@@ -28,7 +28,7 @@ Made = tuple[Mapping[str, LawNetwork | PolicyNetwork], list[dict[str, Any]], str
 
 def execute(options: Options, console: Console) -> str:
     """Train networks, save them and show their results in validation."""
-    out = command_line.out_folder(options.out)
+    out = out_folder(options.out)
     target = PRETRAINED if options.keep else out
     networks, rows, said = (_ppo if options.network == "ppo" else _told)(options, out)
     shown = pd.DataFrame(rows).map(lambda x: f"{x:.4g}" if isinstance(x, float) else str(x))
@@ -39,30 +39,11 @@ def execute(options: Options, console: Console) -> str:
     return f"{said} in {target}"
 
 
-def trained(
-    trainings: Sequence[Training],
-    out: Path,
-    fan_out: FanOut,
-    *,
-    retrain: bool = False,
-    here: bool = True,
-) -> list[LawNetwork]:
-    """Train in parallel the networks that `out` does not hold yet, and return all of them.
-
-    If the trainings run `here`, with access to `out`, it also holds their progress.
-    """
-    runs = {}
-    for each in trainings:
-        file = out / training_key(each) / "network.npz"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        state = file.with_name("state.pt")
-        if retrain:
-            state.unlink(missing_ok=True)
-        runs[file] = partial(train, each, state if here else None, commit())
-    networks = kept.trained(runs, LawNetwork.load, fan_out, retrain=retrain)
-    for file in networks:
-        file.with_name("state.pt").unlink(missing_ok=True)
-    return [*networks.values()]
+def trained(trainings: Sequence[Training], out: Path, fan_out: FanOut) -> list[LawNetwork]:
+    """Train in parallel the networks that `out` does not hold yet, and return all of them."""
+    tasks = {f"seed {each.seed}": partial(train, each, commit()) for each in trainings}
+    kept = Kept(out / "tasks", ".npz", LawNetwork.save, LawNetwork.load)
+    return [*fan_out.run(tasks, "training", kept).values()]
 
 
 def _told(options: Options, out: Path) -> Made:
@@ -73,13 +54,7 @@ def _told(options: Options, out: Path) -> Made:
     first = Training()
     first = replace(first, steps=options.steps or first.steps)
     seeds = range(first.seed, first.seed + (options.networks or 1))
-    networks = trained(
-        [replace(first, seed=seed) for seed in seeds],
-        out,
-        options.fan_out.open(),
-        retrain=options.retrain,
-        here=options.fan_out.backend == "loky",
-    )
+    networks = trained([replace(first, seed=seed) for seed in seeds], out, options.fan_out)
     rows = []
     for seed, network in zip(seeds, networks, strict=True):
         logarithms = {kind: network.provenance["validation"][kind] for kind in KINDS}
@@ -93,9 +68,7 @@ def _told(options: Options, out: Path) -> Made:
 
 def _ppo(options: Options, out: Path) -> Made:
     """Train PPO policies, and save all of them."""
-    asked = ppo.PolicyRequest(
-        options.fan_out.open(), out, options.steps, options.networks, options.retrain
-    )
+    asked = ppo.PolicyRequest(options.fan_out, out, options.steps, options.networks)
     policies, rows = {}, []
     for policy in ppo.members(asked, shipped=False).values():
         seed, curve = policy.provenance["arguments"]["seed"], policy.provenance["curve"]

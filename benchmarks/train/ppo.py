@@ -15,7 +15,7 @@ from pathlib import Path
 from agents import PolicyNetwork
 from agents.archive import PRETRAINED
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.fingerprint import fingerprint
+from benchmarks.lib.storage import key
 from benchmarks.train import kept
 from benchmarks.train.ppo_arguments import PPOArguments
 
@@ -28,7 +28,7 @@ TUNING_SEED, FINAL_SEED = 1000, 2000  # of policies in a search; no comparison u
 class PolicyRequest:
     """A request for trained policies, and how to train those that are missing."""
 
-    fan_out: FanOut = field(default_factory=lambda: FanOut(1))
+    fan_out: FanOut = field(default_factory=lambda: FanOut(jobs=1))
     """Runs the trainings."""
     folder: Path = KEPT
     """Folder of the trained policies."""
@@ -87,7 +87,7 @@ def file_name(seed: int) -> str:
 
 def policy_key(arguments: PPOArguments) -> str:
     """Return a fingerprint of everything that shapes a policy."""
-    return fingerprint(__name__, arguments=asdict(arguments))
+    return str(key(asdict(arguments)))
 
 
 def _comes(arguments: PPOArguments) -> bool:

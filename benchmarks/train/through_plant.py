@@ -13,20 +13,17 @@ import copy
 import math
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from agents.neural_law import INPUTS, MOST_ADDED, OUTPUTS, LawNetwork
-from benchmarks.lib.fingerprint import fingerprint
-from benchmarks.lib.storage import replacing, versions
+from benchmarks.lib.storage import code, versions
 from benchmarks.train.loops import Draw, Loops, environment
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
 VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED = 64, 600, 3_000_000
-SAVED_EVERY = 50  # steps; a training takes minutes
 # Kinds of validation plants, with the ranges drawn from: low, high, and the power of `small`.
 KINDS: dict[str, dict[str, tuple[float, float, int]]] = {
     "calm": {},
@@ -153,45 +150,23 @@ def validate(net: Net, training: Training) -> dict[str, float]:
     return found
 
 
-def train(training: Training, state: Path | None = None, source: str = "") -> LawNetwork:
-    """Train, and return the network.
-
-    Parameters
-    ----------
-    training
-        Arguments of the training.
-    state
-        File that stores the progress; the training resumes from it if it exists.
-    source
-        Commit of the code that runs, for the provenance.
-    """
+def train(training: Training, source: str = "") -> LawNetwork:
+    """Train and return the network; `source` is the commit of the code that runs."""
     torch.set_num_threads(1)  # the network is too small for more
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(training.seed)
         net = Net(training)
     mean, optimiser = copy.deepcopy(net), torch.optim.Adam(net.parameters())
-    done, seconds = 0, 0.0
-    parts: dict[str, Any] = {"net": net, "mean": mean, "optimiser": optimiser}
-    if state is not None and state.exists():
-        kept = torch.load(state, weights_only=True)
-        for name, part in parts.items():
-            part.load_state_dict(kept[name])
-        done, seconds = kept["done"], kept["seconds"]
+    began = time.process_time()
     plants = environment(training.plants, training.stretches * training.samples)
-    for step in range(done, training.steps, training.stretches):
-        began = time.process_time()
+    for step in range(0, training.steps, training.stretches):
         _advance(net, mean, optimiser, plants, training, step)
-        seconds += time.process_time() - began
-        done = step + training.stretches
-        if state is not None and done % SAVED_EVERY < training.stretches:
-            kept = {name: part.state_dict() for name, part in parts.items()}
-            with replacing(state) as file:
-                torch.save({**kept, "done": done, "seconds": seconds}, file)
+    seconds = time.process_time() - began
     return mean.export(
         training=asdict(training),
         validation={"seed": VALIDATION_SEED, **validate(mean, training)},
         cpu_seconds=round(seconds, 1),
-        code=training_key(training),
+        code=code(),
         versions=versions(),
         commit=source,
     )
@@ -224,8 +199,3 @@ def _advance(
         with torch.no_grad():
             for slow, new in zip(mean.parameters(), net.parameters(), strict=True):
                 slow.lerp_(new, share)
-
-
-def training_key(training: Training) -> str:
-    """Return a fingerprint of all that shapes a network: arguments, versions and code."""
-    return fingerprint(__name__, training=asdict(training))

@@ -1,10 +1,10 @@
-"""Search for a controller's gains with Optuna, keeping every trial."""
+"""Search for a controller's gains with Optuna, whose storage keeps every trial."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,19 @@ import numpy as np
 import optuna
 import pandas as pd
 from optuna.distributions import BaseDistribution, FloatDistribution
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import create_trial
+from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks.controllers.records import RosterEntry, Tuning
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.command import out_folder
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.fingerprint import code, fingerprint
-from benchmarks.lib.storage import write_text
-from benchmarks.lib.tables import write_csv
+from benchmarks.lib.storage import key, write_text
+from benchmarks.lib.tables import on_screen, write_csv
+from benchmarks.tune.__main__ import Options
 from benchmarks.tune.objective import SCENARIOS, score
 
 SEED = 1  # seed of the search
@@ -27,6 +33,18 @@ FINAL_RUNS, FINAL_FIRST_RUN = 1000, 4_000_000  # for judging the best again
 DIGITS = 3  # significant digits of the gains that are judged again
 
 Row = dict[str, float]  # gains, and their result from `score`
+
+
+def execute(options: Options, console: Console) -> str:
+    """Run the search, and write and print its results."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    plant, out = options.plant.chosen().arguments, out_folder(options.out)
+    search = Search(ROSTER[options.controller], options.runs, plant, out, options.fan_out)
+    report = search.report(search.run(options.trials or search.tuning.trials))
+    console.print(f"The best, on {FINAL_RUNS} new runs")
+    shown = report[[*search.tuning.space, "objective"]].head(5)
+    console.print(on_screen(shown.map("{:.4g}".format)))
+    return f"All trials are in {search.path}, the best in {search.path.with_suffix('.md')}"
 
 
 @dataclass(frozen=True)
@@ -40,8 +58,7 @@ class Search:
     plant: Mapping[str, Any]
     """Arguments of the environment, if the plant is not the paper's."""
     folder: Path
-    """Folder for `<controller>.csv` and `<controller>.md`. The trials are kept in a subfolder
-    named after everything that shapes them: code, plant, runs and versions."""
+    """Folder for `<controller>.csv`, `<controller>.md` and the trials."""
     fan_out: FanOut
     """Runs the members of a trial, or the finalists, in parallel."""
 
@@ -56,53 +73,74 @@ class Search:
         assert self.controller.tuning is not None
         return self.controller.tuning
 
-    @cached_property
-    def _kept(self) -> Path:
-        train = self.tuning.train
-        maker = train.__module__ if train else self.controller.members()[0].module
-        judges = ("benchmarks.loop.metrics", "benchmarks.loop.rollout")
-        name = fingerprint(
-            maker,
-            *judges,
-            objective=code("benchmarks.tune.objective"),  # without its imports
-            case=[self.runs, dict(self.plant), SEED, FIRST_RUN, optuna.__version__],
-            tuning=[self.tuning.space, self.tuning.penalty, self.tuning.startup],
-        )
-        return self.folder / f"{self.controller.name}-{name}"
-
     def run(self, trials: int) -> pd.DataFrame:
-        """Try gains until there are `trials` in all, and return one row for each trial."""
-        rows: list[Row] = []
+        """Try gains until there are `trials` in all, and return one row for each trial.
+
+        Each trial has a sampler of its own, seeded with the search's seed and the number of
+        trials before, so that an interrupted search continues exactly as it would have.
+        """
+        study, tuning = self._study(), self.tuning
+        space: dict[str, BaseDistribution] = {
+            name: FloatDistribution(*ends, log=True) for name, ends in tuning.space.items()
+        }
         try:
-            with tqdm(total=trials, desc=self.controller.name) as bar:
-                while len(rows) < trials:
-                    propose = partial(_proposed, self.tuning, rows)
-                    rows += self._judge({f"trial {len(rows)}": propose}, final=False)
-                    bar.set_postfix(best=f"{min(row['objective'] for row in rows):.3f}")
+            with tqdm(
+                total=trials, initial=len(study.trials), desc=self.controller.name
+            ) as bar:
+                for number in range(len(study.trials), trials):
+                    sampler = optuna.samplers.TPESampler(
+                        seed=SEED * 1_000_000 + number,
+                        n_startup_trials=tuning.startup,
+                        multivariate=True,
+                    )
+                    before = optuna.create_study(sampler=sampler)
+                    before.add_trials(study.trials)
+                    gains = before.ask(space).params
+                    (row,) = self._judge({"": gains}, final=False)
+                    study.add_trial(
+                        create_trial(
+                            params=gains,
+                            distributions=space,
+                            value=row["objective"],
+                            user_attrs=row,
+                        )
+                    )
+                    bar.set_postfix(best=f"{study.best_value:.3f}")
                     bar.update()
         finally:
-            if rows:
-                write_csv(self.path, pd.DataFrame(rows))
-        return pd.DataFrame(rows)
+            rows = pd.DataFrame([trial.user_attrs for trial in study.trials[:trials]])
+            write_csv(self.path, rows)
+        return rows
 
-    def _judge(self, candidates: Mapping[str, Callable[[], Row]], *, final: bool) -> list[Row]:
+    def _study(self) -> optuna.Study:
+        """Return the study of everything that shapes the trials, with those of before."""
+        tuning = self.tuning
+        shaped_by = self.controller.name, self.runs, dict(self.plant), tuning.space
+        return optuna.create_study(
+            study_name=key(*shaped_by, tuning.penalty, tuning.startup),
+            storage=JournalStorage(JournalFileBackend(str(self.folder / "trials.log"))),
+            load_if_exists=True,
+        )
+
+    def _judge(self, candidates: Mapping[str, Row], *, final: bool) -> list[Row]:
         """Return each candidate's gains with the mean of its members' scores."""
         members = range(self.tuning.members[final])
         runs = (FINAL_RUNS, FINAL_FIRST_RUN) if final else (self.runs, FIRST_RUN)
         judged = partial(_judged, self.controller, self.plant, *runs, final)
         tasks = {
-            f"{name}, member {member}": partial(judged, propose, member)
-            for name, propose in candidates.items()
+            f"{name}, member {member}": partial(judged, gains, member)
+            for name, gains in candidates.items()
             for member in members
         }
         # A single task gains nothing from another process, which takes seconds to start.
         fan_out = self.fan_out if len(tasks) > 1 else FanOut(jobs=1)
-        title = "new runs for the best" if final else ""
-        found = fan_out.run(tasks, None if final else self._kept, title)
+        found = fan_out.run(tasks, "new runs for the best" if final else "")
         rows = []
         for name in candidates:
             answers = [found[f"{name}, member {member}"] for member in members]
-            rows.append({key: float(np.mean([a[key] for a in answers])) for key in answers[0]})
+            rows.append(
+                {each: float(np.mean([a[each] for a in answers])) for each in answers[0]}
+            )
         return rows
 
     def report(self, trials: pd.DataFrame) -> pd.DataFrame:
@@ -112,10 +150,12 @@ class Search:
         The rows are sorted, best first.
         """
         best = trials.nsmallest(self.tuning.finalists, "objective")
-        candidates: dict[str, Callable[[], Row]] = {}
-        for i, trial in best.iterrows():
-            gains = {name: float(f"{trial[name]:.{DIGITS}g}") for name in self.tuning.space}
-            candidates[f"trial {i}"] = partial(dict, gains)
+        candidates = {
+            f"trial {i}": {
+                name: float(f"{trial[name]:.{DIGITS}g}") for name in self.tuning.space
+            }
+            for i, trial in best.iterrows()
+        }
         table = pd.DataFrame(self._judge(candidates, final=True))
         table["in the search"] = best["objective"].to_numpy()
         table = table.sort_values("objective", ignore_index=True)
@@ -147,38 +187,17 @@ class Search:
         )
 
 
-def _proposed(tuning: Tuning, rows: list[Row]) -> Row:
-    """Return the gains to try after these trials.
-
-    The sampler is seeded anew with the search's seed and the trial's number, so that an
-    interrupted search continues exactly as it would have without the interruption.
-    """
-    sampler = optuna.samplers.TPESampler(
-        seed=SEED * 1_000_000 + len(rows), n_startup_trials=tuning.startup, multivariate=True
-    )
-    space: dict[str, BaseDistribution] = {
-        name: FloatDistribution(*ends, log=True) for name, ends in tuning.space.items()
-    }
-    study = optuna.create_study(sampler=sampler)
-    for row in rows:
-        gains = {name: row[name] for name in space}
-        study.add_trial(
-            optuna.trial.create_trial(params=gains, distributions=space, value=row["objective"])
-        )
-    return study.ask(space).params
-
-
 def _judged(
     controller: RosterEntry,
     plant: Mapping[str, Any],
     runs: int,
     first_run: int,
     final: bool,
-    propose: Callable[[], Row],
+    gains: Row,
     member: int,
 ) -> Row:
     """Return gains together with the score of a controller that has them."""
-    gains, tuning = propose(), controller.tuning
+    tuning = controller.tuning
     assert tuning is not None
     if tuning.train is None:
         (factory,) = controller.members()

@@ -14,14 +14,14 @@ from rich.console import Console
 from benchmarks.controllers.own import own_entry
 from benchmarks.controllers.records import Factory, RosterEntry
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command_line import UsageError
+from benchmarks.lib.command import UsageError
 from benchmarks.lib.storage import replacing
 from benchmarks.lib.tables import on_screen
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import Trajectory
 from benchmarks.loop.scenarios import SCENARIOS, Scenario, scenarios_of
 from benchmarks.watch import game
-from benchmarks.watch.options import YOU, Options
+from benchmarks.watch.__main__ import YOU, Options
 from mptc_gym import MiddlePointEnv
 from mptc_gym.drawing import SIZE
 

@@ -1,10 +1,9 @@
 """Identify known plants from synthetic logs: `python -m benchmarks.identify.study`."""
 
-from benchmarks.lib.commands import command
+from benchmarks.identify.study.options import Options
+from benchmarks.lib.command import command
 
-main = command(
-    "identify.study", interrupted="what has finished is kept, and the next call goes on."
-)
+main = command(Options, "benchmarks.identify.study.command")
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

@@ -27,10 +27,9 @@ from benchmarks.identify.options import Knowledge
 from benchmarks.identify.study.faults import FAULTS, HARMFUL, faulty
 from benchmarks.identify.study.options import Options
 from benchmarks.identify.tuning import MOST_SENSITIVE, recommended
-from benchmarks.lib.command_line import out_folder
-from benchmarks.lib.fingerprint import fingerprint
+from benchmarks.lib.command import out_folder
 from benchmarks.lib.statistics import share
-from benchmarks.lib.storage import write_text
+from benchmarks.lib.storage import Kept, write_text
 from benchmarks.lib.tables import groups, on_screen, write_csv
 from benchmarks.loop.designs import Arguments, random_design
 from benchmarks.loop.linear import LinearModel, nominal
@@ -267,9 +266,7 @@ def execute(options: Options, console: Console) -> str:
     for kind in FAULTS:
         for i in range(options.faults or 0):
             tasks[f"{kind} valve {i}"] = partial(task_of_faults, kind, i, options.seed)
-    shaped_by = {name: getattr(options, name) for name in ("samples", "seed", "logs")}
-    key = fingerprint("benchmarks.identify.study.command", **shaped_by)
-    results = options.fan_out.open().run(tasks, out / "tasks" / key, title="logs")
+    results = options.fan_out.run(tasks, "logs", Kept(out / "tasks"))
     found = pd.DataFrame([results.pop(name) for name in logs])
     write_csv(out / "identify_study.csv", _rounded(found))
     closing = (

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.lib.options import FanOutOptions, Folder, Runs, Seed, options
+from benchmarks.lib.command import Folder, Runs, Seed, options
+from benchmarks.lib.fan_out import FanOut
 
 
 @options
@@ -23,5 +24,5 @@ class Options:
     """Number of rows of a log."""
     seed: Seed = 1
     """Seed of the plants, the steps of the flow and the noise."""
-    fan_out: FanOutOptions = field(default_factory=FanOutOptions)
+    fan_out: FanOut = field(default_factory=FanOut)
     out: Folder = Path("results/identify-study")

@@ -1,1 +1,0 @@
-"""Which of the paper's claims hold? `python -m benchmarks.claims`."""

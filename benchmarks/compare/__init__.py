@@ -1,1 +1,0 @@
-"""How do the controllers compare? `python -m benchmarks.compare`."""

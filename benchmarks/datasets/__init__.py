@@ -1,1 +1,0 @@
-"""Offline data sets with a known optimum: `python -m benchmarks.datasets`."""

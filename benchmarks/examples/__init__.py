@@ -1,1 +1,0 @@
-"""Short programs that use the environment with popular libraries."""

@@ -1,1 +1,0 @@
-"""How do the paper's figures look here? `python -m benchmarks.figures`."""

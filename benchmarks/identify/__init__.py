@@ -1,1 +1,0 @@
-"""From a recorded log to a plant and its controllers: `python -m benchmarks.identify`."""

@@ -1,1 +1,0 @@
-"""How often is the identification correct? `python -m benchmarks.identify.study`."""

@@ -1,1 +1,0 @@
-"""The control loop: the plant, the cases, the rollout loop and its performance measures."""

@@ -1,1 +1,0 @@
-"""How fast is it? `python -m benchmarks.speed`."""

@@ -1,1 +1,0 @@
-"""Where do controllers still work on other plants? `python -m benchmarks.sweep`."""

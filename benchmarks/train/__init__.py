@@ -1,1 +1,0 @@
-"""How are the learnt controllers trained? `python -m benchmarks.train`."""

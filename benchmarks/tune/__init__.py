@@ -1,1 +1,0 @@
-"""Which gains are best? `python -m benchmarks.tune`."""
