@@ -4,6 +4,7 @@ import math
 import re
 from unittest.mock import Mock
 
+import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,7 +13,7 @@ from agents import DirectNNController
 from benchmarks.claims import verdicts
 from benchmarks.claims.__main__ import main
 from benchmarks.claims.claims import CLAIMS, largest_pole
-from benchmarks.claims.runs import Batch, converged_at, fail_node
+from benchmarks.claims.runs import Batch, converged_at, fail_node, typical
 from benchmarks.claims.verdicts import Claim
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.metrics import join, mean_error, settled, split
@@ -238,3 +239,23 @@ class TestCommand:
         assert (claim.verdict == "cannot be tested from the text") is (name == "figures")
         for row in claim.findings:
             assert row["low"] <= row["value"] <= row["high"], row["quantity"]
+
+
+class TestFigures:
+    def test_the_typical_run_is_the_median_one(self):
+        outputs = [1.0, 9.0, 4.0, 2.0]  # errors 4, 4, 1, 3 of set point 5
+        runs = join([trajectory([5.0], [y], [10.0 * y]) for y in outputs])
+        row = typical(runs).iloc[0]
+        assert (row["setpoint"], row["output_typical"], row["command_typical"]) == (5, 2, 20)
+        assert row["output_p10"] == pytest.approx(1 + 0.3 * (2 - 1))
+        assert row["output_p90"] == pytest.approx(4 + 0.7 * (9 - 4))
+
+    def test_they_are_drawn_with_their_data(self, tmp_path):
+        assert run_claims(tmp_path, "figures") == 0
+        picture = matplotlib.image.imread(tmp_path / "figures.png")[..., :3]
+        assert 0.01 < np.mean(picture.min(axis=2) < 0.9) < 0.5  # dark or coloured
+        data = pd.read_csv(tmp_path / "figures.csv")
+        assert data.groupby("case").size().tolist() == [1200] * 6
+        assert (data["output_p10"] <= data["output_p90"]).all()
+        noisy = data[data["case"].str.contains("NN.*R = 0.5")]
+        assert (noisy["noise_p10"] < noisy["noise_p90"])[1:].all()  # at k = 0 there is none

@@ -13,7 +13,15 @@ import pandas as pd
 
 from agents import PIController
 from agents.pi import SEARCHED_GAINS
-from benchmarks.claims.runs import Array, Batch, converged_at, fail_node, flat
+from benchmarks.claims.runs import (
+    FIGURES,
+    Array,
+    Batch,
+    converged_at,
+    fail_node,
+    flat,
+    typical,
+)
 from benchmarks.claims.verdicts import OFTEN, Claim
 from benchmarks.lib.statistics import Estimate, exact, median
 from benchmarks.lib.tables import groups
@@ -389,7 +397,12 @@ def direction_only(batch: Batch, claim: Claim) -> None:
     "Section 5, Figs 5 to 12",
     "The curves of the figures themselves",
     "The text gives neither their set points nor the gains, initial weights and noise behind "
-    "them. `python -m benchmarks.figures` draws counterparts.",
+    "them. `python -m benchmarks.claims figures` draws counterparts.",
 )
 def figures(batch: Batch, claim: Claim) -> None:
-    pass
+    curves = []
+    for case in FIGURES:
+        agent = PIController() if case.nodes is None else batch.networks(nodes=case.nodes)
+        runs = batch.run(agent, case.samples, **case.arguments)
+        curves.append(typical(runs).assign(case=case.title))
+    claim.tables["figures"] = pd.concat(curves, ignore_index=True)

@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 
-from benchmarks.lib.drawing import COLOURS, colours, drawn
+from benchmarks.claims.runs import FIGURES
+from benchmarks.lib.drawing import COLOURS, colours, draw_actuator, drawn
 from benchmarks.lib.tables import groups
 from benchmarks.loop.metrics import METRICS
+from mptc_gym import Parameters
 
 
 def plot_convergence(times: pd.DataFrame, path: Path) -> None:
@@ -74,8 +77,59 @@ def plot_other_plants(cells: pd.DataFrame, path: Path) -> None:
         figure.colorbar(image, ax=panels, label="settled (% of draws)")
 
 
+SIGNALS = {
+    "output": ("temperature y (°C)", COLOURS[0]),
+    "command": ("command u (t/h)", COLOURS[2]),
+    "noise": ("noise n (°C)", COLOURS[3]),
+}
+
+
+def plot_figures(curves: pd.DataFrame, path: Path) -> None:
+    """Draw counterparts of Figs 5 to 12: a typical run, and the spread of all runs."""
+    panels = [
+        (f"Fig. {number}: {case.title}", signal, case)
+        for case in FIGURES
+        for number, signals in case.figures.items()
+        for signal in signals
+    ]
+    with drawn(path, 13, 2.4 * math.ceil(len(panels) / 2)) as sheet:
+        grid = sheet.subplots(math.ceil(len(panels) / 2), 2, sharex=True, squeeze=False)
+        for axes, (title, signal, case) in zip(grid.flat, panels, strict=False):
+            of_case = curves[curves["case"] == case.title]
+            _draw_signal(axes, signal, of_case, Parameters(**case.arguments))
+            axes.set_title(title, loc="left", fontsize="medium")
+        for axes in grid.flat[: len(panels)][-2:]:  # the lowest of each column
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel("time (min)")
+        for axes in grid.flat[len(panels) :]:
+            axes.set_visible(False)
+
+
+def _draw_signal(axes: Axes, signal: str, curves: pd.DataFrame, plant: Parameters) -> None:
+    minutes = curves["time_s"] / 60
+    name, colour = SIGNALS[signal]
+    axes.fill_between(
+        minutes, curves[f"{signal}_p10"], curves[f"{signal}_p90"], color=colour, alpha=0.25,
+        linewidth=0, label="10th to 90th percentile",
+    )  # fmt: skip
+    typical = curves[f"{signal}_typical"]
+    axes.plot(minutes, typical, color=colour, linewidth=1, label="a typical run")
+    if signal == "output":
+        axes.step(
+            minutes, curves["setpoint"], "k--", linewidth=1, where="post", label="set point"
+        )
+    if signal == "command":
+        draw_actuator(axes, plant)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
+    axes.set_xlim(0, minutes.max())
+    axes.set_ylabel(name)
+    axes.legend(loc="upper right", ncols=3, fontsize="small")
+
+
 PLOTS = {
     "convergence": plot_convergence,
+    "figures": plot_figures,
     "pi_gains": plot_pi_gains,
     "other_plants": plot_other_plants,
 }

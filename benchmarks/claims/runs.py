@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from agents import DirectNNController, PIController
 from agents.direct_nn import Weights
+from benchmarks.lib.tables import percentiles
+from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
+from mptc_gym import PRESETS, Parameters
 
 Array = NDArray[np.floating]
 
@@ -101,3 +105,54 @@ def fail_node(controller: DirectNNController, stuck_at: int) -> None:
     # So far out on the sigmoid the slope vanishes, and the node cannot learn.
     weights.theta_1[..., 0] = 1e6 if stuck_at else -1e6
     controller.weights = weights
+
+
+@dataclass(frozen=True)
+class Case:
+    """The runs behind one or more figures of the paper."""
+
+    title: str
+    figures: dict[int, tuple[str, ...]]
+    """Signals in each figure, from top to bottom: "output" is set point and temperature."""
+    arguments: dict[str, Any] = field(default_factory=dict)
+    """Arguments of the environment."""
+    nodes: int | None = 3
+    """Hidden nodes of the network; None for the paper's PI controller."""
+    samples: int = 1200
+
+
+OUTPUT = ("output",)
+FIGURES = (
+    Case("NN, dead zone 5 t/h, R = 0", {5: OUTPUT}),
+    Case("NN, dead zone 7 t/h, R = 0", {6: OUTPUT, 7: ("command",)}, PRESETS["dead-zone-7"]),
+    Case(
+        "NN, dead zone 5 t/h, R = 0.5 °C²", {8: OUTPUT, 9: ("command", "noise")},
+        PRESETS["noisy"],
+    ),
+    Case("PI, dead zone 5 t/h, R = 0", {10: OUTPUT}, nodes=None),
+    Case("PI, dead zone 5 t/h, R = 0.5 °C²", {11: OUTPUT}, PRESETS["noisy"], None),
+    Case("NN, six hidden nodes, dead zone 5 t/h, R = 0", {12: OUTPUT}, nodes=6),
+)  # fmt: skip
+
+
+def typical(trajectory: Trajectory) -> pd.DataFrame:
+    """Return the set point, and each signal's typical run and percentiles, a row per sample.
+
+    Returns
+    -------
+    DataFrame
+        `time_s`, `setpoint`, and for `output`, `command` and `noise`: `_typical`, the run with
+        the median mean error (the better of two middle runs), `_p10` and `_p90`.
+    """
+    error = mean_error(trajectory)
+    middle = np.argsort(error, kind="stable")[(len(error) - 1) // 2]
+    columns = {
+        "time_s": np.arange(len(trajectory.setpoint)) * Parameters().sampling_interval,
+        "setpoint": trajectory.setpoint[:, 0],  # the same in all runs
+    }
+    for signal in ("output", "command", "noise"):
+        values = getattr(trajectory, signal)
+        columns[f"{signal}_typical"] = values[:, middle]
+        spread = percentiles(values)
+        columns |= {f"{signal}_{name}": spread[name] for name in ("p10", "p90")}
+    return pd.DataFrame(columns)
