@@ -23,7 +23,7 @@ from benchmarks.lib.storage import ROOT, UnfinishedError
 
 EXTRAS = {
     "compare": "cyclopts joblib matplotlib pandas rich scipy tabulate tqdm",
-    "render": "moviepy pygame",
+    "render": "pygame",
     "data": "h5py minari",
     "bench": "optuna PIL stable_baselines3",
     "ray": "ray",
