@@ -13,13 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from benchmarks.controllers.roster import label
-from benchmarks.lib.statistics import (
-    Estimate,
-    bootstrap,
-    improvement,
-    interquartile_mean,
-    student,
-)
+from benchmarks.lib.statistics import Estimate, bootstrap, improvement, student
 from benchmarks.lib.tables import groups
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
@@ -98,7 +92,7 @@ def bounds(scenario: Scenario, runs: int) -> dict[str, Any]:
 def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
     """Return estimates for a scenario with 95 % intervals, one row for each agent.
 
-    They are `mean` and `interquartile_mean` of |e|, degC; `ratio`, the mean as a multiple of
+    They are the `mean` of |e|, degC; `ratio`, the mean as a multiple of
     `limit`, the least possible error that applies; `difference`, the mean paired difference
     from the reference agent; `improvement`, the probability of doing better than that agent;
     and `student_high`, the upper end of Student's interval of the mean. `preview` is the least
@@ -115,7 +109,6 @@ def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
             student_high = math.inf
             if values.size == 1:
                 mean = replace(mean, low=-math.inf, high=math.inf)
-        middle = bootstrap(values, seed=BOOTSTRAP, statistic=interquartile_mean)
         row: dict[str, Any] = {
             "scenario": scale.scenario,
             "agent": agent,
@@ -123,7 +116,6 @@ def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
             "preview": scale.preview.value,
             "mean": mean,
             "student_high": student_high,
-            "interquartile_mean": middle,
             "ratio": replace(
                 mean, value=mean.value / limit, low=mean.low / limit, high=mean.high / limit
             ),
@@ -139,15 +131,15 @@ def score(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> Score:
     """Return an agent's score, overall and in each scenario.
 
     A run scores 0 for the mean error of a valve that is left alone and 1 for the least possible
-    error. The overall score is the interquartile mean over the runs of all scenarios, which
-    weigh the same however hard they are, with a 95 % interval from resampling policies and runs
-    within each scenario. The scores by scenario are means.
+    error. The score of a scenario is the mean over its runs, which is the score of
+    `mptc_gym.evaluate`; the overall score is the mean over the scenarios, however hard they
+    are. Its 95 % interval resamples policies and runs within each scenario.
     """
     tables = {
         scenario: scales[scenario].least.score(_errors(group))
         for scenario, group in groups(runs, "scenario")
     }
-    overall = bootstrap(*tables.values(), seed=BOOTSTRAP, statistic=interquartile_mean)
+    overall = bootstrap(*tables.values(), seed=BOOTSTRAP)
     return overall, {scenario: float(table.mean()) for scenario, table in tables.items()}
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import scipy  # loads its modules on first use
@@ -92,15 +91,8 @@ def share(happened: NDArray[np.bool_]) -> Estimate:
     return Estimate(count / runs, float(interval.low), float(interval.high), runs)
 
 
-def interquartile_mean(values: ArrayLike, axis: int | None = None) -> Any:
-    """Return the mean of the middle half of the values, which is robust to outliers."""
-    return scipy.stats.trim_mean(values, 0.25, axis=axis)
-
-
-def bootstrap(
-    *tasks: NDArray[np.float64], seed: int, statistic: Callable[..., Any] = np.mean
-) -> Estimate:
-    """Estimate a statistic over runs of one or more tasks, by a percentile bootstrap.
+def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
+    """Estimate the mean over the runs of one or more tasks, by a percentile bootstrap.
 
     Parameters
     ----------
@@ -114,8 +106,6 @@ def bootstrap(
         tasks themselves are not resampled.
     seed
         Seed of the resampling.
-    statistic
-        Called with an array of the values of all tasks and `axis=-1`.
 
     Raises
     ------
@@ -129,7 +119,7 @@ def bootstrap(
             f"values must be finite, one for each run, and as many in each task, got {tasks!r}"
         )
     together = np.concatenate([table.ravel() for table in tables])
-    value = float(statistic(together[np.newaxis], axis=-1)[0])
+    value = float(together.mean())
     if all(np.all(table == table.flat[0]) for table in tables):  # nothing was random
         return Estimate(value, value, value, together.size)
     generator = np.random.default_rng(seed)
@@ -139,7 +129,7 @@ def bootstrap(
         member = generator.integers(members, size=(RESAMPLES, members, 1))
         run = generator.integers(runs, size=(RESAMPLES, 1, runs))
         samples.append(table[member, run].reshape(RESAMPLES, -1))
-    low, high = np.quantile(statistic(np.hstack(samples), axis=-1), ENDS)
+    low, high = np.quantile(np.hstack(samples).mean(axis=-1), ENDS)
     return Estimate(value, float(low), float(high), together.size)
 
 
