@@ -25,7 +25,6 @@ import pytest
 from agents import PIController
 from benchmarks.bounds import least_possible
 from benchmarks.compare import plots, report
-from benchmarks.compare import tables as compare_tables
 from benchmarks.compare.__main__ import main
 from benchmarks.compare.estimates import estimate, scale_of, score, standing, verdict
 from benchmarks.controllers import records
@@ -103,7 +102,7 @@ class TestTables:
             "s": [1.5, np.inf],
             "e": [Estimate(2.0, 1.0, 3.0, 4), np.nan],
         }
-        compare_tables.write(tmp_path / "table.csv", pd.DataFrame(columns))
+        report.write_numbers(tmp_path / "table.csv", pd.DataFrame(columns))
         written = (tmp_path / "table.csv").read_text()
         assert written == "a,s,e,e_low,e_high\nx,1.5,2.0,1.0,3.0\ny,not settled,,,\n"
 
@@ -548,7 +547,7 @@ def test_a_long_legend_leaves_the_responses_their_room(tmp_path, monkeypatch):
     monkeypatch.setattr(plots, "drawn", measured)
     runs = rollout(make_plants(1, 40, setpoint=5.0), PIController(), 40, seed=0)
     scenario = SCENARIOS["constant"]
-    responses = [compare_tables.summarise_responses(runs, scenario, name) for name in ROSTER]
+    responses = [report.summarise_responses(runs, scenario, name) for name in ROSTER]
     plots.plot_responses(pd.concat(responses), scenario, tmp_path / "x.png")
     assert min(widths) > 0.7
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from benchmarks.compare import tables
-from benchmarks.compare.comparison import Comparison
 from benchmarks.compare.estimates import (
     Scale,
     Score,
@@ -25,7 +24,19 @@ from benchmarks.compare.estimates import (
 from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.report import Section, write_report
+from benchmarks.lib.statistics import Estimate
 from benchmarks.lib.storage import NotWrittenError
+from benchmarks.lib.tables import PERCENTILES, groups, percentiles, write_csv
+from benchmarks.loop.metrics import METRICS
+from benchmarks.loop.rollout import Trajectory
+from benchmarks.loop.scenarios import Scenario
+
+if TYPE_CHECKING:
+    from benchmarks.compare.comparison import Comparison
+
+NOT_SETTLED = "not settled"
+NO_MEASURE = "not measured"
+STEP_METRICS = ("overshoot", "settling_time")  # meaningless in noise
 
 
 def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -> list[Section]:
@@ -53,9 +64,9 @@ def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -
     made = dict(fan_out.stream(to_estimate | to_score))
     estimates = pd.concat([made[key] for key in to_estimate], ignore_index=True)
     scores = dict(zip(agents, (made[key] for key in to_score), strict=True))
-    summary = tables.summarise(runs)
-    tables.write(folder / "summary.csv", summary)
-    tables.write(folder / "estimates.csv", estimates)
+    summary = summarise(runs)
+    write_numbers(folder / "summary.csv", summary)
+    write_numbers(folder / "estimates.csv", estimates)
 
     plots: dict[str, tuple[Any, ...]] = {
         "travel.png": ("travel", summary, scales),
@@ -66,7 +77,7 @@ def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -
     for name in names:
         cases = [case for case in comparison.finished if case.scenario == name]
         responses = pd.concat([case.responses for case in cases], ignore_index=True)
-        tables.write(folder / f"{name}.csv", responses)
+        write_numbers(folder / f"{name}.csv", responses)
         shown = responses[responses["agent"].isin(drawn)]
         plots[f"{name}.png"] = ("responses", shown, comparison.scenarios[name])
     curves = [
@@ -77,7 +88,7 @@ def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -
     ]
     if curves:
         learning = pd.concat(curves, ignore_index=True)
-        tables.write(folder / "learning.csv", learning)
+        write_numbers(folder / "learning.csv", learning)
         plots["learning.png"] = ("learning", learning)
     draw = {name: partial(_draw, *what, folder / name) for name, what in plots.items()}
     faults = {name: fault for name, fault in fan_out.stream(draw) if fault}
@@ -130,7 +141,7 @@ def _sections(
                 f"The picture: {titles[0][1]}. A line is the median over all runs at each "
                 "sample, a band the 10th to 90th percentile. The grey band is the dead zone.",
             ],
-            tables.score_table(scores),
+            score_table(scores),
             [f"{names[0]}.png"],
         ),
         Section(
@@ -146,7 +157,7 @@ def _sections(
                 "A point is the mean over all runs, a bar its 95 % interval. Each axis begins "
                 "at the least possible error, the vertical line.",
             ],
-            tables.ratio_table(estimates, scales),
+            ratio_table(estimates, scales),
             ["bounds.png"],
         ),
         Section(
@@ -177,7 +188,7 @@ def _sections(
                 "The noise is the same for all. Overshoot and settling time are left out where "
                 "there is noise: it crosses every band."
             ],
-            tables.metrics_table(summary, comparison.scenarios),
+            metrics_table(summary, comparison.scenarios),
         ),
         Section(
             "Scenarios",
@@ -190,7 +201,7 @@ def _sections(
     if len(comparison.agents) > 1:
         title = f"Difference to {label(comparison.agents[0])} (°C), 95 % interval"
         text = ["And the share of runs in which the error is smaller, in the same noise."]
-        sections.insert(4, Section(title, text, tables.paired_table(estimates)))
+        sections.insert(4, Section(title, text, paired_table(estimates)))
     return sections
 
 
@@ -212,3 +223,116 @@ def _costs(comparison: Comparison) -> pd.DataFrame:
             }
         )
     return pd.DataFrame(rows)
+
+
+def summarise(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return percentiles over the runs, one row for each scenario, agent and metric."""
+    return pd.DataFrame(
+        [
+            {"scenario": scenario, "agent": agent, "metric": metric, "runs": len(group)}
+            | percentiles(group[metric].to_numpy())
+            for (scenario, agent), group in runs.groupby(["scenario", "agent"], sort=False)
+            for metric in METRICS
+        ]
+    )
+
+
+def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) -> pd.DataFrame:
+    """Return the set point and percentiles of y and u_a over the runs, one row per sample.
+
+    If the runs differ in their set points, the first run stands for all.
+    """
+    if (trajectory.setpoint != trajectory.setpoint[:, :1]).any():
+        trajectory = Trajectory(*(values[:, :1] for values in vars(trajectory).values()))
+    k = np.arange(len(trajectory.setpoint))
+    columns = {
+        "agent": agent,
+        "sample": k,
+        "time_s": k * scenario.parameters.sampling_interval,
+        "setpoint": trajectory.setpoint[:, 0],
+    }
+    for signal in ("output", "applied"):
+        # Values that occurred: an interpolated applied input could lie in the dead zone.
+        for name, values in percentiles(getattr(trajectory, signal), "nearest").items():
+            columns[f"{signal}_{name}"] = values
+    return pd.DataFrame(columns)
+
+
+def write_numbers(path: Path, table: pd.DataFrame) -> None:
+    """Write a table of numbers, texts and estimates as CSV.
+
+    An estimate becomes three columns: its value and the ends of its interval. Infinite values,
+    which apart from these ends are settling times, are written in words.
+    """
+    columns: dict[Any, Any] = {}
+    for name, cells in table.items():
+        columns[name] = cells
+        if any(isinstance(cell, Estimate) for cell in cells):
+            for end, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
+                columns[f"{name}{suffix}"] = [getattr(cell, end, math.nan) for cell in cells]
+    flat = pd.DataFrame(columns)
+    write_csv(path, flat.astype(object).where(flat != math.inf, NOT_SETTLED))
+
+
+def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
+    """Return the least possible errors, and the mean errors as multiples of them."""
+    bounds = [{"agent": "least possible (°C)"}, {"agent": "with preview (°C)"}]
+    for name, scale in scales.items():
+        mark = "*" * (scale.least.kind == "reference")
+        bounds[0][name] = f"{scale.least.value:.3f}{mark}"
+        bounds[1][name] = f"{scale.preview.value:.3f}"
+    table = _by_agent(estimates, estimates["ratio"].map("{:.2f}".format))
+    return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
+
+
+def score_table(scores: Mapping[str, Score]) -> pd.DataFrame:
+    """Return the scores, one row for each agent, the overall score first."""
+    rows = [
+        {"agent": label(agent), "score": f"{overall:.3f}"}
+        | {scenario: f"{mean:.2f}" for scenario, mean in means.items()}
+        for agent, (overall, means) in scores.items()
+    ]
+    return pd.DataFrame(rows).fillna("")  # after an interruption, not all have run
+
+
+def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
+    """Return differences from the reference, one row for each other agent."""
+    others = estimates.dropna(subset=["difference"])
+    pairs = zip(others["difference"], others["improvement"], strict=True)
+    return _by_agent(
+        others, [f"{mean:+.3f}; {100 * better.value:.0f} %" for mean, better in pairs]
+    )
+
+
+def _by_agent(rows: pd.DataFrame, cells: Any) -> pd.DataFrame:
+    table = rows.assign(cell=cells).pivot_table(
+        index="agent", columns="scenario", values="cell", aggfunc="first", sort=False
+    )
+    return table.fillna("").rename(index=label).reset_index().rename_axis(columns=None)
+
+
+def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> pd.DataFrame:
+    """Return all metrics, one row for each scenario and agent, one column for each metric."""
+    rows = []
+    for name, scenario in scenarios.items():
+        noisy = scenario.parameters.range_of("noise_variance")[1] > 0.0
+        for agent, group in groups(summary[summary["scenario"] == name], "agent"):
+            cells = {
+                METRICS[row["metric"]]: (
+                    "" if noisy and row["metric"] in STEP_METRICS else _median(row)
+                )
+                for row in group.to_dict("records")
+            }
+            rows.append({"scenario": name, "agent": label(agent)} | cells)
+    return pd.DataFrame(rows)
+
+
+def _median(row: Mapping[Any, Any]) -> str:
+    """Format the median and, where they differ, the 10th and 90th percentiles."""
+    form = ".3f" if row["metric"] == "mae" else ",.0f"
+    words = {math.inf: NOT_SETTLED}
+    median, p10, p90 = (
+        NO_MEASURE if math.isnan(row[name]) else words.get(row[name], format(row[name], form))
+        for name in PERCENTILES
+    )
+    return median if p10 == p90 else f"{median} ({p10} to {p90})"
