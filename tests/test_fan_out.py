@@ -48,6 +48,14 @@ class TestNumbers:
     def test_with_one_job_tasks_run_here(self):
         assert run({"pid": os.getpid}, jobs=1) == {"pid": os.getpid()}
         assert run({"pid": os.getpid}) != {"pid": os.getpid()}
+        one = partial(next, (os.getpid() for _ in "1"))  # which cannot be pickled
+        assert run({"pid": one}) == {"pid": os.getpid()}
+
+    def test_a_bar_has_a_title(self, capsys):
+        run(work(1), jobs=1)
+        assert capsys.readouterr().err == ""
+        FanOut(jobs=1).run(work(1), "Plants")
+        assert "Plants: 100%" in capsys.readouterr().err
 
     @pytest.mark.parametrize("jobs", [1, 2])
     def test_a_result_that_json_cannot_hold_costs_no_other(self, tmp_path, jobs):
