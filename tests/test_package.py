@@ -117,7 +117,9 @@ PAGES = [
 EXAMPLES = [
     example
     for page in PAGES
-    for example in re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+    for example in re.findall(
+        r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", page.read_text("utf-8"), re.DOTALL
+    )
 ]
 
 
@@ -126,8 +128,8 @@ COMPARE = {  # the extra
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=range(len(EXAMPLES)))
-def test_examples_of_the_readme_run(example, monkeypatch, tmp_path):
+@pytest.mark.parametrize(("example", "printed"), EXAMPLES, ids=range(len(EXAMPLES)))
+def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, capsys):
     names = packages(example)
     # `.ci/versions` tests without the extras; then only what needs none of them can run.
     for name in (names - {"agents", "benchmarks"}) | (
@@ -144,6 +146,8 @@ def test_examples_of_the_readme_run(example, monkeypatch, tmp_path):
     exec(
         re.sub(r"\d+_000", "1", example).replace("samples=1200", "samples=100, episodes=5"), {}
     )
+    if printed:
+        assert capsys.readouterr().out == printed.replace("\\\n", "")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
