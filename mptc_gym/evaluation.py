@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import cache, partial
@@ -124,10 +123,13 @@ def evaluate(
         - another object with `predict(observations)`. If that takes them by name or by
           `**kwargs`, it is also given `state`, `episode_start` and `deterministic=True`. It
           returns actions, or actions and state.
-        - an object with `act(observations)`, such as the controllers in `agents`.
-        - a `torch.nn.Module`, which is called with tensors, in evaluation mode and without
-          gradients.
+        - another object with `act(observations)`, such as the controllers in `agents`.
+        - a `torch.nn.Module`, which is called with tensors. With or without `predict` or
+          `act`, it is in evaluation mode and computes no gradients.
         - a function of the observations. For what it reads and does, the caller vouches.
+
+        `act`, a module's `forward` and a function are given `deterministic=True`, too, if they
+        take it by name.
     env
         An id, such as one of `IDS`; an `EnvSpec`, which may include wrappers, such as that of
         `mptc_gym.sb3.spec_of`; or a function that makes a new environment at each call, which
@@ -164,7 +166,9 @@ valve travel 0 t/h; 100 episodes, all alike
     make = _maker(policy, env, arguments)
     single = make()
     parameters = _parameters(single)
-    with closing(single):
+    with closing(single), closing(make()) as other:
+        if _parameters(other) != parameters:
+            raise ValueError("env must be a function that makes the same plant at each call")
         check_fit(policy, single, parameters, episodes)
         spec = single.spec
         name = spec.id if spec else type(single.unwrapped).__name__
@@ -313,7 +317,7 @@ def _one_by_one(make: Callable[[], Env]) -> Batch:
 
     def batch(n: int) -> VectorEnv[Any, Any, Any]:
         plants = SyncVectorEnv([make] * n)
-        if len({id(each) for each in plants.envs}) < n:
+        if len({id(each.unwrapped) for each in plants.envs}) < n:
             raise ValueError("env must be a function that makes a new environment at each call")
         return plants
 
@@ -329,14 +333,12 @@ def _run(
     Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each episode.
     """
     n = len(seeds)
-    error, travel, rest = np.zeros(n), np.zeros(n), np.zeros((n, 1))
+    error, travel = np.zeros(n), np.zeros(n)
     with ExitStack() as stack:
         plants = stack.enter_context(closing(batch(n)))
-        steps: Iterable[Step] = rollout(plants, start(policy, n), samples, seeds[0])
+        steps = rollout(plants, start(policy, n), samples, seeds[0])
         if native:
-            expected = stack.enter_context(closing(native(n)))
-            theirs = rollout(expected, lambda seen: rest, samples, seeds[0])
-            steps = map(_same_episodes, steps, theirs, itertools.count(1))
+            steps = _same_episodes(steps, stack.enter_context(closing(native(n))), seeds[0])
         for k, (before, after, ended) in enumerate(steps, 1):
             error += np.abs(after["error"])
             travel += np.abs(after["applied"] - before["applied"])
@@ -345,22 +347,29 @@ def _run(
     return error / samples, travel
 
 
-def _same_episodes(own: Step, other: Step, k: int) -> Step:
-    """Return a step to sample k if its set points, noise, loads and plants are the other's.
+def _same_episodes(steps: Iterable[Step], plants: Any, seed: int) -> Iterator[Step]:
+    """Yield steps, as long as `plants`, given the same commands, show the same."""
+    expected = plants.reset(seed=seed)[1]
+    limits = [
+        expected.get(each, getattr(plants.parameters, each)) for each in ("u_min", "u_max")
+    ]
+    for k, step in enumerate(steps):
+        if k == 0:
+            _check_infos(step.before, expected, k)
+        flows = step.after.get("command", np.zeros(plants.num_envs))
+        expected = plants.step(action_from_command(flows, *limits)[:, np.newaxis])[-1]
+        _check_infos(step.after, expected, k + 1)
+        yield step
 
-    None of these depends on the actions.
-    """
-    pairs = [(own.after, other.after)]
-    if k == 1:
-        pairs.append((own.before, other.before))
-    for infos, expected in pairs:
-        for name in expected:
-            if name.startswith("_") or name in ("output", "error", "command", "applied"):
-                continue
-            if not np.array_equal(infos.get(name, ()), expected[name]):
-                raise ValueError(
-                    f"env must run the episodes of its seeds, whose {name} by sample {k} is "
-                    f"{shorten(expected[name])}, got {shorten(infos.get(name))}: it must not "
-                    "reset with another seed, skip or repeat samples, or change info"
-                )
-    return own
+
+def _check_infos(infos: dict[str, Any], expected: dict[str, Any], k: int) -> None:
+    """Refuse infos at sample k that are not those expected, but for rounding."""
+    follow = "output", "error", "command", "applied"  # from the others, which tell more
+    for name in sorted(expected, key=lambda name: name in follow):
+        found, value = infos.get(name, np.nan), expected[name]
+        if not name.startswith("_") and not np.allclose(found, value, 1e-6, 1e-6, True):
+            raise ValueError(
+                f"env must run the episodes of its seeds, whose {name} by sample {k} is "
+                f"{shorten(value)}, got {shorten(infos.get(name))}: it must not reset with "
+                "another seed, skip or repeat samples, or change the plant or info"
+            )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from inspect import Parameter
 from typing import Any, cast
 
@@ -48,20 +49,41 @@ def start(policy: Any, n: int) -> Act:
     predicts, acts = (callable(getattr(policy, name, None)) for name in ("predict", "act"))
     if isinstance(policy, type) or not (predicts or acts or callable(policy)):
         reject(
-            "policy", policy, "a function, or an object with predict or with act, not a class"
+            "policy",
+            policy,
+            "a function, or an object with predict, such as mptc_gym.sb3.load(path), or with "
+            "act, not a class",
         )
-    # Of a bound method, such as controller.act, the object is reset.
-    reset = getattr(getattr(policy, "__self__", policy), "reset", None)
-    if callable(reset):
+    owner = _owner(policy)
+    reset = getattr(owner, "reset", None)
+    if callable(reset) and not isinstance(owner, type):
         _check_call(reset, "policy.reset", "no argument")
         reset()
-    if predicts:
-        return _predicting(policy, n)
-    if acts:
-        return cast("Act", policy.act)
-    if _is_instance(policy, "torch.nn", "Module"):
-        return _evaluating(policy)
-    return cast("Act", policy)
+    act = _predicting(policy, n) if predicts else _deterministic(policy.act if acts else policy)
+    if _is_instance(owner, "torch.nn", "Module"):
+        return _evaluating(owner, act, tensors=not (predicts or acts or owner is not policy))
+    return act
+
+
+def _owner(policy: Any) -> Any:
+    """Return a policy; of a method, such as `controller.act`, its object."""
+    while isinstance(policy, partial):
+        policy = policy.func
+    return getattr(policy, "__self__", policy)
+
+
+def _deterministic(act: Any) -> Act:
+    """Return a function that explores only on request as one that does not explore."""
+    explores = "deterministic" in _names(getattr(act, "forward", act))
+    return partial(act, deterministic=True) if explores else cast("Act", act)
+
+
+def _names(function: Any) -> Iterable[str]:
+    """Return the names of a function's arguments, as far as they can be known."""
+    try:
+        return inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return ()
 
 
 def _predicting(policy: Any, n: int) -> Act:
@@ -120,22 +142,24 @@ def _check_call(
         raise ValueError(f"{name} must be a method that needs {what} alone: {error}") from error
 
 
-def _evaluating(module: Any) -> Act:
-    """Return the function of observations of a `torch.nn.Module`, in evaluation mode."""
+def _evaluating(module: Any, act: Act, tensors: bool) -> Act:
+    """Return the function of a `torch.nn.Module`, in evaluation mode and without gradients."""
     torch: Any = sys.modules["torch"]
-    weights = next(module.parameters(), torch.empty(0))
+    numbers = (*module.parameters(), *module.buffers())
+    like = next(filter(torch.is_floating_point, numbers), torch.empty(0))
 
-    def act(observations: NDArray[np.float32]) -> Any:
-        trains = module.training
+    def evaluating(observations: NDArray[np.float32]) -> Any:
+        in_training = [part for part in module.modules() if part.training]
         module.eval()
         try:
             with torch.no_grad():
-                actions = module(torch.as_tensor(observations).to(weights))
+                actions = act(torch.tensor(observations).to(like) if tensors else observations)
         finally:
-            module.train(trains)
-        return actions.cpu().numpy() if isinstance(actions, torch.Tensor) else actions
+            for part in in_training:
+                part.training = True
+        return np.array(actions.tolist()) if isinstance(actions, torch.Tensor) else actions
 
-    return act
+    return evaluating
 
 
 def check_fit(
@@ -148,11 +172,17 @@ def check_fit(
     ValueError
         If they differ, or if a model does not say how it was trained.
     """
+    predict = getattr(policy, "predict", None)
+    if env.has_wrapper_attr("action_masks") and "action_masks" in _names(predict):
+        raise ValueError(
+            "policy.predict takes the action_masks of env, which are not handed to it: give a "
+            "function that finds the masks from the observations"
+        )
     training = training_of(policy)
     if training is not None:
         training.check(env)
         return
-    owner = getattr(policy, "__self__", policy)
+    owner = _owner(policy)
     seen = getattr(getattr(owner, "observation_space", None), "shape", None)
     if seen not in (None, env.observation_space.shape):
         raise ValueError(

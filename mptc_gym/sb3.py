@@ -32,7 +32,7 @@ from mptc_gym.checks import MOST_PLANTS, count, plain, reject
 from mptc_gym.evaluation import EPISODES, SEED, Evaluation, evaluate, native_batch
 from mptc_gym.sb3_training import restored, training_of
 from mptc_gym.sb3_vec_env import GymnasiumVecEnv
-from mptc_gym.training import MEMBER, Training, make_one
+from mptc_gym.training import MEMBER, Training, make_one, zip_path
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
@@ -107,7 +107,7 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     model
         A model with its training environments.
     path
-        Path of the zip.
+        Path of the zip; `.zip` is added to a name without an ending.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
         written as JSON.
     """
     record = training_of(model).to_json()
-    path = Path(path)
+    path = zip_path(path)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.zip")
     try:
         model.save(partial)
@@ -129,6 +129,8 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
 
 def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
     """Load a model that `save` wrote, with environments like those of its training.
+
+    Wrappers that change nothing but rewards are left out.
 
     Loading runs code from the zip and from the modules that it names: load only what you trust.
 
@@ -152,16 +154,20 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
         its weights cannot be loaded.
     """
     record = Training.read(path)
-    spec = record.spec(record.env, record.arguments)
-    spec.max_episode_steps = record.max_episode_steps
-    with closing(make_one(spec, {})) as single:
-        batch = native_batch(single)
-    if batch is not None:
-        many = batch(record.n_envs, autoreset_mode=AutoresetMode.SAME_STEP)
-        plants: VecEnv = GymnasiumVecEnv(many, spec=spec)
-    else:
-        plants = DummyVecEnv([functools.partial(gymnasium.make, spec)] * record.n_envs)
+    if "env" in arguments:
+        raise ValueError(
+            "env must not be given to load, but by set_env to the model it returns"
+        )
     try:
+        spec = record.spec(record.env, record.arguments)
+        spec.max_episode_steps = record.max_episode_steps
+        with closing(make_one(spec, {})) as single:
+            batch = native_batch(single)
+        if batch is not None:
+            many = batch(record.n_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+            plants: VecEnv = GymnasiumVecEnv(many, spec=spec)
+        else:
+            plants = DummyVecEnv([functools.partial(gymnasium.make, spec)] * record.n_envs)
         for each in record.vec_wrappers:
             plants = restored(plants, **each)
         algorithm = pkgutil.resolve_name(record.algorithm)
@@ -253,7 +259,11 @@ class ScoreCallback(BaseCallback):
 
     def _init_callback(self) -> None:
         self._spec = spec_of(self.model, self._env, **self._arguments)
-        self._next = self.num_timesteps + self.every
+        if self.path is not None:
+            training_of(self.model).to_json()  # now, rather than when it is to be saved
+
+    def _on_training_start(self) -> None:
+        self._latest, self._next = -1, self.num_timesteps + self.every
 
     def _on_step(self) -> bool:
         if self.num_timesteps >= self._next:
@@ -262,11 +272,12 @@ class ScoreCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        if not self.scores or self.scores[-1][0] < self.num_timesteps:
+        if self._latest < self.num_timesteps:
             self._score()
 
     def _score(self) -> None:
         found = evaluate(self.model, self._spec, episodes=self.episodes, seed=SEED + EPISODES)
+        self._latest = self.num_timesteps
         self.scores.append((self.num_timesteps, found))
         self.logger.record("score/mean_error", found.mean_error)
         if found.score is not None:

@@ -58,7 +58,14 @@ def training_of(model: Any) -> Training:
         wrappers = acting_wrappers(spec.additional_wrappers if spec else ())
         found = [Training.of_plant(each.unwrapped, spec, wrappers) for each in batches]
     else:
-        specs, cores = plants.get_attr("spec"), plants.get_attr("unwrapped")
+        try:
+            specs, cores = plants.get_attr("spec"), plants.get_attr("unwrapped")
+        except (OSError, EOFError) as error:  # from the pipes of a SubprocVecEnv
+            raise ValueError(
+                "the environments of policy's training are closed, or their processes cannot "
+                "send them: evaluate and save policy before they are closed, and train on "
+                f"mptc_gym.sb3.make_vec_env or a DummyVecEnv ({error!r})"
+            ) from error
         live = isinstance(plants, DummyVecEnv)  # not in another process
         wrapped = [
             wrappers_of(cast("DummyVecEnv", plants).envs[i])
@@ -97,7 +104,7 @@ def preparation(model: Any, n: int) -> Callable[[NDArray[Any]], NDArray[Any]]:
 def _stack(wrapper: VecFrameStack, n: int) -> Callable[[NDArray[Any]], NDArray[Any]]:
     """Return the function that stacks the frames of n episodes."""
     space = cast("Box", wrapper.venv.observation_space)
-    frames = StackedObservations[NDArray[Any]](n, wrapper.stacked_obs.n_stack, space, "last")
+    frames = StackedObservations[NDArray[Any]](n, observation_space=space, **_frames(wrapper))
     running = np.zeros(n, np.bool_)
     begun = False
 
@@ -128,6 +135,12 @@ def _chain(model: Any) -> tuple[VecEnv, list[VecEnvWrapper]]:
             "observations"
         )
     for each in wrappers:
+        sees = isinstance(each, VecFrameStack) or cast("VecNormalize", each).norm_obs
+        if sees and not isinstance(each.venv.observation_space, Box):
+            raise ValueError(
+                f"policy was trained in {type(each).__name__} on observations that are not a "
+                "Box: train in gymnasium.wrappers.FlattenObservation"
+            )
         if isinstance(each, VecNormalize) and each.norm_obs:
             seen = cast("RunningMeanStd", each.obs_rms).count
             if seen < (max(model.num_timesteps, 1) if each.training else 1):
@@ -156,7 +169,7 @@ _OPTIONS: Final = (
 def _recorded(wrapper: VecEnvWrapper) -> dict[str, Any]:
     """Return a `VecFrameStack` or a `VecNormalize` as JSON values."""
     if isinstance(wrapper, VecFrameStack):
-        return {"name": "VecFrameStack", "n_stack": wrapper.stacked_obs.n_stack}
+        return {"name": "VecFrameStack", **_frames(wrapper)}
     found = {"name": "VecNormalize", **{name: getattr(wrapper, name) for name in _OPTIONS}}
     for name in ("obs_rms", "ret_rms"):
         statistics = getattr(wrapper, name, None)
@@ -165,10 +178,17 @@ def _recorded(wrapper: VecEnvWrapper) -> dict[str, Any]:
     return found
 
 
+def _frames(wrapper: VecFrameStack) -> dict[str, Any]:
+    order = "first" if wrapper.stacked_obs.channels_first else "last"
+    return {"n_stack": wrapper.stacked_obs.n_stack, "channels_order": order}
+
+
 def restored(plants: VecEnv, name: str, **about: Any) -> VecEnvWrapper:
     """Return environments in a wrapper that `_recorded` wrote down."""
     if name == "VecFrameStack":
         return VecFrameStack(plants, **about)
+    if name != "VecNormalize":
+        raise ValueError(f"{name} is not known here")
     statistics = {each: about.pop(each) for each in ("obs_rms", "ret_rms") if each in about}
     wrapper = VecNormalize(plants, **about)
     for each, parts in statistics.items():

@@ -7,17 +7,19 @@ import inspect
 import json
 import pkgutil
 import zipfile
-from collections.abc import Iterable, Mapping
+import zlib
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import gymnasium
+import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from gymnasium.spaces import Box, Space
 
-from mptc_gym.checks import plain, reject, shorten
+from mptc_gym.checks import reject, shorten
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import Parameters
 from mptc_gym.presets import IDS
@@ -26,10 +28,13 @@ from mptc_gym.vector_env import MiddlePointVectorEnv
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
 MEMBER: Final = "mptc_gym.json"  # of a zip
 LARGEST_MEMBER: Final = 2**29  # bytes, unpacked: far more than any policy here needs
+VOUCH: Final = (
+    "vouch for what it sees and does by a function, lambda observations: "
+    "model.predict(observations, deterministic=True)[0]"
+)
 WAYS_OUT: Final = (
     "save it by mptc_gym.sb3.save and load it by mptc_gym.sb3.load; or load it with the "
-    "environment of its training, PPO.load(path, env=...); or vouch for what it sees and does "
-    "by a function, lambda observations: model.predict(observations, deterministic=True)[0]"
+    f"environment of its training, PPO.load(path, env=...); or {VOUCH}"
 )
 # They change neither observations nor actions; a policy that is trained sees no rewards.
 _WATCHING: Final = {
@@ -63,7 +68,7 @@ class Training:
     max_episode_steps: int | None
     """Length of an episode, samples."""
     wrappers: Wrappers
-    """Gymnasium's wrappers that act, with their arguments."""
+    """Gymnasium's wrappers that act, with their arguments as JSON values."""
     vec_wrappers: tuple[Mapping[str, Any], ...] = ()
     """`VecFrameStack` and `VecNormalize` of Stable-Baselines3, with their numbers; the
     innermost first."""
@@ -105,7 +110,10 @@ class Training:
         try:
             return json.dumps(dataclasses.asdict(self), indent=1)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"an argument of a wrapper cannot be recorded: {error}") from error
+            raise ValueError(
+                f"an argument of a wrapper cannot be recorded ({error}): write a wrapper whose "
+                "arguments are numbers, texts, arrays or lists of these"
+            ) from error
 
     @classmethod
     def read(cls, path: str | Path) -> Training:
@@ -116,6 +124,7 @@ class Training:
         ValueError
             If the file cannot be read, or if it has no record.
         """
+        path = zip_path(path)
         try:
             with zipfile.ZipFile(path) as archive:
                 for member in archive.infolist():
@@ -127,17 +136,21 @@ class Training:
                 text = archive.read(MEMBER) if MEMBER in archive.namelist() else None
         except OSError as error:
             raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-        except zipfile.BadZipFile as error:
+        except (zipfile.BadZipFile, zlib.error, RuntimeError) as error:
             raise ValueError(f"{path} must be a zip that Stable-Baselines3 saved") from error
         if text is None:
             raise ValueError(f"{path} does not say how its policy was trained: {WAYS_OUT}")
         try:
             about = json.loads(text)
             about["wrappers"] = tuple(WrapperSpec(**each) for each in about["wrappers"])
-            Parameters(**about["arguments"])
-            return cls(**about)
+            found = cls(**about)
+            Parameters(**{**found.arguments, **found.windows})
         except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-            raise ValueError(f"{path} has a damaged record of its training: {error}") from error
+            raise ValueError(
+                f"{path} has a damaged record of its training, or that of a newer version: "
+                f"{error!r}"
+            ) from error
+        return found
 
     def spec(self, env: str | EnvSpec, arguments: Mapping[str, Any]) -> EnvSpec:
         """Return the spec of an environment with the windows and wrappers of the training.
@@ -157,7 +170,10 @@ class Training:
         with closing(make_one(env, {**arguments, **self.windows})) as single:
             spec = single.spec
         assert spec is not None  # gymnasium.make sets it
-        return dataclasses.replace(spec, additional_wrappers=self.wrappers)
+        wrappers = tuple(
+            dataclasses.replace(each, kwargs=_unpacked(each.kwargs)) for each in self.wrappers
+        )
+        return dataclasses.replace(spec, additional_wrappers=wrappers)
 
     def check(self, env: gymnasium.Env[Any, Any]) -> None:
         """Refuse an environment other than that of the training with a ValueError.
@@ -189,7 +205,12 @@ class Training:
 
 
 def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
-    """Make an environment from an id or a spec; ValueError if there is no such id."""
+    """Make an environment from an id or a spec; ValueError if it cannot be found."""
+    try:
+        for each in env.additional_wrappers if isinstance(env, EnvSpec) else ():
+            pkgutil.resolve_name(each.entry_point)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"wrappers of env must be importable: {error}") from error
     try:
         return gymnasium.make(env, disable_env_checker=True, **arguments)
     except (gymnasium.error.UnregisteredEnv, ModuleNotFoundError):
@@ -220,19 +241,58 @@ def acting_wrappers(wrappers: Iterable[WrapperSpec]) -> Wrappers:
 
 
 def _with_arguments(wrapper: WrapperSpec) -> WrapperSpec:
-    """Return a wrapper with its arguments; refuse one that does not record them."""
-    if wrapper.kwargs is not None:
-        known = {name: plain(value) for name, value in wrapper.kwargs.items()}
-        return dataclasses.replace(wrapper, kwargs=known)
+    """Return a wrapper with its arguments as JSON values; refuse one that hides some."""
+    known = wrapper.kwargs or {}
     try:
-        (_,) = inspect.signature(pkgutil.resolve_name(wrapper.entry_point)).parameters
+        _, *named = inspect.signature(
+            pkgutil.resolve_name(wrapper.entry_point)
+        ).parameters.values()
     except (ImportError, AttributeError, TypeError, ValueError):
+        complete = wrapper.kwargs is not None
+    else:
+        catches_all = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
+        complete = all(
+            each.name in known or (wrapper.kwargs is not None and each.kind in catches_all)
+            for each in named
+        )
+    if not complete:
         raise ValueError(
             f"the wrapper {wrapper.entry_point} does not record its arguments: let it inherit "
-            "from gymnasium.utils.RecordConstructorArgs, and make the environment inside it by "
-            "gymnasium.make"
-        ) from None
-    return dataclasses.replace(wrapper, kwargs={})
+            "from gymnasium.utils.RecordConstructorArgs, give that all of them, and make the "
+            f"environment inside it by gymnasium.make; or {VOUCH}"
+        )
+    return dataclasses.replace(wrapper, kwargs=_packed(known))
+
+
+def _packed(value: Any) -> Any:
+    """Return an argument as JSON values, from which `_unpacked` makes it again."""
+    if isinstance(value, np.ndarray):
+        return {"array": value.tolist(), "dtype": str(value.dtype)}
+    if isinstance(value, tuple):
+        return {"tuple": _packed(list(value))}
+    return _mapped(_packed, value.item() if isinstance(value, np.generic) else value)
+
+
+def _unpacked(value: Any) -> Any:
+    match value:
+        case {"array": numbers, "dtype": dtype}:
+            return np.array(numbers, dtype)
+        case {"tuple": values}:
+            return tuple(_unpacked(values))
+    return _mapped(_unpacked, value)
+
+
+def _mapped(function: Callable[[Any], Any], value: Any) -> Any:
+    """Return a list or a dict with a function of its values; any other value as it is."""
+    if isinstance(value, dict):
+        return {name: function(each) for name, each in value.items()}
+    return [function(each) for each in value] if isinstance(value, list) else value
+
+
+def zip_path(path: str | Path) -> Path:
+    """Return the path of a zip, whose ending may be left out, as in Stable-Baselines3."""
+    path = Path(path)
+    return path if path.suffix else path.with_suffix(".zip")
 
 
 def describe(space: Space[Any]) -> dict[str, Any]:

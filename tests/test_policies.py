@@ -1,5 +1,7 @@
 """Tests that `evaluate` runs each kind of policy as it was meant, or refuses it."""
 
+import copy
+import json
 import zipfile
 from contextlib import closing
 from functools import partial
@@ -10,7 +12,14 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import FrameStackObservation, RescaleAction, TimeLimit
+from gymnasium.wrappers import (
+    FrameStackObservation,
+    RescaleAction,
+    ReshapeObservation,
+    TimeLimit,
+    TransformObservation,
+)
+from sb3_contrib import MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -23,7 +32,7 @@ from stable_baselines3.common.vec_env import (
 from agents import DirectNNController, PIController
 from mptc_gym import MiddlePointEnv, evaluate
 from mptc_gym.evaluation import SEED
-from mptc_gym.sb3 import GymnasiumVecEnv, load, make_vec_env, save, spec_of
+from mptc_gym.sb3 import GymnasiumVecEnv, ScoreCallback, load, make_vec_env, save, spec_of
 from mptc_gym.training import MEMBER
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as IncrementalBatch
@@ -132,6 +141,78 @@ class Levels(gymnasium.ActionWrapper, RecordConstructorArgs):
         return np.array([2.0 * action / (self.levels - 1) - 1.0], np.float32)
 
 
+class Gains(gymnasium.ActionWrapper, RecordConstructorArgs):
+    def __init__(self, env, about):
+        RecordConstructorArgs.__init__(self, about=about)
+        gymnasium.ActionWrapper.__init__(self, env)
+        self.gain = about["gains"][1].max()
+
+    def action(self, action):
+        return self.gain * action
+
+
+class Masked(Levels):
+    def action_masks(self):
+        return np.array([False, True, False])
+
+
+class Moves(IncrementalAction):
+    def __init__(self, env, share=1.0, **arguments):
+        super().__init__(env, **arguments)
+        self.share = share
+
+    def action(self, action):
+        return super().action(self.share * action)
+
+
+class Blocks(gymnasium.ObservationWrapper, RecordConstructorArgs):
+    """Show set points and errors by name."""
+
+    def __init__(self, env):
+        RecordConstructorArgs.__init__(self)
+        gymnasium.ObservationWrapper.__init__(self, env)
+        box = env.observation_space
+        self.observation_space = gymnasium.spaces.Dict(
+            {
+                "setpoints": gymnasium.spaces.Box(box.low[:3], box.high[:3]),
+                "errors": gymnasium.spaces.Box(box.low[3:], box.high[3:]),
+            }
+        )
+
+    def observation(self, observation):
+        return {"setpoints": observation[:3], "errors": observation[3:]}
+
+
+class Network(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        layers = torch.nn.Linear(6, 9), torch.nn.Dropout(), torch.nn.Linear(9, 1)
+        self.layers = torch.nn.Sequential(*layers)
+
+    def forward(self, seen):
+        return torch.tanh(self.layers(seen))
+
+
+class Acting(torch.nn.Module):
+    def __init__(self, module):
+        super().__init__()
+        self.module = module
+
+    def act(self, observations):
+        dtype = next(self.parameters()).dtype
+        return self.module(torch.as_tensor(observations, dtype=dtype))
+
+
+class Constant(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("gain", torch.tensor([0, 0, 0, -0.3, 0, 0], dtype=torch.float64))
+
+    def forward(self, seen):
+        return seen @ self.gain[:, None]
+
+
 class Scaled(gymnasium.ObservationWrapper):
     def observation(self, observation):
         return observation * np.float32(0.01)
@@ -152,11 +233,13 @@ class Times(VecEnvWrapper):
 
 class TestPoliciesWithoutARecord:
     @pytest.mark.parametrize("episodes", [3, 130])
-    @pytest.mark.parametrize("form", ["call", "act", "method", "predict"])
+    @pytest.mark.parametrize("form", ["call", "act", "method", "partial", "predict"])
     def test_memory_is_forgotten_before_the_episodes(self, form, episodes):
         policy = Resettable()
         if form == "method":
             policy = policy.act
+        elif form == "partial":
+            policy = partial(policy.act)
         elif form == "predict":
             policy = SimpleNamespace(predict=policy.act, reset=policy.reset)
         short = {**SHORT, "max_episode_steps": 30}
@@ -170,24 +253,40 @@ class TestPoliciesWithoutARecord:
         found = evaluate(Integrator(), NOISY, episodes=130, **SHORT)
         assert found.errors[:3] == pytest.approx(errors_of(Integrator), abs=1e-9)
 
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
     def test_modules_run_in_evaluation_mode(self, dtype):
-        torch.manual_seed(0)
-        layers = (
-            torch.nn.Linear(6, 9),
-            torch.nn.Tanh(),
-            torch.nn.Dropout(),
-            torch.nn.Linear(9, 1),
-        )
-        module = torch.nn.Sequential(*layers).to(dtype)
+        module = Network().to(dtype)
+        frozen = module.layers[0].eval()
+        evaluating = copy.deepcopy(module).eval()
 
         def act(observation):
-            return module(torch.as_tensor(observation, dtype=dtype)).detach().numpy()
+            seen = torch.as_tensor(observation, dtype=dtype)
+            return evaluating(seen).detach().float().numpy()
 
-        found = evaluate(module, NOISY, episodes=3, **SHORT)
+        expected = errors_of(lambda: act)
+        for policy in (module, Acting(module), Acting(module).act):
+            found = evaluate(policy, NOISY, episodes=3, **SHORT)
+            assert found.errors == pytest.approx(expected, abs=1e-6)
         assert module.training
-        module.eval()
-        assert found.errors == pytest.approx(errors_of(lambda: act), abs=1e-6)
+        assert not frozen.training
+
+    def test_constants_of_a_module_set_its_dtype(self):
+        found = evaluate(Constant(), NOISY, episodes=3, **SHORT)
+        expected = errors_of(lambda: lambda seen: -0.3 * seen[3:4].astype(float))
+        assert found.errors == pytest.approx(expected, abs=1e-6)
+
+    @pytest.mark.parametrize("form", ["call", "act", "forward"])
+    def test_what_explores_on_request_does_not(self, form):
+        def act(observations, deterministic=False):
+            return -0.3 * observations[..., 3:4] + (0.0 if deterministic else 0.5)
+
+        policy = act if form == "call" else SimpleNamespace(act=act)
+        if form == "forward":
+            policy = torch.nn.Module()
+            policy.forward = act
+        found = evaluate(policy, NOISY, episodes=3, **SHORT)
+        expected = errors_of(lambda: lambda seen: act(seen, True))
+        assert found.errors == pytest.approx(expected, abs=1e-6)
 
     def test_keywords_pass_a_thin_wrapper(self, ppo):
         def named(observations, **keywords):
@@ -315,6 +414,9 @@ class TestModels:
             envs.close()
         found = evaluate(load(tmp_path / "model.zip", device="cpu"), NOISY, episodes=3, **SHORT)
         assert found.errors == pytest.approx(errors_of(acting(model)), abs=1e-6)
+        for attempt in (evaluate, partial(save, path=tmp_path / "closed.zip")):
+            with pytest.raises(ValueError, match="of policy's training are closed"):
+                attempt(model)
 
     def test_the_default_environment_is_that_of_the_training(self, velocity):
         found = evaluate(velocity, episodes=3, **SHORT)
@@ -330,6 +432,49 @@ class TestModels:
         expected = errors_of(acting(model), wrapped)
         for env in (wrapped, spec_of(model, NOISY, **SHORT)):
             assert evaluate(model, env, episodes=3).errors == pytest.approx(expected, abs=1e-6)
+
+    @pytest.mark.parametrize(
+        "wrap",
+        [
+            lambda env: RescaleAction(env, LIMITS[:1], LIMITS[1:]),
+            lambda env: ReshapeObservation(env, (2, 3)),
+            lambda env: Gains(env, {"gains": [0.1, np.float32([-0.2, 0.2])]}),
+        ],
+    )
+    def test_arguments_of_wrappers_are_kept_as_they_are(self, wrap, tmp_path):
+        model = trained(PPO, wrap(made()))
+        expected = errors_of(acting(model), lambda: wrap(made()))
+        save(model, tmp_path / "model")
+        for each in (model, load(tmp_path / "model.zip", device="cpu")):
+            for env in (lambda: wrap(made()), spec_of(each, NOISY, **SHORT)):
+                found = evaluate(each, env, episodes=3)
+                assert found.errors == pytest.approx(expected, abs=1e-6)
+
+    @pytest.mark.parametrize("order", ["first", "last"])
+    def test_frames_are_stacked_along_the_axis_of_the_training(self, order, tmp_path):
+        twice = lambda: FrameStackObservation(made(), 2)  # noqa: E731
+        model = trained(PPO, VecFrameStack(DummyVecEnv([twice]), 3, channels_order=order))
+
+        def new_act():
+            frames = [np.zeros((2, 6), np.float32)] * 3
+
+            def act(observation):
+                frames[:] = [*frames[1:], observation]
+                seen = np.concatenate(frames, axis=0 if order == "first" else 1)
+                return model.predict(seen, deterministic=True)[0]
+
+            return act
+
+        expected = errors_of(new_act, twice)
+        save(model, tmp_path / "model.zip")
+        for each in (model, load(tmp_path / "model.zip", device="cpu")):
+            found = evaluate(each, spec_of(each, NOISY, **SHORT), episodes=3)
+            assert found.errors == pytest.approx(expected, abs=1e-6)
+
+    def test_masked_actions_are_refused(self):
+        model = MaskablePPO("MlpPolicy", Masked(made(), 3), device="cpu")
+        with pytest.raises(ValueError, match="takes the action_masks of env, which are not"):
+            evaluate(model, spec_of(model, NOISY, **SHORT), episodes=3)
 
     @pytest.mark.parametrize(
         ("policy", "env", "message"),
@@ -382,6 +527,11 @@ class TestModels:
                 IncrementalBatch(gymnasium.make_vec(NOISY, 2, autoreset_mode="SameStep"))
             ), "trained on a batch whose wrappers are not known"),
             (lambda: Levels(MiddlePointEnv(), 3), "Levels does not record its arguments"),
+            (lambda: Moves(made(), 0.3), "Moves does not record its arguments"),
+            (lambda: VecNormalize(DummyVecEnv([lambda: Blocks(made())])),
+             "trained in VecNormalize on observations that are not a Box"),
+            (lambda: VecFrameStack(DummyVecEnv([lambda: Blocks(made())]), 2),
+             "trained in VecFrameStack on observations that are not a Box"),
             (lambda: "CartPole-v1", "policy must be trained on environments of this package"),
             (lambda: DummyVecEnv([made, partial(made, error_window=2, output_window=1)]),
              "plants of different windows or wrappers"),
@@ -390,7 +540,9 @@ class TestModels:
     def test_training_that_cannot_be_recorded(self, make, message, tmp_path):
         envs = make()
         discrete = isinstance(envs, Levels | str)
-        model = (DQN if discrete else PPO)("MlpPolicy", envs, device="cpu")
+        named = not discrete and isinstance(envs.observation_space, gymnasium.spaces.Dict)
+        policy = "MultiInputPolicy" if named else "MlpPolicy"
+        model = (DQN if discrete else PPO)(policy, envs, device="cpu")
         for attempt in (evaluate, spec_of, partial(save, path=tmp_path / "x.zip")):
             with pytest.raises(ValueError, match=message):
                 attempt(model)
@@ -455,6 +607,45 @@ class TestRecords:
         with pytest.raises(ValueError, match=r"none\.zip cannot be read: No such file"):
             spec_of(tmp_path / "none.zip")
 
+    @pytest.mark.parametrize(
+        ("edit", "message"),
+        [
+            (lambda record: record["arguments"].pop("error_window"), "damaged.*error_window"),
+            (lambda record: record.update(later=1), "damaged .* or that of a newer version"),
+            (lambda record: record.update(env="None-v0"), "cannot be loaded as .*None-v0"),
+            (
+                lambda record: record.update(
+                    wrappers=[{"name": "X", "entry_point": "none:X", "kwargs": {}}]
+                ),
+                "wrappers of env must be importable: No module named 'none'",
+            ),
+            (
+                lambda record: record.update(vec_wrappers=[{"name": "VecTimes"}]),
+                "cannot be loaded as .*VecTimes is not known here",
+            ),
+        ],
+    )
+    def test_an_edited_record_is_refused(self, edit, message, ppo, tmp_path):
+        save(ppo, tmp_path / "model.zip")
+        with zipfile.ZipFile(tmp_path / "model.zip") as archive:
+            record = json.loads(archive.read(MEMBER))
+        edit(record)
+        ppo.save(tmp_path / "model.zip")
+        with zipfile.ZipFile(tmp_path / "model.zip", "a") as archive:
+            archive.writestr(MEMBER, json.dumps(record))
+        with pytest.raises(ValueError, match=message):
+            load(tmp_path / "model.zip")
+
+    def test_an_argument_that_is_no_value_cannot_be_saved(self, tmp_path):
+        model = PPO("MlpPolicy", TransformObservation(made(), lambda seen: seen, None))
+        for attempt in (partial(save, model), partial(model.learn, 8)):
+            given = {"path": tmp_path / "model.zip"}
+            if attempt.func != save:
+                given = {"callback": ScoreCallback(**given)}
+            with pytest.raises(ValueError, match="argument of a wrapper cannot be recorded"):
+                attempt(**given)
+        assert model.num_timesteps == 0
+
     def test_members_of_absurd_size_are_not_read(self, tmp_path):
         path = tmp_path / "large.zip"
         with (
@@ -486,14 +677,23 @@ class TestEpisodes:
             (lambda: Reseeded(made()), "episodes of its seeds, whose noise by sample 1"),
             (
                 lambda: Reseeded(made(noise_variance=0.0, delay=[3, 9])),
-                "whose delay by sample 1",
+                "whose delay by sample 0",
             ),
             (lambda: Skipping(made()), "whose noise by sample 1 is"),
             (
                 lambda: TimeLimit(
                     Skipping(gymnasium.make("MiddlePoint-v0", max_episode_steps=4800)), 1200
                 ),
-                "whose setpoint by sample 75 is",
+                "whose output by sample 29 is",
+            ),
+            (
+                lambda: Flatters(made()),
+                "whose error by sample 1 is",
+            ),
+            (lambda: Faster(noise_variance=0.5), "whose output by sample 2"),
+            (
+                lambda: made(delay=int(np.random.default_rng().integers(2, 1000))),
+                "makes the same plant at each call",
             ),
             (
                 lambda: Ends(gymnasium.make("MiddlePoint-v0", max_episode_steps=60)),
@@ -506,9 +706,28 @@ class TestEpisodes:
             evaluate(Integrator(), make, episodes=3)
 
     def test_one_environment_for_all_episodes_is_refused(self):
-        one = Scaled(made())
-        with pytest.raises(ValueError, match="makes a new environment at each call"):
-            evaluate(Integrator(), lambda: one, episodes=3)
+        one = gymnasium.make("MiddlePoint-v0", setpoint=5.0)
+        scaled = Scaled(one)
+        for make in (lambda: scaled, lambda: Scaled(one)):
+            with pytest.raises(ValueError, match="makes a new environment at each call"):
+                evaluate(Integrator(), make, episodes=3)
+
+
+class Flatters(gymnasium.Wrapper):
+    def step(self, action):
+        *others, info = self.env.step(action)
+        return *others, info | {"error": 0.1 * info["error"]}
+
+
+class Faster(MiddlePointEnv):
+    """A plant other than its arguments say."""
+
+    def reset(self, **given):
+        other = MiddlePointEnv(time_constant_factor=0.5)
+        other.reset()
+        returned = super().reset(**given)
+        self._plant = other._plant
+        return returned
 
 
 class Ends(gymnasium.Wrapper):

@@ -191,6 +191,18 @@ class TestScoreCallback:
         assert "score/mean_error" in logged
         assert "score/score" in logged
 
+    def test_each_training_has_its_own_scores(self):
+        model = model_of(
+            make_vec_env("MiddlePointNoisy-v0", 2, seed=0, max_episode_steps=5)
+        ).learn(256)
+        callback = ScoreCallback(every=64, episodes=2, verbose=0, max_episode_steps=5)
+        model.learn(128, callback=callback, reset_num_timesteps=False)
+        assert [samples for samples, _ in callback.scores] == [320, 384]
+        model.learn(96, callback=callback)
+        assert [samples for samples, _ in callback.scores[2:]] == [64, 128]
+        model.learn(128, callback=callback)
+        assert [samples for samples, _ in callback.scores[4:]] == [64, 128]
+
     def test_it_refuses_what_it_cannot_judge(self, tmp_path):
         with pytest.raises(ValueError, match="every must be an integer from 1"):
             ScoreCallback(every=0)

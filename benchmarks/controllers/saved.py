@@ -35,7 +35,8 @@ def policies(location: str) -> list[Factory]:
     algorithm, _, pattern = location.partition(":")
     if not pattern:
         raise ValueError(f"{location!r} must be ALGORITHM:FILE.zip, such as PPO:{location}")
-    files = sorted(glob.glob(pattern))  # noqa: PTH207 (patterns of absolute paths, too)
+    found = glob.glob(pattern)  # noqa: PTH207 (patterns of absolute paths, too)
+    files = [pattern] if Path(pattern).is_file() else sorted(found)
     if not files:
         raise ValueError(f"{location!r}: there is no file {pattern}")
     return [_policy(algorithm, Path(file).resolve()) for file in files]
