@@ -34,6 +34,7 @@ DOUBT: Final = 0.0002  # of the reach, added to the noise before its logarithm i
 MISS_RATES: Final = (0.05, 0.01)  # per sample
 TRUST: Final = (5.0, 30.0)
 SATURATION: Final = 0.07
+CALM: Final = 0.004  # of the reach, noise at which half of the haste is used
 CLEARANCE: Final = 0.005  # of half the range, by which commands clear the dead zone
 MOST_ADDED: Final = 0.45  # of half the range
 MOST_WEIGHT: Final = 40.0  # largest logarithm of a weight, in absolute value
@@ -105,7 +106,6 @@ class Law:
         self._rates = self._array(LOAD_RATES + RESIDUAL_RATES)
         self._tilt, self._haste = self._array(TILT), haste
         self._preference = self._array(PREFERENCE)
-        self._preference[:_LOADS] -= haste * self._tilt
         self._sharpness = self._array([1.0, *(rate**-0.5 for rate in LOAD_RATES[1:-1])])
         groups = np.zeros((_MEANS, _MEANS))
         groups[:_LOADS, :_LOADS] = groups[_LOADS:, _LOADS:] = 1.0
@@ -214,12 +214,14 @@ class Law:
             xp.concatenate([self._nothing, xp.stack(resting, axis=1), about], axis=1),
         )
         preferred = xp.concatenate([-against, self._plain], axis=1) + self._preference
-        chosen = [2.0 * outputs[:, :1] * self._tilt, 3.0 * outputs[:, 1:-1]]
+        # In calm, haste would amplify what the model misses at each return of the delay.
+        haste = self._haste * noise / (noise + CALM)
+        chosen = [(2.0 * outputs[:, :1] - haste[:, None]) * self._tilt, 3.0 * outputs[:, 1:-1]]
         weights = xp.concatenate(chosen, axis=1) + preferred
         weights = xp.exp(xp.clip(weights, -MOST_WEIGHT, MOST_WEIGHT))
         weights = weights / (weights @ self._groups)
         target = setpoint - (weights * means * self._shares).sum(1)
-        rate = 1.0 / (1.0 + xp.exp(0.5 - self._haste - outputs[:, -1]))
+        rate = 1.0 / (1.0 + xp.exp(0.5 - haste - outputs[:, -1]))
         return target + rate / self.prior.unit * (target - now) + added
 
     def applied(self, flow: Any) -> tuple[Any, Any]:

@@ -36,7 +36,8 @@ class NeuralSelfTuningController(SelfTuningController):
     haste
         How much quicker the law is than the network asks for, see `agents.neural_law.Law`. The
         network was trained with fixed models; the residual of a changing model is sooner out of
-        date. 0 halves the valve travel in noise.
+        date. It fades where the plant is calm, as it would only move the valve there. 0 halves
+        the valve travel in noise.
     """
 
     forgetting: Positive = 0.999

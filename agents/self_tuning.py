@@ -11,7 +11,6 @@ from agents.actuator import applied_flow, avoid_dead_zone
 from agents.controller import (
     PAPER_WINDOWS,
     Index,
-    NotNegative,
     Positive,
     ToldController,
     Values,
@@ -56,11 +55,12 @@ class SelfTuningController(ToldController):
 
     *Control.* As in a Smith predictor, the model predicts the output at the end of the delay.
     The disturbance, which is the difference between the output and the model, is added. It
-    decays over the delay like the plant's own response, except for its slow mean, so that no
-    offset remains. The command is `u = s + K (y_d - predicted output)`, where K makes the error
-    decay with the requested time constant. The response s takes the place of an integral; it
-    is the response to the flow after the actuator, so nothing winds up. A command within the
-    most likely dead zone is moved to its edge or to 0, whichever is nearer.
+    decays over the delay like the plant's own response, except for its slow mean, a filter of
+    200 samples: the offset that a steady load leaves fades with that time constant. The command
+    is `u = s + K (y_d - predicted output)`, where K makes the error decay with the requested
+    time constant. The response s takes the place of an integral; it is the response to the flow
+    after the actuator, so nothing winds up. A command within the most likely dead zone is moved
+    to its edge or to 0, whichever is nearer.
 
     *Safeguards* (K. J. Astrom and B. Wittenmark, "Adaptive Control", 2nd edition, 1995,
     chapter 11):
@@ -81,7 +81,7 @@ class SelfTuningController(ToldController):
     ----------
     dead_zone
         Best guess of the half width of the actuator's dead zone, t/h. The bank holds this one
-        and up to seven around it.
+        and up to seven around it; for the default of 0, three above it.
     shortest_delay
         Shortest delay d that the plant may have, samples; an input shows after d + 1.
     longest_delay
@@ -96,7 +96,6 @@ class SelfTuningController(ToldController):
         Index of e(k), degC, in the observation.
     """
 
-    dead_zone: NotNegative = 5.0
     shortest_delay: Index = 6
     longest_delay: Index = 36
     closed_loop_time_constant: Positive = 0.15

@@ -5,6 +5,7 @@ import pytest
 
 from agents import (
     NeuralSelfTuningController,
+    NeuralSmithPredictor,
     SelfTuningController,
     SmithPredictor,
     self_tuning,
@@ -13,7 +14,7 @@ from benchmarks.loop.metrics import travel
 from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import PRESETS, evaluate
 
-STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
+STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0, "dead_zone": 5.0}
 # Steady-state gain of (28), degC per t/h, and 1 / (1 - p) samples of 8 s, p its slowest pole.
 GAIN = (-0.04560 - 0.00404) / (1.0 - 0.45181 - 0.47546)
 TIME_CONSTANT = 8.0 / (1.0 - 0.95147)
@@ -47,7 +48,7 @@ def test_it_finds_out_what_the_plant_is(delay, gain, time_constant, noise):
 
 
 def test_before_it_has_learnt_it_is_what_the_step_test_says():
-    controller = SelfTuningController(**STEP_TEST, dead_zone=3.5)
+    controller = SelfTuningController(**{**STEP_TEST, "dead_zone": 3.5})
     assert controller.estimates == {}
     controller.act(np.zeros(6))
     found = controller.estimates
@@ -74,7 +75,7 @@ def test_it_follows_a_plant_that_drifts(gain):
         "runs": 3,
     }  # fmt: skip
     tuning = SelfTuningController(**STEP_TEST)
-    fixed = SmithPredictor(**STEP_TEST, closed_loop_time_constant=80.0, dead_zone=5.0)
+    fixed = SmithPredictor(**STEP_TEST, closed_loop_time_constant=80.0)
     ours, theirs = (mean_error(control(each, **plant), 600) for each in (tuning, fixed))
     assert ours < theirs - 0.1
     assert tuning.estimates["gain"] == pytest.approx(np.full(3, GAIN * last), rel=0.2)
@@ -116,6 +117,28 @@ def test_behind_the_bank_the_network_takes_no_load_for_a_gain():
         for make in (NeuralSelfTuningController, SelfTuningController)
     )
     assert ours < theirs - 0.015
+
+
+@pytest.mark.parametrize("plant", [{}, {"time_constant_factor": 1.5}, {"setpoint": 5.0}])
+def test_on_a_calm_plant_the_valve_is_as_calm_as_with_the_plant_told(plant):
+    # Where the told numbers are wrong, both learn of it once; then nothing is left to do.
+    told, tuning = (
+        control(make(**STEP_TEST), **plant)
+        for make in (NeuralSmithPredictor, NeuralSelfTuningController)
+    )
+    assert travel(tuning)[0] < 1.2 * travel(told)[0] + 5.0
+    assert mean_error(tuning) < 1.04 * mean_error(told)
+
+
+def test_no_dead_zone_is_assumed_unless_told():
+    shown = {name: value for name, value in STEP_TEST.items() if name != "dead_zone"}
+    plant = {"dead_zone": 0.0, "noise_variance": 0.1, "setpoint": 1.0}
+    unaware, told = (
+        travel(control(SelfTuningController(**shown, **dead_zone), **plant))[0]
+        for dead_zone in ({}, {"dead_zone": 5.0})
+    )
+    assert SelfTuningController(**shown).dead_zone == 0.0
+    assert unaware < 0.5 * told
 
 
 def test_haste_is_paid_for_in_valve_travel():
