@@ -15,7 +15,7 @@ from benchmarks.controllers.engineered import simc_pi
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop import designs
-from benchmarks.loop.designs import SPANS, WIDE, grid, random_design
+from benchmarks.loop.designs import SPANS, WIDE, around, grid, random_design
 from benchmarks.sweep import command, report, tasks
 from benchmarks.sweep.__main__ import main
 from benchmarks.sweep.tasks import agent_task, limit_task
@@ -56,6 +56,19 @@ class TestDesigns:
                 assert low - 1e-6 <= end <= high + 1e-6
             assert plant["drift_samples"] == 600
         assert all(Parameters(**plant).delay == plant["delay"] for plant in plants)
+
+    def test_around_another_plant_a_design_spans_its_own_numbers(self):
+        design = random_design(50, 0, 600)
+        assert around({}, design) == design
+        other = {"delay": 36, "dead_zone": 0.5, "u_min": -1.0, "u_max": 1.0, "gain_factor": 2.0}
+        for plant, paper in zip(around(other, design), design, strict=True):
+            assert plant["delay"] == 2 * paper["delay"]
+            assert plant["dead_zone"] == pytest.approx(0.1 * paper["dead_zone"])
+            assert plant["gain_factor"] == 2.0 * paper["gain_factor"]
+            # The flow reaches a fifth as far: a tenth of the flow at twice the gain.
+            variance = plant["noise_variance"]
+            assert variance == pytest.approx(0.04 * paper["noise_variance"])
+            assert plant.get("gain_drift") == paper.get("gain_drift")
 
     def test_a_wide_design_lies_beyond_the_spans_which_are_those_of_the_self_tuning_bank(self):
         plants = random_design(200, 0, 600, WIDE)
@@ -140,7 +153,7 @@ class TestSweep:
             # nothing, of the controller
             ("", 3), ("--runs 3", 2), ("--samples 50", 3), ("--design-seed 1", 3),
             ("--design wide", 3), ("--told each", 2), ("--agents pi", 1),
-            ("--set dead_zone=7", 2), ("", 0),
+            ("--set dead_zone=7", 3), ("", 0),
         ]  # fmt: skip
         for options, anew in changes:
             kept = len(list(tmp_path.glob("tasks/*")))

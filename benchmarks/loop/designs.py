@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from benchmarks.loop.linear import nominal
+from mptc_gym import Parameters
 
 Arguments = dict[str, Any]  # arguments of the environment
 
@@ -64,3 +67,34 @@ def random_design(
             }
         plants.append(plant)
     return plants
+
+
+def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
+    """Return the plants of a design, which are around the paper's, around another plant.
+
+    They differ from it by the same factors: the delay, the dead zone and the factors on gain
+    and time constant, and the noise variance as a share of the square of what the flow reaches.
+    """
+    ratios = np.array(_scales(Parameters(**plant))) / np.array(_scales(Parameters()))
+    by_name = dict(zip(SPANS, ratios.tolist(), strict=True))
+    moved = [
+        {name: by_name.get(name, 1.0) * value for name, value in each.items()}
+        for each in design
+    ]  # fmt: skip
+    integers = "delay", "drift_samples"
+    return [
+        {name: round(value) if name in integers else value for name, value in each.items()}
+        for each in moved
+    ]
+
+
+def _scales(plant: Parameters) -> list[float]:
+    """Return a plant's delay, dead zone, variance of the reach, and factors, as in `SPANS`."""
+    delay, zone, gain, time_constant, low, high = (
+        sum(plant.range_of(name)) / 2.0
+        for name in (
+            "delay", "dead_zone", "gain_factor", "time_constant_factor", "u_min", "u_max"
+        )
+    )  # fmt: skip
+    reach = nominal(plant).gain * (high - low) / 2.0
+    return [delay, zone, reach**2, gain, time_constant]

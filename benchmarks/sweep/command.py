@@ -19,7 +19,7 @@ from benchmarks.lib.command import blame, out_folder
 from benchmarks.lib.report import provenance_line, show, write_report
 from benchmarks.lib.storage import Kept, origin, write_json
 from benchmarks.lib.tables import write_csv
-from benchmarks.loop.designs import SPANS, WIDE, grid, random_design
+from benchmarks.loop.designs import SPANS, WIDE, around, grid, random_design
 from benchmarks.sweep.__main__ import Options
 from benchmarks.sweep.report import report, table
 from benchmarks.sweep.tasks import agent_task, limit_task
@@ -37,6 +37,8 @@ def execute(options: Options, console: Console) -> str:
     else:
         spans = SPANS if options.design == "random" else WIDE
         differing = random_design(options.plants, options.design_seed, options.samples, spans)
+    with blame("--plant, --preset, --set"):
+        differing = around(nominal, differing)
     plants = [{**nominal, **plant} for plant in differing]
     for plant in plants:
         with blame(f"--design {options.design}"):

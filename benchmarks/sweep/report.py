@@ -12,7 +12,7 @@ from benchmarks.controllers.roster import label
 from benchmarks.lib.report import Section
 from benchmarks.lib.statistics import bootstrap, improvement
 from benchmarks.lib.tables import groups
-from benchmarks.loop.designs import Arguments
+from benchmarks.loop.designs import SPANS, Arguments
 from benchmarks.sweep import maps
 
 SEED = 0  # seed of the bootstraps
@@ -99,7 +99,12 @@ def report(runs: pd.DataFrame, out: Path, design: str, told: str) -> list[Sectio
     picture = "map.png" if design == "grid" else "plants.png"
     maps.plot_maps(runs, out / picture, grid=design == "grid")
     title = "How many plants each controller works on"
-    sections = [Section(title, [OVERVIEW_TEXT], overview(runs), [picture])]
+    spans = ", ".join(
+        f"{name} {runs[name].min():.4g} to {runs[name].max():.4g}"
+        for name in SPANS if name in runs
+    )  # fmt: skip
+    text = [f"The plants have: {spans}.", OVERVIEW_TEXT]
+    sections = [Section(title, text, overview(runs), [picture])]
     if design == "grid" or told == "each":
         return sections
     for title, text, pairs, picture in QUESTIONS:
