@@ -60,7 +60,7 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
     _check_answer(likelihood, fits[0])
     rival = _of_impulse_response(likelihood)
     tried = _tried(likelihood, fits, rival)
-    fault = valve_fault(likelihood, fits[0])
+    fault = valve_fault(likelihood, fits)
     if fault:
         passed = replace(log, flow=fault.passed + likelihood.operating_flow)
         other = Likelihood(passed, replace(knowledge, operating_flow=likelihood.operating_flow))

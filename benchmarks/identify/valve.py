@@ -23,18 +23,23 @@ WIDTHS = np.geomspace(0.08, 0.6, 16)
 CENTRES, ZONES = (-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (0.05, 0.1, 0.15, 0.2, 0.25)
 RATIOS = (0.5, 0.625, 0.8, 1.25, 1.6, 2.0)  # of the gain above the operating point and below
 # Least gain in twice the log likelihood: by chance, the best of so many gains up to five.
-EVIDENT = 12.0
+EVIDENT = 8.0
 
 
-def valve_fault(likelihood: Likelihood, best: Fit) -> Fault | None:
-    """Return the fault that explains a log clearly better than a valve without one."""
+def valve_fault(likelihood: Likelihood, fits: list[Fit]) -> Fault | None:
+    """Return the fault that explains a log clearly better than a valve without one.
+
+    `fits` are those without a fault, the best first. The orders and C of the best one are
+    tried, and of the best one of the other kind: a random walk may stand for a fault.
+    """
+    best = fits[0]
+    others = [fit for fit in fits if fit.orders.walk != best.orders.walk]
     gaps = dict.fromkeys([Gap(0.0, 0.0), best.place.gap])
     found, least = None, best.place.deviance - EVIDENT
     for fault in _faults(likelihood):
-        with_gaps = [
-            np.where(np.abs(fault.passed) <= gap.low, 0.0, fault.passed) for gap in gaps
-        ]
-        deviance = likelihood.of_flows(with_gaps, best)
+        flow = fault.passed
+        with_gaps = [np.where(np.abs(flow) <= gap.low, 0.0, flow) for gap in gaps]
+        deviance = min(likelihood.of_flows(with_gaps, fit) for fit in [best, *others[:1]])
         if deviance < least:
             found, least = fault, deviance
     return found

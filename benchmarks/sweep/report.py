@@ -103,8 +103,8 @@ def report(runs: pd.DataFrame, out: Path, design: str, told: str) -> list[Sectio
         f"{name} {runs[name].min():.4g} to {runs[name].max():.4g}"
         for name in SPANS if name in runs
     )  # fmt: skip
-    text = [f"The plants have: {spans}.", OVERVIEW_TEXT]
-    sections = [Section(title, text, overview(runs), [picture])]
+    about = [f"The plants have: {spans}.", OVERVIEW_TEXT]
+    sections = [Section(title, about, overview(runs), [picture])]
     if design == "grid" or told == "each":
         return sections
     for title, text, pairs, picture in QUESTIONS:
