@@ -43,11 +43,6 @@ def test_observations_stay_in_their_space_whatever_the_actions(arguments, action
         assert env.observation_space.contains(observation)
 
 
-def test_registration():
-    env = gymnasium.make("mptc_gym:MiddlePoint-v0")
-    assert env.spec.max_episode_steps == 1200
-
-
 @pytest.mark.parametrize("setpoint", [np.ones(5), [np.float32(1.5), 2], np.float32(3.0)])
 def test_the_spec_is_json_whatever_numpy_it_was_made_of(setpoint):
     arguments = {"setpoint": setpoint, "delay": np.array([12, 24]), "noise_variance": 0.5}
@@ -165,17 +160,6 @@ def test_noise_and_set_point_come_from_the_seed_alone_in_separate_streams(others
     second = run(MiddlePointEnv(**{**arguments, **others}), rng.uniform(-1, 1, 600))
     for key in alone:
         np.testing.assert_array_equal(first[key], second[key])
-
-
-def test_later_episodes_differ_and_do_not_depend_on_the_length_of_earlier_ones():
-    env = MiddlePointEnv(noise_variance=0.5, setpoint="random")
-    first = run(env, np.zeros(900), seed=3)
-    second = run(env, np.zeros(300), seed=None)
-    run(env, np.zeros(2), seed=3)
-    again = run(env, np.zeros(300), seed=None)
-    for key in ("noise", "setpoint"):
-        assert not np.array_equal(first[key][:301], second[key])
-        np.testing.assert_array_equal(second[key], again[key])
 
 
 def test_a_generator_of_the_user_is_used():

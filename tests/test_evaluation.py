@@ -19,7 +19,7 @@ from benchmarks.bounds.command import PACKAGED as CASES
 from mptc_gym import IDS, PRESETS, MiddlePointEnv, Parameters, evaluate
 from mptc_gym.evaluation import SEED, least_errors
 from mptc_gym.wrappers import IncrementalAction
-from tests.conftest import ROOT, python, run_closed
+from tests.conftest import ROOT, run_closed
 
 HARD = "MiddlePointHard-v0"
 
@@ -171,14 +171,6 @@ class TestEvaluate:
         least = least_possible(kind="preview", folder=None, **case)
         assert bounds_command([*shlex.split(command)[3:], f"--cache={tmp_path}"]) == 0
         assert f"{least:.3f}" in capsys.readouterr().out
-
-    def test_it_needs_numpy_and_gymnasium_alone(self):
-        code = (
-            "import sys, mptc_gym\n"
-            "mptc_gym.evaluate(lambda seen: 0.0 * seen[:, :1], episodes=2)\n"
-            "print({'torch', 'scipy', 'pygame', 'stable_baselines3'} & set(sys.modules))"
-        )
-        assert python("-c", code, check=True).stdout == "set()\n"
 
 
 def normalised():

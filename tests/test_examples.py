@@ -102,7 +102,7 @@ def test_settings_for_rl_zoo_make_a_model_that_learns(algorithm):
 def test_controllers_are_evaluated_without_any_extra():
     program = """
 import sys
-for name in ("torch", "stable_baselines3", "scipy", "pandas", "matplotlib"):
+for name in ("torch", "stable_baselines3", "scipy", "pandas", "matplotlib", "pygame"):
     sys.modules[name] = None  # an import is an error from now on
 import agents, mptc_gym
 print(mptc_gym.evaluate(agents.PIController(), "MiddlePointNoisy-v0").mean_error)

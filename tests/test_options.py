@@ -133,10 +133,13 @@ class TestRanges:
 
     def test_draws_come_from_the_seed_and_the_episode_alone(self):
         first, second = (MiddlePointEnv(**EVERYTHING) for _ in range(2))
-        run(first, np.ones(10), seed=5)
-        run(second, -np.ones(300), seed=5)
-        assert first.reset()[1] == second.reset()[1]
-        assert first.reset(seed=5)[1] != first.reset(seed=6)[1]
+        before = run(first, np.ones(1500), seed=5)
+        run(second, -np.ones(2), seed=5)
+        ours, theirs = (run(env, np.zeros(300), seed=None) for env in (first, second))
+        for name in ours:
+            np.testing.assert_array_equal(ours[name], theirs[name])
+        for name in ("noise", "setpoint", "disturbance", "gain_factor"):
+            assert not np.array_equal(before[name][:301], ours[name])
 
 
 @pytest.mark.parametrize(

@@ -130,12 +130,3 @@ def test_an_episode_begins_2_to_the_64_draws_after_the_one_before_it():
     for _ in range(3):
         np.testing.assert_array_equal(stream.next_episode().random(5), whole.random(5))
         whole.bit_generator.advance(2**64 - 5)
-
-
-def test_episodes_of_a_seed_do_not_overlap_however_long_they_are():
-    stream = EpisodeStream(0, (0,))
-    first = stream.next_episode().random(2_000_000)
-    second = stream.next_episode().random(10)
-    third = stream.next_episode().random(10)
-    assert not np.isin([second, third], first).any()
-    assert not np.isin(second, third).any()

@@ -65,23 +65,6 @@ class TestForward:
 
 
 class TestIncrements:
-    def test_the_position_adds_up_and_stops_at_the_limit(self):
-        network = constant(0.5, increments=Increments(max_move=0.8))
-        actions = [float(network.act([0.0])[0]) for _ in range(4)]
-        assert actions == pytest.approx([0.4, 0.8, 1.0, 1.0])
-
-    def test_the_dead_zone_is_stepped_over(self):
-        # Positions 0.2, 0.4, ...: of the 5 t/h beyond the dead zone's edge of 5 t/h.
-        up = constant(0.5, increments=Increments(max_move=0.4, dead_zone=5.0))
-        flows = []
-        for _ in range(3):
-            up.act([0.0])
-            flows.append(float(up.command))
-        assert flows == pytest.approx([6.0, 7.0, 8.0])
-        down = constant(-0.5, increments=Increments(max_move=0.4, dead_zone=5.0))
-        down.act([0.0])
-        assert down.command == pytest.approx(-6.0)
-
     @settings(max_examples=200, deadline=None)
     @given(
         u_min=st.floats(-15, -0.5),

@@ -14,7 +14,6 @@ from agents.pi import SEARCHED_GAINS
 from benchmarks.claims.runs import Batch
 from benchmarks.compare import comparison
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib import storage
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.loop import scenarios
 from benchmarks.train import ppo, ppo_training
@@ -187,11 +186,6 @@ def search(tmp_path, short, monkeypatch):
 
 
 class TestKeptTrials:
-    def test_those_before_and_after_an_edit_are_not_mixed(self, search, monkeypatch):
-        search(2)
-        monkeypatch.setattr(storage, "code", lambda: "edited")
-        assert search(3)[1] == 3
-
     def test_those_of_another_search_are_not_mixed(self, search):
         first, _ = search(2)
         assert search(2, runs=2)[1] == 2

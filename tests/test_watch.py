@@ -106,11 +106,6 @@ def test_a_controller_of_one_s_own(capsys):
     assert own.split("error ")[1][:5] == capsys.readouterr().out.split("error ")[1][:5]
 
 
-def test_a_policy(capsys):
-    assert main(["--agent", "ppo", "--video", "film.gif"]) == 0
-    assert "PPO on square wave" in capsys.readouterr().out
-
-
 def post(kind, **about):
     pygame.event.post(pygame.event.Event(kind, **about))
 
