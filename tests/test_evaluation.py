@@ -203,17 +203,11 @@ class TestRefusals:
             ({"env": 7}, "env must be an id, an EnvSpec or a function that makes an env.* 7"),
             ({"env": lambda: None}, "env must be a MiddlePointEnv, in wrappers or not, got No"),
             ({"env": normalised}, "env must not be in NormalizeObservation, whose statistics"),
-            (
-                {"env": MiddlePointEnv, "delay": 3},
-                "delay must be given in the function that is",
-            ),
+            ({"env": MiddlePointEnv, "delay": 3}, "delay must be given in the function that"),
             ({"delay": -1}, "delay must be"),
-            *(
-                ({"episodes": n}, "episodes must be an integer from 2")
-                for n in (1, 2.5, "many")
-            ),
+            *(({"episodes": n}, "episodes must be an integer from") for n in (1, 2.5, "many")),
         ],
-    )
+    )  # fmt: skip
     def test_arguments(self, arguments, message):
         with pytest.raises(ValueError, match=message):
             evaluate(idle, **arguments)

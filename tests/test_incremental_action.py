@@ -18,16 +18,10 @@ from tests.arguments import MODES
 from tests.conftest import native_and_sync
 
 RANGES = {
-    "dead_zone": [2.0, 8.0],
-    "u_min": [-14.0, -9.0],
-    "u_max": [8.0, 12.0],
-    "delay": [3, 9],
-    "noise_variance": 0.3,
-    "setpoint": "random",
-    "setpoint_period": 40,
-    "action_window": 4,
+    "dead_zone": [2.0, 8.0], "u_min": [-14.0, -9.0], "u_max": [8.0, 12.0], "delay": [3, 9],
+    "noise_variance": 0.3, "setpoint": "random", "setpoint_period": 40, "action_window": 4,
     "move_weight": 0.1,
-}
+}  # fmt: skip
 PLANTS, LIMIT = 3, 7
 
 
@@ -53,29 +47,15 @@ def infos_of(env, moves, *, seed=0):
         # An action beyond the box moves no further.
         ({"dead_zone": 0.0}, {"max_move": 0.3}, [17], [3]),
         # The first flow is none, whatever the limits.
-        *(
-            ({"u_min": -7.3, "u_max": 12.9}, {"compensate_dead_zone": compensate}, [0], [0])
-            for compensate in (False, True)
-        ),
+        *(({"u_min": -7.3, "u_max": 12.9}, {"compensate_dead_zone": compensated}, [0], [0])
+          for compensated in (False, True)),
         # A number is compensated, whatever the dead zone is: a quarter wants half of the way.
-        *(
-            (
-                {"dead_zone": z},
-                {"max_move": 2, "compensate_dead_zone": 6},
-                [0.25],
-                [6 + 4 * 0.5],
-            )
-            for z in (0.0, [1.0, 4.0], 5.0)
-        ),
+        *(({"dead_zone": z}, {"max_move": 2, "compensate_dead_zone": 6}, [0.25], [6 + 4 * 0.5])
+          for z in (0.0, [1.0, 4.0], 5.0)),
         # A limit within the dead zone is reached.
-        (
-            {"u_min": -3, "u_max": 9},
-            {"max_move": 2, "compensate_dead_zone": True},
-            [-0.1],
-            [-3],
-        ),
+        ({"u_min": -3}, {"max_move": 2, "compensate_dead_zone": True}, [-0.1], [-3]),
     ],
-)
+)  # fmt: skip
 def test_flows_by_hand(arguments, wrapper, moves, flows):
     infos = infos_of(make(arguments, **wrapper), moves)
     assert [info["applied"] for info in infos] == pytest.approx(flows, abs=5e-5)

@@ -15,13 +15,10 @@ from mptc_gym.wrappers import IncrementalAction
 WINDOWS = {"setpoint_window": 1, "output_window": 2, "action_window": 2}
 
 
-def layers(*sizes, seed=0, dtype=np.float64):
-    generator = np.random.default_rng(seed)
+def layers(*sizes):
+    generator = np.random.default_rng(0)
     return [
-        (
-            generator.normal(size=(after, before)).astype(dtype),
-            generator.normal(size=after).astype(dtype),
-        )
+        (generator.normal(size=(after, before)), generator.normal(size=after))
         for before, after in itertools.pairwise(sizes)
     ]
 
@@ -78,13 +75,10 @@ class TestIncrements:
         self, u_min, u_max, dead_zone, max_move, outputs
     ):
         network = PolicyNetwork(
-            [(np.ones((1, 1)), np.zeros(1))],
-            observation={"error_window": 1},
-            input_scale=[1.0],
-            increments=Increments(max_move=max_move, dead_zone=dead_zone),
-            u_min=u_min,
-            u_max=u_max,
-        )
+            [(np.ones((1, 1)), np.zeros(1))], observation={"error_window": 1},
+            input_scale=[1.0], increments=Increments(max_move, dead_zone),
+            u_min=u_min, u_max=u_max,
+        )  # fmt: skip
         plant = MiddlePointEnv(dead_zone=0.0, u_min=u_min, u_max=u_max)
         wrapped = IncrementalAction(plant, max_move=max_move, compensate_dead_zone=dead_zone)
         wrapped.reset(seed=0)

@@ -7,13 +7,7 @@ import pytest
 from scipy import stats
 
 from benchmarks.lib import statistics
-from benchmarks.lib.statistics import (
-    bootstrap,
-    improvement,
-    median,
-    quantile,
-    share,
-)
+from benchmarks.lib.statistics import bootstrap, improvement, median, quantile, share
 from tests.conftest import assert_the_seed_is_all_that_differs
 
 

@@ -15,12 +15,7 @@ from hypothesis import strategies as st  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
 from agents.actuator import applied_flow  # noqa: E402
-from mptc_gym import (  # noqa: E402
-    PRESETS,
-    MiddlePointEnv,
-    MiddlePointVectorEnv,
-    Parameters,
-)
+from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv, Parameters  # noqa: E402
 from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
 from mptc_gym.ranges import Ranges  # noqa: E402
 from mptc_gym.signals import Signals, Streams  # noqa: E402
@@ -82,10 +77,8 @@ def compare(env, envs, *, steps, rng, partial_resets, episodes, rtol=1e-9, atol=
         if envs.autoreset_mode is AutoresetMode.DISABLED:
             mask |= truncated
         if mask.any():
-            masks = ({"reset_mask": each} for each in (torch.tensor(mask), mask))
-            checked(
-                *(e.reset(options=each) for e, each in zip((env, envs), masks, strict=True))
-            )
+            ours = env.reset(options={"reset_mask": torch.tensor(mask)})
+            checked(ours, envs.reset(options={"reset_mask": mask}))
 
 
 @settings(max_examples=60, deadline=None)
@@ -131,15 +124,11 @@ class TestEdgeOfTheDeadZone:
     @pytest.mark.parametrize(
         ("dtype", "action_of", "atol"),
         [
-            (
-                torch.float64,
-                lambda u, u_min, u_max, **_: action_from_command(u, u_min, u_max),
-                1e-13,
-            ),
+            (torch.float64, lambda u, dead_zone, **of: action_from_command(u, **of), 1e-13),
             (torch.float64, float32_action, 1e-5),
             (torch.float32, float32_action, 1e-5),
         ],
-    )
+    )  # fmt: skip
     def test_it_passes_in_numpy_and_in_pytorch(self, rng, dtype, action_of, atol):
         # Of plants with limits of their own.
         n, ranges = 600, {"u_min": [-12, -5], "u_max": [5, 12], "dead_zone": [0.1, 5]}
@@ -160,13 +149,12 @@ class TestEdgeOfTheDeadZone:
             {"dead_zone": 4.0, "u_min": -12.0, "u_max": 6.0},
             {"dead_zone": 5.0, "u_min": -3.0},  # this limit lies inside
             {"dead_zone": 2.0, "u_min": 6.0, "u_max": 8.0},
+            {"dead_zone": 10.0, "u_min": -8.62},  # the way to an action and back is not exact
         ],
     )
     def test_the_actuator_is_one_for_plants_and_controllers(self, numbers):
-        sizes = np.array(
-            [0.0, 1e-9, 1.0, 2.0, 3.0, 3.999, 4.0, 4.001, 5.0, 6.0, 9.0, 12.0, 1e3]
-        )
-        commands = np.concatenate([-sizes, sizes])
+        sizes = np.r_[0.0, 1e-9, 1.0, 2.0, 3.0, 3.999, 4.0, 4.001, 5.0, 6.0, 10.0, 12.0, 1e3]
+        commands = np.r_[-sizes, sizes]
         n, parameters = len(commands), Parameters(**numbers)
         limits = parameters.dead_zone, parameters.u_min, parameters.u_max
         expected = applied_flow(commands, *limits)
@@ -180,11 +168,6 @@ class TestEdgeOfTheDeadZone:
         in_torch = tensors.step(torch.tensor(actions))[-1]["applied"]
         for found in (alone, batch, in_torch):
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-
-    def test_limits_in_odd_numbers(self):
-        env = make(1, u_min=-8.62, dead_zone=10.0)
-        env.reset(seed=0)
-        assert env.step(torch.ones(1, 1))[-1]["applied"].item() == pytest.approx(10.0)
 
 
 def make(num_envs=2, **arguments):
@@ -200,11 +183,10 @@ class TestGradients:
     @pytest.mark.parametrize(
         "plant",
         [
-            {"dead_zone": 0.0, "action_window": 2},
-            {"delay": [2, 4], "gain_factor": [0.5, 2]},
+            {"dead_zone": 0.0, "action_window": 2}, {"delay": [2, 4], "gain_factor": [0.5, 2]},
             HARD,
         ],
-    )
+    )  # fmt: skip
     def test_it_is_that_of_differences_away_from_the_kinks(self, plant):
         env = make(2, **{"delay": 2, "output_window": 1, "differentiable": True, **plant})
 

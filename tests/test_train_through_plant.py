@@ -16,13 +16,7 @@ from benchmarks.loop.rollout import make_plants, rollout  # noqa: E402
 from benchmarks.train import __main__ as program  # noqa: E402
 from benchmarks.train import loops, through_plant  # noqa: E402
 from benchmarks.train.loops import Draw, Loops, environment  # noqa: E402
-from benchmarks.train.through_plant import (  # noqa: E402
-    Net,
-    Training,
-    loss_of,
-    train,
-    validate,
-)
+from benchmarks.train.through_plant import Net, Training, loss_of, train, validate  # noqa: E402
 from mptc_gym import Parameters  # noqa: E402
 from tests.conftest import assert_the_seed_is_all_that_differs  # noqa: E402
 
@@ -73,19 +67,13 @@ class TestLaw:
             of["gain_factor"], of["time_constant_factor"]
         )
         a, b = [1.0, *(-x for x in alpha)], [scale * x for x in Parameters().b]
+        actuator = {name: of[name] for name in ("dead_zone", "u_min", "u_max")}
         controller = NeuralSmithPredictor(
-            gain=sum(b) / sum(a),
-            time_constant=-8.0 / np.log(pole),
-            delay=8.0 * (of["delay"] + 1.0),
-            dead_zone=of["dead_zone"],
-            coefficients=None if first else (a, b),
-            uncertainty=0.1,
-            u_min=of["u_min"],
-            u_max=of["u_max"],
-            network=net.export(),
-        )
-        plant = {"a": a, "b": b, "setpoint": [3.0] * 70 + [-4.0]}
-        plant |= {name: of[name] for name in ("dead_zone", "u_min", "u_max")}
+            gain=sum(b) / sum(a), time_constant=-8.0 / np.log(pole), uncertainty=0.1,
+            delay=8.0 * (of["delay"] + 1.0), coefficients=None if first else (a, b),
+            network=net.export(), **actuator,
+        )  # fmt: skip
+        plant = {"a": a, "b": b, "setpoint": [3.0] * 70 + [-4.0], **actuator}
         plants = make_plants(1, samples + 1, **plant, delay=int(of["delay"]))
         trajectory = rollout(plants, controller, samples + 1, seed=0)
         error = (trajectory.setpoint - trajectory.output)[1:]
