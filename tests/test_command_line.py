@@ -75,7 +75,6 @@ REFUSED = {
         (["--preset", "harder"], "--preset: no 'harder'; there are paper, dead-zone-7"),
         (["--out"], "--out requires an argument"),
         (["stray"], "stray"),
-        (["--kept", __file__], "--kept: .* cannot be written to: it is no folder"),
         (["--plant", "nowhere.json"], "nowhere.json"),
         (["--set", "delay"], "ARGUMENT=VALUE"),
         (["--set", "dely=3"], "'dely': did you mean 'delay'?"),

@@ -36,15 +36,13 @@ from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.metrics import METRICS, measure
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import SCENARIOS
-from benchmarks.train import ppo, ppo_training
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from tests.conftest import ROOT, python, trajectory
-from tests.small_training import SMALL
 from tests.tasks import until
 
-# Those that are compared without any training before.
-FIXED = [name for name, each in ROSTER.items() if each.compared and not each.trained]
+# Those with one member.
+FIXED = [name for name, each in ROSTER.items() if each.compared and "ppo" not in name]
 QUICK = "--agents pi --scenarios constant --runs 1 --jobs 1"
 
 
@@ -264,9 +262,9 @@ def compared(tmp_path):
     """Return a function that compares, and returns the folder of the results."""
 
     def compared(options, *more, status=0, into="out"):
-        out, policies = tmp_path / into, tmp_path / "policies"
+        out = tmp_path / into
         # In this process, unless an option says otherwise.
-        given = ["--out", out, "--kept", policies, "--jobs", 1, *options.split(), *more]
+        given = ["--out", out, "--jobs", 1, *options.split(), *more]
         assert main([str(each) for each in given]) == status
         return out
 
@@ -377,27 +375,12 @@ class TestCompare:
             assert against["limit"] == pytest.approx(found.least_possible, abs=1e-12)
             assert against["ratio"] == pytest.approx(found.multiple, abs=1e-12)
 
-    def test_ppo_is_trained_once(self, compared, monkeypatch, capsys):
-        monkeypatch.setattr(ppo, "PPOArguments", lambda: SMALL)
-        monkeypatch.setattr(ppo, "POLICIES", 2)
-        given = "--agents ppo --scenarios constant --runs 1 --training-steps 256"
-        one = compared(given, into="one")
-        curve = pd.read_csv(one / "learning.csv")
-        assert curve.groupby("policy")["steps"].max().to_dict() == {0: 256, 1: 256}
-        assert (one / "learning.png").exists()
-        provenance = json.loads((one / "provenance.json").read_text())
-        for seed, used in enumerate(provenance["policies"]["ppo"]):
-            assert used["arguments"]["seed"] == seed
-            assert used["arguments"]["steps"] == 256
-            assert used["file"] == "policy.npz"
-        runs = pd.read_csv(one / "runs.csv")
-        assert list(runs["policy"]) == [0, 1]
-
-        monkeypatch.setattr(ppo_training.PPO, "learn", None)  # training again would raise
-        again = compared(given, into="two")
-        pd.testing.assert_frame_equal(pd.read_csv(again / "runs.csv"), runs)
-        compared(f"{given} --retrain", into="three", status=1)
-        assert "policy.npz: TypeError" in capsys.readouterr().out
+    def test_policies_are_loaded_and_none_is_trained(self, compared):
+        out = compared("--agents ppo --scenarios constant --runs 1 --jobs 1")
+        files = [f"ppo-{seed}.npz" for seed in range(10_000, 10_005)]
+        provenance = json.loads((out / "provenance.json").read_text())
+        assert [each["file"] for each in provenance["policies"]["ppo"]] == files
+        assert list(pd.read_csv(out / "runs.csv")["policy"]) == [*range(5)]
 
     def test_the_example_of_the_page(self, compared, tmp_path, monkeypatch):
         readme = (ROOT / "benchmarks/compare/README.md").read_text(encoding="utf-8")

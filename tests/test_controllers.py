@@ -20,7 +20,6 @@ from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import IdleValve
 from benchmarks.loop.scenarios import Scenario
 from benchmarks.sweep.tasks import agent_task
-from benchmarks.train.ppo import PolicyRequest
 from benchmarks.watch import game
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
@@ -32,7 +31,7 @@ ACTUATOR = {"u_min": -9.0, "u_max": 14.0, "dead_zone": 4.0}
 OTHER = {**ACTUATOR, "b": [0.0456, 0.00404], "delay": 9}
 IDLE = 5.0  # mean |e| of a valve that is left alone, degC
 # Those that are made for the paper's plant, and told no more than the actuator.
-UNTOLD = ("pi", "pi-searched", "ppo")
+UNTOLD = ("pi", "pi-searched", "ppo", "ppo-hard")
 
 
 @pytest.fixture(params=ROSTER)
@@ -41,8 +40,8 @@ def entry(request):
 
 
 @pytest.fixture
-def factory(entry, tmp_path):
-    return entry.members(PolicyRequest(folder=tmp_path, policies=1))[0]
+def factory(entry):
+    return entry.members()[0]
 
 
 def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, monkeypatch):

@@ -16,12 +16,10 @@ from benchmarks.compare import comparison
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.loop import scenarios
-from benchmarks.train import ppo, ppo_training
 from benchmarks.tune import objective
 from benchmarks.tune import search as tune
 from benchmarks.tune.__main__ import TUNED, main
 from tests.conftest import ROOT
-from tests.small_training import SMALL
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -148,8 +146,7 @@ class TestSearch:
         assert sign * tried[20:].mean() < sign * tried[:10].mean() - 0.3
 
     def test_defaults_are_the_best_of_the_published_searches(self):
-        # Up to rounding; the page of the PI controller says how its search differs. Those of
-        # PPO are not from its search.
+        # Up to rounding; the page of the PI controller says how its search differs.
         defaults = {"nn": DirectNNController(), "pi": PIController(**SEARCHED_GAINS)}
         for controller, default in defaults.items():
             text = (ROOT / f"benchmarks/published/tune_{controller}.md").read_text("utf-8")
@@ -157,18 +154,6 @@ class TestSearch:
             best = {name.strip(): value for name, value in zip(rows[0], rows[2], strict=True)}
             for name in ROSTER[controller].tuning.space:
                 assert getattr(default, name) == pytest.approx(float(best[name]), rel=0.005)
-
-    def test_ppo_is_trained_once_a_trial(self, tmp_path, monkeypatch):
-        state = ppo_training.begin(SMALL).policy.state_dict()
-        train = Mock(return_value=ppo_training.exported(state, SMALL))
-        monkeypatch.setattr(ppo_training, "train", train)
-        assert run_tune(tmp_path, "ppo", trials=2) == 0
-        trained = [call.args[0] for call in train.call_args_list]
-        search = [ppo.TUNING_SEED + i for i in range(2)]
-        final = [ppo.FINAL_SEED + i for i in range(4)]
-        assert [arguments.seed for arguments in trained] == [*search * 2, *final * 2]
-        table = pd.read_csv(tmp_path / "ppo.csv")
-        assert list(table["gamma"]) == [trained[0].gamma, trained[2].gamma]
 
 
 @pytest.fixture

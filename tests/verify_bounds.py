@@ -71,7 +71,7 @@ class Counting:
 
 def controllers() -> dict[str, Factory]:
     """Return factories by name: the roster's that need no training, and `Counting`."""
-    known = {name: entry.members()[0] for name, entry in ROSTER.items() if not entry.trained}
+    known = {name: entry.members()[0] for name, entry in ROSTER.items()}
     return {**known, "counting": Factory(Counting)}
 
 

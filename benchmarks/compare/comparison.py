@@ -47,8 +47,7 @@ def execute(options: Options, console: Console) -> str:
     if not names:
         raise UsageError("--scenarios: none to run")
     scenarios = {name: known_cases[name] for name in names}
-    training = options.controllers.training()
-    members = {name: entry.members(training) for name, entry in controllers.items()}
+    members = {name: entry.members() for name, entry in controllers.items()}
     if plant.arguments:
         _try_out(members, scenarios.values(), options.runs)
     out = options.out or _folder(
@@ -81,7 +80,7 @@ def execute(options: Options, console: Console) -> str:
         return report.write(comparison, folder, provenance_line("compare", made), fan_out)
 
     try:
-        comparison.run(training.fan_out, Kept(folder / "tasks"))
+        comparison.run(options.controllers.fan_out, Kept(folder / "tasks"))
     except BaseException:  # including Ctrl-C
         if comparison.cases:
             write(FanOut(jobs=1))

@@ -16,9 +16,8 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from benchmarks.compare.estimates import Scale
 from benchmarks.controllers.roster import label
-from benchmarks.lib.drawing import COLOURS, colours, draw_actuator, drawn, panels
+from benchmarks.lib.drawing import colours, draw_actuator, drawn, panels
 from benchmarks.lib.tables import groups
-from benchmarks.loop.metrics import METRICS
 from benchmarks.loop.scenarios import Scenario
 
 
@@ -156,30 +155,3 @@ def plot_travel(summary: pd.DataFrame, scales: Mapping[str, Scale], path: Path) 
             axes.xaxis.set_minor_locator(NullLocator())
             axes.set_xlabel("valve travel (t/h)")
             axes.set_ylabel("mean |e| (°C)")
-
-
-def plot_learning(curves: pd.DataFrame, path: Path) -> None:
-    """Draw mean |e| against samples of experience, a panel for each agent."""
-    shown = {
-        "training_mae": "training: random set points, exploring",
-        "validation_mae": "validation: set points of its own",
-        "square_mae": "square wave, no noise",
-    }
-    agents = list(curves["agent"].unique())
-    titles = [f"{label(agent)}: a line a policy" for agent in agents]
-    with panels(path, titles, (9, 4.5), 1) as (figure, found):
-        for axes, agent in zip(found, agents, strict=True):
-            policies = curves[curves["agent"] == agent].dropna(axis=1, how="all")
-            for (column, name), colour in zip(shown.items(), COLOURS, strict=False):
-                for i, (_, curve) in enumerate(policies.groupby("policy")):
-                    if column in curve:
-                        axes.plot(
-                            curve["steps"] / 1000, curve[column], color=colour,
-                            linewidth=0.8, label=None if i else name,
-                        )  # fmt: skip
-            axes.set_ylim(bottom=0)
-            axes.set_xlim(left=0)
-            axes.set_xlabel("samples of experience (thousands)")
-            axes.set_ylabel(METRICS["mae"])
-        handles, names = found[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=3)

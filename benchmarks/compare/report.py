@@ -80,16 +80,6 @@ def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -
         write_numbers(folder / f"{name}.csv", responses)
         shown = responses[responses["agent"].isin(drawn)]
         plots[f"{name}.png"] = ("responses", shown, comparison.scenarios[name])
-    curves = [
-        pd.DataFrame(member.curve).assign(agent=name, policy=number)
-        for name, members in comparison.controllers.items()
-        for number, member in enumerate(members)
-        if member.curve
-    ]
-    if curves:
-        learning = pd.concat(curves, ignore_index=True)
-        write_numbers(folder / "learning.csv", learning)
-        plots["learning.png"] = ("learning", learning)
     draw = {name: partial(_draw, *what, folder / name) for name, what in plots.items()}
     faults = {name: fault for name, fault in fan_out.stream(draw) if fault}
 
@@ -196,8 +186,6 @@ def _sections(
             pictures=[f"{name}.png" for name in names[1:]],
         ),
     ]
-    if any(member.curve for each in comparison.controllers.values() for member in each):
-        sections.append(Section("Training", pictures=["learning.png"]))
     if len(comparison.agents) > 1:
         title = f"Difference to {label(comparison.agents[0])} (°C), 95 % interval"
         text = ["And the share of runs in which the error is smaller, in the same noise."]
@@ -210,7 +198,8 @@ def _costs(comparison: Comparison) -> pd.DataFrame:
     for name in comparison.agents:
         members = comparison.controllers[name]
         cost = members[0].cost
-        training = [member.curve[-1]["seconds"] for member in members if member.curve]
+        seconds = [member.provenance.get("cpu_seconds") for member in members]
+        training = [each for each in seconds if each is not None]
         runs = [case.seconds for case in comparison.finished if case.agent == name]
         rows.append(
             {

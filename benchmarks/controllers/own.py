@@ -37,7 +37,7 @@ def own_entry(name: str, locations: Sequence[str]) -> RosterEntry:
             for factory in made:
                 _try_out(factory, location)
             factories += made
-    return RosterEntry(name, name, lambda request: factories, drawn=True)
+    return RosterEntry(name, name, lambda: factories, drawn=True)
 
 
 def own_factory(location: str) -> Factory:

@@ -9,7 +9,6 @@ from typing import Any
 
 from agents.controller import PAPER_WINDOWS
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
-from benchmarks.train.ppo import PolicyRequest
 from mptc_gym import Parameters
 
 LEARNING = 1200  # samples of the square wave on which a network is commissioned
@@ -44,8 +43,6 @@ class Factory:
     """The module whose code shapes the controllers, if it is not that of `make`."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """Origin of a trained policy, JSON-serialisable; empty if nothing was trained."""
-    curve: Sequence[Mapping[str, float]] = ()
-    """Learning curve of a trained policy, one row per evaluation."""
 
     @property
     def module(self) -> str:
@@ -87,8 +84,7 @@ class Factory:
         return controller
 
 
-# Returns the factories of a controller's members, given a request for trained policies.
-Members = Callable[[PolicyRequest], Sequence[Factory]]
+Members = Callable[[], Sequence[Factory]]  # reads the factories of a controller's members
 
 
 @dataclass(frozen=True)
@@ -105,13 +101,6 @@ class Tuning:
     penalty: float = 5.0
     """Penalty for failing to settle at a constant set point, degC: the cost of doing nothing
     about an error of 5 degC."""
-    members: tuple[int, int] = (1, 1)
-    """Number of controllers with the same gains, in the search and in the final evaluation.
-    Their objectives are averaged."""
-    train: Callable[..., Factory] | None = None
-    """Function of the gains, `final` (whether this is the final evaluation) and `member` (the
-    number of the controller) that returns a factory. If None, the controller's own factory is
-    called with the gains."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +113,6 @@ class RosterEntry:
     """Name in tables and plots."""
     made_by: Factory | Members
     """Its factory, or a function that returns several, for policies trained separately."""
-    trained: bool = False
-    """Whether `made_by` may have to train."""
     tuning: Tuning | None = None
     """The search for its gains, if there is one."""
     compared: bool = True
@@ -134,15 +121,11 @@ class RosterEntry:
     drawn: bool = False
     """Whether its responses are drawn in a comparison."""
 
-    def members(self, request: PolicyRequest | None = None) -> list[Factory]:
+    def members(self) -> list[Factory]:
         """Return the factories of its members: one, or several trained separately."""
         if isinstance(self.made_by, Factory):
             return [self.made_by]
-        return list(self.made_by(request or PolicyRequest()))
-
-    def first(self) -> Factory:
-        """Return the factory of the first member, without training any other."""
-        return self.members(PolicyRequest(policies=1))[0]
+        return list(self.made_by())
 
 
 def provenances(members: Mapping[str, Sequence[Factory]]) -> dict[str, list[dict[str, Any]]]:

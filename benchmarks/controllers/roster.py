@@ -103,24 +103,19 @@ _ENTRIES = (
     RosterEntry(
         "ppo",
         "PPO",
-        pretrained.ppo_policies,
-        trained=True,
-        tuning=Tuning(
-            {
-                "learning_rate": (7e-4, 2e-3),
-                "gamma": (0.96, 0.985),
-                "noise_variance": (0.1, 0.8),
-                "setpoint_amplitude": (5.0, 7.0),
-            },
-            trials=9,
-            startup=5,
-            finalists=2,
-            # Without integral action, a policy does not settle exactly; only its errors count.
-            penalty=0.0,
-            members=(2, 4),
-            train=pretrained.tuned_policy,
+        pretrained.policies(
+            "ppo-[0-9]*.npz",
+            Cost("dead zone; trained on the paper's plant", "644 weights", "5 M a policy"),
         ),
         drawn=True,
+    ),
+    RosterEntry(
+        "ppo-hard",
+        "PPO, hard",
+        pretrained.policies(
+            "ppo-hard-*.npz",
+            Cost("trained on plants that vary", "12,608 weights", "4 M a policy"),
+        ),
     ),
     RosterEntry(
         "nn-smith",

@@ -46,9 +46,8 @@ def execute(options: Options, console: Console) -> str:
     told = plants if options.told == "each" else [nominal] * len(plants)
     made = origin()
     out = out_folder(options.out or Path(f"results/sweep-{options.design}"))
-    training = options.controllers.training()
     known = {NOTHING: ROSTER[NOTHING], **controllers}
-    members = {name: entry.members(training) for name, entry in known.items()}
+    members = {name: entry.members() for name, entry in known.items()}
     began = time.perf_counter()
 
     tasks: dict[str, Callable[[], Any]] = {
@@ -61,7 +60,7 @@ def execute(options: Options, console: Console) -> str:
             tasks[f"plant {i}, {name}"] = partial(
                 agent_task, *given, options.samples, options.runs
             )
-    found = training.fan_out.run(tasks, "sweep", Kept(out / "tasks"))
+    found = options.controllers.fan_out.run(tasks, "sweep", Kept(out / "tasks"))
     limits = [found[f"plant {i}"] for i in range(len(plants))]
     results = {
         name: [found[f"plant {i}, {name}"] for i in range(len(plants))] for name in members

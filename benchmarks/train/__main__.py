@@ -9,6 +9,7 @@ from typing import Annotated
 from benchmarks.lib.command import Count, Folder, choice, command, options
 from benchmarks.lib.fan_out import FanOut
 
+NETWORKS = "nn-smith", "ppo", "ppo-hard"
 OUT = Path("results/networks")
 
 
@@ -20,7 +21,7 @@ class Options:
     Finished networks are kept: the same command, run again, trains only the missing ones.
     """
 
-    network: Annotated[str, choice(("nn-smith", "ppo"), "What to train")] = field(kw_only=False)
+    network: Annotated[str, choice(NETWORKS, "What to train")] = field(kw_only=False)
     networks: Count | None = None
     """Number of networks to train, each from its own seed (default: 1 for nn-smith, where
     validation chooses the best of several; 5 for PPO, which are all compared)."""

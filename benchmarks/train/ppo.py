@@ -1,97 +1,296 @@
-"""Train PPO of Stable-Baselines3, or load the policies that are trained already.
+"""Train PPO of Stable-Baselines3 on many plants at once, and export its policy to NumPy.
 
-The policy controls in velocity form: its action changes the flow, so it can also hold it. A
-trained policy is a `PolicyNetwork`, which needs NumPy alone; PyTorch is imported only for
-training.
+`RECIPES` holds the settings of `ppo`, for the paper's plant, and of `ppo-hard`, for plants that
+vary. What makes them work:
+
+- **Groups.** Eight plants meet the same noise, load and set points, so that they differ only in
+  what they explore. Subtracting the mean of the group takes most of the variance out of the
+  advantages.
+- **Changes.** The policy sees changes between means over longer and longer stretches of the
+  past. One that sees no levels is at rest only where the error is 0, so it has no offset.
+- **Symmetry.** A policy without biases is odd: what it learns at +5 degC holds at -5 degC.
+- **Exploration that falls.** If it is learnt, it stays high, and a policy that is right with
+  exploration is wrong without it.
 """
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field, replace
-from functools import partial
-from pathlib import Path
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, cast
 
-from agents import PolicyNetwork
-from agents.archive import PRETRAINED
-from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.storage import key
-from benchmarks.train import kept
-from benchmarks.train.ppo_arguments import PPOArguments
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+from torch import nn
 
-KEPT = Path("results/policies")
-POLICIES = 5  # that are trained and compared, from consecutive seeds
-TUNING_SEED, FINAL_SEED = 1000, 2000  # of policies in a search; no comparison uses them
+from agents import Increments, PolicyNetwork
+from benchmarks.lib.storage import versions
+from mptc_gym import PRESETS, evaluate
+from mptc_gym.sb3 import GymnasiumVecEnv
+from mptc_gym.wrappers.vector import IncrementalAction
 
+Array = NDArray[np.float64]
 
-@dataclass(frozen=True)
-class PolicyRequest:
-    """A request for trained policies, and how to train those that are missing."""
-
-    fan_out: FanOut = field(default_factory=lambda: FanOut(jobs=1))
-    """Runs the trainings."""
-    folder: Path = KEPT
-    """Folder of the trained policies."""
-    steps: int | None = None
-    """Samples of experience; None for the default of the training."""
-    policies: int | None = None
-    """Number of policies, which differ in their seeds; None for the default."""
-    retrain: bool = False
-    """Whether to train finished policies again."""
+GROUP = 8  # plants that meet the same noise, load and set points
+TRAINING_SEEDS = 1 << 32  # seeds from here on are those of the training plants alone
+VALIDATION_SEED = 9_000_000  # no published result uses the seeds from here on
+SINGLE = 8, 30  # newest temperatures and flows whose changes are seen one by one
 
 
-def members(
-    request: PolicyRequest, arguments: PPOArguments | None = None, *, shipped: bool = True
-) -> dict[Path, PolicyNetwork]:
-    """Return policies that differ in their seeds, by file, and train those that are missing.
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """The settings of a training."""
 
-    Policies in the request's folder take precedence over those that come with the project.
+    plants: tuple[tuple[int, Mapping[str, Any]], ...]
+    """Numbers of training plants and their arguments."""
+    cases: Mapping[str, Mapping[str, Any]]
+    """Arguments of the validation cases, by name. No published result uses them."""
+    dead_zone: float
+    """Half width of the dead zone that is compensated between policy and plant, t/h. If it is
+    above 0, a comparison compensates that of the plant it runs."""
+    levels: bool
+    """Whether the policy also sees the set point and the flow."""
+    hidden: tuple[int, ...]
+    """Nodes of the policy's hidden layers; without any, it is linear."""
+    memory: int
+    """Past temperatures and past flows in the observation."""
+    steps: int
+    """Samples of experience, summed over all plants."""
+    max_move: float = 2.0
+    """Change of the flow at an action of 1, as a share of half its range."""
+    n_steps: int = 64
+    """Samples per plant between updates."""
+    batch_size: int = 4096
+    """Samples per gradient step."""
+    n_epochs: int = 5
+    """Passes over the samples per update."""
+    learning_rate: float = 2e-3
+    """Initial learning rate; it falls linearly to a twentieth."""
+    gamma: float = 0.96
+    """Discount factor per sample."""
+    gae_lambda: float = 1.0
+    """GAE's lambda; below 1, the value function also stands in for effects in transit."""
+    log_std: tuple[float, float] = (-1.2, -3.5)
+    """Logarithm of the action's standard deviation, at the start and at the end."""
 
-    Parameters
-    ----------
-    request
-        Number of policies, their folder, and what trains them.
-    arguments
-        Arguments of the first policy; the others take the seeds that follow.
-    shipped
-        Whether to accept policies that come with the project.
+    @property
+    def windows(self) -> dict[str, Any]:
+        """Arguments of the environment that give the policy its observation."""
+        past = {"output_window": self.memory, "action_window": self.memory}
+        return {"setpoint_window": 3, "error_window": 1, **past}
 
-    Raises
-    ------
-    ValueError
-        If a file is damaged; the message names it and says what to do.
+
+# An error scale of 50 degC brings returns to a size of about 1, which are learnt quickly.
+_COST = {"reward": "absolute", "error_scale": 50.0}
+_RANDOM = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
+
+RECIPES = {
+    "ppo": Recipe(
+        plants=((152, _RANDOM), (360, {**_RANDOM, "noise_variance": 0.5})),
+        cases={
+            "calm": {"setpoint_amplitude": 5.4, "setpoint_period": 500},
+            "noise": {
+                "noise_variance": 0.4,
+                "setpoint_amplitude": 5.4,
+                "setpoint_period": 500,
+            },
+        },
+        dead_zone=5.0,
+        levels=False,
+        hidden=(),
+        memory=320,
+        steps=5_000_000,
+        log_std=(-1.2, -4.0),
+    ),
+    "ppo-hard": Recipe(
+        plants=((512, {**PRESETS["hard"], **_COST, "setpoint_amplitude": 5.5}),),
+        cases={"hard": {**PRESETS["hard"], "setpoint_amplitude": 5.5, "setpoint_period": 560}},
+        dead_zone=0.0,
+        levels=True,
+        hidden=(64, 64),
+        memory=64,
+        steps=4_000_000,
+    ),
+}
+
+
+def train(recipe: Recipe, seed: int) -> PolicyNetwork:
+    """Train a policy, and return it with the results of its validation.
+
+    The seed is that of the initial weights, the exploration and the training plants.
     """
-    first = arguments or PPOArguments()
-    first = replace(first, steps=request.steps or first.steps)
-    seeds = range(first.seed, first.seed + (request.policies or POLICIES))
-    trainings = {}
-    for each in (replace(first, seed=seed) for seed in seeds):
-        file = request.folder / policy_key(each) / "policy.npz"
-        if shipped and not (request.retrain or file.exists()) and _comes(each):
-            file = PRETRAINED / file_name(each.seed)
-        trainings[file] = partial(train, each)
-    return kept.trained(trainings, PolicyNetwork.load, request.fan_out, retrain=request.retrain)
+    began = time.process_time()
+    model = begin(recipe, seed)
+    model.learn(recipe.steps, callback=Exploration(recipe))
+    seconds = time.process_time() - began
+    policy = export(model, recipe)
+    validation = {
+        name: evaluate(
+            policy, episodes=100, seed=VALIDATION_SEED, **recipe.windows, **case
+        ).mean_error
+        for name, case in recipe.cases.items()
+    }
+    policy.provenance = {
+        "algorithm": "PPO of Stable-Baselines3",
+        "recipe": asdict(recipe),
+        "seed": seed,
+        "steps": model.num_timesteps,
+        "cpu_seconds": round(seconds, 1),
+        "validation": validation,
+        "versions": versions(),
+    }
+    return policy
 
 
-def train(arguments: PPOArguments) -> PolicyNetwork:
-    """Train a policy, and return the one that did best in validation."""
-    from benchmarks.train import ppo_training  # here: torch takes seconds to load
+def begin(recipe: Recipe, seed: int) -> PPO:
+    """Return an untrained model."""
+    torch.set_num_threads(1)  # the networks are too small for more
+    model = PPO(
+        "MlpPolicy",
+        Plants(recipe),
+        # At the last update nothing remains; the lower bound lets it have an effect.
+        learning_rate=lambda remaining: recipe.learning_rate * max(remaining, 0.05),
+        n_steps=recipe.n_steps,
+        batch_size=recipe.batch_size,
+        n_epochs=recipe.n_epochs,
+        gamma=recipe.gamma,
+        gae_lambda=recipe.gae_lambda,
+        rollout_buffer_class=GroupBuffer,
+        policy_kwargs={"net_arch": {"pi": list(recipe.hidden), "vf": [64, 64]}},
+        seed=seed,
+        device="cpu",
+    )
+    for layer in _layers(model):
+        nn.init.zeros_(layer.bias)
+        layer.bias.requires_grad_(False)
+    return model
 
-    return ppo_training.train(arguments)
+
+class Plants(GymnasiumVecEnv):
+    """The training plants, in groups that draw the same numbers from one seed.
+
+    Their observations are the inputs of the networks, which are much shorter.
+    """
+
+    def __init__(self, recipe: Recipe) -> None:
+        moves = {"max_move": recipe.max_move, "compensate_dead_zone": recipe.dead_zone}
+        given = {**recipe.windows, "autoreset_mode": "SameStep"}
+        super().__init__(
+            *(
+                IncrementalAction(
+                    gymnasium.make_vec("MiddlePoint-v0", number, **given, **arguments), **moves
+                )
+                for number, arguments in recipe.plants
+            )
+        )
+        self._features = features(recipe).T.astype(np.float32)
+        self.observation_space = Box(-np.inf, np.inf, self._features.shape[1:])
+
+    def seed(self, seed: int | None = None) -> list[int | None]:
+        """Set the seeds of the next reset."""
+        (first,) = np.random.SeedSequence(seed).generate_state(1).tolist()
+        self._seeds = [TRAINING_SEEDS + first + i // GROUP for i in range(self.num_envs)]
+        return self._seeds
+
+    def reset(self) -> NDArray[Any]:
+        """Reset all plants."""
+        return super().reset() @ self._features
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step all plants."""
+        observations, rewards, ended, infos = super().step_wait()
+        for i in np.flatnonzero(ended).tolist():
+            infos[i]["terminal_observation"] = infos[i]["terminal_observation"] @ self._features
+        return cast("Array", observations) @ self._features, rewards, ended, infos
 
 
-def file_name(seed: int) -> str:
-    """Return the file name of a seed's policy among those that come with the project."""
-    return f"ppo-{seed}.npz"
+class GroupBuffer(RolloutBuffer):
+    """Rollouts whose advantages are relative to the mean of a plant's group."""
+
+    def compute_returns_and_advantage(
+        self, last_values: torch.Tensor, dones: NDArray[Any]
+    ) -> None:
+        """Compute returns as usual, and advantages relative to those of the group."""
+        super().compute_returns_and_advantage(last_values, dones)
+        groups = self.advantages.reshape(self.buffer_size, -1, GROUP)
+        groups -= groups.mean(axis=2, keepdims=True)
 
 
-def policy_key(arguments: PPOArguments) -> str:
-    """Return a fingerprint of everything that shapes a policy."""
-    return str(key(asdict(arguments)))
+def features(recipe: Recipe) -> Array:
+    """Return the matrix that turns an observation into the inputs of the networks.
+
+    The inputs are the error, the changes of set point, temperature and flow and, if the recipe
+    has them, the levels of set point and flow. Factors bring each to about 1. The matrix has
+    the shape (inputs, observation size).
+    """
+    sizes = np.cumsum([*recipe.windows.values()])
+    setpoints, errors, outputs, actions = np.split(np.eye(sizes[-1]), sizes[:-1])
+    levels = [0.2 * setpoints[:1], actions[:1]] if recipe.levels else []
+    return np.vstack(
+        [
+            errors,
+            0.2 * changes(setpoints, len(setpoints)),
+            0.5 * changes(outputs, SINGLE[0]),
+            1.0 * changes(actions, SINGLE[1]),
+            *levels,
+        ]
+    )
 
 
-def _comes(arguments: PPOArguments) -> bool:
-    """Return whether a policy trained with these arguments comes with the project."""
-    file = PRETRAINED / file_name(arguments.seed)
-    asked = json.loads(json.dumps(asdict(arguments)))
-    return file.exists() and bool(PolicyNetwork.load(file).provenance["arguments"] == asked)
+def changes(window: Array, single: int) -> Array:
+    """Return the differences between means over stretches of a window, newest first.
+
+    The first stretches have a single sample; those that follow have 2, 4, 8 and so on.
+    """
+    ends = [*range(1, single + 1)]
+    while ends[-1] < len(window):
+        ends.append(min(2 * ends[-1] - single + 2, len(window)))
+    means = [each.mean(axis=0) for each in np.split(window, ends[:-1])]
+    return -np.diff(means, axis=0)
+
+
+def _layers(model: PPO) -> list[nn.Linear]:
+    """Return the layers of the policy, but not of the value function."""
+    layers = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
+    return [layer for layer in layers if isinstance(layer, nn.Linear)]
+
+
+def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
+    """Return the mean of a model's policy as a network in NumPy."""
+    layers = [
+        (layer.weight.detach().double().numpy(), layer.bias.double().numpy())
+        for layer in _layers(model)
+    ]
+    (weights, bias), *others = layers
+    return PolicyNetwork(
+        [(weights @ features(recipe), bias), *others],
+        observation=recipe.windows,
+        input_scale=np.ones(sum(recipe.windows.values())),
+        activation="tanh",
+        increments=Increments(recipe.max_move, recipe.dead_zone),
+    )
+
+
+class Exploration(BaseCallback):
+    """Reduce the exploration over the training."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        super().__init__()
+        self._recipe = recipe
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        done = self.num_timesteps / self._recipe.steps
+        with torch.no_grad():
+            log_std = cast("torch.Tensor", self.model.policy.log_std)
+            log_std.fill_(float(np.interp(done, (0.0, 1.0), self._recipe.log_std)))

@@ -22,8 +22,7 @@ _TRIALS = ", ".join(f"{tuning.trials} for {name}" for name, tuning in TUNED.item
 class Options:
     """Tune a controller's gains with Optuna.
 
-    All trials use the same set points and seeds, which no comparison uses. NN and PI get the
-    same number of trials; PPO gets fewer, as each trial is a training. The search is saved
+    All trials use the same set points and seeds, which no comparison uses. The search is saved
     after every trial; the same command resumes it and gives the same result.
     """
 

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import optuna
 import pandas as pd
 from optuna.distributions import BaseDistribution, FloatDistribution
@@ -60,7 +59,7 @@ class Search:
     folder: Path
     """Folder for `<controller>.csv`, `<controller>.md` and the trials."""
     fan_out: FanOut
-    """Runs the members of a trial, or the finalists, in parallel."""
+    """Runs the finalists in parallel."""
 
     @property
     def path(self) -> Path:
@@ -123,25 +122,13 @@ class Search:
         )
 
     def _judge(self, candidates: Mapping[str, Row], *, final: bool) -> list[Row]:
-        """Return each candidate's gains with the mean of its members' scores."""
-        members = range(self.tuning.members[final])
+        """Return each candidate's gains with its score."""
         runs = (FINAL_RUNS, FINAL_FIRST_RUN) if final else (self.runs, FIRST_RUN)
-        judged = partial(_judged, self.controller, self.plant, *runs, final)
-        tasks = {
-            f"{name}, member {member}": partial(judged, gains, member)
-            for name, gains in candidates.items()
-            for member in members
-        }
+        judged = partial(_judged, self.controller, self.plant, *runs)
+        tasks = {name: partial(judged, gains) for name, gains in candidates.items()}
         # A single task gains nothing from another process, which takes seconds to start.
         fan_out = self.fan_out if len(tasks) > 1 else FanOut(jobs=1)
-        found = fan_out.run(tasks, "new runs for the best" if final else "")
-        rows = []
-        for name in candidates:
-            answers = [found[f"{name}, member {member}"] for member in members]
-            rows.append(
-                {each: float(np.mean([a[each] for a in answers])) for each in answers[0]}
-            )
-        return rows
+        return [*fan_out.run(tasks, "new runs for the best" if final else "").values()]
 
     def report(self, trials: pd.DataFrame) -> pd.DataFrame:
         """Judge the best trials again, with rounded gains on new runs; write and return them.
@@ -192,16 +179,10 @@ def _judged(
     plant: Mapping[str, Any],
     runs: int,
     first_run: int,
-    final: bool,
     gains: Row,
-    member: int,
 ) -> Row:
     """Return gains together with the score of a controller that has them."""
-    tuning = controller.tuning
-    assert tuning is not None
-    if tuning.train is None:
-        (factory,) = controller.members()
-        factory = replace(factory, make=partial(factory.make, **gains))
-    else:
-        factory = tuning.train(**gains, final=final, member=member)
-    return {**gains, **score(factory, plant, runs, first_run, tuning.penalty)}
+    assert controller.tuning is not None
+    (factory,) = controller.members()
+    factory = replace(factory, make=partial(factory.make, **gains))
+    return {**gains, **score(factory, plant, runs, first_run, controller.tuning.penalty)}

@@ -48,7 +48,7 @@ def execute(options: Options, console: Console) -> str:
     needs_film = path is not None or not _has_screen()
     if controller is None and needs_film:
         raise UsageError(f"--agent {YOU}: needs a screen to open a window on, and no --video")
-    factory = controller.first() if controller else None
+    factory = controller.members()[0] if controller else None
     if path is None and needs_film:
         path = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.gif"
         console.print(f"There is no screen to open a window on: writing a film, {path}")

@@ -147,9 +147,9 @@ def tabulate(
     There is no bound if the load was moved by hand.
     """
     runs = {label: trajectory} | {
-        controller.label: replay(controller.first(), scenario, seed, moves)
+        controller.label: replay(controller.members()[0], scenario, seed, moves)
         for controller in ROSTER.values()
-        if controller.compared and not controller.trained and controller.label != label
+        if controller.compared and controller.label != label
     }
     found = {name: float(mean_error(run)[0]) for name, run in runs.items()}
     rows = [
@@ -161,7 +161,7 @@ def tabulate(
         if moves:
             # The viewer knows the moves of the set point in advance.
             kind, longer = "preview", replace(scenario, samples=scenario.samples + 1)
-            idle = replay(ROSTER["nothing"].first(), longer, seed, moves)
+            idle = replay(ROSTER["nothing"].members()[0], longer, seed, moves)
             arguments["setpoint"] = idle.setpoint[:, 0].tolist()
         bound = least_possible(
             samples=scenario.samples, kind=kind, episodes=EPISODES, **arguments
