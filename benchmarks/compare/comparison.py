@@ -29,8 +29,6 @@ from mptc_gym.evaluation import SEED
 
 OUT = Path("results/compare")
 LONGEST = 60  # characters at which a folder's name is cut
-# Slow controllers start first, so that no core is idle at the end.
-LONG = {"mpc", "nn-self-tuning", "ppo", "self-tuning", "nn-smith"}
 
 
 def execute(options: Options, console: Console) -> str:
@@ -75,19 +73,19 @@ def execute(options: Options, console: Console) -> str:
         state = {"complete": complete, "seconds": seconds}
         write_json(folder / "provenance.json", {**state, **made, **about})
 
-    def write(fan_out: FanOut) -> list[Section]:
+    def write() -> list[Section]:
         save()
-        return report.write(comparison, folder, provenance_line("compare", made), fan_out)
+        return report.write(comparison, folder, provenance_line("compare", made))
 
     try:
         comparison.run(options.controllers.fan_out, Kept(folder / "tasks"))
     except BaseException:  # including Ctrl-C
         if comparison.cases:
-            write(FanOut(jobs=1))
+            write()
         raise
-    sections = write(FanOut(jobs=options.controllers.fan_out.jobs))
+    sections = write()
     save(complete=True)
-    show(sections[:3], console)
+    show(sections[:2], console)
     return f"The report, tables, data and plots are in {out}/"
 
 
@@ -172,9 +170,7 @@ class Comparison:
             f"{each.name}: bounds": partial(bounds, each, self.count)
             for each in sorted(scenarios, key=lambda each: not each.parameters.ranges)
         }
-        agents = sorted(self.controllers, key=lambda agent: agent not in LONG)
-        for agent, each in itertools.product(agents, scenarios):
-            members = self.controllers[agent]
+        for (agent, members), each in itertools.product(self.controllers.items(), scenarios):
             tasks[f"{agent}, {each.name}"] = partial(run_case, each, agent, members, self.count)
         for _, result in fan_out.stream(tasks, "compare", kept):
             if "agent" in result:

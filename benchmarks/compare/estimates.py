@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -12,8 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.controllers.roster import label
-from benchmarks.lib.statistics import Estimate, bootstrap, improvement, student
+from benchmarks.lib.statistics import Estimate, bootstrap, improvement
 from benchmarks.lib.tables import groups
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
 Score = tuple[Estimate, dict[str, float]]  # overall, and by scenario
 
 BOOTSTRAP = 0  # seed of the bootstraps
-TOLERANCE = 1e-4  # relative error allowed in a bound
 
 
 @dataclass(frozen=True)
@@ -92,30 +89,26 @@ def bounds(scenario: Scenario, runs: int) -> dict[str, Any]:
 def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
     """Return estimates for a scenario with 95 % intervals, one row for each agent.
 
-    They are the `mean` of |e|, degC; `ratio`, the mean as a multiple of
-    `limit`, the least possible error that applies; `difference`, the mean paired difference
-    from the reference agent; `improvement`, the probability of doing better than that agent;
-    and `student_high`, the upper end of Student's interval of the mean. `preview` is the least
-    possible error of any controller. Ends are infinite if runs differ but there is only one.
+    They are the `mean` of |e|, degC; `ratio`, the mean as a multiple of `limit`, the least
+    possible error that applies; `difference`, the mean paired difference from the reference
+    agent; and `improvement`, the probability of doing better than that agent. `preview` is the
+    least possible error of any controller. Ends are infinite if runs differ but there is only
+    one.
     """
     rows = []
     limit = scale.least.value
     errors = {agent: _errors(group) for agent, group in groups(runs, "agent")}
     base = errors[reference].mean(axis=0) if reference in errors else None
     for agent, values in errors.items():
-        mean, by_run = bootstrap(values, seed=BOOTSTRAP), student(values.mean(axis=0))
-        student_high = by_run.high if scale.drawn else by_run.value
-        if scale.drawn and by_run.runs == 1:
-            student_high = math.inf
-            if values.size == 1:
-                mean = replace(mean, low=-math.inf, high=math.inf)
+        mean = bootstrap(values, seed=BOOTSTRAP)
+        if scale.drawn and values.size == 1:
+            mean = replace(mean, low=-math.inf, high=math.inf)
         row: dict[str, Any] = {
             "scenario": scale.scenario,
             "agent": agent,
             "limit": limit,
             "preview": scale.preview.value,
             "mean": mean,
-            "student_high": student_high,
             "ratio": replace(
                 mean, value=mean.value / limit, low=mean.low / limit, high=mean.high / limit
             ),
@@ -146,70 +139,3 @@ def score(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> Score:
 def _errors(runs: pd.DataFrame) -> NDArray[np.float64]:
     """Return the errors of a controller's runs, shape (policies, seeds)."""
     return runs.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
-
-
-def standing(
-    runs: pd.DataFrame, scales: Mapping[str, Scale], scores: Mapping[str, Score]
-) -> str:
-    """Say which agent is best, at what valve travel, and which do not differ significantly."""
-    overall = {agent: found.value for agent, (found, _) in scores.items()}
-    agents = sorted(overall, key=lambda agent: -overall[agent])
-    travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
-    at = [f"{overall[each]:.3f} at {travels[each].mean():,.0f} t/h" for each in agents]
-    if len(agents) == 1:
-        return f"{label(agents[0])} has a score of {at[0]} of valve travel a run."
-    best = (
-        f"{label(agents[0])} is best, with a score of {at[0]} of valve travel a run; "
-        f"{label(agents[1])} follows with {at[1]}."
-    )
-    if any(scale.drawn for scale in scales.values()) and runs["seed"].nunique() == 1:
-        return f"{best} One run of each does not tell them apart."
-    near = [pair for pair in itertools.pairwise(agents) if _alike(runs, scales, *pair)]
-    if not near:
-        return f"{best} The runs tell all of them apart, at 95 %."
-    pairs = "; ".join(f"{label(one)} and {label(other)}" for one, other in near)
-    return f"{best} Not to be told apart, at 95 %: {pairs}."
-
-
-def _alike(runs: pd.DataFrame, scales: Mapping[str, Scale], one: str, other: str) -> bool:
-    """Return whether the mean scores of two controllers do not differ significantly."""
-    tables = []
-    for scenario, cases in groups(runs, "scenario"):
-        errors = [_errors(cases[cases["agent"] == agent]) for agent in (one, other)]
-        if not all(each.size for each in errors):
-            continue  # after an interruption, not all have run
-        # Policies are resampled for the controller that has more of them.
-        many, few = sorted(map(scales[scenario].least.score, errors), key=len, reverse=True)
-        tables.append(many - few.mean(axis=0))
-    if not tables:
-        return True
-    difference = bootstrap(*tables, seed=BOOTSTRAP)
-    return difference.low <= 0.0 <= difference.high
-
-
-def verdict(estimates: pd.DataFrame) -> str:
-    """Say whether a controller came below a bound, and what that means."""
-    if impossible := _below(estimates, "preview"):
-        return (
-            f"Below the bound of every controller, beyond the interval: {impossible}. "
-            "The plant or the bound is another one than was run."
-        )
-    if below := _below(estimates, "limit"):
-        return (
-            f"Below what is possible without knowing the set point beforehand: {below}. "
-            "Such a controller uses the future, or reckons with the next change."
-        )
-    return "No controller comes below the least possible error, in any scenario."
-
-
-def _below(estimates: pd.DataFrame, bound: str) -> str:
-    """Name the controllers whose mean error is significantly below a bound.
-
-    The whole interval must lie below it. As the bootstrap makes it too narrow where runs are
-    few, Student's interval must lie below, too.
-    """
-    return ", ".join(
-        f"{row['agent']} in {row['scenario']}"
-        for row in estimates.to_dict("records")
-        if max(row["mean"].high, row["student_high"]) < row[bound] * (1.0 - TOLERANCE)
-    )

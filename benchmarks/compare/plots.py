@@ -24,7 +24,7 @@ from benchmarks.loop.scenarios import Scenario
 def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> None:
     """Draw set point, output and applied input of every agent over time.
 
-    `responses` holds the rows of `tables.summarise_responses` for all agents.
+    `responses` holds the rows of `report.summarise_responses` for all agents.
     """
     palette = colours(list(responses["agent"].unique()))
     with drawn(path, 9, 6) as figure:
@@ -117,39 +117,32 @@ def _scenario_panels(
 def plot_travel(summary: pd.DataFrame, scales: Mapping[str, Scale], path: Path) -> None:
     """Draw the error of every agent against its valve travel, a panel for each scenario.
 
-    `summary` is what `tables.summarise` returns.
+    `summary` is what `report.summarise` returns. A valve that never moves is not drawn.
     """
     medians = summary.pivot_table(
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
+    line: dict[str, Any] = {"color": "0.4", "linewidth": 1}
     with _scenario_panels(path, medians, 3.0) as (found, shades):
         # Fewer marks than hues, so that agents of similar colour have different marks.
         marks = dict(zip(shades, itertools.cycle("osD^v"), strict=False))
-        for axes, rows in found:
-            # A valve that never moves has no place on a logarithmic axis.
-            moving = rows[rows["total_variation"] > 0.0]
-            for row in moving.to_dict("records"):
-                agent = row["agent"]
-                axes.plot(
-                    row["total_variation"], row["mae"], marks[agent], color=shades[agent],
-                    label=label(agent),
-                )  # fmt: skip
-            if moving.empty:
+        for axes, cases in found:
+            rows = cases[cases["total_variation"] > 0.0]
+            if rows.empty:
                 continue
-            scale, travels = scales[rows["scenario"].iloc[0]], moving["total_variation"]
+            travels, errors = rows["total_variation"], rows["mae"]
+            for agent, travel, error in zip(rows["agent"], travels, errors, strict=True):
+                axes.plot(travel, error, marks[agent], color=shades[agent], label=label(agent))
+            scale = scales[rows["scenario"].iloc[0]]
             across = np.geomspace(0.7 * travels.min(), 1.4 * travels.max(), 200)
-            line: dict[str, Any] = {"color": "0.4", "linewidth": 1}
             if scale.frontier:
-                travel, error = np.transpose(scale.frontier[::-1])
-                axes.plot(
-                    across, np.interp(across, travel, error), **line,
-                    label="least possible for this travel",
-                )  # fmt: skip
+                least = np.interp(across, *np.transpose(scale.frontier[::-1]))
+                axes.plot(across, least, **line, label="least possible for this travel")
             limit = scale.least.value
             axes.axhline(limit, linestyle="--", **line, label="least possible for any travel")
             axes.set_xscale("log")
             axes.set_xlim(across[0], across[-1])
-            axes.set_ylim(0.9 * min(limit, moving["mae"].min()), 1.1 * moving["mae"].max())
+            axes.set_ylim(0.9 * min(limit, errors.min()), 1.1 * errors.max())
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_locator(NullLocator())

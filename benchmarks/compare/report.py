@@ -12,20 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.compare.estimates import (
-    Scale,
-    Score,
-    estimate,
-    scale_of,
-    score,
-    standing,
-    verdict,
-)
+from benchmarks.compare.estimates import Scale, estimate, scale_of, score
 from benchmarks.controllers.roster import ROSTER, label
-from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.statistics import Estimate
-from benchmarks.lib.storage import NotWrittenError
 from benchmarks.lib.tables import PERCENTILES, groups, percentiles, write_csv
 from benchmarks.loop.metrics import METRICS
 from benchmarks.loop.rollout import Trajectory
@@ -39,39 +29,28 @@ NO_MEASURE = "not measured"
 STEP_METRICS = ("overshoot", "settling_time")  # meaningless in noise
 
 
-def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -> list[Section]:
-    """Write the report of all finished cases, with tables and pictures, and return it.
+def write(comparison: Comparison, folder: Path, made_by: str) -> list[Section]:
+    """Write the report of all finished cases, with tables and pictures, and return it."""
+    from benchmarks.compare import plots  # here, so that only drawing loads Matplotlib
 
-    The fan-out computes the estimates and draws the pictures. A picture that cannot be drawn
-    becomes a sentence in the report.
-    """
     runs, names, agents = comparison.runs, comparison.names, comparison.agents
     scales = {  # after an interruption, some may be missing
         name: comparison.scales.get(name)
         or scale_of(comparison.scenarios[name], comparison.count)
         for name in names
     }
-    to_estimate: dict[str, Callable[[], Any]] = {
-        f"estimates, {name}": partial(
-            estimate, runs[runs["scenario"] == name], scales[name], agents[0]
-        )
-        for name in names
-    }
-    to_score: dict[str, Callable[[], Any]] = {
-        f"score, {agent}": partial(score, runs[runs["agent"] == agent], scales)
-        for agent in agents
-    }
-    made = dict(fan_out.stream(to_estimate | to_score))
-    estimates = pd.concat([made[key] for key in to_estimate], ignore_index=True)
-    scores = dict(zip(agents, (made[key] for key in to_score), strict=True))
+    estimates = pd.concat(
+        [estimate(cases, scales[name], agents[0]) for name, cases in groups(runs, "scenario")],
+        ignore_index=True,
+    )
     summary = summarise(runs)
     write_numbers(folder / "summary.csv", summary)
     write_numbers(folder / "estimates.csv", estimates)
 
-    plots: dict[str, tuple[Any, ...]] = {
-        "travel.png": ("travel", summary, scales),
-        "bounds.png": ("bounds", estimates),
-        "runs.png": ("runs", runs),
+    pictures: dict[str, Callable[[Path], None]] = {
+        "travel.png": partial(plots.plot_travel, summary, scales),
+        "bounds.png": partial(plots.plot_bounds, estimates),
+        "runs.png": partial(plots.plot_runs, runs),
     }
     drawn = [agent for agent in agents if agent not in ROSTER or ROSTER[agent].drawn] or agents
     for name in names:
@@ -79,32 +58,33 @@ def write(comparison: Comparison, folder: Path, made_by: str, fan_out: FanOut) -
         responses = pd.concat([case.responses for case in cases], ignore_index=True)
         write_numbers(folder / f"{name}.csv", responses)
         shown = responses[responses["agent"].isin(drawn)]
-        plots[f"{name}.png"] = ("responses", shown, comparison.scenarios[name])
-    draw = {name: partial(_draw, *what, folder / name) for name, what in plots.items()}
-    faults = {name: fault for name, fault in fan_out.stream(draw) if fault}
-
-    sections = []
-    for section in _sections(comparison, scales, summary, estimates, scores):
-        pictures = [name for name in section.pictures if name not in faults]
-        missing = [
-            f"{name} could not be drawn ({faults[name]})."
-            for name in section.pictures
-            if name in faults
-        ]
-        sections.append(replace(section, text=[*section.text, *missing], pictures=pictures))
+        scenario = comparison.scenarios[name]
+        pictures[f"{name}.png"] = partial(plots.plot_responses, shown, scenario)
+    faults = {
+        name: f"{name} could not be drawn ({fault})."
+        for name, draw in pictures.items()
+        if (fault := _draw(draw, folder / name))
+    }
+    sections = [
+        replace(
+            section,
+            text=[
+                *section.text,
+                *(faults[name] for name in section.pictures if name in faults),
+            ],
+            pictures=[name for name in section.pictures if name not in faults],
+        )
+        for section in _sections(comparison, scales, summary, estimates)
+    ]
     write_report(folder, "Comparison of controllers", sections, made_by)
     return sections
 
 
-def _draw(kind: str, *arguments: Any) -> str:
+def _draw(draw: Callable[[Path], None], path: Path) -> str:
     """Draw a picture and return any error as text, so that the report is still written."""
-    from benchmarks.compare import plots  # here, so that only drawing loads Matplotlib
-
     try:
-        getattr(plots, f"plot_{kind}")(*arguments)
-    except NotWrittenError:
-        raise
-    except Exception as error:
+        draw(path)
+    except (ValueError, ArithmeticError) as error:  # what a plant gives may fit no axis
         return f"{type(error).__name__}: {error}"
     return ""
 
@@ -114,38 +94,36 @@ def _sections(
     scales: Mapping[str, Scale],
     summary: pd.DataFrame,
     estimates: pd.DataFrame,
-    scores: Mapping[str, Score],
 ) -> list[Section]:
     """Return the sections of the report, the most interesting ones first."""
-    names = comparison.names
+    names, (reference, *others) = comparison.names, comparison.agents
     titles = [(name, comparison.scenarios[name].title) for name in names]
-    sections = [
-        Section("", [standing(comparison.runs, scales, scores)]),
+    paired = Section(
+        f"Difference to {label(reference)} (°C), 95 % interval",
+        ["And the share of runs in which the error is smaller, in the same noise."],
+        paired_table(estimates) if others else None,
+    )
+    return [
         Section(
             "Score: 0 for leaving the valve alone, 1 for the least possible error",
             [
-                "The score of a scenario is that of `mptc_gym.evaluate`; the first column is "
-                "their mean, with a 95 % interval over policies and runs. With five policies "
-                "that differ much it covers 82 %. Below 0, doing nothing is better. The valve "
-                "travel above is that of the median run, as a mean over the scenarios.",
+                "A scenario is scored as by `mptc_gym.evaluate`. The first column is the mean "
+                "over the scenarios, with a 95 % interval over policies and runs; travel is "
+                "that of the valve in the median run.",
                 f"The picture: {titles[0][1]}. A line is the median over all runs at each "
                 "sample, a band the 10th to 90th percentile. The grey band is the dead zone.",
             ],
-            score_table(scores),
+            score_table(comparison.runs, scales),
             [f"{names[0]}.png"],
         ),
         Section(
             "Mean absolute error as a multiple of the least possible error, with its 95 % "
             "interval",
             [
-                verdict(estimates),
                 "The least possible error marked * supposes that each change of the set point "
-                "finds the plant settled and is not foreseen; of random set points it supposes "
-                "that their law is known. With preview of the whole set point, no controller "
-                "that reads the transmitter, and not the true output, does better than the "
-                "second row says.",
-                "A point is the mean over all runs, a bar its 95 % interval. Each axis begins "
-                "at the least possible error, the vertical line.",
+                "finds the plant settled and is not foreseen. A controller below 1, beyond its "
+                "interval, uses the future or counts on the next change. None that reads the "
+                "transmitter comes below the second row, even with preview of the set point.",
             ],
             ratio_table(estimates, scales),
             ["bounds.png"],
@@ -153,31 +131,21 @@ def _sections(
         Section(
             "Error against valve travel",
             [
-                "A point is the median run of a controller: its error against the distance "
-                "that it moves the valve. Down and left is better. The line is the least "
-                "possible error for a given travel, the dashed one for any travel."
+                "A point is the median run of a controller; down and left is better. The line "
+                "is the least possible error for a given travel, the dashed one for any travel."
             ],
             pictures=["travel.png"],
         ),
+        *([paired] if others else []),
         Section(
             "What each controller costs",
-            [
-                "Training: of one policy, the median. Runs: all scenarios, including what is "
-                "measured."
-            ],
+            ["Training: the median policy. Runs: all scenarios, including measuring."],
             _costs(comparison),
         ),
-        Section(
-            "Every run",
-            ["A point is one run: so unlucky initial weights and unlucky trainings show."],
-            pictures=["runs.png"],
-        ),
+        Section("Every run", pictures=["runs.png"]),
         Section(
             f"All measures: median (10th to 90th percentile) of {comparison.count} runs",
-            [
-                "The noise is the same for all. Overshoot and settling time are left out where "
-                "there is noise: it crosses every band."
-            ],
+            ["Overshoot and settling time have no meaning in noise, which crosses every band."],
             metrics_table(summary, comparison.scenarios),
         ),
         Section(
@@ -186,11 +154,6 @@ def _sections(
             pictures=[f"{name}.png" for name in names[1:]],
         ),
     ]
-    if len(comparison.agents) > 1:
-        title = f"Difference to {label(comparison.agents[0])} (°C), 95 % interval"
-        text = ["And the share of runs in which the error is smaller, in the same noise."]
-        sections.insert(4, Section(title, text, paired_table(estimates)))
-    return sections
 
 
 def _costs(comparison: Comparison) -> pd.DataFrame:
@@ -274,14 +237,20 @@ def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.Data
     return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
 
 
-def score_table(scores: Mapping[str, Score]) -> pd.DataFrame:
-    """Return the scores, one row for each agent, the overall score first."""
+def score_table(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
+    """Return the scores and the mean travel of the median runs, the best agent first."""
+    scores = {agent: score(of_agent, scales) for agent, of_agent in groups(runs, "agent")}
+    travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
     rows = [
         {"agent": label(agent), "score": f"{overall:.3f}"}
+        | {"travel (t/h)": f"{travels[agent].mean():,.0f}"}
         | {scenario: f"{mean:.2f}" for scenario, mean in means.items()}
-        for agent, (overall, means) in scores.items()
+        for agent, (overall, means) in sorted(
+            scores.items(), key=lambda each: each[1][0].value, reverse=True
+        )
     ]
-    return pd.DataFrame(rows).fillna("")  # after an interruption, not all have run
+    columns = ["agent", "score", "travel (t/h)", *scales]  # after an interruption, with gaps
+    return pd.DataFrame(rows, columns=columns).fillna("")
 
 
 def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
