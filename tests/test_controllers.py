@@ -19,7 +19,7 @@ from benchmarks.lib.command import UsageError
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import IdleValve
 from benchmarks.loop.scenarios import Scenario
-from benchmarks.sweep.tasks import agent_task
+from benchmarks.sweep.command import agent_task
 from benchmarks.watch import game
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED

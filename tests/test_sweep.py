@@ -16,9 +16,9 @@ from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop import designs
 from benchmarks.loop.designs import SPANS, WIDE, around, grid, random_design
-from benchmarks.sweep import command, report, tasks
+from benchmarks.sweep import command, report
 from benchmarks.sweep.__main__ import main
-from benchmarks.sweep.tasks import agent_task, limit_task
+from benchmarks.sweep.command import agent_task, limit_task
 from mptc_gym import Parameters
 from tests.conftest import trajectory
 
@@ -95,7 +95,7 @@ class TestCells:
         # Two of them, of 1, 3 and of 10, 10, 10, 16: variances 1 and 6.75.
         setpoint = np.repeat([5.0, -5.0], [4, 8])
         error = [9, 9, 1, 3, 9, 9, 9, 9, 10, 10, 10, 16]
-        found = tasks.swing(trajectory(setpoint, setpoint - error))
+        found = command.swing(trajectory(setpoint, setpoint - error))
         assert found == pytest.approx([np.sqrt(7.75 / 2)])
 
     def test_the_limit_is_that_of_the_plant(self):

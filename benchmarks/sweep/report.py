@@ -52,10 +52,8 @@ OVERVIEW_TEXT = (
     "Ratio: mean error as a multiple of the least possible error, median and 90th percentile "
     "over the plants (the median run of each). Travel: of the valve in a run, the median. "
     "Oscillates: on steady stretches the standard deviation of the error is "
-    f"{OSCILLATES:g} °C larger than with no control at all. The actuator is limited and the "
-    "plant stable, so that an unstable loop comes to no more than that. Useless: the mean "
-    "error is no smaller than with no control. Both are shares of the runs. PPO's policies "
-    "take the plants in turn."
+    f"{OSCILLATES:g} °C larger than with no control at all. Useless: the mean error is no "
+    "smaller than with no control. Both are shares of the runs."
 )
 DIFFERENCES_TEXT = (
     "Differences of the mean error (°C), run by run in the same noise, with 95 % intervals "
