@@ -1,8 +1,8 @@
-"""Run independent tasks in parallel, on this machine or on a Ray cluster.
+"""Run independent tasks in parallel, in processes of this machine or on a Ray cluster.
 
-joblib schedules them on this machine, Ray on a cluster. A result does not depend on which
-process runs the task, or when, as long as all its randomness comes from its arguments. A
-finished task is kept, so that an interrupted run goes on with the missing ones.
+A result does not depend on which process runs the task, or when, as long as all its randomness
+comes from its arguments. A finished task is kept, so that an interrupted run goes on with the
+missing ones.
 
 The nodes of a cluster need Ray and the packages that a task imports. They need no shared folder
 and no checkout: Ray unpacks the code where its workers run.
@@ -16,17 +16,20 @@ import socket
 import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
+from pickle import PicklingError
 from typing import Any, Literal
 
 from benchmarks.lib.command import Count, blame, options
 from benchmarks.lib.storage import ROOT, Kept, UnfinishedError, versions
 
 NAMED = 10  # failed tasks listed in a message
+ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
 QUEUED = 4  # tasks submitted per core of a cluster, enough to occupy nodes that join later
 LOST = "The process that ran it ended, perhaps for lack of memory: the same command tries again"
 # Files that are not uploaded, in .gitignore syntax: the whole checkout except its packages and
@@ -39,6 +42,7 @@ STAYS = [
 Task = Callable[[], Any]
 Tasks = Mapping[str, Task]
 Answer = tuple[str, Any, str]  # the name of a task, its result, and its error or ""
+Submit = Callable[[str, Task], Future[Answer]]
 
 
 class TasksFailedError(UnfinishedError):
@@ -81,7 +85,7 @@ class FanOut:
         ----------
         tasks
             Functions without arguments, by name, such as a `functools.partial` of a function of
-            a module. Those that cannot be pickled run in this process, last.
+            a module. Those that cannot be pickled run in this process.
         title
             Label of the progress bar; "" for no bar.
         kept
@@ -131,55 +135,41 @@ def _attempt(name: str, task: Task) -> Answer:
         return name, None, traceback.format_exc()
 
 
+def _answers(tasks: Tasks, submit: Submit, at_once: int) -> Iterator[Answer]:
+    """Keep so many tasks under way, and yield each answer as it comes."""
+    waiting, running = iter(tasks.items()), dict[Future[Answer], str]()
+    while True:
+        for name, task in islice(waiting, at_once - len(running)):
+            running[submit(name, task)] = name
+        if not running:
+            return
+        for done in wait(running, return_when=FIRST_COMPLETED).done:
+            name = running.pop(done)
+            try:
+                answer = done.result()
+            except PicklingError:  # perhaps of a user's own controller: it runs here
+                answer = _attempt(name, tasks[name])
+            except Exception as lost:
+                answer = name, None, f"{lost}\n{LOST}"
+            yield answer
+
+
 def _on_this_machine(tasks: Tasks, jobs: int | None) -> Iterator[Answer]:
-    """Run tasks with joblib. If a process is killed, the tasks under way fail."""
-    import joblib  # here: slow to import
+    """Run tasks in processes of their own. If one is killed, the tasks under way fail."""
+    from joblib import cpu_count  # here: slow to import
+    from joblib.externals.loky import get_reusable_executor
 
-    jobs = jobs or joblib.cpu_count()
-    away = {name: task for name, task in tasks.items() if jobs > 1 and _travels(task)}
-    here = {name: task for name, task in tasks.items() if name not in away}
-    while away:
-        under_way: list[str] = []
-        try:
-            for answer in _in_processes(dict(away), jobs, under_way):
-                del away[answer[0]]
-                yield answer
-        except BrokenExecutor:
-            for name in [name for name in under_way if name in away]:
-                del away[name]
-                yield name, None, LOST
-    for name, task in here.items():
-        yield _attempt(name, task)
-
-
-def _in_processes(tasks: Tasks, jobs: int, under_way: list[str]) -> Iterator[Answer]:
-    """Run tasks in other processes, and list in `under_way` which have begun."""
-    import joblib
-
-    def handed_out() -> Iterator[Any]:
-        for name, task in tasks.items():
-            under_way.append(name)
-            yield joblib.delayed(_attempt)(name, task)
-
-    with joblib.parallel_config("loky", inner_max_num_threads=1):
-        # With one process joblib would use this one, which no task may bring down. Nothing is
-        # handed out in advance, so that a killed process takes few tasks with it.
-        processes = max(2, min(jobs, len(tasks)))
-        parallel = joblib.Parallel(
-            processes, return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs"
-        )
-    yield from parallel(handed_out())
-
-
-def _travels(task: Task) -> bool:
-    """Return whether a task can be pickled: one with a user's own controller may not be."""
-    from joblib.externals.loky.backend.reduction import dumps
-
+    jobs = jobs or cpu_count()
+    at_once = min(jobs, len(tasks))
+    if jobs == 1 or not tasks:
+        yield from (_attempt(name, task) for name, task in tasks.items())
+        return
+    pool = partial(get_reusable_executor, at_once, env=ONE_THREAD)  # anew if it is broken
     try:
-        dumps(task)
-    except Exception:
-        return False
-    return True
+        yield from _answers(tasks, lambda *task: pool().submit(_attempt, *task), at_once)
+    except BaseException:  # including Ctrl-C
+        pool().shutdown(kill_workers=True)
+        raise
 
 
 def _on_cluster(tasks: Tasks, jobs: int | None) -> Iterator[Answer]:
@@ -188,25 +178,10 @@ def _on_cluster(tasks: Tasks, jobs: int | None) -> Iterator[Answer]:
 
     if not ray.is_initialized():
         _connect()
-    remote = ray.remote(num_cpus=1, max_retries=2)(_attempt_there)
+    remote: Any = ray.remote(num_cpus=1, max_retries=2)(_attempt_there)
     at_once = jobs or QUEUED * int(ray.cluster_resources().get("CPU", 1))
-    here, waiting = versions(), iter(tasks.items())
-    running: dict[Any, str] = {}
-    try:
-        while True:
-            for name, task in islice(waiting, at_once - len(running)):
-                running[remote.remote(name, task, here)] = name
-            if not running:
-                return
-            for done in ray.wait(list(running))[0]:
-                name = running.pop(done)
-                try:
-                    yield ray.get(done)
-                except ray.exceptions.RayError as lost:
-                    yield name, None, f"{lost}\n{LOST}"
-    finally:
-        for left in running:
-            ray.cancel(left, force=True)
+    here = versions()
+    return _answers(tasks, lambda *task: remote.remote(*task, here).future(), at_once)
 
 
 def _attempt_there(name: str, task: Task, here: dict[str, str]) -> Answer:
