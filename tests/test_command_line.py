@@ -137,11 +137,9 @@ def test_what_does_not_fit_is_refused_before_anything_is_run_or_written(
 @pytest.mark.parametrize(
     ("given", "package", "extra"),
     [
-        ("claims", "cyclopts", "compare"), ("compare", "pandas", "compare"),
-        ("datasets", "minari", "data"), ("watch", "pygame", "render"),
-        ("train nn-smith", "torch", "torch"), ("tune pi", "optuna", "bench"),
-        ("speed", "torch", "torch"),
-        ("claims --backend ray", "ray", "ray"),
+        ("claims", "cyclopts", "compare"), ("datasets", "minari", "data"),
+        ("watch", "pygame", "render"), ("train nn-smith", "torch", "torch"),
+        ("tune pi", "optuna", "bench"), ("claims --backend ray", "ray", "ray"),
         ("compare --agent mine=benchmarks.train.through_plant:train", "torch", "torch"),
     ],
 )  # fmt: skip

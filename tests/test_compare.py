@@ -41,8 +41,6 @@ from mptc_gym.evaluation import SEED
 from tests.conftest import ROOT, python, trajectory
 from tests.tasks import until
 
-# Those with one member.
-FIXED = [name for name, each in ROSTER.items() if each.compared and "ppo" not in name]
 QUICK = "--agents pi --scenarios constant --runs 1 --jobs 1"
 
 
@@ -254,6 +252,12 @@ def compared(tmp_path):
     return compared
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Leave out the pictures, which take most of the time."""
+    monkeypatch.setattr(report, "_draw", lambda *_: "left out")
+
+
 class TestCompare:
     def test_files_and_their_contents(self, compared, capsys):
         out = compared("--agents nn,pi --scenarios constant constant-noise --runs 3")
@@ -330,8 +334,9 @@ class TestCompare:
         assert "could not be drawn" not in page
         assert "(one run)" in page
 
+    @pytest.mark.usefixtures("undrawn")
     def test_a_row_of_the_presets_is_what_evaluate_says(self, compared):
-        parts = {"hard": [agent for agent in FIXED if agent != "mpc"], "noisy": ["mpc"]}
+        parts = {"hard": ["nn", "nn-smith", "pi-simc"], "noisy": ["mpc"]}
         folders = [
             compared(f"--presets --runs 2 --scenarios {preset} --agents", *agents, into=preset)
             for preset, agents in parts.items()
@@ -362,6 +367,7 @@ class TestCompare:
         assert [each["file"] for each in provenance["policies"]["ppo"]] == files
         assert list(pd.read_csv(out / "runs.csv")["policy"]) == [*range(5)]
 
+    @pytest.mark.usefixtures("undrawn")
     def test_the_example_of_the_page(self, compared, tmp_path, monkeypatch):
         readme = (ROOT / "benchmarks/compare/README.md").read_text(encoding="utf-8")
         (example,) = re.findall(r"```python\n(from agents import PIC.*?)```", readme, re.DOTALL)
@@ -406,6 +412,7 @@ class TestCompare:
         assert (tmp_path / "out/report.md").exists()
         assert (tmp_path / "out/square.png").exists()
 
+    @pytest.mark.usefixtures("undrawn")
     def test_the_same_command_goes_on_to_the_same_bytes(self, compared, stopped, tmp_path):
         given = "--agents pi nn --scenarios constant square --runs 1"
         whole = compared(given, into="whole")
@@ -448,6 +455,7 @@ class TestCompare:
         assert pd.read_csv(tmp_path / "runs.csv")["agent"].tolist() == ["pi"] * 3
         assert "PI" in (tmp_path / "report.md").read_text()
 
+    @pytest.mark.usefixtures("undrawn")
     def test_a_second_interruption_while_the_report_is_written(
         self, stopped, tmp_path, monkeypatch
     ):
@@ -465,7 +473,7 @@ class TestCompare:
         monkeypatch.setattr(tempfile, "TemporaryFile", Mock(side_effect=read_only))
         assert "Read-only file system" in refused(main, ["--out", tmp_path / "out"])
 
-    @pytest.mark.parametrize("name", ["runs.csv", "bounds.png", "report.html"])
+    @pytest.mark.parametrize("name", ["runs.csv", "bounds.png"])
     def test_a_disk_that_gets_full(self, name, compared, monkeypatch, capsys):
         real = Path.replace
 
@@ -515,6 +523,7 @@ def test_a_long_legend_leaves_the_responses_their_room(tmp_path, monkeypatch):
     assert min(widths) > 0.7
 
 
+@pytest.mark.usefixtures("undrawn")
 class TestOtherPlants:
     @pytest.mark.parametrize(("preset", "drawn"), [("disturbed", False), ("hard", True)])
     def test_what_needs_the_actuators_numbers_is_not_measured_where_they_are_drawn(
