@@ -8,13 +8,14 @@ import pytest
 from scipy import linalg, optimize, signal, stats
 
 from agents import PIController
-from benchmarks.bounds import command, frontier, least, least_possible, linear_program
+from benchmarks.bounds import command, least, linear_program
 from benchmarks.bounds.__main__ import main
 from benchmarks.bounds.causal import SetPointLaw
+from benchmarks.bounds.least import frontier, least_possible
 from benchmarks.bounds.linear_program import plan, reference
 from benchmarks.bounds.unknown import noise_variance, unknown
 from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.loop.linear import course
+from benchmarks.loop.linear import time_varying_model
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import SCENARIOS
@@ -40,7 +41,7 @@ def minimum_variance(parameters):
 
 def course_of(samples, **arguments):
     parameters = Parameters(**arguments)
-    return course(parameters, Ranges(parameters).given, samples)
+    return time_varying_model(parameters, Ranges(parameters).given, samples)
 
 
 def best_plan(setpoint, **arguments):

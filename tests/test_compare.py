@@ -23,7 +23,7 @@ import pandas as pd
 import pytest
 
 from agents import PIController
-from benchmarks.bounds import least_possible
+from benchmarks.bounds.least import least_possible
 from benchmarks.compare import plots, report
 from benchmarks.compare.__main__ import main
 from benchmarks.compare.estimates import estimate, scale_of, score

@@ -8,12 +8,12 @@ from scipy import signal
 
 from agents import PIController
 from benchmarks.bounds import __main__ as command
-from benchmarks.bounds import frontier, least_possible
+from benchmarks.bounds.least import frontier, least_possible
 from benchmarks.controllers import engineered
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.step_test import step_test
 from benchmarks.loop import linear
-from benchmarks.loop.linear import Coefficients, LinearModel, course, nominal
+from benchmarks.loop.linear import Coefficients, LinearModel, nominal, time_varying_model
 from benchmarks.loop.margins import Loop
 from mptc_gym import MiddlePointEnv, Parameters
 from mptc_gym.parameters import ARGUMENTS
@@ -45,7 +45,9 @@ def test_a_course_is_the_environment_while_it_drifts(rng):
     arguments = {**OTHER, **DRIFT}
     flow, output = outputs(rng, **arguments)
     parameters = Parameters(**arguments)
-    of_plant = course(parameters, numbers_of_plant(Ranges(parameters).given, 0), len(flow))
+    of_plant = time_varying_model(
+        parameters, numbers_of_plant(Ranges(parameters).given, 0), len(flow)
+    )
     np.testing.assert_allclose(of_plant.flow_response() @ flow, output, rtol=0, atol=1e-12)
     assert np.abs(nominal(parameters).response(flow) - output).max() > 0.1
 

@@ -6,7 +6,6 @@ import pytest
 from benchmarks.controllers.step_test import StepTest, step_test
 from benchmarks.lib.command import UsageError
 from benchmarks.loop.linear import nominal
-from benchmarks.loop.metrics import reversals
 from benchmarks.loop.plants import PlantOptions
 from mptc_gym import Parameters
 
@@ -81,16 +80,3 @@ def test_lists_of_any_depth_are_refused_by_name():
     for depth in range(600, 1000, 5):  # what JSON still reads may be too deep to be shown
         with pytest.raises(UsageError, match=r"^--set: delay must be an integer"):
             PlantOptions(set=("delay=" + "[" * depth + "]" * depth,)).chosen()
-
-
-def test_reversals_are_counted_across_stillness():
-    applied = np.array(
-        [
-            # up, still, up, down, still, up: 2 reversals
-            [1.0, 1.0, 2.0, 0.0, 0.0, 3.0],
-            [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],  # never moves
-            [1.0, 0.0, 1.0, 0.0, 1.0, 0.0],  # to and fro: 5
-        ]
-    ).T
-    # 6 samples of 10 s are a minute.
-    np.testing.assert_array_equal(reversals(applied, 10.0), [2.0, 0.0, 5.0])

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from benchmarks.bounds.unknown import Unknown
-from benchmarks.loop.linear import Coefficients, Course
+from benchmarks.loop.linear import Coefficients, TimeVaryingModel
 from benchmarks.loop.metrics import held
 from mptc_gym import Parameters
 
@@ -39,29 +39,31 @@ THRESHOLDS = 8  # thresholds that represent the noise in the guess
 
 
 class SetPointLaw:
-    """The law of random set points, and the guess for it on one course.
+    """The law of random set points, and the guess for it on one plant.
 
-    The guess uses the plant's dynamics at the start of the course.
+    The guess uses the plant's dynamics at the start of the episode.
     """
 
-    def __init__(self, parameters: Parameters, course: Course, unknown: Unknown) -> None:
-        self._course = course
+    def __init__(
+        self, parameters: Parameters, model: TimeVaryingModel, unknown: Unknown
+    ) -> None:
+        self._model = model
         self._amplitude = parameters.setpoint_amplitude
         self._shortest = max(1, -(-parameters.setpoint_period // 6))
         self._longest = max(self._shortest, parameters.setpoint_period // 2)
-        alpha, beta = course.alpha[0], course.beta[0]
+        alpha, beta = model.alpha[0], model.beta[0]
         gain = float(np.abs(beta.sum() / (1.0 - alpha.sum())))
         pace = float(np.abs(np.roots([1.0, *-alpha])).max(initial=0.0))
-        self._reach = gain * min(-course.low, course.high)
+        self._reach = gain * min(-model.low, model.high)
         # Noise blurs the sign of a small error; equally probable thresholds represent it.
         deviation = unknown.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
         blur = stats.halfnorm.ppf((np.arange(THRESHOLDS) + 0.5) / THRESHOLDS)
         self._blur = deviation * blur if deviation > 0.0 else np.zeros(1)
         # After a change the output stands still for `lag` samples. Then it approaches what the
         # limits allow; this is the share of the way that it has made, by age of the level.
-        samples = len(course.load)
+        samples = len(model.load)
         age = np.arange(samples)
-        self._share = 1.0 - pace ** np.maximum(age - course.lag + 1, 0)
+        self._share = 1.0 - pace ** np.maximum(age - model.lag + 1, 0)
         # The age from which the largest change within reach has been made.
         far = 2.0 * self._amplitude / max(self._reach + self._amplitude, 1e-9)
         slowly = 1.0 - np.exp(-4.0)
@@ -70,10 +72,10 @@ class SetPointLaw:
         self._left = np.clip(
             (self._longest - age) / (self._longest - self._shortest + 1), 0.0, 1.0
         )
-        at_start = Coefficients(alpha, beta, course.load[0])
-        after = at_start.impulse_response(max(samples - course.delay - 1, 0))
+        at_start = Coefficients(alpha, beta, model.load[0])
+        after = at_start.impulse_response(max(samples - model.delay - 1, 0))
         # The response to 1 t/h of flow, by the number of samples since.
-        self._impulse = np.concatenate([np.zeros(course.delay + 1), after])[:samples]
+        self._impulse = np.concatenate([np.zeros(model.delay + 1), after])[:samples]
 
     def penalty(self, setpoint: Array) -> Array:
         """Return pi for one draw of y_d(k), degC times samples per t/h, shape (samples,)."""
@@ -94,7 +96,7 @@ class SetPointLaw:
                 ages = np.arange(j + 1 - start, samples - start)
                 expected = self._expected(ages, j - start, stay, change)
                 surprise[j + 1 :, j] = guess[j + 1 :] - expected
-        penalties: Array = (self._course.flow_response() * surprise).sum(axis=0)
+        penalties: Array = (self._model.flow_response() * surprise).sum(axis=0)
         return penalties
 
     def _expected(self, ages: NDArray[np.intp], now: int, stay: Array, change: Array) -> Array:
@@ -136,7 +138,7 @@ class SetPointLaw:
         response times the mean of g vanishes. This is solved backwards from the last age.
         """
         lean = np.zeros(len(change))
-        lag = self._course.lag
+        lag = self._model.lag
         if not self._impulse[lag : lag + 1].any():
             return lean
         for age in range(min(self._longest, len(change)) - 1, self._settled - 1, -1):

@@ -26,7 +26,7 @@ from benchmarks.bounds.linear_program import SMOOTH, TAIL, Plan, plan, reference
 from benchmarks.bounds.unknown import Unknown, unknown
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.lib.storage import ROOT, Kept
-from benchmarks.loop.linear import Course, course
+from benchmarks.loop.linear import TimeVaryingModel, time_varying_model
 from benchmarks.loop.rollout import IdleValve, drawn_numbers, make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
@@ -242,25 +242,25 @@ def _draw(
     for i in range(count):
         of_plant, setpoint = numbers_of_plant(numbers, i), trajectory.setpoint[:, i].copy()
         longer = samples + 1 + int(of_plant.delay) + len(parameters.b) + TAIL
-        along = course(parameters, of_plant, longer)
+        along = time_varying_model(parameters, of_plant, longer)
         cases.append(partial(_best, parameters, along, unknown(along), setpoint))
     return cases, np.abs(trajectory.setpoint - trajectory.output)[1:].mean(axis=0)
 
 
 def _best(
     parameters: Parameters,
-    course: Course,
+    model: TimeVaryingModel,
     unknown: Unknown,
     setpoint: Array,
     kind: str,
     price: float = 0.0,
 ) -> Plan:
-    """Return the best plan for a set point from k = 0 to N; the course is longer by a tail."""
+    """Return the best plan for a set point from k = 0 to N; the model goes on for a tail."""
     if kind == "reference":
-        return reference(course, unknown, setpoint, price=max(price, SMOOTH))
+        return reference(model, unknown, setpoint, price=max(price, SMOOTH))
     samples = len(setpoint)
-    course, unknown = course.first(samples), unknown.of(0, samples)
+    model, unknown = model.first(samples), unknown.of(0, samples)
     penalty = None
     if kind == "causal" and parameters.setpoint_amplitude > 0.0:
-        penalty = SetPointLaw(parameters, course, unknown).penalty(setpoint)
-    return plan(course, unknown, setpoint, price=price, penalty=penalty)
+        penalty = SetPointLaw(parameters, model, unknown).penalty(setpoint)
+    return plan(model, unknown, setpoint, price=price, penalty=penalty)

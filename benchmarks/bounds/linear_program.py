@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import linalg, optimize, sparse
 
 from benchmarks.bounds.unknown import Unknown
-from benchmarks.loop.linear import Course
+from benchmarks.loop.linear import TimeVaryingModel
 from benchmarks.loop.metrics import held
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ class Plan:
 
 
 def plan(
-    course: Course,
+    model: TimeVaryingModel,
     unknown: Unknown,
     setpoint: Array,
     *,
@@ -82,7 +82,7 @@ def plan(
 
     Parameters
     ----------
-    course
+    model
         The plant, for at least as many samples as there are set points.
     unknown
         What no command can counteract in time.
@@ -118,7 +118,7 @@ def plan(
     of_now = unknown.of(start, samples)
     if n:
         output[start + 1 :], flow[start:-1] = _solve(
-            course, of_now, setpoint, output, flow, start, price, penalty, least_slope
+            model, of_now, setpoint, output, flow, start, price, penalty, least_slope
         )
     # The last flow affects no output; if it does not move, it costs nothing either.
     flow[-1] = flow[-2] if samples > 1 else 0.0
@@ -130,7 +130,7 @@ def plan(
 
 
 def _solve(
-    course: Course,
+    model: TimeVaryingModel,
     unknown: Unknown,
     setpoint: Array,
     output: Array,
@@ -144,8 +144,8 @@ def _solve(
     samples = len(setpoint)
     n = samples - 1 - start
     # (28) without noise: A y = B u, rows from start + 1 on; the past goes to the right side.
-    A = sparse.eye_array(samples) - _lagged(course.alpha, samples, 1)
-    B = _lagged(course.beta, samples, course.delay + 1)
+    A = sparse.eye_array(samples) - _lagged(model.alpha, samples, 1)
+    B = _lagged(model.beta, samples, model.delay + 1)
     A, B = A.tocsr()[start + 1 :], B.tocsr()[start + 1 :]
     past = B[:, :start] @ flow[:start] - A[:, : start + 1] @ output[: start + 1]
     A, B = A[:, start + 1 :], B[:, start:-1]
@@ -157,7 +157,7 @@ def _solve(
     lengths = np.repeat(unknown.lengths[1:], 2, axis=1).T.ravel()
     columns = [
         _unknowns(n, 0.0, -np.inf, np.inf),
-        _unknowns(n, penalty[start:-1], course.low, course.high),
+        _unknowns(n, penalty[start:-1], model.low, model.high),
         _unknowns(
             len(lengths), np.repeat(np.maximum(slopes, least_slope), 2 * n), 0.0, lengths
         ),
@@ -176,7 +176,7 @@ def _solve(
     # a zero of B lies outside the unit circle, the flow that gives an output grows without
     # bound: solvers that vary outputs freely fail, or end away from the optimum.
     for_flows_alone = [False, True]
-    if np.any(np.abs(np.roots(course.beta[start])) > 1.0):
+    if np.any(np.abs(np.roots(model.beta[start])) > 1.0):
         for_flows_alone.reverse()
     attempts = list(itertools.product(for_flows_alone, SOLVERS))
     for flows_alone, (method, presolve) in attempts:
@@ -221,7 +221,7 @@ def _lagged(coefficients: Array, samples: int, lag: int) -> sparse.sparray:
 
 
 def reference(
-    course: Course, unknown: Unknown, setpoint: Array, *, price: float = SMOOTH
+    model: TimeVaryingModel, unknown: Unknown, setpoint: Array, *, price: float = SMOOTH
 ) -> Plan:
     """Return the best mean flow of a controller that never expects another change.
 
@@ -233,8 +233,8 @@ def reference(
 
     Parameters
     ----------
-    course, unknown
-        The plant and what is unknown, for `course.lag + TAIL` samples more than set points.
+    model, unknown
+        The plant and what is unknown, for `model.lag + TAIL` samples more than set points.
     setpoint
         y_d(k), degC, shape (samples,).
     price
@@ -245,19 +245,19 @@ def reference(
     ValueError
         If the plant has not settled at a change.
     """
-    settled = SETTLED * (course.high - course.low)
+    settled = SETTLED * (model.high - model.low)
     error = np.zeros(len(setpoint))
     found: Plan | None = None
     for start, stop in held(setpoint):
         last = stop == len(setpoint)
-        beyond = np.full(0 if last else course.lag + TAIL, setpoint[start])
+        beyond = np.full(0 if last else model.lag + TAIL, setpoint[start])
         ahead = np.concatenate([setpoint[:stop], beyond])
         found = plan(
-            course, unknown, ahead, before=found, start=start, price=price, least_slope=LEVEL
+            model, unknown, ahead, before=found, start=start, price=price, least_slope=LEVEL
         )
         error[start:stop] = found.error[start:stop]
-        moving = found.flow[max(stop - course.lag - 1, start - 1, 0) : stop]
-        if not last and (stop - start < course.lag or np.ptp(moving) > settled):
+        moving = found.flow[max(stop - model.lag - 1, start - 1, 0) : stop]
+        if not last and (stop - start < model.lag or np.ptp(moving) > settled):
             raise ValueError(
                 "setpoint must be held until the plant has settled, or there is no reference; "
                 f"got a hold of {stop - start} samples"

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.loop.linear import Course
+from benchmarks.loop.linear import TimeVaryingModel
 from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
@@ -74,16 +74,16 @@ class Unknown:
         return Unknown(self.slopes, self.intercepts[start:stop])
 
 
-def unknown(course: Course) -> Unknown:
+def unknown(model: TimeVaryingModel) -> Unknown:
     """Return the bounds from what remains unknown at each sample of an episode."""
-    numbers, samples = course.numbers, len(course.load)
-    deviation = np.sqrt(noise_variance(course))
+    numbers, samples = model.numbers, len(model.load)
+    deviation = np.sqrt(noise_variance(model))
     walk = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
     amplitude = numbers.disturbance_amplitude
     # The changes of the load in a window, the latest first.
     inside, weights = np.zeros((samples, 0), np.bool_), np.zeros((samples, 0))
     if walk or amplitude:
-        inside, weights = _load_weights(course)
+        inside, weights = _load_weights(model)
     if not deviation.any() and not inside.any():
         return Unknown(np.ones(1), np.zeros((samples, 1)))
 
@@ -104,18 +104,18 @@ def unknown(course: Course) -> Unknown:
     return Unknown(1.0 - 2.0 * np.array(BELOW) / ATOMS, intercepts)
 
 
-def noise_variance(course: Course) -> Array:
+def noise_variance(model: TimeVaryingModel) -> Array:
     """Return the variance of the noise in y(k) that is unknown at k - d - 1, degC^2, for all k.
 
     With a noisy transmitter it is that of the best prediction. Early in an episode, less noise
     has accumulated.
     """
-    samples = len(course.load)
-    R = course.numbers.noise_variance
-    V = course.numbers.measurement_noise_variance
+    samples = len(model.load)
+    R = model.numbers.noise_variance
+    V = model.numbers.measurement_noise_variance
     if R == 0.0:
         return np.zeros(samples)
-    Phi, enters = course.state_space(course.c)
+    Phi, enters = model.state_space(model.c)
     Q = R * np.outer(enters, enters)
     known = np.zeros_like(Phi)  # covariance of the state, given all readings so far
     if V > 0.0:
@@ -125,7 +125,7 @@ def noise_variance(course: Course) -> Array:
             P = P - np.outer(P[:, 0], P[0]) / (P[0, 0] + V)
             known[k] = P
     # Predict from k - lag on, sample by sample, for all k at once.
-    lag = min(course.lag, samples)
+    lag = min(model.lag, samples)
     at = np.arange(samples) - lag
     P = known[np.maximum(at, 0)]
     for _ in range(lag):
@@ -137,22 +137,22 @@ def noise_variance(course: Course) -> Array:
     return variance
 
 
-def _load_weights(course: Course) -> tuple[NDArray[np.bool_], Array]:
+def _load_weights(model: TimeVaryingModel) -> tuple[NDArray[np.bool_], Array]:
     """Return which changes of the load fall into the window of y(k), and their effects on it.
 
     Both have the shape (samples, most changes in a window), the latest change first: whether
     there is one, and what it adds to y(k) per unit of the load.
     """
-    samples, order = course.alpha.shape
-    lag = min(course.lag, samples)
+    samples, order = model.alpha.shape
+    lag = min(model.lag, samples)
     changes = np.arange(LOAD_INTERVAL, samples, LOAD_INTERVAL)
     # Responses to a unit step at each change, after 0, 1, ... samples.
     answers = np.empty((lag, len(changes)))
     for t in range(lag):
         at = np.minimum(changes + t, samples - 1)
-        answers[t] = course.load[at]
+        answers[t] = model.load[at]
         for i in range(min(order, t)):
-            answers[t] += course.alpha[at, i] * answers[t - 1 - i]
+            answers[t] += model.alpha[at, i] * answers[t - 1 - i]
     k = np.arange(samples)
     weights = np.zeros((samples, -(-lag // LOAD_INTERVAL)))
     inside = np.zeros(weights.shape, np.bool_)

@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from benchmarks.bounds.least import LeastPossible, frontier, is_random, least_possible
 from benchmarks.lib.statistics import Estimate, bootstrap, improvement
 from benchmarks.lib.tables import groups
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
-
-if TYPE_CHECKING:
-    from benchmarks.bounds import LeastPossible
 
 Score = tuple[Estimate, dict[str, float]]  # overall, and by scenario
 
@@ -31,7 +29,7 @@ class Scale:
     scenario: str
     least: LeastPossible
     """The least possible error that applies: of the kind "causal", "reference" or "preview", as
-    `benchmarks.bounds.least_possible` chooses."""
+    `least_possible` chooses."""
     preview: LeastPossible
     """The least possible error of any controller, even with preview."""
     drawn: bool
@@ -42,8 +40,6 @@ class Scale:
     @classmethod
     def of(cls, values: dict[str, Any]) -> Scale:
         """Return a scale from the values that `asdict` gives, in JSON or not."""
-        from benchmarks.bounds import LeastPossible
-
         least, preview = (LeastPossible(**values[name]) for name in ("least", "preview"))
         frontier = tuple((travel, error) for travel, error in values["frontier"])
         return cls(**{**values, "least": least, "preview": preview, "frontier": frontier})
@@ -54,8 +50,6 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
 
     Bounds of drawn plants and set points are means over the episodes that are run.
     """
-    from benchmarks.bounds import is_random, least_possible  # here, as SciPy is slow to load
-
     case: dict[str, Any] = {
         "samples": scenario.samples,
         "episodes": min(runs, EPISODES),
@@ -72,8 +66,6 @@ def bounds(scenario: Scenario, runs: int) -> dict[str, Any]:
     straight line. Drawn plants and set points have no frontier: it would take linear programs
     for every episode, more than a picture is worth.
     """
-    from benchmarks.bounds import frontier
-
     scale, parameters = scale_of(scenario, runs), scenario.parameters
     if parameters.ranges or parameters.setpoint == "random":
         return asdict(scale)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from benchmarks.bounds import least_possible
+from benchmarks.bounds.least import least_possible
 from benchmarks.bounds.linear_program import NotSolvedError
 from benchmarks.identify import plots
 from benchmarks.identify.guards import LAGS, autocorrelation, chance

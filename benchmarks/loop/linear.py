@@ -175,7 +175,7 @@ def nominal(parameters: Parameters) -> LinearModel:
 
 
 @dataclass(frozen=True)
-class Course(Coefficients):
+class TimeVaryingModel(Coefficients):
     """(28) and (29) over an episode: the coefficients have one row per sample."""
 
     c: tuple[float, ...]
@@ -195,8 +195,8 @@ class Course(Coefficients):
         shows = np.flatnonzero(self.beta.any(axis=0))
         return self.delay + 1 + int(shows[0]) if len(shows) else len(self.beta)
 
-    def first(self, samples: int) -> Course:
-        """Return the course of the first `samples` samples."""
+    def first(self, samples: int) -> TimeVaryingModel:
+        """Return the model of the first `samples` samples."""
         cut = slice(samples)
         return replace(self, alpha=self.alpha[cut], beta=self.beta[cut], load=self.load[cut])
 
@@ -213,12 +213,14 @@ class Course(Coefficients):
         return G
 
 
-def course(parameters: Parameters, numbers: PlantNumbers[float], samples: int) -> Course:
-    """Return the course of an episode; see `check_linear` for its ValueError."""
+def time_varying_model(
+    parameters: Parameters, numbers: PlantNumbers[float], samples: int
+) -> TimeVaryingModel:
+    """Return the model of an episode; see `check_linear` for its ValueError."""
     flows = [numbers.u_min, numbers.u_max]
     if numbers.dead_zone > 0.0:
         flows.append(0.0)
-    return Course(
+    return TimeVaryingModel(
         **vars(coefficients(parameters, numbers, np.arange(samples))),
         c=tuple(parameters.c),
         delay=int(numbers.delay),

@@ -125,15 +125,3 @@ def join(trajectories: Sequence[Trajectory]) -> Trajectory:
     """Join the runs of several batches into one trajectory."""
     arrays = zip(*(vars(trajectory).values() for trajectory in trajectories), strict=True)
     return Trajectory(*(np.hstack(parts) for parts in arrays))
-
-
-def reversals(applied: Array, sampling_interval: float) -> Array:
-    """Return the number of valve reversals per minute, shape (runs,).
-
-    A reversal is a move in the opposite direction to the last one, after any length of rest.
-    `applied` is u_a(k), t/h, shape (samples, runs); the sampling interval is in s.
-    """
-    moves = np.sign(np.diff(applied, axis=0, prepend=0.0))
-    counts = [np.count_nonzero(np.diff(run[run != 0.0])) for run in moves.T]
-    minutes = len(applied) * sampling_interval / 60.0
-    return np.array(counts, dtype=np.float64) / minutes

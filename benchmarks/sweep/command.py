@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from benchmarks.bounds import least_possible
+from benchmarks.bounds.least import least_possible
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.records import Factory, provenances
 from benchmarks.controllers.roster import ROSTER

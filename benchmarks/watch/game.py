@@ -10,7 +10,7 @@ import pandas as pd
 import pygame
 from gymnasium.vector import SyncVectorEnv
 
-from benchmarks.bounds import least_possible
+from benchmarks.bounds.least import least_possible
 from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
