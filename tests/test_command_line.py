@@ -146,7 +146,12 @@ def test_what_does_not_fit_is_refused_before_anything_is_run_or_written(
 def test_a_missing_package_is_named_with_its_extra(given, package, extra):
     name, *options = given.split()
     program = (
-        f"import sys; sys.modules[{package!r}] = None; "
+        "import sys\n"
+        "class Missing:\n"
+        "    def find_spec(name, *_):\n"
+        f"        if name == {package!r}:\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Missing)\n"
         f"from benchmarks.{name}.__main__ import main; main({options})"
     )
     done = python("-c", program)
