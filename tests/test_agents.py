@@ -316,19 +316,6 @@ class TestSmithPredictor:
         soon = rollout(make_plants(1, 200, **plant, delay=0), prompt, 200, seed=0)
         np.testing.assert_allclose(late.output[18:], soon.output[:-18], atol=1e-4)
 
-    def test_the_model_knows_the_actuator(self):
-        # A command inside the dead zone does nothing to the model either: nothing is foreseen.
-        controller = self.smith(dead_zone=5.0)
-        observation = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
-        plain = PIController(controller.kp, controller.ki, anti_windup=True)
-        for _ in range(5):
-            assert controller.act(observation) == plain.act(observation)
-        assert abs(controller.command) < 5.0
-        knows_less = self.smith()
-        for _ in range(5):
-            knows_less.act(observation)
-        assert abs(knows_less.command) < abs(controller.command)
-
     def test_a_command_on_the_edge_of_the_dead_zone_has_an_effect(self):
         controller = self.smith(dead_zone=7.0)
         controller.kp, controller.ki = 7.0, 0.0  # u = -7 at e = 1

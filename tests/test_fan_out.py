@@ -5,7 +5,6 @@ import os
 import sys
 from collections import Counter
 from functools import partial
-from unittest.mock import Mock
 
 import pytest
 
@@ -144,12 +143,6 @@ class TestFailures:
         mended = {"the fault": partial(tasks.draw, 3), **work(4, calls)}
         assert run(mended, tmp_path / "out", jobs)["the fault"] == tasks.draw(3)
         assert counted(calls) == Counter(range(4))
-
-    def test_a_stop_by_the_user_is_not_a_failure(self, tmp_path):
-        stop = Mock(side_effect=KeyboardInterrupt)
-        with pytest.raises(KeyboardInterrupt):
-            run({**work(2), "stop": stop}, tmp_path, jobs=1)
-        assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_a_node_with_other_versions_computes_nothing():
