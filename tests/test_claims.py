@@ -223,7 +223,7 @@ class TestCommand:
     def test_interrupted(self, tmp_path, monkeypatch, capsys):
         stopped = Claim("noise", "", "", "", Mock(side_effect=KeyboardInterrupt))
         monkeypatch.setitem(CLAIMS, "noise", stopped)
-        assert run_claims(tmp_path, "direction", "noise") == 130
+        assert run_claims(tmp_path, "noise", "direction") == 130
         assert "Interrupted" in capsys.readouterr().out
         assert set(pd.read_csv(tmp_path / "claims.csv")["claim"]) == {"direction"}
 

@@ -24,7 +24,7 @@ import pytest
 
 from agents import PIController
 from benchmarks.bounds.least import least_possible
-from benchmarks.compare import plots, report
+from benchmarks.compare import comparison, plots, report
 from benchmarks.compare.__main__ import main
 from benchmarks.compare.estimates import estimate, scale_of, score
 from benchmarks.controllers import records
@@ -518,7 +518,7 @@ def test_a_long_legend_leaves_the_responses_their_room(tmp_path, monkeypatch):
     monkeypatch.setattr(plots, "drawn", measured)
     runs = rollout(make_plants(1, 40, setpoint=5.0), PIController(), 40, seed=0)
     scenario = SCENARIOS["constant"]
-    responses = [report.summarise_responses(runs, scenario, name) for name in ROSTER]
+    responses = [comparison.summarise_responses(runs, scenario, name) for name in ROSTER]
     plots.plot_responses(pd.concat(responses), scenario, tmp_path / "x.png")
     assert min(widths) > 0.7
 

@@ -43,7 +43,7 @@ class Options:
     beside it that is named after them)."""
 
 
-main = command(Options, "benchmarks.compare.comparison", width=190)
+main = command(Options, "benchmarks.compare.command", width=190)
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

@@ -1,115 +1,26 @@
-"""Run controllers on scenarios in parallel, as the options say, and write the results."""
+"""Run controllers on scenarios in parallel, and hold their results."""
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
-from rich.console import Console
 
-from benchmarks.compare import report
-from benchmarks.compare.__main__ import COMPARED, RUNS, Options
-from benchmarks.compare.estimates import Scale, bounds, scale_of
-from benchmarks.controllers.options import chosen
-from benchmarks.controllers.records import Factory, provenances
-from benchmarks.lib.command import UsageError, blame, known, out_folder
+from benchmarks.compare.estimates import Scale, bounds
+from benchmarks.controllers.records import Factory
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.report import Section, provenance_line, show
-from benchmarks.lib.storage import Kept, origin, write_json
+from benchmarks.lib.storage import Kept
+from benchmarks.lib.tables import percentiles
 from benchmarks.loop.metrics import join, measure
-from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
+from benchmarks.loop.rollout import Trajectory
+from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import SEED
-
-OUT = Path("results/compare")
-LONGEST = 60  # characters at which a folder's name is cut
-
-
-def execute(options: Options, console: Console) -> str:
-    """Run the comparison and write its results."""
-    controllers = chosen(options.agents, options.controllers.agent)
-    plant = options.plant.chosen()
-    if options.presets and plant.arguments:
-        raise UsageError("--presets: goes without --plant, --preset and --set")
-    known_cases = PRESET_SCENARIOS if options.presets else SCENARIOS
-    if plant.arguments:
-        known_cases = scenarios_of(plant.name, plant.arguments)
-    given = list(known_cases) if options.scenarios is None else options.scenarios
-    names = known("--scenarios", given, list(known_cases))
-    if not names:
-        raise UsageError("--scenarios: none to run")
-    scenarios = {name: known_cases[name] for name in names}
-    members = {name: entry.members() for name, entry in controllers.items()}
-    if plant.arguments:
-        _try_out(members, scenarios.values(), options.runs)
-    out = options.out or _folder(
-        [*controllers] if (*controllers,) != COMPARED else [],
-        names if names != [*known_cases] else [],
-        [plant.name] if plant.arguments else ["presets"] if options.presets else [],
-        [f"{options.runs}-runs"] if options.runs != RUNS else [],
-    )
-    folder, made = out_folder(out), origin()
-    about = {
-        "options": {**asdict(options), "agents": list(members)},
-        "seeds": list(range(SEED, SEED + options.runs)),
-        "scenarios": {
-            name: {"samples": each.samples, "arguments": each.arguments}
-            for name, each in scenarios.items()
-        },
-        "policies": provenances(members),
-    }
-    comparison = Comparison(scenarios, members, options.runs)
-    began = time.perf_counter()
-
-    def save(*, complete: bool = False) -> None:
-        report.write_numbers(folder / "runs.csv", comparison.runs)
-        seconds = round(time.perf_counter() - began, 1)
-        state = {"complete": complete, "seconds": seconds}
-        write_json(folder / "provenance.json", {**state, **made, **about})
-
-    def write() -> list[Section]:
-        save()
-        return report.write(comparison, folder, provenance_line("compare", made))
-
-    try:
-        comparison.run(options.controllers.fan_out, Kept(folder / "tasks"))
-    except BaseException:  # including Ctrl-C
-        if comparison.cases:
-            write()
-        raise
-    sections = write()
-    save(complete=True)
-    show(sections[:2], console)
-    return f"The report, tables, data and plots are in {out}/"
-
-
-def _try_out(
-    members: Mapping[str, list[Factory]], scenarios: Collection[Scenario], runs: int
-) -> None:
-    """Reject a plant that has no score, or that a controller cannot be set up for."""
-    for scenario in scenarios:
-        with blame(scenario.title):
-            scale_of(scenario, runs).least.score(0.0)
-    for (name, (first, *_)), scenario in itertools.product(members.items(), scenarios):
-        with blame(f"{name} on {scenario.title}"):
-            first(scenario.arguments, 1, 0)
-
-
-def _folder(*differences: list[str]) -> Path:
-    """Return a folder named after the differences from the default comparison."""
-    name = "-".join(part for difference in differences for part in difference)
-    if not name:
-        return OUT
-    name = "".join(c if c.isalnum() or c in "-_." else "-" for c in name)
-    if len(name) > LONGEST:
-        name = f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-    return OUT.with_name(f"{OUT.name}-{name}")
 
 
 @dataclass(frozen=True)
@@ -138,7 +49,7 @@ def run_case(
         about = {"scenario": scenario.name, "agent": agent, "policy": number}
         seeds = {**about, "seed": range(SEED, SEED + runs)}
         rows.append(pd.DataFrame({**seeds, **measure(trajectory, scenario.parameters)}))
-    responses = report.summarise_responses(join(trajectories), scenario, agent)
+    responses = summarise_responses(join(trajectories), scenario, agent)
     return {
         "scenario": scenario.name,
         "agent": agent,
@@ -201,3 +112,24 @@ class Comparison:
     def runs(self) -> pd.DataFrame:
         """Measures, one row for each run."""
         return pd.concat([case.runs for case in self.finished], ignore_index=True)
+
+
+def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) -> pd.DataFrame:
+    """Return the set point and percentiles of y and u_a over the runs, one row per sample.
+
+    If the runs differ in their set points, the first run stands for all.
+    """
+    if (trajectory.setpoint != trajectory.setpoint[:, :1]).any():
+        trajectory = Trajectory(*(values[:, :1] for values in vars(trajectory).values()))
+    k = np.arange(len(trajectory.setpoint))
+    columns = {
+        "agent": agent,
+        "sample": k,
+        "time_s": k * scenario.parameters.sampling_interval,
+        "setpoint": trajectory.setpoint[:, 0],
+    }
+    for signal in ("output", "applied"):
+        # Values that occurred: an interpolated applied input could lie in the dead zone.
+        for name, values in percentiles(getattr(trajectory, signal), "nearest").items():
+            columns[f"{signal}_{name}"] = values
+    return pd.DataFrame(columns)

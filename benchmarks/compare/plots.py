@@ -24,7 +24,7 @@ from benchmarks.loop.scenarios import Scenario
 def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> None:
     """Draw set point, output and applied input of every agent over time.
 
-    `responses` holds the rows of `report.summarise_responses` for all agents.
+    `responses` holds the rows of `comparison.summarise_responses` for all agents.
     """
     palette = colours(list(responses["agent"].unique()))
     with drawn(path, 9, 6) as figure:

@@ -7,22 +7,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from benchmarks.compare.comparison import Comparison
 from benchmarks.compare.estimates import Scale, estimate, scale_of, score
 from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.statistics import Estimate
 from benchmarks.lib.tables import PERCENTILES, groups, percentiles, write_csv
 from benchmarks.loop.metrics import METRICS
-from benchmarks.loop.rollout import Trajectory
 from benchmarks.loop.scenarios import Scenario
-
-if TYPE_CHECKING:
-    from benchmarks.compare.comparison import Comparison
 
 NOT_SETTLED = "not settled"
 NO_MEASURE = "not measured"
@@ -187,27 +184,6 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
             for metric in METRICS
         ]
     )
-
-
-def summarise_responses(trajectory: Trajectory, scenario: Scenario, agent: str) -> pd.DataFrame:
-    """Return the set point and percentiles of y and u_a over the runs, one row per sample.
-
-    If the runs differ in their set points, the first run stands for all.
-    """
-    if (trajectory.setpoint != trajectory.setpoint[:, :1]).any():
-        trajectory = Trajectory(*(values[:, :1] for values in vars(trajectory).values()))
-    k = np.arange(len(trajectory.setpoint))
-    columns = {
-        "agent": agent,
-        "sample": k,
-        "time_s": k * scenario.parameters.sampling_interval,
-        "setpoint": trajectory.setpoint[:, 0],
-    }
-    for signal in ("output", "applied"):
-        # Values that occurred: an interpolated applied input could lie in the dead zone.
-        for name, values in percentiles(getattr(trajectory, signal), "nearest").items():
-            columns[f"{signal}_{name}"] = values
-    return pd.DataFrame(columns)
 
 
 def write_numbers(path: Path, table: pd.DataFrame) -> None:
