@@ -168,11 +168,13 @@ def _draw(likelihood: Likelihood, entries: list[Entry], weights: Array) -> list[
             )
             draws += [likelihood.models(replace(found, linear=each))[0] for each in drawn]
     stable = [each for each in draws if np.max(np.abs(each.poles), initial=0.0) < 1.0]
-    if len(stable) <= len(draws) / 2:
+    # One whose time constant is longer than the log cannot be told from one that integrates.
+    settling = [each for each in stable if slowest(each.a) < len(likelihood.output)]
+    if len(settling) <= len(draws) / 2:
         raise CannotTellError(
             "the log does not show where the temperature settles: most of the plants that it "
-            "leaves possible are integrating or unstable. Hold the flow longer, and see "
-            "whether the temperature drifts"
+            "leaves possible are integrating, unstable or slower than the log is long. Hold "
+            "the flow longer, and see whether the temperature drifts"
         )
     return stable
 
