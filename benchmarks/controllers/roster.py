@@ -111,7 +111,7 @@ _ENTRIES = (
     ),
     RosterEntry(
         "ppo-hard",
-        "PPO, hard",
+        "PPO (hard)",
         pretrained.policies(
             "ppo-hard-*.npz",
             Cost("trained on plants that vary", "12,608 weights", "4 M a policy"),
