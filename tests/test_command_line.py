@@ -184,7 +184,8 @@ def test_the_map_names_a_missing_package_and_the_command_that_was_meant(monkeypa
 def test_an_interruption_while_it_imports_shows_no_traceback(wait):
     # A marker says that the interpreter is up: what comes before cannot be caught.
     program = (
-        "import sys; from benchmarks.compare.__main__ import main; print('up', flush=True); "
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from benchmarks.compare.__main__ import main; print('up', flush=True)\n"
         "sys.exit(main(['--runs', '1']))"
     )
     run = subprocess.Popen(
