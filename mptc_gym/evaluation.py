@@ -166,8 +166,10 @@ valve travel 0 t/h; 100 episodes, all alike
     make = _maker(policy, env, arguments)
     single = make()
     parameters = _parameters(single)
-    with closing(single), closing(make()) as other:
-        if _parameters(other) != parameters:
+    with ExitStack() as made:
+        made.enter_context(closing(single))
+        # Of an id or a spec, all are alike.
+        if callable(env) and _parameters(made.enter_context(closing(make()))) != parameters:
             raise ValueError("env must be a function that makes the same plant at each call")
         check_fit(policy, single, parameters, episodes)
         spec = single.spec
