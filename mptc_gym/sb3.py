@@ -17,7 +17,6 @@ import os
 import pkgutil
 import zipfile
 from collections.abc import Callable, Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
 
@@ -84,15 +83,23 @@ def make_vec_env(
         single = wrapper(single)
     elif wrapper is not None:
         reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
-    batch = native_batch(single)
-    if batch is None:
+    plants = _step_together(single, n_envs, render_mode)
+    if plants is None:
         raise ValueError(f"wrapper must be IncrementalAction, got {single}")
-    single.close()
-    mode = AutoresetMode.SAME_STEP
-    many = batch(n_envs, autoreset_mode=mode, render_mode=render_mode)
-    plants = GymnasiumVecEnv(many, spec=single.spec)
     plants.seed(seed)
     return plants
+
+
+def _step_together(
+    single: gymnasium.Env[Any, Any], n: int, render_mode: str | None = None
+) -> GymnasiumVecEnv | None:
+    """Close an environment and return n like it, or None where a batch cannot be."""
+    batch = native_batch(single)
+    single.close()
+    if batch is None:
+        return None
+    many = batch(n, autoreset_mode=AutoresetMode.SAME_STEP, render_mode=render_mode)
+    return GymnasiumVecEnv(many, spec=single.spec)
 
 
 def save(model: BaseAlgorithm, path: str | Path) -> None:
@@ -112,8 +119,8 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     Raises
     ------
     ValueError
-        If it is unknown how the model was trained, or if an argument of a wrapper cannot be
-        written as JSON.
+        If it is unknown how the model was trained, if an argument of a wrapper cannot be
+        written as JSON, or if the file cannot be written.
     """
     record = training_of(model).to_json()
     path = zip_path(path)
@@ -123,6 +130,8 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
         with zipfile.ZipFile(partial, "a") as archive:
             archive.writestr(MEMBER, record)
         partial.replace(path)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written: {error.strerror}") from error
     finally:
         partial.unlink(missing_ok=True)
 
@@ -161,13 +170,9 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
     try:
         spec = record.spec(record.env, record.arguments)
         spec.max_episode_steps = record.max_episode_steps
-        with closing(make_one(spec, {})) as single:
-            batch = native_batch(single)
-        if batch is not None:
-            many = batch(record.n_envs, autoreset_mode=AutoresetMode.SAME_STEP)
-            plants: VecEnv = GymnasiumVecEnv(many, spec=spec)
-        else:
-            plants = DummyVecEnv([functools.partial(gymnasium.make, spec)] * record.n_envs)
+        plants: VecEnv = _step_together(make_one(spec, {}), record.n_envs) or DummyVecEnv(
+            [functools.partial(gymnasium.make, spec)] * record.n_envs
+        )
         for each in record.vec_wrappers:
             plants = restored(plants, **each)
         algorithm = pkgutil.resolve_name(record.algorithm)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, Final, cast
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -30,8 +31,8 @@ from mptc_gym.sb3_vec_env import GymnasiumVecEnv
 from mptc_gym.training import (
     WAYS_OUT,
     Training,
+    Wrappers,
     acting_wrappers,
-    describe,
     entry_point,
     wrappers_of,
 )
@@ -48,42 +49,40 @@ def training_of(model: Any) -> Training:
         does in a way that is not known here.
     """
     plants, vec_wrappers = _chain(model)
-    if isinstance(plants, GymnasiumVecEnv):
-        batches, spec = plants.batches, plants.spec
-        if spec is None and any(type(each) is not MiddlePointVectorEnv for each in batches):
-            raise ValueError(
-                "policy was trained on a batch whose wrappers are not known: make it by "
-                "mptc_gym.sb3.make_vec_env"
-            )
-        wrappers = acting_wrappers(spec.additional_wrappers if spec else ())
-        found = [Training.of_plant(each.unwrapped, spec, wrappers) for each in batches]
-    else:
-        try:
-            specs, cores = plants.get_attr("spec"), plants.get_attr("unwrapped")
-        except (OSError, EOFError) as error:  # from the pipes of a SubprocVecEnv
-            raise ValueError(
-                "the environments of policy's training are closed, or their processes cannot "
-                "send them: evaluate and save policy before they are closed, and train on "
-                f"mptc_gym.sb3.make_vec_env or a DummyVecEnv ({error!r})"
-            ) from error
-        live = isinstance(plants, DummyVecEnv)  # not in another process
-        wrapped = [
-            wrappers_of(cast("DummyVecEnv", plants).envs[i])
-            if live
-            else acting_wrappers(spec.additional_wrappers)
-            for i, spec in enumerate(specs)
-        ]
-        found = [Training.of_plant(*each) for each in zip(cores, specs, wrapped, strict=True)]
+    found = [Training.of(*each, plants) for each in _parts(plants)]
     if len({repr((each.plant, each.windows, each.wrappers)) for each in found}) > 1:
         raise ValueError("policy was trained on plants of different windows or wrappers")
     return dataclasses.replace(
         found[0],
         algorithm=entry_point(type(model)),
         vec_wrappers=tuple(map(_recorded, vec_wrappers)),
-        observation_space=describe(plants.observation_space),
-        action_space=describe(plants.action_space),
         n_envs=plants.num_envs,
     )
+
+
+def _parts(plants: VecEnv) -> list[tuple[Any, EnvSpec | None, Wrappers]]:
+    """Return the core, the spec and the wrappers of each environment, or of each batch."""
+    if isinstance(plants, DummyVecEnv):
+        return [(each.unwrapped, each.spec, wrappers_of(each)) for each in plants.envs]
+    if isinstance(plants, GymnasiumVecEnv):
+        spec, batches = plants.spec, plants.batches
+        if spec is None and any(type(each) is not MiddlePointVectorEnv for each in batches):
+            raise ValueError(
+                "policy was trained on a batch whose wrappers are not known: make it by "
+                "mptc_gym.sb3.make_vec_env"
+            )
+        wrappers = acting_wrappers(spec.additional_wrappers if spec else ())
+        return [(each.unwrapped, spec, wrappers) for each in batches]
+    try:
+        cores, specs = plants.get_attr("unwrapped"), plants.get_attr("spec")
+    except (OSError, EOFError) as error:  # from the pipes of a SubprocVecEnv
+        raise ValueError(
+            "the environments of policy's training are closed, or their processes cannot send "
+            "them: evaluate and save policy before they are closed, and train on "
+            f"mptc_gym.sb3.make_vec_env or a DummyVecEnv ({error!r})"
+        ) from error
+    wrapped = [acting_wrappers(each.additional_wrappers) for each in specs]
+    return [*zip(cores, specs, wrapped, strict=True)]
 
 
 def preparation(model: Any, n: int) -> Callable[[NDArray[Any]], NDArray[Any]]:
@@ -106,16 +105,7 @@ def _stack(wrapper: VecFrameStack, n: int) -> Callable[[NDArray[Any]], NDArray[A
     space = cast("Box", wrapper.venv.observation_space)
     frames = StackedObservations[NDArray[Any]](n, observation_space=space, **_frames(wrapper))
     running = np.zeros(n, np.bool_)
-    begun = False
-
-    def stack(seen: NDArray[Any]) -> NDArray[Any]:
-        nonlocal begun
-        if begun:
-            return frames.update(seen, running, [{}] * n)[0]
-        begun = True
-        return frames.reset(seen)
-
-    return stack
+    return lambda seen: frames.update(seen, running, [{}] * n)[0]
 
 
 def _chain(model: Any) -> tuple[VecEnv, list[VecEnvWrapper]]:

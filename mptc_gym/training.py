@@ -8,16 +8,15 @@ import json
 import pkgutil
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
-from gymnasium.spaces import Box, Space
 
 from mptc_gym.checks import reject, shorten
 from mptc_gym.env import MiddlePointEnv
@@ -68,32 +67,40 @@ class Training:
     max_episode_steps: int | None
     """Length of an episode, samples."""
     wrappers: Wrappers
-    """Gymnasium's wrappers that act, with their arguments as JSON values."""
+    """Gymnasium's wrappers that act."""
+    observations: str
+    """Shape and type of an observation of one environment, before `vec_wrappers`."""
+    actions: str
+    """Action space of one environment."""
     vec_wrappers: tuple[Mapping[str, Any], ...] = ()
     """`VecFrameStack` and `VecNormalize` of Stable-Baselines3, with their numbers; the
     innermost first."""
-    observation_space: Mapping[str, Any] = field(default_factory=dict)
-    """Observations of one environment, before `vec_wrappers`."""
-    action_space: Mapping[str, Any] = field(default_factory=dict)
-    """Actions of one environment."""
     algorithm: str = ""
     """Class of the model, `module:name`."""
     n_envs: int = 1
     """Number of environments."""
 
     @classmethod
-    def of_plant(cls, core: Any, spec: EnvSpec | None, wrappers: Wrappers) -> Training:
-        """Record an environment, or one out of a batch, without its wrappers."""
+    def of(
+        cls, core: Any, spec: EnvSpec | None, wrappers: Wrappers, outermost: Any
+    ) -> Training:
+        """Record an environment, or one out of a batch, from its core and what is around it.
+
+        `outermost` has its spaces.
+        """
         if not isinstance(core, MiddlePointEnv | MiddlePointVectorEnv):
             reject("policy", core, "trained on environments of this package")
         batch = type(core) is MiddlePointVectorEnv
-        plant = entry_point(MiddlePointEnv if batch else type(core))
-        arguments = {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in dataclasses.asdict(core.parameters).items()
-        }
-        name, length = (spec.id, spec.max_episode_steps) if spec else (IDS["paper"], None)
-        return cls(name, plant, arguments, length, tuple(map(_with_arguments, wrappers)))
+        seen = outermost.observation_space
+        return cls(
+            env=spec.id if spec else IDS["paper"],
+            plant=entry_point(MiddlePointEnv if batch else type(core)),
+            arguments=dataclasses.asdict(core.parameters),
+            max_episode_steps=spec.max_episode_steps if spec else None,
+            wrappers=tuple(map(_complete, wrappers)),
+            observations=f"{seen.shape} {seen.dtype}",
+            actions=repr(outermost.action_space),
+        )
 
     @property
     def windows(self) -> dict[str, int]:
@@ -108,7 +115,7 @@ class Training:
                 "changes into a gymnasium.Wrapper"
             )
         try:
-            return json.dumps(dataclasses.asdict(self), indent=1)
+            return json.dumps(_packed(dataclasses.asdict(self)), indent=1)
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"an argument of a wrapper cannot be recorded ({error}): write a wrapper whose "
@@ -141,7 +148,7 @@ class Training:
         if text is None:
             raise ValueError(f"{path} does not say how its policy was trained: {WAYS_OUT}")
         try:
-            about = json.loads(text)
+            about = json.loads(text, object_hook=_unpacked)
             about["wrappers"] = tuple(WrapperSpec(**each) for each in about["wrappers"])
             found = cls(**about)
             Parameters(**{**found.arguments, **found.windows})
@@ -170,38 +177,35 @@ class Training:
         with closing(make_one(env, {**arguments, **self.windows})) as single:
             spec = single.spec
         assert spec is not None  # gymnasium.make sets it
-        wrappers = tuple(
-            dataclasses.replace(each, kwargs=_unpacked(each.kwargs)) for each in self.wrappers
-        )
-        return dataclasses.replace(spec, additional_wrappers=wrappers)
+        return dataclasses.replace(spec, additional_wrappers=self.wrappers)
 
     def check(self, env: gymnasium.Env[Any, Any]) -> None:
         """Refuse an environment other than that of the training with a ValueError.
 
         Its other arguments may differ, and with the set point the bounds of observations.
         """
-        there = Training.of_plant(env.unwrapped, env.spec, wrappers_of(env))
-        seen, taken = describe(env.observation_space), describe(env.action_space)
+        there = Training.of(env.unwrapped, env.spec, wrappers_of(env), env)
         way_out = f"take mptc_gym.sb3.spec_of(policy, {there.env!r})"
         if self.plant != there.plant:
             way_out = f"give a function that makes a {self.plant}"
-        read = [
-            {name: each.get(name) for name in ("shape", "dtype")}
-            for each in (self.observation_space, seen)
-        ]
-        pairs: dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
-            "class": ({"env": self.plant}, {"env": there.plant}),
-            "windows": (self.windows, there.windows),
-            "wrappers": (_named(self.wrappers), _named(there.wrappers)),
-            "observations": (read[0], read[1]),
-            "action space": (self.action_space, taken),
-        }
-        for what, (own, other) in pairs.items():
+        for what, own in self._compared().items():
+            other = there._compared()[what]
             if own != other:
                 raise ValueError(
                     f"env must have the {what} of policy's training, {_listed(own, other)}, "
                     f"got {_listed(other, own)}: {way_out}"
                 )
+
+    def _compared(self) -> dict[str, Mapping[str, Any]]:
+        """Return what must be the same wherever the policy acts."""
+        wrappers = enumerate(self.wrappers, 1)
+        return {
+            "class": {"env": self.plant},
+            "windows": self.windows,
+            "wrappers": {f"{i}. {w.entry_point}": _packed(w.kwargs) for i, w in wrappers},
+            "observations": {"shape": self.observations},
+            "action space": {"space": self.actions},
+        }
 
 
 def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
@@ -225,7 +229,7 @@ def entry_point(kind: type) -> str:
 
 
 def wrappers_of(env: gymnasium.Env[Any, Any]) -> Wrappers:
-    """Return the wrappers of an environment that act, with those arguments that are known."""
+    """Return the wrappers of an environment that act."""
     if env.spec is not None:
         return acting_wrappers(env.spec.additional_wrappers)
     found: Wrappers = ()
@@ -240,20 +244,19 @@ def acting_wrappers(wrappers: Iterable[WrapperSpec]) -> Wrappers:
     return tuple(each for each in wrappers if each.entry_point not in _WATCHING)
 
 
-def _with_arguments(wrapper: WrapperSpec) -> WrapperSpec:
-    """Return a wrapper with its arguments as JSON values; refuse one that hides some."""
-    known = wrapper.kwargs or {}
+def _complete(wrapper: WrapperSpec) -> WrapperSpec:
+    """Return a wrapper with all its arguments, as far as its class is known, or refuse it."""
+    known = wrapper.kwargs
     try:
-        _, *named = inspect.signature(
-            pkgutil.resolve_name(wrapper.entry_point)
-        ).parameters.values()
+        kind = pkgutil.resolve_name(wrapper.entry_point)
+        _, *arguments = inspect.signature(kind).parameters.values()
     except (ImportError, AttributeError, TypeError, ValueError):
-        complete = wrapper.kwargs is not None
+        complete = known is not None
     else:
-        catches_all = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
-        complete = all(
-            each.name in known or (wrapper.kwargs is not None and each.kind in catches_all)
-            for each in named
+        catch_all = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+        complete = not arguments or (
+            known is not None
+            and all(each.name in known or each.kind in catch_all for each in arguments)
         )
     if not complete:
         raise ValueError(
@@ -261,51 +264,38 @@ def _with_arguments(wrapper: WrapperSpec) -> WrapperSpec:
             "from gymnasium.utils.RecordConstructorArgs, give that all of them, and make the "
             f"environment inside it by gymnasium.make; or {VOUCH}"
         )
-    return dataclasses.replace(wrapper, kwargs=_packed(known))
+    return dataclasses.replace(wrapper, kwargs=known or {})
 
 
 def _packed(value: Any) -> Any:
-    """Return an argument as JSON values, from which `_unpacked` makes it again."""
-    if isinstance(value, np.ndarray):
-        return {"array": value.tolist(), "dtype": str(value.dtype)}
-    if isinstance(value, tuple):
-        return {"tuple": _packed(list(value))}
-    return _mapped(_packed, value.item() if isinstance(value, np.generic) else value)
+    """Return a value as JSON values, from which `_unpacked` makes it again."""
+    match value:
+        case np.ndarray():
+            return {"array": value.tolist(), "dtype": str(value.dtype)}
+        case np.generic():
+            return value.item()
+        case tuple():
+            return {"tuple": _packed([*value])}
+        case list():
+            return [*map(_packed, value)]
+        case dict():
+            return {name: _packed(each) for name, each in value.items()}
+    return value
 
 
-def _unpacked(value: Any) -> Any:
+def _unpacked(value: dict[str, Any]) -> Any:
     match value:
         case {"array": numbers, "dtype": dtype}:
             return np.array(numbers, dtype)
         case {"tuple": values}:
-            return tuple(_unpacked(values))
-    return _mapped(_unpacked, value)
-
-
-def _mapped(function: Callable[[Any], Any], value: Any) -> Any:
-    """Return a list or a dict with a function of its values; any other value as it is."""
-    if isinstance(value, dict):
-        return {name: function(each) for name, each in value.items()}
-    return [function(each) for each in value] if isinstance(value, list) else value
+            return tuple(values)
+    return value
 
 
 def zip_path(path: str | Path) -> Path:
     """Return the path of a zip, whose ending may be left out, as in Stable-Baselines3."""
     path = Path(path)
     return path if path.suffix else path.with_suffix(".zip")
-
-
-def describe(space: Space[Any]) -> dict[str, Any]:
-    """Return a space as JSON values."""
-    if not isinstance(space, Box):
-        return {"space": repr(space)}
-    bounds = {"low": space.low.tolist(), "high": space.high.tolist()}
-    return {"shape": list(space.shape), "dtype": str(space.dtype), **bounds}
-
-
-def _named(wrappers: Wrappers) -> dict[str, Any]:
-    """Return the arguments of wrappers by their places and entry points."""
-    return {f"{i + 1}. {each.entry_point}": each.kwargs for i, each in enumerate(wrappers)}
 
 
 def _listed(named: Mapping[str, Any], other: Mapping[str, Any]) -> str:
