@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from inspect import Parameter
 from typing import Any, cast
@@ -74,62 +74,54 @@ def _owner(policy: Any) -> Any:
 
 def _deterministic(act: Any) -> Act:
     """Return a function that explores only on request as one that does not explore."""
-    explores = "deterministic" in _names(getattr(act, "forward", act))
+    explores = "deterministic" in _keywords(getattr(act, "forward", act))
     return partial(act, deterministic=True) if explores else cast("Act", act)
-
-
-def _names(function: Any) -> Iterable[str]:
-    """Return the names of a function's arguments, as far as they can be known."""
-    try:
-        return inspect.signature(function).parameters
-    except (TypeError, ValueError):
-        return ()
 
 
 def _predicting(policy: Any, n: int) -> Act:
     """Return the function of observations of a policy in the form of Stable-Baselines3."""
-    accepted = _accepted(policy.predict)
+    offered: dict[str, Any] = {"state": None, "episode_start": None, "deterministic": True}
+    keywords = _keywords(policy.predict)
+    if "*" in keywords and "**" not in keywords:
+        raise ValueError(
+            "policy.predict must name its arguments, such as state, episode_start and "
+            f"deterministic, or take **kwargs, got {inspect.signature(policy.predict)}"
+        )
+    accepted = [name for name in offered if name in keywords or "**" in keywords]
+    _check_call(
+        policy.predict, "policy.predict", "the observations", 0, **dict.fromkeys(accepted)
+    )
     prepare: Act = lambda seen: seen  # noqa: E731
     if is_model(policy):
         from mptc_gym import sb3_training
 
         prepare = sb3_training.preparation(policy, n)
-    state, begins = None, True
+    offered["episode_start"] = np.ones(n, np.bool_)
 
     def act(observations: NDArray[np.float32]) -> Any:
-        nonlocal state, begins
-        starts = np.full(n, begins)
-        begins = False
-        offered = {"state": state, "episode_start": starts, "deterministic": True}
-        chosen = {name: value for name, value in offered.items() if name in accepted}
-        actions = policy.predict(prepare(observations), **chosen)
+        given = {name: offered[name] for name in accepted}
+        actions = policy.predict(prepare(observations), **given)
+        offered["episode_start"] = np.zeros(n, np.bool_)
         if isinstance(actions, tuple):
-            actions, state = actions
-        if state is not None and "state" not in accepted:
+            actions, offered["state"] = actions
+        if offered["state"] is not None and "state" not in accepted:
             raise ValueError("policy.predict must take the state that it returns: state=None")
         return actions
 
     return act
 
 
-def _accepted(predict: Callable[..., Any]) -> set[str]:
-    """Return which keywords `predict` takes; refuse one that hides what it reads."""
-    offered = {"state", "episode_start", "deterministic"}
+def _keywords(function: Any) -> set[str]:
+    """Return the names of a function's arguments, as far as they can be known.
+
+    "*" stands for arguments that have no names, and "**" for any further names.
+    """
     try:
-        parameters = inspect.signature(predict).parameters.values()
+        parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
-        reject("policy.predict", predict, "a method whose arguments can be inspected")
-    kinds = [each.kind for each in parameters]
-    if Parameter.VAR_KEYWORD in kinds:
-        return offered
-    if Parameter.VAR_POSITIONAL in kinds or Parameter.POSITIONAL_ONLY in kinds[1:]:
-        raise ValueError(
-            "policy.predict must name its arguments, such as state, episode_start and "
-            f"deterministic, or take **kwargs, got {inspect.signature(predict)}"
-        )
-    accepted = offered.intersection(each.name for each in parameters)
-    _check_call(predict, "policy.predict", "the observations", 0, **dict.fromkeys(accepted))
-    return accepted
+        return set()
+    marks = {Parameter.VAR_POSITIONAL: "*", Parameter.VAR_KEYWORD: "**"}
+    return {marks.get(each.kind, each.name) for each in parameters}
 
 
 def _check_call(
@@ -173,7 +165,7 @@ def check_fit(
         If they differ, or if a model does not say how it was trained.
     """
     predict = getattr(policy, "predict", None)
-    if env.has_wrapper_attr("action_masks") and "action_masks" in _names(predict):
+    if env.has_wrapper_attr("action_masks") and "action_masks" in _keywords(predict):
         raise ValueError(
             "policy.predict takes the action_masks of env, which are not handed to it: give a "
             "function that finds the masks from the observations"
