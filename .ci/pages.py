@@ -7,12 +7,16 @@ import re
 import subprocess
 from pathlib import Path
 
+import markdown
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 
+from mptc_gym.parameters import argument_table
+
 ROOT = Path(__file__).parent.parent
 SHOWN = {".csv", ".gif", ".ipynb", ".json", ".md", ".png", ".txt"}
+TABLE = markdown.markdown(argument_table(), extensions=["tables"])
 PICTURE = re.compile(r'(<img [^>]*src="([^"]+)"[^>]*>)')
 TO_SOURCE = re.compile(r"(\]\((?!https?:)[^)#]+\.py)\)")
 
@@ -45,6 +49,8 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 def on_page_content(html: str, **_: object) -> str:
     """Link each picture to its full-size version, for small screens.
 
-    Remove the `::` before literal blocks in docstrings, which Markdown does not know.
+    Remove the `::` before literal blocks in docstrings, which Markdown does not know, and put
+    in the table of arguments, which the environment's docstring gets when it is imported.
     """
-    return PICTURE.sub(r'<a href="\2">\1</a>', html.replace("<p>::</p>\n", ""))
+    html = html.replace("<p>::</p>\n", "").replace("<p><arguments></p>", TABLE)
+    return PICTURE.sub(r'<a href="\2">\1</a>', html)

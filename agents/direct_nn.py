@@ -65,11 +65,12 @@ class DirectNNController(Controller):
 
     It implements steps A to E of Section 4 of the paper: the forward pass with the weights of
     sample k, then their update from e(k) and the activations of that pass. All it knows of the
-    plant is the direction D(G) of its response. `u_min` and `u_max` are U_min and U_max, the
-    range of the command.
+    plant is the direction D(G) of its response.
 
     Parameters
     ----------
+    u_min, u_max
+        U_min and U_max, the range of the command, t/h.
     n_inputs
         N, number of inputs, which are the first N elements of the observation.
     n_hidden
@@ -101,6 +102,21 @@ class DirectNNController(Controller):
     update_interval
         The weights are updated at every `update_interval`-th sample, starting with the first of
         an episode.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range; the message names it.
+
+    Examples
+    --------
+    >>> import gymnasium, mptc_gym
+    >>> from agents import DirectNNController
+    >>> env = gymnasium.make("MiddlePoint-v0")
+    >>> controller = DirectNNController(seed=0)
+    >>> observation, info = env.reset(seed=0)
+    >>> for _ in range(1200):
+    ...     observation, reward, *_ = env.step(controller.act(observation))
     """
 
     n_inputs: Size = 6

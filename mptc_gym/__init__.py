@@ -1,6 +1,12 @@
 """Control the middle-point temperature of a once-through boiler: a Gymnasium environment.
 
-Importing this package registers `MiddlePoint-v0`, and each of `PRESETS` under its own id.
+    env = gymnasium.make("mptc_gym:MiddlePointNoisy-v0")
+    observation, info = env.reset(seed=0)
+    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+
+Importing this package registers the ids `MiddlePoint-v0`, `MiddlePointDeadZone7-v0`,
+`MiddlePointNoisy-v0`, `MiddlePointDisturbed-v0`, `MiddlePointFouling-v0`,
+`MiddlePointRandomised-v0` and `MiddlePointHard-v0`; see `PRESETS`. `evaluate` scores a policy.
 """
 
 import gymnasium

@@ -140,29 +140,28 @@ samples = partial(count, minimum=0, maximum=LONGEST)  # of a delay or a window
 duration = partial(count, minimum=1, maximum=LARGEST)  # in samples
 
 
-def numbers(name: str, value: Any, allowed: str) -> tuple[float, ...]:
-    """Return the numbers of a list that has at least one."""
+def numbers(
+    name: str, value: Any, allowed: str = COEFFICIENTS, most: float = MOST_COEFFICIENTS
+) -> tuple[float, ...]:
+    """Return the numbers of a list that has 1 to `most`."""
     if not isinstance(value, list | tuple) or not value:
         reject(name, value, allowed)
     for i, element in enumerate(value):
         if not is_number(element):
             where = f"{shorten(value)}, where element {i} is {shorten(element)}"
             raise ValueError(f"{name} must be {allowed}, got {where}")
+    if len(value) > most:
+        reject(name, value, allowed)
     return tuple(float(element) for element in value)
 
 
-def coefficients(name: str, value: Any, allowed: str = COEFFICIENTS) -> tuple[float, ...]:
-    """Return at most `MOST_COEFFICIENTS` coefficients."""
-    checked = numbers(name, value, allowed)
-    if len(checked) > MOST_COEFFICIENTS:
-        reject(name, value, allowed)
-    return checked
+coefficients = numbers
 
 
 def polynomial(name: str, value: Any) -> tuple[float, ...]:
     """Return coefficients, the first of which is 1."""
     allowed = f"{COEFFICIENTS}, the first of them 1"
-    checked = coefficients(name, value, allowed)
+    checked = numbers(name, value, allowed)
     if checked[0] != 1.0:
         reject(name, value, allowed)
     return checked
@@ -172,7 +171,7 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     """Return a kind of set point, a constant, or one number per sample."""
     allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
     if isinstance(value, list | tuple):
-        return numbers(name, value, allowed)
+        return numbers(name, value, allowed, math.inf)
     if is_number(value):
         return number(name, value)
     if not isinstance(value, str) or value not in SETPOINTS:

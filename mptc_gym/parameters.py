@@ -28,7 +28,8 @@ class Argument:
 
     default: Any
     check: checks.Check  # returns a valid value in plain Python types, or raises a ValueError
-    meaning: str  # and unit, as in the tables of arguments
+    unit: str
+    meaning: str
     # Whether the plant is (28) and (29), linear between the limits, for any value. An analysis
     # that assumes this refuses any other argument that is not at its default.
     linear: bool
@@ -47,12 +48,14 @@ class Argument:
         """Return its row in a Markdown table of arguments."""
         default = repr(self.default).replace("'", '"')
         star = "*" if name in PLANT_NUMBERS else ""
-        return f"| `{name}` | {default}{star} | {self.meaning} |"
+        return f"| `{name}` | {default}{star} | {self.unit} | {self.meaning} |"
 
 
-def _argument(default: Any, check: checks.Check, meaning: str, *, linear: bool = False) -> Any:
+def _argument(
+    default: Any, check: checks.Check, unit: str, meaning: str, *, linear: bool = False
+) -> Any:
     """Declare an argument: a dataclass field that carries an `Argument`."""
-    argument = Argument(default, check, meaning, linear)
+    argument = Argument(default, check, unit, meaning, linear)
     return field(default=default, metadata={"argument": argument})
 
 
@@ -68,51 +71,57 @@ class PlantNumbers(Generic[Value]):
     order never changes, so that seeds keep their meaning, and new fields come last.
     """
 
-    delay: Value = _linear(18, checks.samples, "transport delay d of the plant (28), samples")
+    delay: Value = _linear(18, checks.samples, "samples", "transport delay d of (28)")
     dead_zone: Value = _linear(
-        5.0, checks.not_negative, "half width of the actuator's dead zone (29), t/h"
+        5.0, checks.not_negative, "t/h", "half width of the actuator's dead zone (29)"
     )
     u_min: Value = _linear(
-        -10.0, checks.number, "lower limit of the actuator, U_min in (29), t/h"
+        -10.0, checks.number, "t/h", "lower limit of the actuator, U_min in (29)"
     )
     u_max: Value = _linear(
-        10.0, checks.number, "upper limit of the actuator, U_max in (29), t/h"
+        10.0, checks.number, "t/h", "upper limit of the actuator, U_max in (29)"
     )
     noise_variance: Value = _linear(
-        0.0, checks.not_negative, "R, the variance of xi in (28), degC^2"
+        0.0, checks.not_negative, "degC^2", "R, the variance of xi in (28)"
     )
     measurement_noise_variance: Value = _linear(
         0.0,
         checks.not_negative,
-        "variance of the transmitter's white noise, which observations show and rewards do "
-        "not, degC^2",
+        "degC^2",
+        "variance of the transmitter's white noise, which observations show and rewards do not",
     )
     disturbance_amplitude: Value = _linear(
         0.0,
         checks.not_negative,
-        "largest level of the load disturbance's steps, up or down, degC",
+        "degC",
+        "largest level of the load disturbance's steps, up or down",
     )
     disturbance_interval: Value = _linear(
         150.0,
         checks.at_least_1,
-        "mean interval between these steps; below 10 it is 10, samples",
+        "samples",
+        "mean interval between these steps; below 10 it is 10",
     )
     disturbance_walk_variance: Value = _linear(
         0.0,
         checks.not_negative,
-        "variance that the load disturbance's random walk adds a sample, degC^2",
+        "degC^2",
+        "variance that the load disturbance's random walk adds a sample",
     )
     gain_factor: Value = _linear(
-        1.0, checks.positive, "steady-state gain, as a multiple of that of `a` and `b`"
+        1.0, checks.positive, "1", "steady-state gain, as a multiple of that of `a` and `b`"
     )
     time_constant_factor: Value = _linear(
-        1.0, checks.positive, "dominant time constant, as a multiple of that of `a`"
+        1.0, checks.positive, "1", "dominant time constant, as a multiple of that of `a`"
     )
     gain_drift: Value = _linear(
-        1.0, checks.positive, "factor by which the gain changes in `drift_samples`"
+        1.0, checks.positive, "1", "factor by which the gain changes in `drift_samples`"
     )
     time_constant_drift: Value = _linear(
-        1.0, checks.positive, "factor by which the time constant changes in `drift_samples`"
+        1.0,
+        checks.positive,
+        "1",
+        "factor by which the time constant changes in `drift_samples`",
     )
 
     def chosen(self, names: Sequence[str]) -> dict[str, Value]:
@@ -144,65 +153,73 @@ class Parameters(PlantNumbers[Number]):
     a: Sequence[float] = _linear(
         (1.0, -0.45181, -0.47546),
         checks.polynomial,
-        "coefficients of A in (28), from z^0 on; the first is 1. If A is unstable, y may "
-        "grow beyond all floats",
+        "1",
+        "coefficients of A in (28), from z^0 on; the first is 1. If A is unstable, y may grow "
+        "beyond all floats",
     )
     b: Sequence[float] = _linear(
         (-0.04560, -0.00404),
-        checks.coefficients,
-        "coefficients of B in (28), from z^-1 on, degC per t/h",
+        checks.numbers,
+        "degC per t/h",
+        "coefficients of B in (28), from z^-1 on",
     )
     c: Sequence[float] = _linear(
         (1.0, -0.35740, -0.03392),
         checks.polynomial,
+        "1",
         "coefficients of C in (28), from z^0 on; the first is 1",
     )
     drift_samples: int = _linear(
-        1200, checks.duration, "how long gain and time constant drift, samples"
+        1200, checks.duration, "samples", "how long gain and time constant drift"
     )
     sampling_interval: float = _linear(  # Section 5
-        8.0, checks.positive, "scale of the time axis, without effect on the dynamics, s"
+        8.0, checks.positive, "s", "scale of the time axis, without effect on the dynamics"
     )
     # The paper plots the set point without stating it.
     setpoint: str | float | Sequence[float] = _linear(
         "square",
         checks.setpoint,
+        "degC",
         '"square", "random", a number (constant), or a list with a number for each sample, '
-        "the last one held: [-5, 5] is two samples, not a range, degC",
+        "the last one held: [-5, 5] is two samples, not a range",
     )
     setpoint_amplitude: float = _linear(
         5.0,
         checks.not_negative,
+        "degC",
         'A. "square": A for the first half period, then -A. "random": levels uniform in '
-        "[-A, A], degC",
+        "[-A, A]",
     )
     setpoint_period: int = _linear(
         600,
         checks.duration,
+        "samples",
         'period of "square". "random": each level is held for a length uniform in '
-        "[period/6, period/2], samples",
+        "[period/6, period/2]",
     )
     # The observation. By default it is the six inputs of the paper's network: y_d(k), y_d(k-1),
     # y_d(k-2), e(k), e(k-1), e(k-2).
     setpoint_window: int = _linear(
-        3, checks.samples, "how many of the latest set points the observation holds, samples"
+        3, checks.samples, "samples", "how many of the latest set points the observation holds"
     )
-    error_window: int = _linear(3, checks.samples, "the same for errors, samples")
-    output_window: int = _linear(0, checks.samples, "the same for measured outputs, samples")
-    action_window: int = _linear(0, checks.samples, "the same for past actions, samples")
+    error_window: int = _linear(3, checks.samples, "samples", "the same for errors")
+    output_window: int = _linear(0, checks.samples, "samples", "the same for measured outputs")
+    action_window: int = _linear(0, checks.samples, "samples", "the same for past actions")
     temperature_span: float = _linear(
         50.0,
         checks.positive,
-        "range of the transmitter: the measurement saturates at +-`temperature_span`, degC",
+        "degC",
+        "range of the transmitter: the measurement saturates at +-`temperature_span`",
     )
-    reward: str = _linear("quadratic", checks.reward, '"quadratic" or "absolute"')
+    reward: str = _linear("quadratic", checks.reward, "", '"quadratic" or "absolute"')
     error_scale: float = _linear(
         5.0,
         checks.positive,
-        'the error that costs 1/2 ("quadratic") or 1 ("absolute") in each sample, degC',
+        "degC",
+        'the error that costs 1/2 ("quadratic") or 1 ("absolute") in each sample',
     )
     move_weight: float = _linear(
-        0.0, checks.not_negative, "cost of a change of the normalised action by 1"
+        0.0, checks.not_negative, "1", "cost of a change of the normalised action by 1"
     )
 
     def __post_init__(self) -> None:
@@ -363,7 +380,7 @@ PLANT_NUMBERS: Final[Mapping[str, int]] = MappingProxyType(
 def argument_table() -> str:
     """Return a Markdown table of all arguments except `render_mode`."""
     rows = (argument.row(name) for name, argument in ARGUMENTS.items())
-    return "\n".join(["| Argument | Default | Meaning, unit |", "|---|---|---|", *rows])
+    return "\n".join(["| Argument | Default | Unit | Meaning |", "|---|---|---|---|", *rows])
 
 
 def insert_table(docstring: str | None) -> str | None:

@@ -154,7 +154,7 @@ class Training:
             Parameters(**{**found.arguments, **found.windows})
         except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(
-                f"{path} has a damaged record of its training, or that of a newer version: "
+                f"{path} has a damaged record of its training, or that of another version: "
                 f"{error!r}"
             ) from error
         return found

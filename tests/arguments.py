@@ -17,7 +17,7 @@ BY_CHECK = {
     checks.at_least_1: st.floats(1, 100),
     checks.positive: st.floats(0.5, 4),
     checks.polynomial: tails,
-    checks.coefficients: st.lists(few, min_size=1, max_size=5),
+    checks.numbers: st.lists(few, min_size=1, max_size=5),
     checks.reward: st.sampled_from(checks.REWARDS),
     checks.setpoint: st.sampled_from(checks.SETPOINTS)
     | levels

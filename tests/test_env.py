@@ -293,7 +293,7 @@ def test_help_shows_every_argument():
     assert all(f"`{name}`" in documented for name in names)
     lines = [line.strip() for line in documented.splitlines()]
     assert all(row in lines for row in mptc_gym.parameters.argument_table().splitlines())
-    assert "| `delay` | 18* | transport delay d of the plant (28), samples |" in lines
+    assert "| `delay` | 18* | samples | transport delay d of (28) |" in lines
 
 
 @pytest.mark.parametrize(

@@ -581,7 +581,7 @@ class TestRecords:
         ("edit", "message"),
         [
             (lambda record: record["arguments"].pop("error_window"), "damaged.*error_window"),
-            (lambda record: record.update(later=1), "damaged .* or that of a newer version"),
+            (lambda record: record.update(later=1), "damaged .* or that of another version"),
             (lambda record: record.update(env="None-v0"), "cannot be loaded as .*None-v0"),
             (lambda record: record.update(
                 wrappers=[{"name": "X", "entry_point": "none:X", "kwargs": {}}]
