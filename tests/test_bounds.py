@@ -18,7 +18,7 @@ from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.linear import time_varying_model
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import make_plants, rollout
-from benchmarks.loop.scenarios import SCENARIOS
+from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.ranges import Ranges
@@ -477,11 +477,19 @@ class TestPredictiveController:
         assert runs.output[300:].mean() == pytest.approx(setpoint, abs=0.05)  # ... and holds
 
 
-def test_command(capsys, tmp_path, monkeypatch):
-    some = {name: PRESETS[name] for name in ("noisy", "hard")}
-    monkeypatch.setattr(command, "PRESETS", some)
-    assert main(["--episodes", "1", "--jobs", "1", "--cache", str(tmp_path)]) == 0
+def test_command_prints_each_row_once_it_is_finished(capsys, tmp_path, monkeypatch):
+    some = {name: PRESET_SCENARIOS[name] for name in ("noisy", "hard", "fouling")}
+    monkeypatch.setattr(command, "PRESET_SCENARIOS", some)
+    compute = command.row
+
+    def interrupted(case, *more):
+        if case.name == "fouling":
+            raise KeyboardInterrupt
+        return compute(case, *more)
+
+    monkeypatch.setattr(command, "row", interrupted)
+    assert main(["--episodes", "1", "--jobs", "1", "--cache", str(tmp_path)]) == 130
     shown = capsys.readouterr().out
-    for name in (*SCENARIOS, *some):
-        assert name in shown
+    for name in (*SCENARIOS, "noisy", "hard"):
+        assert f"\n{name} " in shown
     assert "0.9114" in shown

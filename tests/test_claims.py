@@ -10,11 +10,10 @@ import pandas as pd
 import pytest
 
 from agents import DirectNNController
-from benchmarks.claims import verdicts
+from benchmarks.claims import command
 from benchmarks.claims.__main__ import main
 from benchmarks.claims.claims import CLAIMS, largest_pole
-from benchmarks.claims.runs import Batch, converged_at, fail_node, typical
-from benchmarks.claims.verdicts import Claim
+from benchmarks.claims.runs import Batch, Claim, converged_at, fail_node, typical
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.metrics import join, mean_error, settled, split
 from tests.conftest import trajectory
@@ -70,7 +69,7 @@ class TestVerdicts:
         for low, value, high in ((0.12345, 12.345, 1234.5), (-math.inf, 0.0, math.inf)):
             good.ask("a number", Estimate(value, low, high, 1000))
         good.ask("another", 0.5, "t/h")
-        page = verdicts.markdown([good, none], "a command")
+        page = command.markdown([good, none], "a command")
         assert "| It is good   | holds" in page
         assert "| It cannot be | cannot be tested from the text |" in page
         rows = [
@@ -82,7 +81,7 @@ class TestVerdicts:
             ["a number", "0.000", "? to never"],
         ]
         assert re.search(r"another \(t/h\) *\| 0.500 *\| exact", page)
-        assert list(verdicts.table([good, none])["claim"]) == ["good"] * 4 + ["none"]
+        assert list(command.table([good, none])["claim"]) == ["good"] * 4 + ["none"]
 
 
 def paths(*distances):
@@ -199,15 +198,22 @@ class TestCommand:
         wrong = table[table["claim"] == "direction"]
         assert wrong["value"].iloc[1] == 100.0  # all of them diverge in the end ...
         assert wrong["shown"].iloc[1] == "undecided"  # ... but eight prove little
-        assert len(pd.read_csv(tmp_path / "convergence.csv")) == 8
-        assert (tmp_path / "convergence.png").exists()
         page = (tmp_path / "claims.md").read_text()
         for shown in (page, capsys.readouterr().out):
             assert "cannot be tested from the text" in shown
+        assert len(pd.read_csv(tmp_path / "convergence.csv")) == 8
+        for picture in ("convergence.png", "figures.png"):
+            pixels = matplotlib.image.imread(tmp_path / picture)[..., :3]
+            assert 0.01 < np.mean(pixels.min(axis=2) < 0.9) < 0.5  # dark or coloured
+        curves = pd.read_csv(tmp_path / "figures.csv")
+        assert curves.groupby("case").size().tolist() == [1200] * 6
+        assert (curves["output_p10"] <= curves["output_p90"]).all()
+        noisy = curves[curves["case"].str.contains("NN.*R = 0.5")]
+        assert (noisy["noise_p10"] < noisy["noise_p90"])[1:].all()  # at k = 0 there is none
 
     def test_same_seed_same_verdicts_on_any_count_of_cores(self, tmp_path):
         for jobs in ("1", "2"):
-            run_claims(tmp_path / jobs, "figures", "noise", "--jobs", jobs)
+            run_claims(tmp_path / jobs, "noise", "--jobs", jobs)
         one, two = ((tmp_path / jobs / "claims.csv").read_text() for jobs in ("1", "2"))
         assert one == two
         assert "standard deviation of y without control" in one
@@ -230,10 +236,11 @@ class TestCommand:
     @pytest.mark.parametrize("name", CLAIMS)
     def test_every_claim_but_that_of_the_curves_can_be_tested(self, name):
         class Short(Batch):
-            """Shorter runs where there are a hundred plants."""
-
             def run_nn(self, samples, **arguments):
-                return super().run_nn(300 if name == "direction-only" else samples, **arguments)
+                return super().run_nn(300, **arguments)
+
+            def run_pi(self, kp, ki, samples, **arguments):
+                return super().run_pi(kp, ki, 300, **arguments)
 
         claim = CLAIMS[name].examined(Short(4, 500))
         assert (claim.verdict == "cannot be tested from the text") is (name == "figures")
@@ -241,21 +248,10 @@ class TestCommand:
             assert row["low"] <= row["value"] <= row["high"], row["quantity"]
 
 
-class TestFigures:
-    def test_the_typical_run_is_the_median_one(self):
-        outputs = [1.0, 9.0, 4.0, 2.0]  # errors 4, 4, 1, 3 of set point 5
-        runs = join([trajectory([5.0], [y], [10.0 * y]) for y in outputs])
-        row = typical(runs).iloc[0]
-        assert (row["setpoint"], row["output_typical"], row["command_typical"]) == (5, 2, 20)
-        assert row["output_p10"] == pytest.approx(1 + 0.3 * (2 - 1))
-        assert row["output_p90"] == pytest.approx(4 + 0.7 * (9 - 4))
-
-    def test_they_are_drawn_with_their_data(self, tmp_path):
-        assert run_claims(tmp_path, "figures") == 0
-        picture = matplotlib.image.imread(tmp_path / "figures.png")[..., :3]
-        assert 0.01 < np.mean(picture.min(axis=2) < 0.9) < 0.5  # dark or coloured
-        data = pd.read_csv(tmp_path / "figures.csv")
-        assert data.groupby("case").size().tolist() == [1200] * 6
-        assert (data["output_p10"] <= data["output_p90"]).all()
-        noisy = data[data["case"].str.contains("NN.*R = 0.5")]
-        assert (noisy["noise_p10"] < noisy["noise_p90"])[1:].all()  # at k = 0 there is none
+def test_the_typical_run_is_the_median_one():
+    outputs = [1.0, 9.0, 4.0, 2.0]  # errors 4, 4, 1, 3 of set point 5
+    runs = join([trajectory([5.0], [y], [10.0 * y]) for y in outputs])
+    row = typical(runs).iloc[0]
+    assert (row["setpoint"], row["output_typical"], row["command_typical"]) == (5, 2, 20)
+    assert row["output_p10"] == pytest.approx(1 + 0.3 * (2 - 1))
+    assert row["output_p90"] == pytest.approx(4 + 0.7 * (9 - 4))

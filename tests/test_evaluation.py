@@ -170,7 +170,7 @@ class TestEvaluate:
         case = {**PRESETS["hard" if case.pop("env", "") else "paper"], **case}
         least = least_possible(kind="preview", folder=None, **case)
         assert bounds_command([*shlex.split(command)[3:], f"--cache={tmp_path}"]) == 0
-        assert f"{least:.3f}" in capsys.readouterr().out
+        assert f"{least:.4f}" in capsys.readouterr().out
 
 
 def normalised():

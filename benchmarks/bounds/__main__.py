@@ -8,7 +8,7 @@ from pathlib import Path
 from benchmarks.lib.command import Count, Runs, Seed, command, options
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.loop.plants import PlantOptions
-from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
+from mptc_gym.evaluation import EPISODES, SEED
 
 
 @options
@@ -20,13 +20,13 @@ class Options:
     """
 
     mpc: Runs | None = None
-    """Also run the predictive controller this many times on each plant."""
+    """Also run the predictive controller this many times in each case."""
     package: bool = False
     """Write the bounds of the presets that ship with the package instead."""
     fan_out: FanOut = field(default_factory=FanOut)
     plant: PlantOptions = field(default_factory=PlantOptions)
-    samples: Count = SAMPLES
-    """Length of an episode of each plant, samples."""
+    samples: Count | None = None
+    """Length of an episode, samples (default: that of the case)."""
     episodes: Count = EPISODES
     """Episodes to average a bound over, where plants or set points are drawn."""
     seed: Seed = SEED
@@ -35,7 +35,7 @@ class Options:
     """Folder in which computed bounds are kept (default: results/bounds)."""
 
 
-main = command(Options, "benchmarks.bounds.command", width=180)
+main = command(Options, "benchmarks.bounds.command", width=150)
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

@@ -25,8 +25,8 @@ A poor guess makes the bound loose, never wrong.
 from __future__ import annotations
 
 import numpy as np
+import scipy  # loads its modules on first use
 from numpy.typing import NDArray
-from scipy import stats
 
 from benchmarks.bounds.unknown import Unknown
 from benchmarks.loop.linear import Coefficients, TimeVaryingModel
@@ -57,7 +57,7 @@ class SetPointLaw:
         self._reach = gain * min(-model.low, model.high)
         # Noise blurs the sign of a small error; equally probable thresholds represent it.
         deviation = unknown.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
-        blur = stats.halfnorm.ppf((np.arange(THRESHOLDS) + 0.5) / THRESHOLDS)
+        blur = scipy.stats.halfnorm.ppf((np.arange(THRESHOLDS) + 0.5) / THRESHOLDS)
         self._blur = deviation * blur if deviation > 0.0 else np.zeros(1)
         # After a change the output stands still for `lag` samples. Then it approaches what the
         # limits allow; this is the share of the way that it has made, by age of the level.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy  # loads its modules on first use
 from numpy.typing import NDArray
-from scipy import linalg, optimize, sparse
 
 from benchmarks.bounds.unknown import Unknown
 from benchmarks.loop.linear import TimeVaryingModel
@@ -144,7 +144,7 @@ def _solve(
     samples = len(setpoint)
     n = samples - 1 - start
     # (28) without noise: A y = B u, rows from start + 1 on; the past goes to the right side.
-    A = sparse.eye_array(samples) - _lagged(model.alpha, samples, 1)
+    A = scipy.sparse.eye_array(samples) - _lagged(model.alpha, samples, 1)
     B = _lagged(model.beta, samples, model.delay + 1)
     A, B = A.tocsr()[start + 1 :], B.tocsr()[start + 1 :]
     past = B[:, :start] @ flow[:start] - A[:, : start + 1] @ output[: start + 1]
@@ -152,8 +152,8 @@ def _solve(
 
     # The unknowns are y, u, the pieces of E|m - n| for m above and below 0, and the moves up
     # and down, if they have a price.
-    eye, slopes = sparse.eye_array(n), unknown.slopes
-    pieces = sparse.hstack([eye, -eye] * len(slopes))
+    eye, slopes = scipy.sparse.eye_array(n), unknown.slopes
+    pieces = scipy.sparse.hstack([eye, -eye] * len(slopes))
     lengths = np.repeat(unknown.lengths[1:], 2, axis=1).T.ravel()
     columns = [
         _unknowns(n, 0.0, -np.inf, np.inf),
@@ -165,9 +165,9 @@ def _solve(
     rows: list[list[Any]] = [[A, -B, None], [eye, None, pieces]]
     right = [past, setpoint[start + 1 :]]
     if price:
-        moves = eye - sparse.eye_array(n, k=-1)
+        moves = eye - scipy.sparse.eye_array(n, k=-1)
         rows = [[*row, None] for row in rows]
-        rows.append([None, moves, None, sparse.hstack([-eye, eye])])
+        rows.append([None, moves, None, scipy.sparse.hstack([-eye, eye])])
         right.append(np.zeros(n))
         right[-1][0] = flow[start - 1] if start else 0.0
         columns.append(_unknowns(2 * n, price, 0.0, np.inf))
@@ -182,15 +182,15 @@ def _solve(
     for flows_alone, (method, presolve) in attempts:
         blocks, targets, unknowns = rows, right, columns
         if flows_alone:  # each output is the sum of the effects of the flows
-            idle = linalg.solve_triangular(A.toarray(), past, lower=True)
-            G = linalg.solve_triangular(A.toarray(), B.toarray(), lower=True)
+            idle = scipy.linalg.solve_triangular(A.toarray(), past, lower=True)
+            G = scipy.linalg.solve_triangular(A.toarray(), B.toarray(), lower=True)
             G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
-            blocks = [[sparse.csr_array(G), *rows[1][2:]], *(row[1:] for row in rows[2:])]
+            blocks = [[scipy.sparse.csr_array(G), *rows[1][2:]], *(row[1:] for row in rows[2:])]
             targets, unknowns = [right[1] - idle, *right[2:]], columns[1:]
         costs_and_ends = np.concatenate(unknowns)
-        solved = optimize.linprog(
+        solved = scipy.optimize.linprog(
             costs_and_ends[:, 0],
-            A_eq=sparse.block_array(blocks).tocsc(),
+            A_eq=scipy.sparse.block_array(blocks).tocsc(),
             b_eq=np.concatenate(targets),
             bounds=costs_and_ends[:, 1:],
             method=method,
@@ -210,14 +210,14 @@ def _unknowns(count: int, cost: Any, low: Any, high: Any) -> Array:
     return np.column_stack([np.broadcast_to(each, count) for each in (cost, low, high)])
 
 
-def _lagged(coefficients: Array, samples: int, lag: int) -> sparse.sparray:
+def _lagged(coefficients: Array, samples: int, lag: int) -> scipy.sparse.sparray:
     """Return the matrix that maps x to the sum over i of coefficients[k, i] x(k - lag - i)."""
     inside = [i for i in range(coefficients.shape[1]) if lag + i < samples]
     if not inside:
-        return sparse.csr_array((samples, samples))
+        return scipy.sparse.csr_array((samples, samples))
     diagonals = [coefficients[lag + i : samples, i] for i in inside]
     offsets = [-(lag + i) for i in inside]
-    return sparse.diags_array(diagonals, offsets=offsets, shape=(samples, samples))
+    return scipy.sparse.diags_array(diagonals, offsets=offsets, shape=(samples, samples))
 
 
 def reference(

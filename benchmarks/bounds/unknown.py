@@ -29,8 +29,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # loads its modules on first use
 from numpy.typing import NDArray
-from scipy import stats
 
 from benchmarks.loop.linear import TimeVaryingModel
 from mptc_gym.signals import LOAD_INTERVAL
@@ -88,7 +88,7 @@ def unknown(model: TimeVaryingModel) -> Unknown:
         return Unknown(np.ones(1), np.zeros((samples, 1)))
 
     # Means of equally probable slices of the standard normal distribution.
-    edges = stats.norm.pdf(stats.norm.ppf(np.linspace(0.0, 1.0, ATOMS + 1)))
+    edges = scipy.stats.norm.pdf(scipy.stats.norm.ppf(np.linspace(0.0, 1.0, ATOMS + 1)))
     atoms = deviation[:, np.newaxis] * (-np.diff(edges) * ATOMS)
     jump = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval) if amplitude else 0.0
     for place in range(weights.shape[1] if walk else 0):

@@ -15,14 +15,15 @@ from agents import PIController
 from agents.pi import SEARCHED_GAINS
 from benchmarks.claims.runs import (
     FIGURES,
+    OFTEN,
     Array,
     Batch,
+    Claim,
     converged_at,
     fail_node,
     flat,
     typical,
 )
-from benchmarks.claims.verdicts import OFTEN, Claim
 from benchmarks.lib.statistics import Estimate, exact, median
 from benchmarks.lib.tables import groups
 from benchmarks.loop.linear import nominal
@@ -41,8 +42,7 @@ NOISY_SQUARE = "square wave, R = 0.5 °C²"
 SQUARE, CONSTANT = (arguments for *_, arguments in CASES)
 # The constant set point comes first, as it shows initial learning alone.
 SETPOINTS = tuple((title, arguments, samples) for _, title, samples, arguments in CASES[::-1])
-PAPER_PI = (2.2, 0.3)  # Kp, Ki
-KP, KI = PAPER_PI
+KP, KI = PAPER_PI = (2.2, 0.3)
 SEARCHED_PI = (SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"])
 LEARNING = 600  # samples after which a network counts as trained
 GAINS = {False: "the same gains", True: "gains in proportion"}  # of networks of other shapes
@@ -154,16 +154,17 @@ def pi_gains(batch: Batch, claim: Claim) -> None:
     for name, arguments in (
         ("constant set point", CONSTANT), ("square wave", SQUARE), (NOISY_SQUARE, NOISY),
     ):  # fmt: skip
-        errors = {
-            gain: mean_error(batch.run_pi(gain, KI, samples, **arguments)) for gain in gains
-        }
-        medians = {gain: float(np.median(error)) for gain, error in errors.items()}
-        rows += [{"setpoint": name, "kp": kp, "mean_error": medians[kp]} for kp in gains]
-        best = min(gains[:-1], key=medians.__getitem__)
+        errors = [mean_error(batch.run_pi(kp, KI, samples, **arguments)) for kp in gains]
+        medians = [float(np.median(error)) for error in errors]
+        rows += [
+            {"setpoint": name, "kp": kp, "mean_error": middle}
+            for kp, middle in zip(gains, medians, strict=True)
+        ]
+        best = int(np.argmin(medians[:-1]))
         claim.ask(
-            f"mean error with the best lower Kp ({best:.1f}) as a multiple of that with "
+            f"mean error with the best lower Kp ({gains[best]:.1f}) as a multiple of that with "
             f"{KP:g}, {name}",
-            ratio(errors[best], errors[gains[-1]]), at_least=1 - NOTABLE,
+            ratio(errors[best], errors[-1]), at_least=1 - NOTABLE,
         )  # fmt: skip
     doubled = batch.run_pi(2 * KP, KI, samples, **CONSTANT)
     limited = 100 * np.mean(np.abs(doubled.applied[-300:]) == Parameters().u_max)
@@ -366,31 +367,27 @@ def direction_only(batch: Batch, claim: Claim) -> None:
             about = {"delay": delay, "gain": gain, "time_constant": time_constant}
             found = {"settled": draws[-1].mean(), "mean_error": np.median(mean_error(runs))}
             rows.append({"setpoint": family, **about, **found})
-    cells = pd.DataFrame(rows)
-
+    cells = claim.tables["other_plants"] = pd.DataFrame(rows)
     paper = pd.Series({"delay": 18, "gain": 1.0, "time_constant": 1.0})
 
     def ask(text: str, of: pd.DataFrame) -> None:
-        i = min(of.index, key=lambda i: rows[i]["settled"])
+        i = of["settled"].idxmin()
         where = ", ".join(f"{name.replace('_', ' ')} {rows[i][name]:g}" for name in paper.index)
         quantity = f"settled within 1,200 samples, the worst of {text} ({where})"
         claim.ask_share(quantity, draws[i], often=True)
 
-    held, scaled = (those for _, those in groups(cells, "setpoint"))
-    for name, text, those in (
-        ("delay", "delays from 9 to 36", held),
-        ("time_constant", "time constants from 0.5 to 2 times the paper's", held),
-        ("gain", "gains from 0.7 to 1.5 times the paper's", held),
-        ("gain", "gains from 0.7 to 1.5 times the paper's", scaled),
+    for name, text, family in (
+        ("delay", "delays from 9 to 36", "set point 5 °C"),
+        ("time_constant", "time constants from 0.5 to 2 times the paper's", "set point 5 °C"),
+        *(("gain", "gains from 0.7 to 1.5 times the paper's", family) for family in families),
     ):
         others = paper.drop(name)
-        alone = those[(those[others.index] == others).all(axis=1)]
-        ask(f"{text}, {alone['setpoint'].iloc[0]}", alone)
+        alone = (cells["setpoint"] == family) & (cells[others.index] == others).all(axis=1)
+        ask(f"{text}, {family}", cells[alone])
     for family, those in groups(cells, "setpoint"):
         ask(f"all {len(those)} combinations, {family}", those)
         quantity = f"combinations in which at least {OFTEN:.0%} of draws settle, {family}"
         claim.ask(quantity, 100 * (those["settled"] >= OFTEN).mean(), "%")
-    claim.tables["other_plants"] = cells
 
 
 @claimed(
@@ -403,6 +400,5 @@ def figures(batch: Batch, claim: Claim) -> None:
     curves = []
     for case in FIGURES:
         agent = PIController() if case.nodes is None else batch.networks(nodes=case.nodes)
-        runs = batch.run(agent, case.samples, **case.arguments)
-        curves.append(typical(runs).assign(case=case.title))
+        curves.append(typical(batch.run(agent, 1200, **case.arguments)).assign(case=case.title))
     claim.tables["figures"] = pd.concat(curves, ignore_index=True)

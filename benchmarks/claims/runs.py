@@ -1,17 +1,19 @@
-"""Run batches of the NN and the PI controller for claims and figures."""
+"""Run batches of the NN and the PI controller, and record findings about a claim."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from agents import DirectNNController, PIController
 from agents.direct_nn import Weights
+from benchmarks.lib.statistics import Estimate, exact, median, quantile, share
 from benchmarks.lib.tables import percentiles
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
@@ -19,8 +21,7 @@ from mptc_gym import PRESETS, Parameters
 
 Array = NDArray[np.floating]
 
-BAND = 0.05  # fraction of the distance from the first weights to the last
-STILL = 100  # last samples of a run, in which converged weights stay within the band
+OFTEN = 0.9  # "works", "converges": in at least this share of the draws
 
 
 @dataclass(frozen=True)
@@ -86,16 +87,16 @@ def converged_at(weights: Array) -> Array:
     """Return the sample at which weights have converged, shape (runs,).
 
     This is the first sample from which on their Euclidean distance to their final values is at
-    most `BAND` times that at the start. It is infinite for weights that come so close only in
-    the last `STILL` samples: they have not converged, as the run might end anywhere on their
-    way. `weights` are those before each sample, shape (samples, runs, n).
+    most 5 % of that at the start. It is infinite for weights that come so close only in the
+    last 100 samples: they have not converged, as the run might end anywhere on their way.
+    `weights` are those before each sample, shape (samples, runs, n).
     """
     distance = np.linalg.norm(weights - weights[-1], axis=2)
-    outside = distance > BAND * distance[0]
+    outside = distance > 0.05 * distance[0]
     samples = len(weights)
     # The first sample of the final stretch inside the band, found from the end.
     first = np.where(outside.any(axis=0), samples - np.argmax(outside[::-1], axis=0), 0)
-    return np.where(first <= samples - STILL, first, np.inf)
+    return np.where(first <= samples - 100, first, np.inf)
 
 
 def fail_node(controller: DirectNNController, stuck_at: int) -> None:
@@ -105,6 +106,81 @@ def fail_node(controller: DirectNNController, stuck_at: int) -> None:
     # So far out on the sigmoid the slope vanishes, and the node cannot learn.
     weights.theta_1[..., 0] = 1e6 if stuck_at else -1e6
     controller.weights = weights
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim of the paper, its examination and the findings."""
+
+    name: str
+    """Short name, for options."""
+    section: str
+    """Place in the paper."""
+    statement: str
+    method: str
+    """Description of the test."""
+    examine: Callable[[Batch, Claim], None]
+    """Performs the runs, and records the findings with `ask`."""
+    findings: list[dict[str, Any]] = field(default_factory=list)
+    """Rows of the table of numbers."""
+    tables: dict[str, pd.DataFrame] = field(default_factory=dict)
+    """Tables to draw, by name."""
+
+    def examined(self, batch: Batch) -> Claim:
+        """Return the claim with its findings."""
+        claim = replace(self, findings=[], tables={})
+        self.examine(batch, claim)
+        return claim
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in words; an undecided finding counts as not shown."""
+        shown = [row["shown"] == "yes" for row in self.findings if row["shown"]]
+        if not shown:
+            return "cannot be tested from the text"
+        if all(shown):
+            return "holds"
+        return "holds in part" if any(shown) else "does not hold"
+
+    def ask(
+        self,
+        quantity: str,
+        found: Estimate | ArrayLike,
+        unit: str = "",
+        *,
+        at_least: float = -math.inf,
+        at_most: float = math.inf,
+    ) -> None:
+        """Record a number: an estimate, the median of one value per run, or an exact value.
+
+        A bound makes the number part of the verdict. It is shown if the whole interval keeps
+        the bound, and not shown if no part of the interval does.
+        """
+        if not isinstance(found, Estimate):
+            found = median(found) if np.ndim(found) else exact(float(np.asarray(found)))
+        bounds = {"at least": at_least, "at most": at_most}
+        asked = [f"{name} {bound:g}" for name, bound in bounds.items() if math.isfinite(bound)]
+        if not asked:
+            shown = ""
+        elif at_least <= found.low and found.high <= at_most:
+            shown = "yes"
+        else:
+            out = found.high < at_least or found.low > at_most
+            shown = "no" if out else "undecided"
+        criterion = {"criterion": " and ".join(asked), "shown": shown}
+        self.findings.append({"quantity": quantity, "unit": unit, **vars(found), **criterion})
+
+    def ask_share(
+        self, quantity: str, found: NDArray[np.bool_], *, often: bool = False
+    ) -> None:
+        """Record the share of draws in which `found` is true; `often` requires `OFTEN`."""
+        at_least = 100 * OFTEN if often else -math.inf
+        self.ask(quantity, share(found).scaled(100), "% of draws", at_least=at_least)
+
+    def ask_time(self, quantity: str, samples: ArrayLike) -> None:
+        """Record the 10th, 50th and 90th percentiles of a time; infinite means never."""
+        for p in (0.1, 0.5, 0.9):
+            self.ask(f"{quantity}, {p:.0%} of draws", quantile(samples, p), "samples")
 
 
 @dataclass(frozen=True)
@@ -118,7 +194,6 @@ class Case:
     """Arguments of the environment."""
     nodes: int | None = 3
     """Hidden nodes of the network; None for the paper's PI controller."""
-    samples: int = 1200
 
 
 OUTPUT = ("output",)
