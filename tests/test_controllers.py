@@ -12,8 +12,7 @@ from gymnasium.wrappers import DelayObservation
 from stable_baselines3 import PPO
 
 from benchmarks.compare.comparison import run_case
-from benchmarks.controllers.options import chosen
-from benchmarks.controllers.own import own_factory
+from benchmarks.controllers.options import chosen, own_factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import UsageError
 from benchmarks.loop.metrics import mean_error

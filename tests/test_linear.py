@@ -11,9 +11,14 @@ from benchmarks.bounds import __main__ as command
 from benchmarks.bounds.least import frontier, least_possible
 from benchmarks.controllers import engineered
 from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.controllers.step_test import step_test
 from benchmarks.loop import linear
-from benchmarks.loop.linear import Coefficients, LinearModel, nominal, time_varying_model
+from benchmarks.loop.linear import (
+    Coefficients,
+    LinearModel,
+    nominal,
+    step_test,
+    time_varying_model,
+)
 from benchmarks.loop.margins import Loop
 from mptc_gym import MiddlePointEnv, Parameters
 from mptc_gym.parameters import ARGUMENTS

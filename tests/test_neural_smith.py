@@ -8,7 +8,7 @@ import pytest
 
 from agents import LawNetwork, NeuralSelfTuningController, NeuralSmithPredictor, SmithPredictor
 from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.controllers.step_test import step_test
+from benchmarks.loop.linear import step_test
 from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import Parameters
 

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.controllers.step_test import StepTest, step_test
 from benchmarks.lib.command import UsageError
-from benchmarks.loop.linear import nominal
+from benchmarks.loop.linear import StepTest, nominal, step_test
 from benchmarks.loop.plants import PlantOptions
 from mptc_gym import Parameters
 

@@ -1,5 +1,12 @@
 """Compute lower bounds for every controller, a reference, and a score."""
 
-from benchmarks.bounds.least import least_possible
+from typing import Any
 
-__all__ = ["least_possible"]
+
+def __getattr__(name: str) -> Any:
+    """Import `least_possible` when it is used, as SciPy loads more slowly than a help text."""
+    if name != "least_possible":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from benchmarks.bounds.least import least_possible
+
+    return least_possible

@@ -371,7 +371,7 @@ def direction_only(batch: Batch, claim: Claim) -> None:
     paper = pd.Series({"delay": 18, "gain": 1.0, "time_constant": 1.0})
 
     def ask(text: str, of: pd.DataFrame) -> None:
-        i = of["settled"].idxmin()
+        i = min(of.index, key=lambda i: rows[i]["settled"])
         where = ", ".join(f"{name.replace('_', ' ')} {rows[i][name]:g}" for name in paper.index)
         quantity = f"settled within 1,200 samples, the worst of {text} ({where})"
         claim.ask_share(quantity, draws[i], often=True)

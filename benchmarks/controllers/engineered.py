@@ -18,8 +18,7 @@ from agents import (
 from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.records import Factory
-from benchmarks.controllers.step_test import step_test
-from benchmarks.loop.linear import nominal
+from benchmarks.loop.linear import nominal, step_test
 from benchmarks.loop.rollout import IdleValve
 from mptc_gym import Parameters
 

@@ -1,24 +1,27 @@
-"""Declare and read the options that choose the controllers to run."""
+"""Read the options that choose controllers: of the roster, or a user's own.
+
+A user's own is MODULE:FACTORY, or PPO:FILE.zip.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Annotated
+import inspect
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import partial
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from benchmarks.controllers.own import own_entry
-from benchmarks.controllers.records import RosterEntry
+from agents.policy_network import WINDOWS
+from benchmarks.controllers.engineered import limits
+from benchmarks.controllers.records import Cost, Factory, RosterEntry
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import (
-    Names,
-    Repeated,
-    UsageError,
-    known,
-    options,
-)
+from benchmarks.lib.command import Names, Repeated, UsageError, blame, known, options
 from benchmarks.lib.fan_out import FanOut
+from benchmarks.loop.rollout import Agent
+from mptc_gym import Parameters
 
 AgentNames = Annotated[
     Names, Parameter(help=f"Controllers to run, out of {', '.join(ROSTER)}.")
@@ -40,10 +43,7 @@ class ControllerOptions:
 def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEntry]:
     """Return controllers of the roster by name, then a user's own, as given to `--agent`.
 
-    Raises
-    ------
-    UsageError
-        If there is no such controller, or no controller at all.
+    A `UsageError` says that there is no such controller, or no controller at all.
     """
     found = {name: ROSTER[name] for name in known("--agents", names, list(ROSTER))}
     locations: dict[str, list[str]] = {}
@@ -60,3 +60,66 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEnt
     if not found:
         raise UsageError("--agents, --agent: no controller to run")
     return found
+
+
+def own_entry(name: str, locations: Sequence[str]) -> RosterEntry:
+    """Return an entry for a user's own controller, with one or more members per location.
+
+    A `UsageError` says what is wrong with a location.
+    """
+    factories: list[Factory] = []
+    with blame("--agent"):
+        for location in locations:
+            if location.endswith(".zip"):
+                from benchmarks.controllers import saved  # here: PyTorch takes seconds to load
+
+                made = saved.policies(location)
+            else:
+                made = [own_factory(location)]
+            for factory in made:
+                _try_out(factory, location)
+            factories += made
+    return RosterEntry(name, name, lambda: factories, drawn=True)
+
+
+def own_factory(location: str) -> Factory:
+    """Import a user's factory, `module:factory`; a ValueError says what is expected.
+
+    The README of `benchmarks.compare` lists the arguments and attributes it may have.
+    """
+    try:
+        found: Any = pkgutil.resolve_name(location)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{location!r} cannot be imported: {error}") from error
+    if not callable(found):
+        raise ValueError(f"{location!r} must be MODULE:FACTORY, got {found!r}")
+    observation = getattr(found, "observation", {})
+    if not (isinstance(observation, Mapping) and set(observation) <= set(WINDOWS)):
+        raise ValueError(
+            f"observation of {found!r} must be a dict with names out of {', '.join(WINDOWS)}, "
+            f"got {observation!r}"
+        )
+    cost = Cost(*(str(getattr(found, each.name, "")) for each in fields(Cost)))
+    return Factory(partial(_made, found), cost, dict(observation), code=found.__module__)
+
+
+def _try_out(factory: Factory, location: str) -> None:
+    """Run a controller for two samples on two plants; raise a ValueError if it fails."""
+    size = Parameters(**factory.arguments({})).observation_size
+    try:
+        factory.run({}, samples=2, runs=2, seed=0)
+    except (Exception, SystemExit) as error:
+        raise ValueError(
+            f"{location!r} must give an object with reset() and act(observations), and act "
+            f"take observations of shape (2, {size}), one row a plant, and return actions of "
+            f"shape (2, 1); trying it raised {type(error).__name__}: {error}"
+        ) from error
+
+
+def _made(made_by: Callable[..., Agent], plant: Parameters, runs: int, seed: int) -> Agent:
+    """Call a user's factory with the arguments that it accepts, by name."""
+    offered = {"parameters": plant, "num_envs": runs, "seed": seed, **limits(plant)}
+    accepted = inspect.signature(made_by).parameters
+    if any(each.kind is each.VAR_KEYWORD for each in accepted.values()):
+        return made_by(**offered)
+    return made_by(**{name: offered[name] for name in offered if name in accepted})

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from agents import PIController, SmithPredictor
-from benchmarks.controllers.step_test import StepTest, read_off
 from benchmarks.identify.model import Model
 from benchmarks.identify.plant import plant_arguments
 from benchmarks.lib.statistics import Estimate, student
-from benchmarks.loop.linear import nominal
+from benchmarks.loop.linear import StepTest, nominal, read_off
 from benchmarks.loop.margins import Loop, sensitivities
 from benchmarks.loop.metrics import mean_error, travel
 from benchmarks.loop.rollout import make_plants, rollout

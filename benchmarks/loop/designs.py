@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import scipy  # loads its modules on first use
 
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
@@ -49,9 +50,9 @@ def random_design(
     The second half of them drift: over `samples` samples, their gain and time constant move to
     other values within the spans.
     """
-    from scipy.stats import qmc  # here: slow to import
-
-    drawn = qmc.LatinHypercube(len(spans) + 2, rng=np.random.default_rng(seed)).random(count)
+    drawn = scipy.stats.qmc.LatinHypercube(
+        len(spans) + 2, rng=np.random.default_rng(seed)
+    ).random(count)
     drifting = ("gain_factor", "time_constant_factor")
     ends = np.array([*spans.values(), *(spans[name] for name in drifting)])
     rows = ends[:, 0] + drawn * (ends[:, 1] - ends[:, 0])

@@ -25,9 +25,6 @@ from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
 
 Array = NDArray[np.float64]
 
-SETTLED = 1e-5  # fraction of a transient that remains at the end of a step response
-LONGEST = 1_000_000  # samples; a plant that needs more is treated as never settling
-
 
 def check_linear(parameters: Parameters) -> None:
     """Raise ValueError for a plant that is more than (28) and (29), naming the argument."""
@@ -74,8 +71,7 @@ class LinearModel:
         """Return y(0), y(1), ..., degC, from rest, given u_a(0), u_a(1), ..., t/h."""
         from scipy import signal  # here: slow to import
 
-        response: Array = signal.lfilter(*self.transfer(), np.asarray(flow, np.float64))
-        return response
+        return np.asarray(signal.lfilter(*self.transfer(), np.asarray(flow, np.float64)))
 
     def step_response(self, samples: int | None = None) -> Array:
         """Return y(0), y(1), ... after a step of u_a from 0 to 1 t/h at k = 0, degC per t/h.
@@ -91,8 +87,9 @@ class LinearModel:
             slowest = float(np.max(np.abs(self.poles), initial=0.0))
             if sum(self.b) == 0.0:
                 raise ValueError(f"b must have a sum other than 0 for a gain, got {self.b}")
-            settling = math.log(SETTLED) / math.log(slowest) if 0.0 < slowest < 1.0 else 0.0
-            if slowest >= 1.0 or settling > LONGEST:
+            # Until 1e-5 of a transient remains; in a million samples, or never.
+            settling = math.log(1e-5) / math.log(slowest) if 0.0 < slowest < 1.0 else 0.0
+            if slowest >= 1.0 or settling > 1e6:
                 raise ValueError(f"a must be of a stable plant for a step test, got {self.a}")
             # Twice as long, since the transients of repeated poles last longer.
             samples = self.delay + len(self.b) + 2 * math.ceil(settling) + 2
@@ -172,6 +169,61 @@ def nominal(parameters: Parameters) -> LinearModel:
         round(middle["delay"]),
         parameters.sampling_interval,
     )
+
+
+@dataclass(frozen=True)
+class StepTest:
+    """A first-order model with delay; its fields are arguments of SIMC and `SmithPredictor`."""
+
+    gain: float
+    """Steady-state gain, degC per t/h."""
+    time_constant: float
+    """Time constant, s."""
+    delay: float
+    """Delay, s, including the one sample that any input takes to show."""
+    sampling_interval: float
+    """Sampling interval, s."""
+
+
+def step_test(parameters: Parameters) -> StepTest:
+    """Return what an engineer would read off the plant's response to a step of the flow.
+
+    The time constant and the delay follow from the times at which the response reaches 28.3 %
+    and 63.2 % of its final value: T = 1.5 (t_63 - t_28), and the delay is t_63 - T (C. L.
+    Smith, "Digital Computer Process Control", 1972). As if read off a chart, the gain has four
+    digits, the time constant three, and the delay is a whole number of samples.
+
+    A range is replaced by its middle, and a drifting plant is tested at k = 0. The flow moves
+    outside the dead zone, and noise and load disturbances average out.
+
+    Raises
+    ------
+    ValueError
+        If the plant is not stable and so reaches no new steady state, or if its gain is 0.
+    """
+    return read_off(nominal(parameters))
+
+
+def read_off(plant: LinearModel) -> StepTest:
+    """Return what `step_test` returns, of a linear model."""
+    response, interval = plant.step_response(), plant.sampling_interval
+    early, late = (_first_reached(response / response[-1], level) for level in (0.283, 0.632))
+    time_constant = 1.5 * (late - early)
+    # In samples, u(k) shows at y(k + 1) at the earliest.
+    delay = max(1, round(late - time_constant + 1.0))
+    return StepTest(
+        gain=float(f"{plant.gain:.4g}"),
+        time_constant=float(f"{time_constant * interval:.3g}"),
+        delay=delay * interval,
+        sampling_interval=interval,
+    )
+
+
+def _first_reached(response: Array, level: float) -> float:
+    """Return when a response first reaches a level, in samples, by linear interpolation."""
+    k = int(np.argmax(response >= level))
+    before, after = response[k - 1], response[k]
+    return float(k - 1 + (level - before) / (after - before))
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy  # loads its modules on first use
 from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
-from scipy import signal
 
 from agents import PIController
 from benchmarks.loop.linear import LinearModel
@@ -64,7 +64,7 @@ class Loop:
     def response_at(self, frequency: Array) -> NDArray[np.complex128]:
         """Return L at frequencies, rad/s."""
         at = frequency * self._interval
-        return np.asarray(signal.freqz(self.numerator, self.denominator, at)[1])
+        return np.asarray(scipy.signal.freqz(self.numerator, self.denominator, at)[1])
 
     @cached_property
     def response(self) -> NDArray[np.complex128]:
@@ -116,14 +116,14 @@ def sensitivities(plants: Sequence[LinearModel]) -> Callable[[PIController], Arr
     at = np.union1d(np.geomspace(slowest, np.pi, 400), np.linspace(np.pi / turns, np.pi, turns))
     back = np.exp(-1j * at)
     responses = np.array([
-        signal.freqz(plant.b, plant.a, at)[1] * back ** (plant.delay + 1) for plant in plants
+        scipy.signal.freqz(each.b, each.a, at)[1] * back ** (each.delay + 1) for each in plants
     ])  # fmt: skip
 
     def sensitivity(controller: PIController) -> Array:
         numerator, denominator = controller.transfer()
         if np.any(np.abs(np.roots(denominator)) > 1.0 + 1e-6):
             return np.full(len(plants), np.inf)
-        difference = 1.0 + responses * signal.freqz(numerator, denominator, at)[1]
+        difference = 1.0 + responses * scipy.signal.freqz(numerator, denominator, at)[1]
         steps = np.angle(difference[:, 1:] / difference[:, :-1])
         start = np.angle(difference[:, 0])
         stable = (start < 0.0) & (np.abs(start + steps.sum(axis=1)) < 1.0)

@@ -11,7 +11,7 @@ import pygame
 from PIL import Image
 from rich.console import Console
 
-from benchmarks.controllers.own import own_entry
+from benchmarks.controllers.options import own_entry
 from benchmarks.controllers.records import Factory, RosterEntry
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import UsageError
