@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.archive import reading
 from agents.controller import (
     MOST,
     PAPER_WINDOWS,
@@ -24,6 +23,7 @@ from agents.controller import (
     check_count,
     check_numbers,
 )
+from agents.networks import reading
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ steady-state effect of such a flow on the plant, and times by the sampling inter
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any, Final
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import avoid_dead_zone
-from agents.archive import PRETRAINED, reading
+from agents.networks import PRETRAINED, Layers, check_layers, forward, reading
 
 Array = NDArray[np.float64]
 
@@ -255,15 +255,15 @@ class LawNetwork:
         Origin of the networks, JSON-serialisable.
     """
 
-    choosing: Sequence[tuple[Array, Array]]
-    adding: Sequence[tuple[Array, Array]]
+    choosing: Layers
+    adding: Layers
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(self, seen: Array, at_rest: Array) -> tuple[Array, Array]:
         """Return the outputs and the addition; see `Network`."""
-        added = np.tanh(_forward(self.adding, np.concatenate([seen, at_rest])))[:, 0]
+        added = np.tanh(forward(self.adding, "silu", np.concatenate([seen, at_rest])))[:, 0]
         half = len(seen)
-        return _forward(self.choosing, seen), MOST_ADDED * (added[:half] - added[half:])
+        return forward(self.choosing, "silu", seen), MOST_ADDED * (added[:half] - added[half:])
 
     @classmethod
     def load(cls, path: str | PathLike[str] = PRETRAINED / "nn-smith.npz") -> LawNetwork:
@@ -281,9 +281,11 @@ class LawNetwork:
                 [(file[f"{part}_W{i}"], file[f"{part}_b{i}"]) for i in range(3)]
                 for part in PARTS
             )
-            _check(choosing, OUTPUTS)
-            _check(adding, 1)
-            return cls(choosing, adding, json.loads(str(file["provenance"])))
+            return cls(
+                check_layers(choosing, INPUTS, OUTPUTS),
+                check_layers(adding, INPUTS, 1),
+                json.loads(str(file["provenance"])),
+            )
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the networks to a `.npz` file."""
@@ -295,21 +297,3 @@ class LawNetwork:
         }
         about = json.dumps(dict(self.provenance))
         np.savez_compressed(path, provenance=about, **layers)
-
-
-def _forward(layers: Sequence[tuple[Array, Array]], x: Array) -> Array:
-    *hidden, (last_W, last_b) = layers
-    for W, b in hidden:
-        x = x @ W.T + b
-        x = x * 0.5 * (1.0 + np.tanh(0.5 * x))  # SiLU
-    return x @ last_W.T + last_b
-
-
-def _check(layers: Sequence[tuple[Array, Array]], outputs: int) -> None:
-    inputs = INPUTS
-    for W, b in layers:
-        if W.shape != (len(b), inputs) or not np.isfinite(np.append(W, b)).all():
-            raise ValueError(f"layers must be finite and fit together, got shape {W.shape}")
-        inputs = len(b)
-    if inputs != outputs:
-        raise ValueError(f"the last layer must have {outputs} nodes, got {inputs}")

@@ -3,37 +3,29 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from agents.actuator import compensate_dead_zone
-from agents.archive import reading
 from agents.controller import (
     Controller,
     Values,
     check_count,
     check_limits,
     check_number,
-    check_numbers,
 )
+from agents.networks import ACTIVATIONS, Layers, check_array, check_layers, forward, reading
 
 Array = NDArray[np.float64]
 
 WINDOWS: Final = ("setpoint_window", "error_window", "output_window", "action_window")
 _FORMAT = 1  # version of the file format
-
-
-ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
-    "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
-    "relu": lambda x: np.maximum(x, 0.0),
-    "tanh": np.tanh,
-}
 
 
 @dataclass(frozen=True)
@@ -72,14 +64,14 @@ class PolicyNetwork(Controller):
     input_scale
         Factor for each element of the observation; shape (n_obs,).
     activation
-        Activation of the hidden layers: "elu", "relu" or "tanh".
+        Activation of the hidden layers: "elu", "relu", "silu" or "tanh".
     increments
         The velocity form, if the network was trained in it; otherwise None.
     provenance
         Origin of the weights, JSON-serialisable.
     """
 
-    layers: Sequence[tuple[Array, Array]] = field(repr=False, kw_only=False)
+    layers: Layers = field(repr=False, kw_only=False)
     observation: Mapping[str, int]
     input_scale: Array = field(repr=False)
     activation: str = "elu"
@@ -104,8 +96,8 @@ class PolicyNetwork(Controller):
                 f"activation must be one of {[*ACTIVATIONS]}, got {self.activation!r}"
             )
         self._remembers = self.increments is not None
-        self.input_scale = _finite("input_scale", self.input_scale, (self.n_obs,))
-        self.layers = _checked(self.layers, self.n_obs)
+        self.input_scale = check_array("input_scale", self.input_scale, (self.n_obs,))
+        self.layers = check_layers(self.layers, self.n_obs, 1)
         self._flow: Values | None = None  # wanted, as a share of half the range
 
     @classmethod
@@ -166,11 +158,8 @@ class PolicyNetwork(Controller):
                 f"observation must have {self.n_obs} elements, those of {self.observation}, "
                 f"got {observation.shape[-1]}{self._advice}"
             )
-        x = observation * self.input_scale
-        *hidden, (last_W, last_b) = self.layers
-        for W, b in hidden:
-            x = ACTIVATIONS[self.activation](x @ W.T + b)
-        output: Values = np.clip(x @ last_W[0] + last_b[0], -1.0, 1.0)
+        outputs = forward(self.layers, self.activation, observation * self.input_scale)
+        output: Values = np.clip(outputs[..., 0], -1.0, 1.0)
         half_range, lowest = (self.u_max - self.u_min) / 2.0, -1.0
         if self.increments is not None:
             lowest, highest = self.u_min / half_range, self.u_max / half_range
@@ -180,25 +169,3 @@ class PolicyNetwork(Controller):
             if self._edge > 0.0:
                 return compensate_dead_zone(output, self._edge, self.u_min, self.u_max)
         return self.u_min + (output - lowest) * half_range
-
-
-def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.array(check_numbers(name, value))  # a copy
-    if array.shape != shape:
-        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite")
-    return array
-
-
-def _checked(layers: Sequence[tuple[Array, Array]], inputs: int) -> list[tuple[Array, Array]]:
-    """Return the layers in float64 if each fits the one before it and the last has one node."""
-    if not layers:
-        raise ValueError("layers must hold at least one layer, got none")
-    checked = []
-    for i, (W, b) in enumerate(layers):
-        nodes = np.size(b) if i < len(layers) - 1 else 1
-        weights = _finite(f"weights of layers[{i}]", W, (nodes, inputs))
-        checked.append((weights, _finite(f"biases of layers[{i}]", b, (nodes,))))
-        inputs = nodes
-    return checked

@@ -25,7 +25,7 @@ from agents import (
     SmithPredictor,
     Weights,
 )
-from agents.archive import PRETRAINED
+from agents.networks import PRETRAINED
 from benchmarks.loop.rollout import make_plants, rollout
 from tests.conftest import assert_the_seed_is_all_that_differs, run_closed
 

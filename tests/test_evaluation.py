@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 
 from agents import DirectNNController, PIController, PolicyNetwork
-from agents.archive import PRETRAINED
+from agents.networks import PRETRAINED
 from benchmarks.bounds import least_possible
 from benchmarks.bounds.__main__ import main as bounds_command
 from benchmarks.bounds.command import PACKAGED as CASES

@@ -140,5 +140,5 @@ class TestLoop:
 def test_a_file_of_other_layers_is_refused(tmp_path):
     layers = [(np.zeros((3, 4)), np.zeros(3))] * 3
     LawNetwork(layers, layers).save(tmp_path / "network.npz")
-    with pytest.raises(ValueError, match="fit together"):
+    with pytest.raises(ValueError, match=r"weights of layers\[0\] must have shape"):
         LawNetwork.load(tmp_path / "network.npz")

@@ -10,7 +10,7 @@ import torch
 from stable_baselines3.common.buffers import RolloutBuffer
 
 from agents import PolicyNetwork
-from agents.archive import PRETRAINED
+from agents.networks import PRETRAINED
 from benchmarks.controllers import pretrained
 from benchmarks.controllers.records import Cost
 from benchmarks.controllers.roster import ROSTER

@@ -9,7 +9,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from agents import LawNetwork, NeuralSmithPredictor  # noqa: E402
-from agents.archive import PRETRAINED  # noqa: E402
+from agents.networks import PRETRAINED  # noqa: E402
 from benchmarks.controllers.roster import ROSTER  # noqa: E402
 from benchmarks.examples import through_plant as example  # noqa: E402
 from benchmarks.loop.rollout import make_plants, rollout  # noqa: E402

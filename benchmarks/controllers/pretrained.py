@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from agents import LawNetwork, PolicyNetwork
-from agents.archive import PRETRAINED
+from agents.networks import PRETRAINED
 from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Cost, Factory, Members
 from benchmarks.loop.rollout import Agent

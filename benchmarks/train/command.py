@@ -13,7 +13,7 @@ import pandas as pd
 from rich.console import Console
 
 from agents import LawNetwork, PolicyNetwork
-from agents.archive import PRETRAINED
+from agents.networks import PRETRAINED
 from benchmarks.lib.command import out_folder
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import Kept, commit, replacing
