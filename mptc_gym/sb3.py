@@ -133,7 +133,8 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     except OSError as error:
         raise ValueError(f"{path} cannot be written: {error.strerror}") from error
     finally:
-        partial.unlink(missing_ok=True)
+        if partial.exists():
+            partial.unlink()
 
 
 def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:

@@ -383,7 +383,7 @@ class TestDraws:
         assert_mean(moves[1:] * moves[:-1], 0.0)
 
     def test_ranges_have_both_ends(self, library):
-        n = 20_000
+        n = 4_000
         for type_ in library.types:
             env = library.make(n, delay=[12, 24], gain_factor=[0.75, 1.5], **type_)
             infos = plain(env.reset(seed=0)[1])
@@ -399,7 +399,7 @@ class TestDraws:
             assert_mean((delays - 18) * (gains - 1.125), 0.0)
 
     def test_resets_leave_the_distributions_as_they_are(self, library):
-        n, steps, variance, walk, jump = 1500, 250, 2.0, 0.01, 0.3
+        n, steps, variance, walk, jump = 800, 250, 2.0, 0.01, 0.3
         env = library.make(
             n, noise_variance=variance, c=[1.0, 3.0], disturbance_walk_variance=walk,
             disturbance_amplitude=jump, disturbance_interval=10, setpoint="random",

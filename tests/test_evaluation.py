@@ -89,16 +89,6 @@ class TestEvaluate:
         alike = evaluate(PIController(1.0, 0.05), episodes=10)
         assert np.ptp(alike.interval) == pytest.approx(0.0, abs=1e-12)
 
-    def test_one_policy_in_three_forms(self):
-        def predict(observation, state=None, episode_start=None, deterministic=False):
-            assert deterministic
-            return proportional(observation), state
-
-        expected = evaluate(proportional, HARD, episodes=5)
-        for policy in ({"act": proportional}, {"predict": predict}, {"predict": proportional}):
-            found = evaluate(SimpleNamespace(**policy), HARD, episodes=5)
-            np.testing.assert_array_equal(found.errors, expected.errors)
-
     def test_reset_keeps_what_a_controller_has_learnt(self):
         learning = DirectNNController(num_envs=3, seed=0)
         first, again = (evaluate(learning, episodes=3) for _ in range(2))
@@ -150,11 +140,10 @@ class TestEvaluate:
         ("arguments", "advice"),
         [
             ({"max_episode_steps": 60}, "--preset paper --samples 60 --episodes 2"),
-            ({"env": HARD, "seed": 3}, "--preset hard --episodes 2 --seed 3"),
-            (
-                {"delay": [5, 9], "setpoint": "random", "seed": SEED + 7},
-                "--set 'delay=[5,9]' --set setpoint=random --episodes 2 --seed 7000007",
-            ),
+            ({"env": HARD, "seed": 3, "max_episode_steps": 60},
+             "--preset hard --samples 60 --episodes 2 --seed 3"),
+            ({"delay": [5, 9], "setpoint": "random", "seed": SEED + 7},
+             "--set 'delay=[5,9]' --set setpoint=random --episodes 2 --seed 7000007"),
             ({"setpoint": [1, 2.5], "a": (1.0, -0.9), "b": (0.2,), "max_episode_steps": 30},
              "--set 'a=[1.0,-0.9]' --set 'b=[0.2]' --set 'setpoint=[1.0,2.5]' --samples 30 "
              "--episodes 2"),
@@ -232,11 +221,11 @@ class TestBounds:
         kept = least_errors(plant, 1200, range(SEED, SEED + 120))
         drawn = bool(plant.ranges) or plant.setpoint == "random"
         assert len(set(kept.tolist())) == (120 if drawn else 1)
-        for i in (7, 118) if drawn else (0,):
-            least = least_possible(
-                samples=1200, episodes=1, seed=SEED + i, folder=None, **CASES[name]
-            )
-            assert kept[i] == pytest.approx(least.value, abs=2e-6)
+        i = 118 if drawn else 0
+        least = least_possible(
+            samples=1200, episodes=1, seed=SEED + i, folder=None, **CASES[name]
+        )
+        assert kept[i] == pytest.approx(least.value, abs=2e-6)
 
     def test_they_say_how_they_were_made(self):
         kept = json.loads((ROOT / "mptc_gym/bounds.json").read_text(encoding="utf-8"))

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from tests.conftest import ROOT
+from tests.conftest import ROOT, python
 
 ALLOWED = {
     "mptc_gym": {"mptc_gym", "gymnasium", "numpy", "pygame"},  # the last when it is used
@@ -144,10 +144,29 @@ def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, caps
         assert main([*re.findall(r"middlepoint/[\w/-]+", example), "--episodes", "2"]) == 0
     # A short time will do to see that it runs.
     exec(
-        re.sub(r"\d+_000", "1", example).replace("samples=1200", "samples=100, episodes=5"), {}
+        re.sub(r"\d+_000", "1", example)
+        .replace("samples=1200", "samples=100, episodes=5")
+        .replace('-v0", 256', '-v0", 4')
+        .replace("2048", "64"),
+        {},
     )
     if printed:
         assert capsys.readouterr().out == printed.replace("\\\n", "")
+
+
+def test_controllers_are_evaluated_without_any_extra():
+    program = """
+import sys
+for name in ("torch", "stable_baselines3", "scipy", "pandas", "matplotlib", "pygame"):
+    sys.modules[name] = None  # an import is an error from now on
+import agents, mptc_gym
+print(mptc_gym.evaluate(agents.PIController(), "MiddlePointNoisy-v0").mean_error)
+import mptc_gym.torch_env
+"""
+    done = python("-c", program)
+    # Between the least possible error and that of an idle valve.
+    assert 1.6 < float(done.stdout) < 5.0, done.stderr
+    assert 'pip install "mptc_gym[torch]"' in done.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -171,9 +171,9 @@ class TestScoreCallback:
         )
         model = model_of(plants, seed=1, learning_rate=0.01)
         model.set_logger(configure(str(tmp_path / "log"), ["csv"]))
-        model.learn(320, callback=callback)
+        model.learn(192, callback=callback)
         model.logger.close()
-        assert [samples for samples, _ in callback.scores] == [128, 256, 320]
+        assert [samples for samples, _ in callback.scores] == [128, 192]
         spec = spec_of(model, "MiddlePointNoisy-v0")
         last = evaluate(model, spec, episodes=3, seed=SEED + 100)
         assert callback.scores[-1][1].mean_error == last.mean_error
@@ -184,7 +184,7 @@ class TestScoreCallback:
             kept, spec_of(tmp_path / "best.zip", spec), episodes=3, seed=SEED + 100
         ).mean_error == min(errors)
         shown = capsys.readouterr().out.splitlines()
-        assert shown[0].startswith("128 of 320 samples: MiddlePointNoisy-v0: mean error ")
+        assert shown[0].startswith("128 of 192 samples: MiddlePointNoisy-v0: mean error ")
         least = np.minimum.accumulate([np.inf, *errors])[:-1]
         assert [line.endswith("; best") for line in shown] == list(errors < least)
         logged = (tmp_path / "log" / "progress.csv").read_text()
