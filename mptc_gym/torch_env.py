@@ -247,14 +247,14 @@ class MiddlePointTorchEnv(BatchEnv):
 
     def _begin(self, mask: Mask) -> dict[str, Tensor]:
         which = None if mask.all() else self._flags(mask)
-        left, self._ahead = len(self._ahead), []  # samples computed, but not returned
+        unused, self._ahead = len(self._ahead), []  # samples computed, but not returned
         first = self._episodes.reset(which, self._starts, self._clock, self._given)
-        self._plants.reset(which, left)
-        at_rest = {name: each.reset(which, left) for name, each in self._signals.items()}
+        self._plants.reset(which, unused)
+        at_rest = {name: each.reset(which, unused) for name, each in self._signals.items()}
         numbers, setpoint = self._episodes.numbers, at_rest["setpoint"]
         rest_action = self._zeros + action_from_command(0.0, numbers["u_min"], numbers["u_max"])
         self._action = select(which, rest_action, self._action)
-        self._shown.reset(which, left, setpoint, rest_action)
+        self._shown.reset(which, unused, setpoint, rest_action)
         first |= {"setpoint": setpoint, "error": setpoint}
         return first | {name: self._zeros + numbers[name] for name in self._factors}
 
@@ -331,14 +331,14 @@ class _Window:
         self._at_once = max(1, _IN_CACHE // numbers) if zeros.is_cpu else LONGEST
 
     def reset(
-        self, which: Tensor | None, left: int, setpoint: Tensor, rest_action: Tensor
+        self, which: Tensor | None, unused: int, setpoint: Tensor, rest_action: Tensor
     ) -> None:
         """Begin an episode of some plants at rest; drop the last samples of the block."""
         for rows, w, newest in zip(
             self._rows, self._windows, (setpoint, setpoint, self._zeros), strict=True
         ):
             at_rest = [*[self._zeros] * (w - 1), newest.clone()][:w]
-            end = len(rows) - left
+            end = len(rows) - unused
             past = rows[end - w : end] or at_rest
             rows[:] = [select(which, *each) for each in zip(at_rest, past, strict=True)]
         if self._past_actions:

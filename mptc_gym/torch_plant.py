@@ -69,10 +69,10 @@ class TorchPlants:
         self.most_samples = shortest + 1
         self._order = len(parameters.a) - 1  # of A
 
-    def reset(self, which: Tensor | None, left: int) -> None:
+    def reset(self, mask: Tensor | None, unused: int) -> None:
         """Bring some plants, or all, to rest, with the numbers of the current episodes.
 
-        The last `left` outputs are dropped before.
+        The last `unused` outputs are dropped before.
         """
         numbers, zeros = self._episodes.numbers, self._zeros
         self._now: tuple[Any, Any] | None = None  # factors and coefficients of (28)
@@ -87,14 +87,14 @@ class TorchPlants:
             ]
         # Flows that have yet to take effect, for all terms of B; and outputs, those of the
         # latest block and those that A needs from before it. Both have the oldest first.
-        if which is None:
+        if mask is None:
             flows = self._longest + len(self._beta)
             self._flows = deque([zeros] * flows, flows)
             self._outputs = [zeros] * self._order
         else:
-            past = self._outputs[: len(self._outputs) - left]
-            self._outputs = [each.masked_fill(which, 0.0) for each in past]
-            self._flows.extend(torch.stack([*self._flows]).masked_fill_(which, 0.0).unbind())
+            past = self._outputs[: len(self._outputs) - unused]
+            self._outputs = [each.masked_fill(mask, 0.0) for each in past]
+            self._flows.extend(torch.stack([*self._flows]).masked_fill_(mask, 0.0).unbind())
         self._limits = u_min, u_max = numbers["u_min"], numbers["u_max"]
         self._middle = zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
@@ -167,7 +167,7 @@ class TorchPlants:
 
     def _changes_at(self, clock: int) -> bool:
         """Whether the drifting dynamics of any plant change at a sample."""
-        return self._drifts and self._episodes.any_changes(clock)
+        return self._drifts and self._episodes.any_due(clock)
 
     def _dynamics_at(self, clock: int) -> tuple[Any, Any]:
         """Return gain and time constant at a sample, and the coefficients of (28) for them."""

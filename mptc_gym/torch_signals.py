@@ -1,8 +1,8 @@
 """Generate external signals in PyTorch, drawn from one generator, or pass on given ones.
 
 The signals have two methods, for many plants and a block of samples at a time, without a loop
-over plants. `reset(which, left)` begins an episode of some plants, or of all if `which` is
-None, after the last `left` samples of the latest block have been dropped, and returns the
+over plants. `reset(mask, unused)` begins an episode of some plants, or of all if `mask` is
+None, after the last `unused` samples of the latest block have been dropped, and returns the
 signal at k = 0, shape (n,). `next(clock, samples)` returns the samples that follow, the first
 of them at that time of the environment's clock, degC, shape (samples, n).
 """
@@ -28,9 +28,9 @@ SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
 Number = float | Tensor  # one for all plants, or one per plant, shape (n,)
 
 
-def select(which: Tensor | None, new: Tensor, old: Tensor) -> Tensor:
+def select(mask: Tensor | None, new: Tensor, old: Tensor) -> Tensor:
     """Return new values for some plants, old ones for the others; None selects all plants."""
-    return new if which is None else torch.where(which, new, old)
+    return new if mask is None else torch.where(mask, new, old)
 
 
 def as_tensor(values: Any, like: Tensor) -> Tensor | None:
@@ -65,12 +65,12 @@ class Episodes:
         # remainders of the clock one of them is a multiple of `DRIFT_INTERVAL` samples old.
         self._changes = parameters.drifts or parameters.is_disturbed
         self._starts: Tensor | int = 0
-        self._phases: set[int] = set()
+        self._due: set[int] = set()
         self._rows = torch.arange(LONGEST, device=zeros.device)[:, None]
 
     def reset(
         self,
-        which: Tensor | None,
+        mask: Tensor | None,
         starts: NDArray[np.int64],
         clock: int,
         given: Mapping[str, Given],
@@ -82,16 +82,16 @@ class Episodes:
         first = {}
         for name, (low, high) in self._ranges.items():
             whole = ARGUMENTS[name].is_integer
-            values = given[name].reset(which) if name in given else self.draw(low, high, whole)
-            self.numbers[name] = select(which, values, self.zeros + self.numbers[name])
+            values = given[name].reset(mask) if name in given else self.draw(low, high, whole)
+            self.numbers[name] = select(mask, values, self.zeros + self.numbers[name])
             first[name] = values.to(torch.int64) if whole else values
         if (starts == clock).all():
             self._starts = clock
         else:
             before = torch.zeros_like(self.zeros, dtype=torch.int64) + self._starts
-            self._starts = select(which, torch.full_like(before, clock), before)
+            self._starts = select(mask, torch.full_like(before, clock), before)
         if self._changes:
-            self._phases = {*np.unique(starts % DRIFT_INTERVAL).tolist()}
+            self._due = {*np.unique(starts % DRIFT_INTERVAL).tolist()}
         return first
 
     def age(self, clock: int) -> Tensor | int:
@@ -102,9 +102,9 @@ class Episodes:
         """Return k at each sample of a block, shape (samples, n), or (samples, 1)."""
         return self._rows[:samples] + self.age(clock)
 
-    def any_changes(self, clock: int) -> bool:
+    def any_due(self, clock: int) -> bool:
         """Whether the age of any plant is a multiple of `DRIFT_INTERVAL`."""
-        return clock % DRIFT_INTERVAL in self._phases
+        return clock % DRIFT_INTERVAL in self._due
 
     def draw_within_one(self, rows: int) -> Tensor:
         """Draw numbers from -1 to 1, 1 excluded, shape (rows, n)."""
@@ -126,14 +126,14 @@ class Noise:
         self._order = len(self._c) - 1
         self._episodes = episodes
 
-    def reset(self, which: Tensor | None, left: int) -> Tensor:
+    def reset(self, mask: Tensor | None, unused: int) -> Tensor:
         """Begin an episode of some plants."""
         zeros = self._episodes.zeros
         self._deviation = self._episodes.numbers[self._variance] ** 0.5
-        if which is None:
+        if mask is None:
             self._xi = zeros.expand(self._order, -1)  # those of the latest block last
         else:
-            self._xi = self._xi[: len(self._xi) - left].masked_fill(which, 0.0)
+            self._xi = self._xi[: len(self._xi) - unused].masked_fill(mask, 0.0)
         return zeros
 
     def next(self, clock: int, samples: int) -> Tensor:
@@ -156,7 +156,7 @@ class RandomSetPoint:
     """A set point of random levels, each held for a random number of samples."""
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
-        self._law, self._episodes = levels, episodes
+        self._distribution, self._episodes = levels, episodes
         zeros = episodes.zeros
         self._rows = torch.arange(LONGEST, dtype=zeros.dtype).to(zeros.device)
         # The current level and those to come, each with the sample where it ends: whole numbers
@@ -165,20 +165,20 @@ class RandomSetPoint:
         # Number of known samples, and of those that were returned, from the same origin.
         self._known = self._returned = 0
 
-    def reset(self, which: Tensor | None, left: int) -> Tensor:
+    def reset(self, mask: Tensor | None, unused: int) -> Tensor:
         """Begin an episode of some plants."""
-        self._returned -= left
+        self._returned -= unused
         self._move_origin()
         (end, level), (hold, first) = self._levels[0], self._draw_level()
-        self._levels = [(select(which, hold, end), select(which, first, level))]
+        self._levels = [(select(mask, hold, end), select(mask, first, level))]
         return self._levels[0][1]
 
     def next(self, clock: int, samples: int) -> Tensor:
         """Return the next samples, drawn if they are not yet known."""
         if self._returned + samples > self._known:
             self._move_origin()
-            self._known = max(samples, self._law.shortest)
-            for _ in range(1 + (self._known - 1) // self._law.shortest):
+            self._known = max(samples, self._distribution.shortest)
+            for _ in range(1 + (self._known - 1) // self._distribution.shortest):
                 hold, level = self._draw_level()
                 self._levels.append((self._levels[-1][0] + hold, level))
         rows = (self._rows[:samples] + (self._returned + 1))[:, None]
@@ -190,8 +190,8 @@ class RandomSetPoint:
 
     def _draw_level(self) -> tuple[Tensor, Tensor]:
         """Draw the lengths of levels, in samples, and the levels, each of shape (n,)."""
-        level = self._episodes.draw_within_one(1)[0] * self._law.amplitude
-        hold = self._episodes.draw(self._law.shortest, self._law.longest, whole=True)
+        level = self._episodes.draw_within_one(1)[0] * self._distribution.amplitude
+        hold = self._episodes.draw(self._distribution.shortest, self._distribution.longest, whole=True)
         return hold, level
 
     def _move_origin(self) -> None:
@@ -214,7 +214,7 @@ class RepeatedSetPoint:
         self._ends = torch.tensor(levels.lengths, device=self._values.device).cumsum(0)
         self._period = sum(levels.lengths)
 
-    def reset(self, which: Tensor | None, left: int) -> Tensor:
+    def reset(self, mask: Tensor | None, unused: int) -> Tensor:
         """Begin an episode of some plants."""
         return self._values[0].expand(len(self._episodes.zeros))
 
@@ -234,15 +234,15 @@ class Disturbance:
     def __init__(self, episodes: Episodes) -> None:
         self._episodes = episodes
 
-    def reset(self, which: Tensor | None, left: int) -> Tensor:
+    def reset(self, mask: Tensor | None, unused: int) -> Tensor:
         """Begin an episode of some plants."""
         zeros = self._episodes.zeros
         # Steps and walk at the sample before the latest block, and at those of the block.
-        if which is None:
+        if mask is None:
             self._parts = [(zeros, zeros)]
         else:
-            step, walk = self._parts[-1 - left]
-            self._parts = [(step.masked_fill(which, 0.0), walk.masked_fill(which, 0.0))]
+            step, walk = self._parts[-1 - unused]
+            self._parts = [(step.masked_fill(mask, 0.0), walk.masked_fill(mask, 0.0))]
         return zeros
 
     def next(self, clock: int, samples: int) -> Tensor:
@@ -250,7 +250,7 @@ class Disturbance:
         parts = self._parts[-1]
         self._parts, total, rows = [parts], torch.add(*parts), []
         for now in range(clock, clock + samples):
-            if self._episodes.any_changes(now):
+            if self._episodes.any_due(now):
                 parts = self._change(*parts, now)
                 total = torch.add(*parts)
             self._parts.append(parts)
@@ -296,9 +296,9 @@ class Given:
         self._values, self._episodes = values, episodes
         self._episode = torch.full_like(episodes.zeros, -1, dtype=torch.int64)  # of each plant
 
-    def reset(self, which: Tensor | None, left: int = 0) -> Tensor:
+    def reset(self, mask: Tensor | None, unused: int = 0) -> Tensor:
         """Begin the next episode of some plants."""
-        self._episode = self._episode + (1 if which is None else which)
+        self._episode = self._episode + (1 if mask is None else mask)
         return self._at(torch.zeros_like(self._episode)[None])[0]
 
     def next(self, clock: int, samples: int) -> Tensor:
