@@ -12,6 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -123,6 +124,12 @@ def _chain(model: Any) -> tuple[VecEnv, list[VecEnvWrapper]]:
             f"policy was trained in {type(plants).__name__}, and what that does is not known "
             "here: put it into a gymnasium.Wrapper, or vouch for it by a function of the "
             "observations"
+        )
+    # Off-policy algorithms keep the original observation in any case: nothing tells.
+    normalised = isinstance(model, OnPolicyAlgorithm) and model._last_original_obs is not None
+    if normalised and not any(isinstance(each, VecNormalize) for each in wrappers):
+        raise ValueError(
+            f"policy was trained in VecNormalize, and its environments now lack it: {WAYS_OUT}"
         )
     for each in wrappers:
         sees = isinstance(each, VecFrameStack) or cast("VecNormalize", each).norm_obs

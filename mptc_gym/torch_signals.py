@@ -191,7 +191,9 @@ class RandomSetPoint:
     def _draw_level(self) -> tuple[Tensor, Tensor]:
         """Draw the lengths of levels, in samples, and the levels, each of shape (n,)."""
         level = self._episodes.draw_within_one(1)[0] * self._distribution.amplitude
-        hold = self._episodes.draw(self._distribution.shortest, self._distribution.longest, whole=True)
+        hold = self._episodes.draw(
+            self._distribution.shortest, self._distribution.longest, whole=True
+        )
         return hold, level
 
     def _move_origin(self) -> None:

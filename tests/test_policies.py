@@ -354,7 +354,8 @@ class TestModels:
         if kind in ("stack", "both"):
             envs = VecFrameStack(envs, 3)
         if kind != "stack":
-            envs = VecNormalize(envs, norm_obs=kind != "rewards alone", clip_obs=1.5)
+            seen = kind != "rewards alone"
+            envs = VecNormalize(envs, norm_obs=seen, clip_obs=1.5, epsilon=0.1)
         model = trained(PPO, envs, 256)
         normalise = envs.normalize_obs if kind != "stack" else (lambda seen: seen)
 
@@ -534,6 +535,13 @@ class TestModels:
         for attempt in (evaluate, partial(save, path=tmp_path / "fresh.zip")):
             with pytest.raises(ValueError, match=r"learnt from 256 samples.* has seen 0, so"):
                 attempt(fresh)
+        without = PPO.load(tmp_path / "plain.zip", env=plants(), device="cpu")
+        fresh.set_env(plants())
+        for each in (without, fresh):
+            with pytest.raises(
+                ValueError, match=r"trained in VecNormalize, and its env.* lack"
+            ):
+                evaluate(each, NOISY, **SHORT)
         kept = VecNormalize.load(str(tmp_path / "statistics.pkl"), plants())
         loaded = PPO.load(tmp_path / "plain.zip", env=kept, device="cpu")
         found = evaluate(loaded, NOISY, episodes=3, **SHORT)
