@@ -43,6 +43,7 @@ def make_vec_env(
     n_envs: int = 1,
     *,
     seed: int | None = None,
+    group: int = 1,
     wrapper: Mapping[str, Any] | Callable[..., Any] | None = None,
     **arguments: Any,
 ) -> GymnasiumVecEnv:
@@ -58,8 +59,11 @@ def make_vec_env(
     n_envs
         Number of plants.
     seed
-        Seed of the first plant at the first reset; plant i has `seed + i`. The seed of a model,
-        if it has one, replaces it.
+        Seed of the first plant at the first reset; plant i has `seed + i // group`. The seed of
+        a model, if it has one, replaces it.
+    group
+        Number of neighbouring plants that share a seed: they draw the same noise, load and
+        set points, and differ only in what a policy explores.
     wrapper
         Adds `IncrementalAction`: its arguments, or the class itself for its defaults.
     **arguments
@@ -72,6 +76,7 @@ def make_vec_env(
         for those, use `stable_baselines3.common.env_util.make_vec_env`.
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
+    group = count("group", group, 1, n_envs)
     arguments = {name: plain(value) for name, value in arguments.items()}
     render_mode = arguments.pop("render_mode", None)  # not part of a policy's training
     single = make_one(env, arguments)
@@ -83,7 +88,7 @@ def make_vec_env(
         single = wrapper(single)
     elif wrapper is not None:
         reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
-    plants = _step_together(single, n_envs, render_mode)
+    plants = _step_together(single, n_envs, render_mode, group)
     if plants is None:
         raise ValueError(f"wrapper must be IncrementalAction, got {single}")
     plants.seed(seed)
@@ -91,7 +96,7 @@ def make_vec_env(
 
 
 def _step_together(
-    single: gymnasium.Env[Any, Any], n: int, render_mode: str | None = None
+    single: gymnasium.Env[Any, Any], n: int, render_mode: str | None = None, group: int = 1
 ) -> GymnasiumVecEnv | None:
     """Close an environment and return n like it, or None where a batch cannot be."""
     batch = native_batch(single)
@@ -99,7 +104,7 @@ def _step_together(
     if batch is None:
         return None
     many = batch(n, autoreset_mode=AutoresetMode.SAME_STEP, render_mode=render_mode)
-    return GymnasiumVecEnv(many, spec=single.spec)
+    return GymnasiumVecEnv(many, spec=single.spec, group=group)
 
 
 def save(model: BaseAlgorithm, path: str | Path) -> None:
@@ -155,7 +160,7 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
     -------
     model
         The model, which `evaluate` can score and `learn` trains further. Its plants all have
-        the arguments of the first one in training.
+        the arguments of the first one in training, and seeds of their own.
 
     Raises
     ------

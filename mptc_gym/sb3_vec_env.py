@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -27,6 +28,8 @@ class GymnasiumVecEnv(VecEnv):
     spec
         Spec of one environment with its wrappers, if all are alike: a model trained on them
         records it.
+    group
+        Number of neighbouring environments that share a seed, and thus what is drawn.
 
     Attributes
     ----------
@@ -41,7 +44,9 @@ class GymnasiumVecEnv(VecEnv):
         If a batch has another autoreset mode, or spaces differ.
     """
 
-    def __init__(self, *batches: VectorEnv, spec: EnvSpec | None = None) -> None:
+    def __init__(
+        self, *batches: VectorEnv, spec: EnvSpec | None = None, group: int = 1
+    ) -> None:
         spaces = batches[0].single_observation_space, batches[0].single_action_space
         for batch in batches:
             mode = batch.metadata.get("autoreset_mode")
@@ -49,7 +54,7 @@ class GymnasiumVecEnv(VecEnv):
                 raise ValueError(f"batches must have autoreset_mode 'SameStep', got {mode}")
             if (batch.single_observation_space, batch.single_action_space) != spaces:
                 raise ValueError(f"batches must have the same spaces, got {batches}")
-        self.batches, self.spec = batches, spec
+        self.batches, self.spec, self.group = batches, spec, group
         self.infos: dict[str, Any] = {}
         starts = np.cumsum([0, *(batch.num_envs for batch in batches)]).tolist()
         self._parts = list(zip(batches, map(slice, starts, starts[1:]), strict=True))
@@ -57,6 +62,12 @@ class GymnasiumVecEnv(VecEnv):
         self._began = time.time()
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, np.int64)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seeds of the next reset: environment i has `seed + i // group`."""
+        first, *_ = super().seed(seed)
+        self._seeds = [cast("int", first) + i // self.group for i in range(self.num_envs)]
+        return self._seeds
 
     def reset(self) -> NDArray[Any]:
         """Reset all environments, with the seeds set by `seed`."""

@@ -14,6 +14,7 @@ from agents.networks import PRETRAINED
 from benchmarks.controllers import pretrained
 from benchmarks.controllers.records import Cost
 from benchmarks.controllers.roster import ROSTER
+from benchmarks.examples import sb3
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.train import ppo
 from mptc_gym import Parameters
@@ -58,7 +59,7 @@ class TestTraining:
         recipe = replace(SMALL, steps=24 * 32 * 4, log_std=(-1.0, -3.0))
         model, spreads = ppo.begin(recipe, 0), []
         monkeypatch.setattr(model, "train", lambda: spreads.append(model.policy.log_std.item()))
-        model.learn(recipe.steps, callback=ppo.Exploration(recipe))
+        model.learn(recipe.steps, callback=ppo.Exploration(*recipe.log_std))
         assert spreads == pytest.approx([-1.0, -1.5, -2.0, -2.5])
 
     def test_a_group_meets_the_same_and_no_other_group_does(self):
@@ -108,9 +109,9 @@ class TestTraining:
 
 class TestPolicy:
     def test_changes_by_hand(self):
-        window = np.array([[8.0, 6.0, 5.0, 1.0, 4.0, 4.0, 0.0]]).T  # newest first
+        window = torch.tensor([[8.0, 6.0, 5.0, 1.0, 4.0, 4.0, 0.0]])  # newest first
         # Means of 8, of 6, of 5 and 1, and of the rest.
-        assert ppo.changes(window, 2).ravel() == pytest.approx([2.0, 3.0, 3.0 - 8.0 / 3.0])
+        assert sb3.changes(window, 2)[0].tolist() == pytest.approx([2.0, 3.0, 3.0 - 8.0 / 3.0])
 
     def test_what_the_networks_see(self):
         recipe = replace(SMALL, levels=True, memory=32)

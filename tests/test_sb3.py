@@ -58,6 +58,17 @@ def make_both(kind):
     return ours, theirs
 
 
+def test_a_group_draws_the_same_and_no_other_does(rng):
+    plants = make_vec_env(HARD, 6, seed=3, group=3)
+    apart = make_vec_env(HARD, 2, seed=3)
+    for _ in range(2):  # of the seed, and of what follows it
+        seen = plants.reset()
+        np.testing.assert_array_equal(seen, np.repeat(apart.reset(), 3, axis=0))
+        assert not np.array_equal(seen[0], seen[3])
+        seen = plants.step(rng.normal(0, 1, (6, 1)))[0]
+        assert len(np.unique(plants.infos["noise"])) == 2
+
+
 @pytest.mark.parametrize("kind", ["wrapped", "two", "terminate"])
 def test_trajectories_equal_those_of_dummy_vec_env(kind, rng):
     ours, theirs = make_both(kind)

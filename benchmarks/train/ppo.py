@@ -1,22 +1,15 @@
 """Train PPO of Stable-Baselines3 on many plants at once, and export its policy to NumPy.
 
 `RECIPES` holds the settings of `ppo`, for the paper's plant, and of `ppo-hard`, for plants that
-vary. What makes them work:
-
-- **Groups.** Eight plants meet the same noise, load and set points, so that they differ only in
-  what they explore. Subtracting the mean of the group takes most of the variance out of the
-  advantages.
-- **Changes.** The policy sees changes between means over longer and longer stretches of the
-  past. One that sees no levels is at rest only where the error is 0, so it has no offset.
-- **Symmetry.** A policy without biases is odd: what it learns at +5 degC holds at -5 degC.
-- **Exploration that falls.** If it is learnt, it stays high, and a policy that is right with
-  exploration is wrong without it.
+vary. What makes them work stands in `benchmarks/examples/sb3.py`, from which they take it:
+groups of plants that meet the same, changes in place of levels, policies without biases, and
+exploration that falls. Here are plants of several kinds, longer memories and the validation.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, cast
 
@@ -26,12 +19,11 @@ import torch
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
-from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import nn
 
 from agents import Increments, PolicyNetwork
+from benchmarks.examples.sb3 import GROUP, Exploration, GroupBuffer, inputs, without_biases
 from benchmarks.lib.storage import versions
 from mptc_gym import PRESETS, evaluate
 from mptc_gym.sb3 import GymnasiumVecEnv
@@ -39,10 +31,8 @@ from mptc_gym.wrappers.vector import IncrementalAction
 
 Array = NDArray[np.float64]
 
-GROUP = 8  # plants that meet the same noise, load and set points
 TRAINING_SEEDS = 1 << 32  # seeds from here on are those of the training plants alone
 VALIDATION_SEED = 9_000_000  # no published result uses the seeds from here on
-SINGLE = 8, 30  # newest temperatures and flows whose changes are seen one by one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +119,7 @@ def train(recipe: Recipe, seed: int) -> PolicyNetwork:
     """
     began = time.process_time()
     model = begin(recipe, seed)
-    model.learn(recipe.steps, callback=Exploration(recipe))
+    model.learn(recipe.steps, callback=Exploration(*recipe.log_std))
     seconds = time.process_time() - began
     policy = export(model, recipe)
     validation = {
@@ -168,10 +158,7 @@ def begin(recipe: Recipe, seed: int) -> PPO:
         seed=seed,
         device="cpu",
     )
-    for layer in _layers(model):
-        nn.init.zeros_(layer.bias)
-        layer.bias.requires_grad_(False)
-    return model
+    return without_biases(model)
 
 
 class Plants(GymnasiumVecEnv):
@@ -189,16 +176,16 @@ class Plants(GymnasiumVecEnv):
                     gymnasium.make_vec("MiddlePoint-v0", number, **given, **arguments), **moves
                 )
                 for number, arguments in recipe.plants
-            )
+            ),
+            group=GROUP,
         )
         self._features = features(recipe).T.astype(np.float32)
         self.observation_space = Box(-np.inf, np.inf, self._features.shape[1:])
 
-    def seed(self, seed: int | None = None) -> list[int | None]:
-        """Set the seeds of the next reset."""
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seeds of the next reset, to numbers that no comparison uses."""
         (first,) = np.random.SeedSequence(seed).generate_state(1).tolist()
-        self._seeds = [TRAINING_SEEDS + first + i // GROUP for i in range(self.num_envs)]
-        return self._seeds
+        return super().seed(TRAINING_SEEDS + first)
 
     def reset(self) -> NDArray[Any]:
         """Reset all plants."""
@@ -212,62 +199,26 @@ class Plants(GymnasiumVecEnv):
         return cast("Array", observations) @ self._features, rewards, ended, infos
 
 
-class GroupBuffer(RolloutBuffer):
-    """Rollouts whose advantages are relative to the mean of a plant's group."""
-
-    def compute_returns_and_advantage(
-        self, last_values: torch.Tensor, dones: NDArray[Any]
-    ) -> None:
-        """Compute returns as usual, and advantages relative to those of the group."""
-        super().compute_returns_and_advantage(last_values, dones)
-        groups = self.advantages.reshape(self.buffer_size, -1, GROUP)
-        groups -= groups.mean(axis=2, keepdims=True)
-
-
 def features(recipe: Recipe) -> Array:
     """Return the matrix that turns an observation into the inputs of the networks.
 
-    The inputs are the error, the changes of set point, temperature and flow and, if the recipe
-    has them, the levels of set point and flow. Factors bring each to about 1. The matrix has
-    the shape (inputs, observation size).
+    With levels, the inputs end with the set point and the flow. The matrix has the shape
+    (inputs, observation size).
     """
-    sizes = np.cumsum([*recipe.windows.values()])
-    setpoints, errors, outputs, actions = np.split(np.eye(sizes[-1]), sizes[:-1])
-    levels = [0.2 * setpoints[:1], actions[:1]] if recipe.levels else []
-    return np.vstack(
-        [
-            errors,
-            0.2 * changes(setpoints, len(setpoints)),
-            0.5 * changes(outputs, SINGLE[0]),
-            1.0 * changes(actions, SINGLE[1]),
-            *levels,
-        ]
-    )
-
-
-def changes(window: Array, single: int) -> Array:
-    """Return the differences between means over stretches of a window, newest first.
-
-    The first stretches have a single sample; those that follow have 2, 4, 8 and so on.
-    """
-    ends = [*range(1, single + 1)]
-    while ends[-1] < len(window):
-        ends.append(min(2 * ends[-1] - single + 2, len(window)))
-    means = [each.mean(axis=0) for each in np.split(window, ends[:-1])]
-    return -np.diff(means, axis=0)
-
-
-def _layers(model: PPO) -> list[nn.Linear]:
-    """Return the layers of the policy, but not of the value function."""
-    layers = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
-    return [layer for layer in layers if isinstance(layer, nn.Linear)]
+    one = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
+    seen = inputs(one, recipe.windows)
+    if recipe.levels:
+        flow = -recipe.memory  # of the newest sample
+        seen = torch.hstack([seen, 0.2 * one[:, :1], one[:, flow, None]])
+    return cast("Array", seen.numpy().T)
 
 
 def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
     """Return the mean of a model's policy as a network in NumPy."""
     layers = [
         (layer.weight.detach().double().numpy(), layer.bias.double().numpy())
-        for layer in _layers(model)
+        for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net)
+        if isinstance(layer, nn.Linear)
     ]
     (weights, bias), *others = layers
     return PolicyNetwork(
@@ -277,20 +228,3 @@ def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
         activation="tanh",
         increments=Increments(recipe.max_move, recipe.dead_zone),
     )
-
-
-class Exploration(BaseCallback):
-    """Reduce the exploration over the training."""
-
-    def __init__(self, recipe: Recipe) -> None:
-        super().__init__()
-        self._recipe = recipe
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_start(self) -> None:
-        done = self.num_timesteps / self._recipe.steps
-        with torch.no_grad():
-            log_std = cast("torch.Tensor", self.model.policy.log_std)
-            log_std.fill_(float(np.interp(done, (0.0, 1.0), self._recipe.log_std)))
