@@ -136,7 +136,10 @@ def _sections(
         *([paired] if others else []),
         Section(
             "What each controller costs",
-            ["Training: the median policy. Runs: all scenarios, including measuring."],
+            [
+                "Search: its trials, all their samples, and minutes of one core. Training: the "
+                "median policy. Runs: all scenarios, including measuring."
+            ],
             _costs(comparison),
         ),
         Section("Every run", pictures=["runs.png"]),
@@ -166,6 +169,7 @@ def _costs(comparison: Comparison) -> pd.DataFrame:
                 "agent": label(name),
                 "prior knowledge": cost.prior_knowledge,
                 "parameters": cost.parameters,
+                "search for its settings": cost.search,
                 "samples before": cost.samples,
                 "training (s)": f"{np.median(training):.0f}" if training else "",
                 "runs (s)": f"{sum(runs):.1f}",

@@ -24,7 +24,9 @@ class Cost:
     parameters: str = ""
     """Number of its gains, and of its weights if it has any."""
     samples: str = ""
-    """Samples of the plant, real or simulated, that were used for tuning and training."""
+    """Samples of the plant, real or simulated, that one tuning or training takes."""
+    search: str = ""
+    """Trials by which its settings were found, all their samples, and minutes of one core."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Train PPO of Stable-Baselines3 to control the plant, in half a minute on one core.
+"""Train PPO of Stable-Baselines3 to control the plant, in a quarter of a minute on one core.
 
 `python benchmarks/examples/sb3.py` trains a policy, saves it in `ppo-0.zip`, and prints its
 scores: 0 is a valve left alone, 1 the least possible error.
