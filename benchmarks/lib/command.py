@@ -10,7 +10,6 @@ import importlib
 import inspect
 import math
 import os
-import re
 import signal
 import sys
 import tempfile
@@ -19,7 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
-from benchmarks.lib.storage import ROOT, UnfinishedError
+from benchmarks.lib.storage import UnfinishedError
 
 EXTRAS = {
     "compare": "cyclopts joblib matplotlib pandas rich scipy tabulate tqdm",
@@ -41,25 +40,23 @@ def stop(error: BaseException, program: str = "python -m benchmarks") -> NoRetur
     If a package is missing, the sentence names the extra that installs it. An import that fails
     for another reason is a bug, and is raised.
     """
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, ImportError):
+    cause, said = error, str(error)
+    while cause.__cause__ is not None:
         cause = cause.__cause__
-    said = str(error)
-    if cause is not None:
-        words = set(re.findall(r"\w+", f"{cause.name} {cause}"))
-        found = [(name, extra) for extra in EXTRAS for name in EXTRAS[extra].split()]
-        missing = [each for each in found if each[0] in words]
-        if missing:
-            name, extra = missing[0]
+    name = (cause.name or "").partition(".")[0] if isinstance(cause, ImportError) else ""
+    for extra, packages in EXTRAS.items():
+        if name in packages.split():
             said = f'{name} is not installed: pip install -e ".[{extra}]" ({cause})'
-        elif cause is error:
+            break
+    else:
+        if isinstance(error, ImportError):
             raise error
     print(f"{program}: error: {said}", file=sys.stderr)
     raise SystemExit(2) from error
 
 
 try:
-    from cyclopts import App, CycloptsError, Parameter, Token
+    from cyclopts import App, CycloptsError, MissingArgumentError, Parameter
     from cyclopts.validators import Number
 except ImportError as _missing:
     stop(_missing)
@@ -70,46 +67,21 @@ Group = TypeVar("Group")
 options: Callable[[type[Group]], type[Group]] = Parameter(name="*")
 
 
-def _latest(_type: object, tokens: Sequence[Token]) -> tuple[str, ...]:
-    """Return the names of the last occurrence of an option, which overrides earlier ones."""
-    begins = [i for i, token in enumerate(tokens) if token.keyword and token.index == 0]
-    return tuple(token.value for token in tokens[max(begins, default=0) :] if token.value)
+def _integer(_type: object, tokens: Sequence[Any]) -> int:
+    """Read an integer, and reject 2.5, which cyclopts would round."""
+    return int(tokens[0].value)
 
 
-def _integers(_type: object, tokens: Sequence[Token]) -> Any:
-    """Read integers, and reject 2.5, which cyclopts would round."""
-    try:
-        found = [int(token.value) for token in tokens]
-    except ValueError as error:
-        given = " ".join(token.value for token in tokens)
-        raise ValueError(f"must be an integer, got {given!r}") from error
-    return tuple(found) if len(found) > 1 else found[0]
+def _integers(least: int, most: int) -> Parameter:
+    return Parameter(converter=_integer, n_tokens=1, validator=Number(gte=least, lte=most))
 
 
-def integer(least: int, most: int, *, many: int = 1) -> Parameter:
-    """Return a parameter for an integer within limits, or for `many` of them."""
-    limits = Number(gte=least, lte=most)
-    return Parameter(converter=_integers, validator=limits, n_tokens=many)
-
-
-def choice(names: Collection[str], text: str) -> Parameter:
-    """Return a parameter for one of `names`, which its help text lists."""
-    listed = ", ".join(names)
-
-    def convert(_: object, tokens: Sequence[Token]) -> str:
-        if tokens[0].value not in names:
-            raise ValueError(f"no {tokens[0].value!r}; there are {listed}")
-        return tokens[0].value
-
-    return Parameter(converter=convert, n_tokens=1, help=f"{text}: {listed}.")
-
-
-Count = Annotated[int, integer(1, 1_000_000_000)]
-Runs = Annotated[int, integer(1, 100_000)]
-Seed = Annotated[int, integer(0, 2**63)]
+Count = Annotated[int, _integers(1, 1_000_000_000)]
+Runs = Annotated[int, _integers(1, 100_000)]
+Seed = Annotated[int, _integers(0, 2**63)]
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 Positive = Annotated[float, Parameter(validator=Number(gt=0.0, lt=math.inf))]
-Names = Annotated[tuple[str, ...], Parameter(converter=_latest, consume_multiple=True)]
+Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
 Repeated = tuple[str, ...]
 Folder = Annotated[Path, Parameter(help="Folder to write to.")]
 
@@ -132,30 +104,24 @@ def out_folder(folder: Path, option: str = "--out") -> Path:
         with tempfile.TemporaryFile(dir=folder) as probe:
             probe.write(b"x")
     except OSError as error:
-        why = "it is no folder" if folder.exists() and not folder.is_dir() else error.strerror
+        why = "it is no folder" if folder.is_file() else error.strerror
         raise UsageError(f"{option}: {folder} cannot be written to: {why}") from error
     return folder
 
 
-def known(option: str, given: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the names that an option lists, separated by spaces or commas, each once.
-
-    A name that is not in `names` raises `UsageError`.
-    """
-    chosen = [name for text in given for name in text.split(",") if name]
-    for name in chosen:
+def known(option: str, given: Sequence[str], names: Collection[str]) -> list[str]:
+    """Return the names that an option lists, each once; `UsageError` if one is not known."""
+    for name in given:
         if name not in names:
             raise UsageError(f"{option}: no {name!r}; there are {', '.join(names)}")
-    return list(dict.fromkeys(chosen))
+    return list(dict.fromkeys(given))
 
 
 def _typed(default: object) -> str | None:
     """Return a default as a user would type it; None if it is not worth showing."""
-    if isinstance(default, tuple):
-        default = " ".join(map(str, default))
-    elif isinstance(default, Path) and default.is_relative_to(ROOT):
-        default = default.relative_to(ROOT)
-    return None if default is None or default is False or default == "" else str(default)
+    if default is None or default is False or default == ():
+        return None
+    return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
 
 
 def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | None:
@@ -168,7 +134,7 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
         name=program,
         help=inspect.getdoc(declared),
         version_flags=[],
-        default_parameter=Parameter(negative=(), allow_repeating=True, show_default=_typed),
+        default_parameter=Parameter(negative=(), show_default=_typed),
         result_action="return_value",
     )
     app["--help"].show = False
@@ -176,9 +142,11 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
     try:
         found = app(list(given), exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        name = error.argument.name if error.argument else ""
-        text = " ".join(str(error).split()).removeprefix("Invalid value for ")
-        raise UsageError(text if name in text else f"{name}: {text}") from error
+        text = " ".join(str(error).split())
+        if isinstance(error, MissingArgumentError) and error.argument:
+            choices = error.argument.get_choices()
+            text = f"{text[:-1]}, one of {', '.join(choices)}." if choices else text
+        raise UsageError(text) from error
     return found if isinstance(found, declared) else None
 
 
@@ -214,23 +182,25 @@ def command(
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")  # for "°C" on an ASCII terminal
-        before = None
         with suppress(ValueError):  # not in the main thread
-            before = signal.signal(signal.SIGTERM, _interrupt)
+            signal.signal(signal.SIGTERM, _interrupt)
         try:
             given = sys.argv[1:] if arguments is None else arguments
-            return _run(declared, program, work, given, width)
+            if (chosen := read(declared, program, given)) is not None:
+                from rich.console import Console
+
+                columns = None if sys.stdout.isatty() else width
+                console = Console(width=columns, highlight=False, markup=False)
+                console.print(importlib.import_module(work).execute(chosen, console))
         except KeyboardInterrupt as stopped:
             print(f"\nInterrupted: {interrupted}")
             return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
-        except MemoryError:
-            print("There is not enough memory for so many runs or samples.", file=sys.stderr)
+        except (UnfinishedError, MemoryError) as error:
+            print(str(error) or "There is not enough memory for so many runs or samples.")
             return 1
         except (UsageError, ImportError) as error:
             stop(error, program)
-        finally:
-            if before is not None:
-                signal.signal(signal.SIGTERM, before)
+        return 0
 
     return main
 
@@ -238,25 +208,3 @@ def command(
 def _interrupt(number: int, _frame: object) -> NoReturn:
     """End as after Ctrl-C, so that what has finished is reported."""
     raise KeyboardInterrupt(number)
-
-
-def _run(
-    declared: type[Group], program: str, work: str, given: Sequence[str], width: int
-) -> int:
-    chosen = read(declared, program, given)
-    if chosen is None:
-        return 0
-    execute = importlib.import_module(work).execute
-    from rich.console import Console
-
-    console = Console(
-        width=None if sys.stdout.isatty() else width, highlight=False, markup=False
-    )
-    try:
-        console.print(execute(chosen, console))
-    except UnfinishedError as error:
-        console.print(str(error))
-        return 1
-    except SystemExit as left:
-        raise UsageError(f"a controller called sys.exit({left.code!r})") from left
-    return 0

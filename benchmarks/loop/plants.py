@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from benchmarks.lib.command import Repeated, UsageError, blame, choice, options
+from cyclopts import Parameter
+
+from benchmarks.lib.command import Repeated, UsageError, blame, options
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.parameters import slowest_pole
 
@@ -30,9 +32,8 @@ class PlantOptions:
     plant: Path | None = None
     """JSON file with arguments of the environment, such as the plant.json that
     benchmarks.identify writes."""
-    preset: Annotated[
-        str | None, choice(PRESETS, "A plant that comes with the environment")
-    ] = None
+    preset: Annotated[str | None, Parameter(choices=PRESETS)] = None
+    """A plant that comes with the environment."""
     set: Repeated = ()
     """An argument of the environment, such as delay=30 or delay=[12,24] (repeatable;
     overrides --plant, which overrides --preset)."""

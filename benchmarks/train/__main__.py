@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from benchmarks.lib.command import Count, Folder, choice, command, options
+from cyclopts import Parameter
+
+from benchmarks.lib.command import Count, Folder, command, options
 from benchmarks.lib.fan_out import FanOut
 
 NETWORKS = "nn-smith", "ppo", "ppo-hard"
@@ -21,7 +23,8 @@ class Options:
     Finished networks are kept: the same command, run again, trains only the missing ones.
     """
 
-    network: Annotated[str, choice(NETWORKS, "What to train")] = field(kw_only=False)
+    network: Annotated[str, Parameter(choices=NETWORKS)] = field(kw_only=False)
+    """What to train."""
     networks: Count | None = None
     """Number of networks to train, each from its own seed (default: 1 for nn-smith, where
     validation chooses the best of several; 5 for PPO, which are all compared)."""

@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Count, Folder, Runs, choice, command, options
+from benchmarks.lib.command import Count, Folder, Runs, command, options
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.loop.plants import PlantOptions
 
@@ -26,7 +26,8 @@ class Options:
     after every trial; the same command resumes it and gives the same result.
     """
 
-    controller: Annotated[str, choice(TUNED, "Whose gains to search")] = field(kw_only=False)
+    controller: Annotated[str, Parameter(choices=TUNED)] = field(kw_only=False)
+    """Whose gains to search."""
     trials: Annotated[
         Count | None, Parameter(help=f"How many sets of gains to try (default: {_TRIALS}).")
     ] = None
