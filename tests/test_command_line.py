@@ -82,7 +82,6 @@ REFUSED = {
         (["--preset", "harder"], '"harder" for --preset. Choose from: "paper", "dead-z'),
         (["--out"], "--out requires an argument"),
         (["--rusn", "3"], "Unknown option: --rusn. Did you mean --runs?"),
-        (["--runs", "3", "--runs", "4"], "--runs specified multiple times"),
         (["stray"], "stray"),
         (["--plant", "nowhere.json"], "nowhere.json"),
         (["--set", "delay"], "ARGUMENT=VALUE"),
@@ -214,8 +213,11 @@ def test_an_interruption_while_it_imports_shows_no_traceback():
     assert "Traceback" not in err
 
 
-def test_lists_are_of_words_and_repeated_options_add_up():
-    given = ["--agents", "nn", "pi", "--set", "delay=3", "--set", "a=[1,-0.5]"]
+def test_of_a_repeated_option_the_last_counts_and_lists_add_up():
+    given = [
+        "--agents", "nn", "pi", "--agents", "mpc", "--runs", "3", "--runs", "4",
+        "--set", "delay=3", "--set", "a=[1,-0.5]",
+    ]  # fmt: skip
     options = read(Options, "program", given)
-    assert options.agents == ("nn", "pi")
+    assert (options.agents, options.runs) == (("nn", "pi", "mpc"), 4)
     assert options.plant.set == ("delay=3", "a=[1,-0.5]")

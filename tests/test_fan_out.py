@@ -1,14 +1,16 @@
 """Fan-out: nothing depends on where and when tasks run, and nothing that is done is lost."""
 
-import importlib
 import os
+import socket
 import sys
 from collections import Counter
 from functools import partial
 
 import pytest
 
+from benchmarks.controllers.options import own_factory
 from benchmarks.lib import fan_out, storage
+from benchmarks.lib.command import UsageError
 from benchmarks.lib.fan_out import FanOut, TasksFailedError
 from benchmarks.lib.storage import Kept
 from tests import tasks
@@ -39,7 +41,7 @@ class TestNumbers:
         there = work(7)
         there["plant 0"] = partial(tasks.draw, 0, None, 0.3)  # the first is not ready first
         back = dict(reversed(there.items()))
-        for given, jobs in ((there, 1), (there, 2), (back, 2), (back, 1)):
+        for given, jobs in ((there, 1), (there, 2), (back, 2)):
             results = run(given, jobs=jobs)
             assert results == {f"plant {seed}": tasks.draw(seed) for seed in range(7)}
             assert list(results) == list(given)
@@ -100,22 +102,24 @@ class TestResume:
         assert not list(tmp_path.iterdir())
 
     def test_edited_code_is_other_code(self, tmp_path, monkeypatch):
-        own = tmp_path / "own_controllers.py"
-        own.write_text("def made():\n    return 1\n")
-        monkeypatch.syspath_prepend(tmp_path)
-        of_own = partial(tasks.until, importlib.import_module("own_controllers").made)
-        keys = [storage.key(of_own)]
         (tmp_path / "agents").mkdir()
-        with monkeypatch.context() as patch:
-            patch.setattr(storage, "ROOT", tmp_path)
-            patch.setattr(storage, "code", storage.code.__wrapped__)
-            for text in ("1", "2"):
-                (tmp_path / "agents/pi.py").write_text(text)
-                keys.append(storage.key(of_own))
-        own.write_text("def made():\n    return 2\n")
-        storage._digest.cache_clear()
-        keys.append(storage.key(of_own))
-        assert len(set(keys)) == 4
+        monkeypatch.setattr(storage, "ROOT", tmp_path)
+        monkeypatch.setattr(storage, "code", storage.code.__wrapped__)
+        keys = []
+        for text in ("1", "2", "2"):
+            (tmp_path / "agents/pi.py").write_text(text)
+            keys.append(storage.key(partial(tasks.draw, 1)))
+        assert keys[0] != keys[1] == keys[2]
+
+    def test_a_user_s_edited_controller_is_another_one(self, tmp_path, monkeypatch):
+        monkeypatch.syspath_prepend(tmp_path)
+        keys = []
+        for text in ("PIController", "PIController  # tuned"):
+            (tmp_path / "own_pi.py").write_text(
+                f"from agents import {text}\n\n\nclass Own(PIController): ...\n"
+            )
+            keys.append(storage.key(partial(tasks.until, own_factory("own_pi:Own"))))
+        assert keys[0] != keys[1]
 
 
 class TestFailures:
@@ -147,9 +151,16 @@ class TestFailures:
 
 def test_a_node_with_other_versions_computes_nothing():
     here = storage.versions()
-    answer = fan_out._attempt_there("one", partial(tasks.draw, 1), here)
-    assert answer == ("one", tasks.draw(1), "")
-    other = {**here, "numpy": "0.1", "more": "1.0"}
-    _, _, error = fan_out._attempt_there("one", partial(tasks.draw, 1), other)
+    one = "one", partial(tasks.draw, 1)
+    assert fan_out._attempt(*one, here) == ("one", tasks.draw(1), "")
+    _, _, error = fan_out._attempt(*one, {**here, "numpy": "0.1", "more": "1.0"})
     assert f"it has {{'numpy': '{here['numpy']}'}}, and not" in error
     assert "'more': '1.0'" in error
+
+
+def test_a_cluster_that_is_gone_is_not_waited_for(monkeypatch):
+    pytest.importorskip("ray", reason="Ray is not installed")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{server.getsockname()[1]}")
+    with pytest.raises(UsageError, match="--backend: no Ray cluster can be reached: start one"):
+        FanOut(backend="ray").run(work(1))

@@ -121,13 +121,14 @@ class TestCells:
 
 
 def run_sweep(out, options):
-    given = f"--agents nn nn-frozen pi-simc --runs 2 --samples 700 --jobs 1 {options}"
+    given = f"--runs 2 --samples 700 --jobs 1 {options}"
     return main([*given.split(), "--out", str(out)])
 
 
 class TestSweep:
     def test_random_design(self, tmp_path, capsys):
-        assert run_sweep(tmp_path, "--design random --plants 6") == 0
+        given = "--design random --plants 6 --agents nn nn-frozen pi-simc"
+        assert run_sweep(tmp_path, given) == 0
         runs = pd.read_csv(tmp_path / "runs.csv")
         assert len(runs) == 3 * 6 * 2
         np.testing.assert_allclose(runs["ratio"], runs["mae"] / runs["limit"])
@@ -142,27 +143,27 @@ class TestSweep:
         # Again: nothing is run, and nothing changes.
         saved = {file: file.stat().st_mtime_ns for file in (tmp_path / "tasks").rglob("*.json")}
         assert len(saved) == 6 * (3 + 2)
-        assert run_sweep(tmp_path, "--design random --plants 6") == 0
+        assert run_sweep(tmp_path, given) == 0
         assert {file: file.stat().st_mtime_ns for file in saved} == saved
         pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "runs.csv"), runs)
 
     def test_tasks_of_other_options_are_not_taken(self, tmp_path, monkeypatch):
         monkeypatch.setattr(command, "report", lambda *_: [])  # which takes its time to draw
-        given = "--design random --plants 2 --agents pi-simc --samples 60"
+        given = "--design random --plants 2 --samples 60"
         changes = [  # and how many tasks are new, for each of two plants: of the limit, of
             # nothing, of the controller
             ("", 3), ("--runs 3", 2), ("--samples 50", 3), ("--design-seed 1", 3),
-            ("--design wide", 3), ("--told each", 2), ("--agents pi", 1),
-            ("--set dead_zone=7", 3), ("", 0),
+            ("--design wide", 3), ("--told each", 2), ("--set dead_zone=7", 3),
+            ("--agents pi", 1), ("", 0),
         ]  # fmt: skip
         for options, anew in changes:
             kept = len(list(tmp_path.glob("tasks/*")))
-            run_sweep(tmp_path, f"{given} {options}")
+            run_sweep(tmp_path, f"{given} --agents pi-simc {options}")
             assert len(list(tmp_path.glob("tasks/*"))) == kept + 2 * anew
         # Neither are those of another training.
         trained = Factory(simc_pi, provenance={"file": "b"})
         monkeypatch.setitem(ROSTER, "pi-simc", replace(ROSTER["pi-simc"], made_by=trained))
-        run_sweep(tmp_path, given)
+        run_sweep(tmp_path, f"{given} --agents pi-simc")
         assert len(list(tmp_path.glob("tasks/*"))) == kept + 2
 
     def test_told_each_plant_a_controller_does_better(self, tmp_path, monkeypatch):
@@ -177,7 +178,7 @@ class TestSweep:
     def test_grid(self, tmp_path, monkeypatch):
         monkeypatch.setitem(designs.GRID, "delay", range(10, 22, 10))
         monkeypatch.setitem(designs.GRID, "gain_factor", np.array([1.0, 1.2]))
-        assert run_sweep(tmp_path, "--design grid") == 0
+        assert run_sweep(tmp_path, "--design grid --agents pi-simc") == 0
         runs = pd.read_csv(tmp_path / "runs.csv")
         assert set(zip(runs["delay"], runs["gain_factor"], strict=True)) == {
             (10, 1.0), (20, 1.0), (10, 1.2), (20, 1.2),
@@ -201,10 +202,10 @@ class TestSweep:
         fails = Factory(Mock(side_effect=RuntimeError("no luck")))
         failing = replace(ROSTER["pi-simc"], made_by=fails)
         monkeypatch.setitem(ROSTER, "pi-simc", failing)
-        assert run_sweep(tmp_path, "--design random --plants 2") == 1
+        assert run_sweep(tmp_path, "--design random --plants 2 --agents nn pi-simc") == 1
         assert "plant 0, pi-simc: RuntimeError: no luck" in capsys.readouterr().out
-        # Of two plants each: the limit, nothing, nn and nn-frozen.
-        assert len(list((tmp_path / "tasks").iterdir())) == 8
+        # Of two plants each: the limit, nothing and nn.
+        assert len(list((tmp_path / "tasks").iterdir())) == 6
 
 
 class TestFindings:

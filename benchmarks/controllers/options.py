@@ -5,11 +5,14 @@ A user's own is MODULE:FACTORY, or PPO:FILE.zip.
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import pkgutil
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter
@@ -100,7 +103,9 @@ def own_factory(location: str) -> Factory:
             f"got {observation!r}"
         )
     cost = Cost(*(str(getattr(found, each.name, "")) for each in fields(Cost)))
-    return Factory(partial(_made, found), cost, dict(observation), code=found.__module__)
+    source = getattr(sys.modules[found.__module__], "__file__", None)
+    code = hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
+    return Factory(partial(_made, found), cost, dict(observation), code=code)
 
 
 def _try_out(factory: Factory, location: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 from agents.controller import PAPER_WINDOWS
@@ -42,15 +41,9 @@ class Factory:
     learns: bool = False
     """Whether the controllers keep learning from run to run."""
     code: str = ""
-    """The module whose code shapes the controllers, if it is not that of `make`."""
+    """Hash of the code of a user's own controller, which is not part of the checkout's."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """Origin of a trained policy, JSON-serialisable; empty if nothing was trained."""
-
-    @property
-    def module(self) -> str:
-        """The module whose code shapes the controllers."""
-        make = self.make.func if isinstance(self.make, partial) else self.make
-        return self.code or make.__module__
 
     def arguments(self, plant: Mapping[str, Any]) -> dict[str, Any]:
         """Return a plant's arguments of the environment, with the observation windows."""

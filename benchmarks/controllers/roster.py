@@ -61,11 +61,7 @@ _ENTRIES = (
     RosterEntry(
         "pi",
         "PI (1992)",
-        Factory(
-            engineered.paper_pi,
-            Cost("gains of the paper", "2", search="not stated"),
-            code="agents.pi",
-        ),
+        Factory(engineered.paper_pi, Cost("gains of the paper", "2", search="not stated")),
         tuning=Tuning({"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}),
         drawn=True,
     ),

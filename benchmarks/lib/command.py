@@ -134,7 +134,7 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
         name=program,
         help=inspect.getdoc(declared),
         version_flags=[],
-        default_parameter=Parameter(negative=(), show_default=_typed),
+        default_parameter=Parameter(negative=(), allow_repeating=True, show_default=_typed),
         result_action="return_value",
     )
     app["--help"].show = False

@@ -13,7 +13,6 @@ from __future__ import annotations
 import logging
 import os
 import socket
-import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -21,16 +20,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from pathlib import Path
 from pickle import PicklingError
 from typing import Any, Literal
 
 from benchmarks.lib.command import Count, blame, options
 from benchmarks.lib.storage import ROOT, Kept, UnfinishedError, versions
 
-NAMED = 10  # failed tasks listed in a message
-ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
-QUEUED = 4  # tasks submitted per core of a cluster, enough to occupy nodes that join later
 LOST = "The process that ran it ended, perhaps for lack of memory: the same command tries again"
 # Files that are not uploaded, in .gitignore syntax: the whole checkout except its packages and
 # the modules beside them, such as a user's own controllers.
@@ -56,7 +51,7 @@ class TasksFailedError(UnfinishedError):
         lines = [f"{name}: {text.strip().splitlines()[-1]}" for name, text in errors.items()]
         super().__init__(
             f"{len(errors)} of {tasks} tasks failed; the results of the others are kept\n"
-            + "\n".join(lines[:NAMED])
+            + "\n".join(lines[:10])
             + f"\nThe first of them:\n{next(iter(errors.values()))}"
         )
 
@@ -126,7 +121,12 @@ class FanOut:
             raise TasksFailedError(errors, len(tasks))
 
 
-def _attempt(name: str, task: Task) -> Answer:
+def _attempt(name: str, task: Task, needed: Mapping[str, str] | None = None) -> Answer:
+    """Run a task, on a node of a cluster only if it has the needed versions of packages."""
+    if needed and versions() != needed:
+        here, there = versions().items(), needed.items()
+        text = f"it has {dict(here - there)}, and not {dict(there - here)}"
+        return name, None, f"A node computes other numbers: {text}"
     try:
         return name, task(), ""
     except SystemExit as left:
@@ -146,12 +146,11 @@ def _answers(tasks: Tasks, submit: Submit, at_once: int) -> Iterator[Answer]:
         for done in wait(running, return_when=FIRST_COMPLETED).done:
             name = running.pop(done)
             try:
-                answer = done.result()
+                yield done.result()
             except PicklingError:  # perhaps of a user's own controller: it runs here
-                answer = _attempt(name, tasks[name])
+                yield _attempt(name, tasks[name])
             except Exception as lost:
-                answer = name, None, f"{lost}\n{LOST}"
-            yield answer
+                yield name, None, f"{lost}\n{LOST}"
 
 
 def _on_this_machine(tasks: Tasks, jobs: int | None) -> Iterator[Answer]:
@@ -160,11 +159,12 @@ def _on_this_machine(tasks: Tasks, jobs: int | None) -> Iterator[Answer]:
     from joblib.externals.loky import get_reusable_executor
 
     jobs = jobs or cpu_count()
-    at_once = min(jobs, len(tasks))
     if jobs == 1 or not tasks:
         yield from (_attempt(name, task) for name, task in tasks.items())
         return
-    pool = partial(get_reusable_executor, at_once, env=ONE_THREAD)  # anew if it is broken
+    at_once = min(jobs, len(tasks))
+    one_thread = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
+    pool = partial(get_reusable_executor, at_once, env=one_thread)  # anew if it is broken
     try:
         yield from _answers(tasks, lambda *task: pool().submit(_attempt, *task), at_once)
     except BaseException:  # including Ctrl-C
@@ -177,44 +177,32 @@ def _on_cluster(tasks: Tasks, jobs: int | None) -> Iterator[Answer]:
     import ray  # here: an optional package that takes a second to import
 
     if not ray.is_initialized():
-        _connect()
-    remote: Any = ray.remote(num_cpus=1, max_retries=2)(_attempt_there)
-    at_once = jobs or QUEUED * int(ray.cluster_resources().get("CPU", 1))
-    here = versions()
-    return _answers(tasks, lambda *task: remote.remote(*task, here).future(), at_once)
+        with blame("--backend"):
+            _connect(os.environ.get("RAY_ADDRESS", "127.0.0.1:6379"))
+    remote: Any = ray.remote(num_cpus=1, max_retries=2)(_attempt)
+    # Several tasks a core, enough to occupy nodes that join later.
+    at_once = jobs or 4 * int(ray.cluster_resources().get("CPU", 1))
+    needed = versions()
+    return _answers(tasks, lambda *task: remote.remote(*task, needed).future(), at_once)
 
 
-def _attempt_there(name: str, task: Task, here: dict[str, str]) -> Answer:
-    """Run a task if this node has the versions of packages that the driver has."""
-    there = versions()
-    if there != here:
-        has, wanted = dict(there.items() - here.items()), dict(here.items() - there.items())
-        return name, None, f"A node computes other numbers: it has {has}, and not {wanted}"
-    return _attempt(name, task)
-
-
-def _connect() -> None:
+def _connect(address: str) -> None:
     import ray
 
     # `ray job submit` has uploaded the same code.
     os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
-    folder = os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
-    latest = Path(folder, "ray", "ray_current_cluster")  # of `ray start`; may be stale
-    found = latest.read_text().strip() if latest.exists() else ""
-    address = os.environ.get("RAY_ADDRESS") or found
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    with blame("--backend"):
-        try:
-            if host and port.isdecimal():  # Ray itself would wait for minutes
-                socket.create_connection((host, int(port)), timeout=10).close()
-            ray.init(
-                address="auto",
-                runtime_env={"working_dir": str(ROOT), "excludes": STAYS},
-                log_to_driver=False,
-                logging_level=logging.ERROR,
-            )
-        except OSError as error:
-            raise ValueError(
-                "No Ray cluster can be reached: start one with `ray start --head`, or set "
-                f"RAY_ADDRESS ({error})"
-            ) from error
+    try:
+        if port.isdecimal():  # Ray itself would wait for minutes
+            socket.create_connection((host, int(port)), timeout=10).close()
+        ray.init(
+            address=address,
+            runtime_env={"working_dir": str(ROOT), "excludes": STAYS},
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+        )
+    except OSError as error:
+        raise ValueError(
+            "no Ray cluster can be reached: start one with `ray start --head`, or set "
+            f"RAY_ADDRESS ({error})"
+        ) from error

@@ -1,4 +1,4 @@
-"""For workers of a cluster: no file of the checkout or of the results is there to be opened.
+"""For workers of a cluster: no file of the checkout is there to be opened.
 
 Python runs this at its start where the folder is on PYTHONPATH.
 """
