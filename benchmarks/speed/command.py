@@ -1,8 +1,4 @@
-"""Compare the steps a second of this and other environments: `python -m benchmarks.speed`.
-
-The compared cases are timed in turns within one run and reported as ratios with their spread.
-EnvPool and gymnax are included if they are installed.
-"""
+"""Compare the steps a second of this and other environments: `python -m benchmarks.speed`."""
 
 from __future__ import annotations
 
@@ -39,13 +35,10 @@ FRAMES = 400  # the chart is full for half of them
 EPISODE = 1200
 BATCHES = (8, 64, 1024, 16384)
 LOOPS = (1, 64, 1000)
-MEMORY_PLANTS = 100
 DEVICE_BATCHES = tuple(4**power for power in range(5, 12))  # 1,024 to 4,194,304 plants
 DEVICE_STEPS = 200
 GRADIENTS, BACKWARD = 1024, 300  # plants and samples of the gradient
-PEER_STEPS = 100  # steps of each environment of EnvPool and gymnax
-INSTALL_PEERS = "pip install envpool gymnax six"
-REFERENCE = "CartPole-v1"
+REFERENCE, PLANT = "CartPole-v1", "MiddlePoint-v0"
 # Arguments of the plants, by the suffix of their names.
 NOISE: dict[str, Any] = {"noise_variance": 0.5}
 PLANTS: dict[str, dict[str, Any]] = {"": {}, ", R = 0.5": NOISE, ", hard": PRESETS["hard"]}
@@ -74,15 +67,12 @@ def execute(options: Options, console: Console) -> str:
             MiddlePointTorchEnv(1, device=options.device)
         show(f"Steps a second on {options.device}", measure_on(options.device, rounds))
         return f"Medians of {rounds} rounds."
-    plant = "MiddlePoint-v0"
     single = [
-        _single(REFERENCE),
-        _single("Pendulum-v1"),
-        _single(plant),
-        _single(plant, ", R = 0.5", **NOISE),
-        _single(plant, ", 20 past actions", action_window=20),
+        *map(_single, (REFERENCE, "Pendulum-v1", PLANT)),
+        _single(PLANT, ", R = 0.5", **NOISE),
+        _single(PLANT, ", 20 past actions", action_window=20),
     ]
-    drawn = [_single(name, render_mode="rgb_array") for name in (REFERENCE, plant)]
+    drawn = [_single(name, render_mode="rgb_array") for name in (REFERENCE, PLANT)]
     learners = f"Plants with R = 0.5 and NNs that learn, one each: {EPISODE} samples together"
     policy = "Through the plant: a policy of two layers of 64, forward and backward"
     show("One environment, from gymnasium.make", compare(single, rounds))
@@ -93,20 +83,17 @@ def execute(options: Options, console: Console) -> str:
     show(policy, compare([_through_the_plant(GRADIENTS)], rounds))
     show("Memory of a plant, 20 past actions", measure_memory())
 
-    python = [sys.executable, "-c"]
     imports = [
-        Timed(module, partial(subprocess.run, [*python, f"import {module}"], check=True), 1)
+        Timed(module, partial(subprocess.run, [sys.executable, "-c", f"import {module}"]), 1)
         for module in ("gymnasium", "mptc_gym")
     ]
     taken = 1000 * _time_in_turns(imports, rounds)
-    more = taken["mptc_gym"] - taken["gymnasium"]
+    low, more, high = (taken["mptc_gym"] - taken["gymnasium"]).quantile([0.1, 0.5, 0.9])
     missing = " and ".join(peer for peer in PEERS if not importlib.util.find_spec(peer))
-    left_out = (
-        f"Without {missing}: {INSTALL_PEERS}, in a virtual environment.\n" if missing else ""
-    )
-    return left_out + (
+    install = "pip install envpool gymnax six, in a virtual environment."
+    return (f"Without {missing}: {install}\n" if missing else "") + (
         f"import gymnasium: {taken['gymnasium'].median():.0f} ms; import mptc_gym: "
-        f"{more.median():+.0f} ms ({more.quantile(0.1):+.0f} to {more.quantile(0.9):+.0f})\n"
+        f"{more:+.0f} ms ({low:+.0f} to {high:+.0f})\n"
         f"Medians of {rounds} rounds; in parentheses, 10th to 90th percentile."
     )
 
@@ -119,25 +106,44 @@ def compare(cases: list[Timed], rounds: int) -> pd.DataFrame:
     seconds = _time_in_turns(cases, rounds)
     rates = seconds.rdiv([case.steps for case in cases], axis="columns")
     first = cases[0].name
+    low, ratio, high = (
+        rates.div(rates[first], axis="index").quantile(share).map("{:.2f}".format)
+        for share in (0.1, 0.5, 0.9)
+    )
     return pd.DataFrame(
         {
             "steps a second": rates.median().map("{:,.0f}".format),
             "seconds a round": seconds.median().map("{:.3f}".format),
-            f"ratio to {first}": rates.div(rates[first], axis="index").apply(_spread),
+            f"ratio to {first}": ratio + " (" + low + " to " + high + ")",
         }
     ).reset_index(names="case")
+
+
+def _time_in_turns(cases: list[Timed], rounds: int) -> pd.DataFrame:
+    """Time the cases in turns, and return seconds: one row per round, one column per case."""
+    rows = []
+    for _ in tqdm(range(rounds), leave=False):
+        row = {}
+        for case in cases:
+            began = time.perf_counter()
+            case.run()
+            row[case.name] = time.perf_counter() - began
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def measure_memory() -> pd.DataFrame:
     """Measure the memory per plant, in a batch and alone."""
     rows = []
-    random = {**NOISE, "setpoint": "random"}
-    for name, given in {"R = 0": {}, "R = 0.5, random set point": random}.items():
+    for name, given in {
+        "R = 0": {},
+        "R = 0.5, random set point": {**NOISE, "setpoint": "random"},
+    }.items():
         arguments = {**given, "action_window": 20}
-        batch = MiddlePointVectorEnv(MEMORY_PLANTS, max_episode_steps=EPISODE, **arguments)
-        sizes = _memory(batch) / MEMORY_PLANTS, _memory(MiddlePointEnv(**arguments))
+        batch = MiddlePointVectorEnv(100, max_episode_steps=EPISODE, **arguments)
+        sizes = _memory(batch) / 100, _memory(MiddlePointEnv(**arguments))
         rows.append([name, *(f"{size / 1024:.1f} KiB" for size in sizes)])
-    return pd.DataFrame(rows, columns=["case", f"in a batch of {MEMORY_PLANTS:,}", "alone"])
+    return pd.DataFrame(rows, columns=["case", "in a batch of 100", "alone"])
 
 
 def _memory(env: Any) -> int:
@@ -172,16 +178,33 @@ def _single(name: str, special: str = "", **arguments: Any) -> Timed:
 
 def _vector(n: int) -> Iterable[Timed]:
     """Yield the cases of vector environments; a call is one plant episode and its reset."""
-    kinds = [(REFERENCE, "", {}), *(("MiddlePoint-v0", *plant) for plant in PLANTS.items())]
+    kinds = [(REFERENCE, "", {}), *((PLANT, *plant) for plant in PLANTS.items())]
     for name, special, arguments in kinds:
         envs = gymnasium.make_vec(name, n, vectorization_mode="vector_entry_point", **arguments)
         envs.reset(seed=0)
         envs.action_space.seed(0)
         actions = [envs.action_space.sample() for _ in range(20)]
-        yield _steps(name + special, envs, actions, EPISODE + 1)
+        yield _steps(name + special, envs.step, actions, EPISODE + 1)
     yield from _in_torch(n, "cpu", EPISODE + 1)
     for peer in filter(importlib.util.find_spec, PEERS):
         yield from PEERS[peer](n)
+
+
+def _steps(
+    name: str,
+    step: Callable[[Any], object],
+    actions: list[Any],
+    steps: int,
+    wait: Callable[[], object] = lambda: None,
+) -> Timed:
+    """Return the case of a batch that cycles through the actions, then waits for its device."""
+
+    def run() -> None:
+        for k in range(steps):
+            step(actions[k % len(actions)])
+        wait()
+
+    return Timed(name, run, steps * len(actions[0]))
 
 
 def _envpool(n: int) -> Iterable[Timed]:
@@ -191,7 +214,7 @@ def _envpool(n: int) -> Iterable[Timed]:
     envs = envpool.make_gymnasium(REFERENCE, num_envs=n, num_threads=1, seed=0)
     envs.reset()
     actions = list(np.random.default_rng(0).integers(0, 2, (20, n), dtype=np.int32))
-    yield _steps(f"{REFERENCE} of envpool", envs, actions, PEER_STEPS)
+    yield _steps(f"{REFERENCE} of envpool", envs.step, actions, 100)
 
 
 def _gymnax(n: int) -> Iterable[Timed]:
@@ -202,18 +225,18 @@ def _gymnax(n: int) -> Iterable[Timed]:
     import jax
 
     env, parameters = gymnax.make(REFERENCE)
-    step_all = jax.vmap(env.step, (0, 0, 0, None))
-    actions = jax.random.randint(jax.random.key(1), (PEER_STEPS, n), 0, 2)
+    actions = jax.random.randint(jax.random.key(1), (100, n), 0, 2)
     keys = jax.random.split(jax.random.key(0), n)
     start = jax.random.key(2), jax.vmap(env.reset, (0, None))(keys, parameters)[1]
 
     def advance(carry: tuple[Any, Any], action: Any) -> tuple[tuple[Any, Any], Any]:
         keys = jax.random.split(carry[0], n + 1)
-        observations, state, *others = step_all(keys[1:], carry[1], action, parameters)
+        step = jax.vmap(env.step, (0, 0, 0, None))
+        observations, state, *others = step(keys[1:], carry[1], action, parameters)
         return (keys[0], state), (observations, others)
 
-    one_by_one, step = list(actions), jax.jit(advance)
-    scan = jax.jit(partial(jax.lax.scan, advance))
+    loop, step = jax.jit(partial(jax.lax.scan, advance)), jax.jit(advance)
+    one_by_one = list(actions)
 
     def run_steps() -> None:
         carry = start
@@ -221,12 +244,12 @@ def _gymnax(n: int) -> Iterable[Timed]:
             carry, returned = step(carry, action)
         jax.block_until_ready(returned)
 
-    def run_scan() -> None:
-        jax.block_until_ready(scan(start, actions))
+    def run_loop() -> None:
+        jax.block_until_ready(loop(start, actions))
 
-    for name, run in {"": run_steps, ", one compiled loop": run_scan}.items():
+    for name, run in {"": run_steps, ", one compiled loop": run_loop}.items():
         run()  # the first call compiles
-        yield Timed(f"{REFERENCE} of gymnax{name}", run, n * PEER_STEPS)
+        yield Timed(f"{REFERENCE} of gymnax{name}", run, n * 100)
 
 
 PEERS: dict[str, Callable[[int], Iterable[Timed]]] = {"envpool": _envpool, "gymnax": _gymnax}
@@ -234,12 +257,12 @@ PEERS: dict[str, Callable[[int], Iterable[Timed]]] = {"envpool": _envpool, "gymn
 
 def _in_torch(n: int, device: str, steps: int) -> Iterable[Timed]:
     """Yield the cases of the PyTorch environment; a call waits for the device to finish."""
+    wait = (lambda: None) if device == "cpu" else torch.accelerator.synchronize
     for special, arguments in PLANTS.items():
         envs = MiddlePointTorchEnv(n, device=device, **arguments)
         envs.reset(seed=0)
         actions = [2.0 * torch.rand(n, 1, device=device) - 1.0 for _ in range(20)]
-        wait = (lambda: None) if device == "cpu" else torch.accelerator.synchronize
-        yield _steps(f"in PyTorch{special}", envs, actions, steps, wait)
+        yield _steps(f"in PyTorch{special}", envs.step, actions, steps, wait)
 
 
 def measure_on(device: str, rounds: int) -> pd.DataFrame:
@@ -274,43 +297,8 @@ def _through_the_plant(n: int) -> Timed:
     return Timed(f"gradient through {n:,} plants and {BACKWARD} samples", train, n * BACKWARD)
 
 
-def _steps(
-    name: str,
-    envs: Any,
-    actions: list[Any],
-    steps: int,
-    wait: Callable[[], object] = lambda: None,
-) -> Timed:
-    """Return the case of a batch that cycles through the actions, then waits for its device."""
-
-    def run() -> None:
-        for k in range(steps):
-            envs.step(actions[k % len(actions)])
-        wait()
-
-    return Timed(name, run, steps * len(actions[0]))
-
-
 def _closed_loop(n: int) -> Timed:
     """Return the case of a batch of plants and their networks."""
     plants, controller = make_plants(n, EPISODE, **NOISE), DirectNNController(num_envs=n)
     run = partial(rollout, plants, controller, EPISODE, seed=0)
     return Timed(f"batch of {n:,}", run, n * EPISODE)
-
-
-def _time_in_turns(cases: list[Timed], rounds: int) -> pd.DataFrame:
-    """Time the cases in turns, and return seconds: one row per round, one column per case."""
-    rows = []
-    for _ in tqdm(range(rounds), leave=False):
-        row = {}
-        for case in cases:
-            began = time.perf_counter()
-            case.run()
-            row[case.name] = time.perf_counter() - began
-        rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def _spread(values: pd.Series) -> str:
-    low, median, high = values.quantile([0.1, 0.5, 0.9])
-    return f"{median:.2f} ({low:.2f} to {high:.2f})"
