@@ -38,7 +38,7 @@ class Options:
     fan_out: FanOut = field(default_factory=FanOut)
 
 
-main = command(Options, "benchmarks.tune.search")
+main = command(Options, "benchmarks.tune.command")
 
 if __name__ == "__main__":
     raise SystemExit(main(None))
