@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import re
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import asdict
@@ -22,9 +23,6 @@ from benchmarks.lib.report import Section, provenance_line, show
 from benchmarks.lib.storage import Kept, origin, write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
 from mptc_gym.evaluation import SEED
-
-OUT = Path("results/compare")
-LONGEST = 60  # characters at which a folder's name is cut
 
 
 def execute(options: Options, console: Console) -> str:
@@ -99,10 +97,7 @@ def _try_out(
 
 def _folder(*differences: list[str]) -> Path:
     """Return a folder named after the differences from the default comparison."""
-    name = "-".join(part for difference in differences for part in difference)
-    if not name:
-        return OUT
-    name = "".join(c if c.isalnum() or c in "-_." else "-" for c in name)
-    if len(name) > LONGEST:
-        name = f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-    return OUT.with_name(f"{OUT.name}-{name}")
+    name = re.sub(r"[^\w.-]", "-", "-".join(["compare", *itertools.chain(*differences)]))
+    if len(name) > 70:
+        name = f"{name[:60]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return Path("results", name)

@@ -23,7 +23,7 @@ from benchmarks.lib.report import provenance_line, show, write_report
 from benchmarks.lib.storage import Kept, origin, write_json
 from benchmarks.lib.tables import write_csv
 from benchmarks.loop.designs import SPANS, WIDE, Arguments, around, grid, random_design
-from benchmarks.loop.metrics import held, measure
+from benchmarks.loop.metrics import held, mean_error, measure, split
 from benchmarks.loop.rollout import Trajectory
 from benchmarks.sweep.__main__ import Options
 from benchmarks.sweep.report import report, table
@@ -115,7 +115,7 @@ def agent_task(
     trajectory = factory.run(case, samples, runs, SEED, controller)
     measures = {
         **measure(trajectory, Parameters(**case)),
-        "late": np.abs(trajectory.error[samples // 2 :]).mean(axis=0),
+        "late": mean_error(split(trajectory, samples // 2)[1]),
         "swing": swing(trajectory),
     }
     return {name: values.tolist() for name, values in measures.items()}

@@ -169,8 +169,8 @@ def _page(name: str, table: pd.DataFrame, trials: pd.DataFrame, runs: int) -> st
             f"# Gains: {ROSTER[name].label}",
             f"By `python -m benchmarks.tune {name} --trials {len(trials)} --runs {runs}`. In "
             "each scenario: the median over runs of the mean absolute error, °C. The objective "
-            f"is their mean, plus {tuning_of(name).penalty:g} °C times the share of runs at the "
-            "constant set point that do not settle.",
+            f"is their mean, plus {tuning_of(name).penalty:g} °C times the share of runs at "
+            "the constant set point that do not settle.",
             f"## The best {len(table)} of {len(trials)}, on {FINAL_RUNS} new runs",
             table.to_markdown(index=False, floatfmt=".4g"),
             "## The search: every trial that was better than all before",
