@@ -179,11 +179,14 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     return value
 
 
-def reward(name: str, value: Any) -> str:
-    """Return a kind of reward."""
-    if not isinstance(value, str) or value not in REWARDS:
-        reject(name, value, "'quadratic' or 'absolute'")
+def one_of(name: str, value: Any, choices: Sequence[str | None]) -> Any:
+    """Return one of some texts; None, too, may be among them."""
+    if not isinstance(value, str | None) or value not in choices:
+        reject(name, value, " or ".join(map(repr, choices)))
     return value
+
+
+reward = partial(one_of, choices=REWARDS)
 
 
 def or_range(check: Check) -> Callable[[str, Any], Number]:

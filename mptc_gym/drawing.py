@@ -61,7 +61,7 @@ class Panel:
 
     def y(self, value: float) -> float:
         """Return the vertical position of a value."""
-        return self.bottom - self.axis.share(value) * (self.bottom - self.top)
+        return self.ys([value])[0]
 
     def ys(self, values: Iterable[float]) -> list[float]:
         """Return the vertical positions of values."""

@@ -15,7 +15,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym import rendering
-from mptc_gym.checks import one_action, plain, reject_action
+from mptc_gym.checks import one_action, one_of, plain, reject_action
 from mptc_gym.parameters import Parameters, insert_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
@@ -210,7 +210,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         self.parameters = parameters = Parameters.of_environment(arguments)
-        rendering.check_mode(render_mode, self.metadata["render_modes"])
+        one_of("render_mode", render_mode, [None, *self.metadata["render_modes"]])
         self.render_mode = render_mode
         self._record: Record | None = None  # for pictures; None if there are none
         self.action_space = action_space()

@@ -85,28 +85,16 @@ class PlantNumbers(Generic[Value]):
         0.0, checks.not_negative, "degC^2", "R, the variance of xi in (28)"
     )
     measurement_noise_variance: Value = _linear(
-        0.0,
-        checks.not_negative,
-        "degC^2",
-        "variance of the transmitter's white noise, which observations show and rewards do not",
+        0.0, checks.not_negative, "degC^2", "variance of the transmitter's white noise"
     )
     disturbance_amplitude: Value = _linear(
-        0.0,
-        checks.not_negative,
-        "degC",
-        "largest level of the load disturbance's steps, up or down",
+        0.0, checks.not_negative, "degC", "largest level of the load disturbance's steps"
     )
     disturbance_interval: Value = _linear(
-        150.0,
-        checks.at_least_1,
-        "samples",
-        "mean interval between these steps; below 10 it is 10",
+        150.0, checks.at_least_1, "samples", "mean interval of these steps; below 10 it is 10"
     )
     disturbance_walk_variance: Value = _linear(
-        0.0,
-        checks.not_negative,
-        "degC^2",
-        "variance that the load disturbance's random walk adds a sample",
+        0.0, checks.not_negative, "degC^2", "variance that the load's walk gains a sample"
     )
     gain_factor: Value = _linear(
         1.0, checks.positive, "1", "steady-state gain, as a multiple of that of `a` and `b`"
@@ -118,10 +106,7 @@ class PlantNumbers(Generic[Value]):
         1.0, checks.positive, "1", "factor by which the gain changes in `drift_samples`"
     )
     time_constant_drift: Value = _linear(
-        1.0,
-        checks.positive,
-        "1",
-        "factor by which the time constant changes in `drift_samples`",
+        1.0, checks.positive, "1", "the same for the time constant"
     )
 
     def chosen(self, names: Sequence[str]) -> dict[str, Value]:
@@ -187,8 +172,7 @@ class Parameters(PlantNumbers[Number]):
         5.0,
         checks.not_negative,
         "degC",
-        'A. "square": A for the first half period, then -A. "random": levels uniform in '
-        "[-A, A]",
+        'A. "square": first A, then -A. "random": levels uniform in [-A, A]',
     )
     setpoint_period: int = _linear(
         600,
@@ -206,10 +190,7 @@ class Parameters(PlantNumbers[Number]):
     output_window: int = _linear(0, checks.samples, "samples", "the same for measured outputs")
     action_window: int = _linear(0, checks.samples, "samples", "the same for past actions")
     temperature_span: float = _linear(
-        50.0,
-        checks.positive,
-        "degC",
-        "range of the transmitter: the measurement saturates at +-`temperature_span`",
+        50.0, checks.positive, "degC", "the transmitter's readings saturate at + and - this"
     )
     reward: str = _linear("quadratic", checks.reward, "", '"quadratic" or "absolute"')
     error_scale: float = _linear(

@@ -34,10 +34,6 @@ class Axis:
         last = math.floor(self.high / self.step + 1e-9)
         return (i * self.step for i in range(first, last + 1))
 
-    def share(self, value: float) -> float:
-        """Return where a value lies in the range, from 0 to 1; values beyond are clipped."""
-        return min(1.0, max(0.0, (value - self.low) / (self.high - self.low)))
-
 
 class Record:
     """The latest samples of an episode that starts at rest with the set point y_d(0), degC."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from types import ModuleType
 from typing import cast
 
@@ -11,16 +10,9 @@ from gymnasium import logger
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from numpy.typing import NDArray
 
-from mptc_gym.checks import reject
 from mptc_gym.record import Record
 
 Frame = NDArray[np.uint8]
-
-
-def check_mode(mode: str | None, modes: Sequence[str]) -> None:
-    """Raise ValueError if a render mode is neither None nor one of `modes`."""
-    if mode is not None and not (isinstance(mode, str) and mode in modes):
-        reject("render_mode", mode, " or ".join(["None", *map(repr, modes)]))
 
 
 def warn_no_mode() -> None:

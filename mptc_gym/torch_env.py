@@ -18,9 +18,8 @@ except ImportError as error:
     ) from error
 from torch import Tensor
 
-from mptc_gym import rendering
 from mptc_gym.batch import BatchEnv, Infos, Mask
-from mptc_gym.checks import is_count, reject
+from mptc_gym.checks import is_count, one_of, reject
 from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import action_from_command
 from mptc_gym.torch_plant import TorchPlants
@@ -140,7 +139,7 @@ class MiddlePointTorchEnv(BatchEnv):
         differentiable: bool = False,
         **arguments: Any,
     ) -> None:
-        rendering.check_mode(arguments.pop("render_mode", None), [])
+        one_of("render_mode", arguments.pop("render_mode", None), [None])
         super().__init__(num_envs, max_episode_steps, autoreset_mode, arguments)
         if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
             reject("dtype", dtype, "torch.float32 or torch.float64")

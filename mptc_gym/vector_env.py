@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mptc_gym import rendering
 from mptc_gym.batch import BatchEnv, Infos, Mask
-from mptc_gym.checks import is_count, many_actions, plain, reject
+from mptc_gym.checks import is_count, many_actions, one_of, plain, reject
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
@@ -88,7 +88,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         render_mode: str | None = None,
         **arguments: Any,
     ) -> None:
-        rendering.check_mode(render_mode, self.metadata["render_modes"])
+        one_of("render_mode", render_mode, [None, "rgb_array"])
         super().__init__(num_envs, max_episode_steps, autoreset_mode, arguments)
         parameters = self.parameters
         self.render_mode = render_mode
