@@ -95,21 +95,21 @@ class TestEvaluate:
         assert again.mean_error < first.mean_error
 
     def test_wrappers_are_those_of_the_spec(self):
-        by_spec = evaluate(proportional, wrapped().spec, episodes=4)
-        by_function = evaluate(proportional, wrapped, episodes=4)
+        by_spec = evaluate(proportional, wrapped().spec, episodes=2)
+        by_function = evaluate(proportional, wrapped, episodes=2)
         # Without a spec, environments are stepped one by one.
         made = partial(MiddlePointEnv, **PRESETS["hard"], action_window=20)
         one_by_one = evaluate(
             proportional,
             lambda: IncrementalAction(made(), max_move=0.2, compensate_dead_zone=True),
-            episodes=4,
+            episodes=2,
         )
         assert by_spec.least_possible is not None
         for other in (by_function, one_by_one):
             np.testing.assert_allclose(other.errors, by_spec.errors, atol=1e-12)
             np.testing.assert_allclose(other.travels, by_spec.travels, atol=1e-9)
             np.testing.assert_array_equal(other.least, by_spec.least)
-        bare = evaluate(proportional, HARD, episodes=4, action_window=20)
+        bare = evaluate(proportional, HARD, episodes=2, action_window=20)
         assert bare.mean_error != pytest.approx(by_spec.mean_error, abs=0.1)
 
     def test_other_episodes_and_lengths(self):
