@@ -40,7 +40,7 @@ from mptc_gym.wrappers.vector import IncrementalAction as IncrementalBatch
 NOISY = "MiddlePointNoisy-v0"
 LIMITS = np.float32([-2.0, 2.0])
 # Without a dead zone, every action matters.
-SHORT = {"max_episode_steps": 100, "dead_zone": 0.0}
+SHORT = {"max_episode_steps": 50, "dead_zone": 0.0}
 VELOCITY = {"max_move": 0.3, "compensate_dead_zone": 4.0}
 
 
