@@ -22,6 +22,7 @@ from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.checks import is_count, one_of, reject
 from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import action_from_command
+from mptc_gym.signals import Levels
 from mptc_gym.torch_plant import TorchPlants
 from mptc_gym.torch_signals import (
     LONGEST,
@@ -161,7 +162,9 @@ class MiddlePointTorchEnv(BatchEnv):
         self._signals: dict[str, Signal] = self._drawn
         # Blocks that fit in the processor's cache or, on other devices, are worth their calls.
         in_cache = max(1, _IN_CACHE // num_envs) if self.device.type == "cpu" else LONGEST
-        self._block = min(self._plants.most_samples, LONGEST, in_cache)
+        levels = Levels(self.parameters)
+        held = levels.shortest if levels.random else LONGEST
+        self._block = min(self._plants.most_samples, LONGEST, in_cache, held)
         # Precomputed returns of the steps ahead, the next one last.
         self._ahead: list[tuple[Any, ...]] = []
         self._shown = _Window(self.parameters.windows, self._zeros, differentiable)

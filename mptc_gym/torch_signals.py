@@ -10,7 +10,6 @@ of them at that time of the environment's clock, degC, shape (samples, n).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -153,58 +152,53 @@ class Noise:
 
 
 class RandomSetPoint:
-    """A set point of random levels, each held for a random number of samples."""
+    """A set point of random levels, each held for a random number of samples.
+
+    In `shortest` samples, a plant changes its level at most once, so one further level is drawn
+    for them. Blocks are no longer than that.
+    """
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
         self._distribution, self._episodes = levels, episodes
         zeros = episodes.zeros
-        self._rows = torch.arange(LONGEST, dtype=zeros.dtype).to(zeros.device)
-        # The current level and those to come, each with the sample where it ends: whole numbers
-        # in floats, which are fastest.
-        self._levels = [(zeros, zeros)]
-        # Number of known samples, and of those that were returned, from the same origin.
-        self._known = self._returned = 0
+        # Samples are counted from the latest draw, in floats, which are fastest.
+        self._rows = torch.arange(1, LONGEST + 1, dtype=zeros.dtype).to(zeros.device)[:, None]
+        self._returned = self._known = 0
+        # The level of then and where it ends, and the same of the level that follows.
+        self._level = self._end = self._next_level = self._next_end = zeros
 
     def reset(self, mask: Tensor | None, unused: int) -> Tensor:
         """Begin an episode of some plants."""
         self._returned -= unused
-        self._move_origin()
-        (end, level), (hold, first) = self._levels[0], self._draw_level()
-        self._levels = [(select(mask, hold, end), select(mask, first, level))]
-        return self._levels[0][1]
+        self._count_from_here()
+        level, hold = self._draw()
+        self._level = select(mask, level, self._level)
+        self._end = select(mask, hold, self._end)
+        return self._level
 
     def next(self, clock: int, samples: int) -> Tensor:
-        """Return the next samples, drawn if they are not yet known."""
+        """Return the next samples."""
         if self._returned + samples > self._known:
-            self._move_origin()
-            self._known = max(samples, self._distribution.shortest)
-            for _ in range(1 + (self._known - 1) // self._distribution.shortest):
-                hold, level = self._draw_level()
-                self._levels.append((self._levels[-1][0] + hold, level))
-        rows = (self._rows[:samples] + (self._returned + 1))[:, None]
+            self._count_from_here()
+            self._known = self._distribution.shortest
+            self._next_level, hold = self._draw()
+            self._next_end = self._end + hold
+        reached = _is_past(self._rows[:samples] + self._returned, self._end)
         self._returned += samples
-        levels = self._levels[0][1].expand(samples, -1)
-        for (change, _), (_, level) in pairwise(self._levels):
-            levels = torch.lerp(levels, level, _is_past(rows, change))
-        return levels
+        return torch.lerp(self._level.expand(samples, -1), self._next_level, reached)
 
-    def _draw_level(self) -> tuple[Tensor, Tensor]:
-        """Draw the lengths of levels, in samples, and the levels, each of shape (n,)."""
-        level = self._episodes.draw_within_one(1)[0] * self._distribution.amplitude
-        hold = self._episodes.draw(
-            self._distribution.shortest, self._distribution.longest, whole=True
-        )
-        return hold, level
+    def _draw(self) -> tuple[Tensor, Tensor]:
+        """Draw levels, degC, and for how many samples they hold, each of shape (n,)."""
+        law = self._distribution
+        level = self._episodes.draw_within_one(1)[0] * law.amplitude
+        return level, self._episodes.draw(law.shortest, law.longest, whole=True)
 
-    def _move_origin(self) -> None:
-        """Move the origin to the sample returned last, and keep only the level there."""
-        end, level = self._levels[0]
-        now = level.new_full((), self._returned)
-        for (change, _), (later, following) in pairwise(self._levels):
-            reached = _is_past(now, change)
-            end, level = torch.lerp(end, later, reached), torch.lerp(level, following, reached)
-        self._levels = [(end - now, level)]
-        self._known = self._returned = 0
+    def _count_from_here(self) -> None:
+        """Count from the sample returned last, and forget what was before."""
+        reached = _is_past(self._end.new_full((), self._returned), self._end)
+        self._level = torch.lerp(self._level, self._next_level, reached)
+        self._end = torch.lerp(self._end, self._next_end, reached) - self._returned
+        self._returned = self._known = 0
 
 
 class RepeatedSetPoint:
