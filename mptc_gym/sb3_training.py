@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 from collections.abc import Callable
 from typing import Any, Final, cast
 
@@ -27,7 +28,6 @@ from stable_baselines3.common.vec_env import (
 )
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
-from mptc_gym.checks import plain
 from mptc_gym.sb3_vec_env import GymnasiumVecEnv
 from mptc_gym.training import (
     WAYS_OUT,
@@ -152,27 +152,19 @@ def _chain(model: Any) -> tuple[VecEnv, list[VecEnvWrapper]]:
 
 _ACTING: Final = VecNormalize, VecFrameStack
 _WATCHING: Final = VecCheckNan, VecMonitor, VecVideoRecorder
-_OPTIONS: Final = (
-    "training",
-    "norm_obs",
-    "norm_reward",
-    "clip_obs",
-    "clip_reward",
-    "gamma",
-    "epsilon",
-)
+_STATISTICS: Final = "obs_rms", "ret_rms"  # of VecNormalize
 
 
 def _recorded(wrapper: VecEnvWrapper) -> dict[str, Any]:
-    """Return a `VecFrameStack` or a `VecNormalize` as JSON values."""
+    """Return a `VecFrameStack` or a `VecNormalize` by its arguments and statistics."""
     if isinstance(wrapper, VecFrameStack):
         return {"name": "VecFrameStack", **_frames(wrapper)}
-    found = {"name": "VecNormalize", **{name: getattr(wrapper, name) for name in _OPTIONS}}
-    for name in ("obs_rms", "ret_rms"):
-        statistics = getattr(wrapper, name, None)
-        if statistics is not None:
-            found[name] = {part: plain(value) for part, value in vars(statistics).items()}
-    return found
+    _, *arguments = inspect.signature(VecNormalize).parameters
+    found = {name: getattr(wrapper, name) for name in arguments}
+    found |= {
+        name: vars(getattr(wrapper, name)) for name in _STATISTICS if hasattr(wrapper, name)
+    }
+    return {"name": "VecNormalize", **found}
 
 
 def _frames(wrapper: VecFrameStack) -> dict[str, Any]:
@@ -186,9 +178,8 @@ def restored(plants: VecEnv, name: str, **about: Any) -> VecEnvWrapper:
         return VecFrameStack(plants, **about)
     if name != "VecNormalize":
         raise ValueError(f"{name} is not known here")
-    statistics = {each: about.pop(each) for each in ("obs_rms", "ret_rms") if each in about}
+    statistics = {each: about.pop(each) for each in _STATISTICS if each in about}
     wrapper = VecNormalize(plants, **about)
     for each, parts in statistics.items():
-        for part, value in parts.items():
-            setattr(getattr(wrapper, each), part, np.array(value)[()])
+        vars(getattr(wrapper, each)).update(parts)
     return wrapper
