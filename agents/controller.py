@@ -195,8 +195,8 @@ class Controller(ABC):
 
 
 @dataclass(eq=False, kw_only=True)
-class ToldController(Controller):
-    """A controller that is told the results of a step test and the actuator's numbers.
+class ModelBasedController(Controller):
+    """A controller that knows the results of a step test and the actuator's numbers.
 
     The limits are those of `Controller`.
 

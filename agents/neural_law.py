@@ -1,4 +1,4 @@
-"""Implement the control law of a told network, from the signals of its model to a flow.
+"""Implement the control law of a network, from the signals of a nominal model to a flow.
 
 The law is written once for NumPy and PyTorch, so that the law in use is the one trained. All
 quantities are scaled: flows by half the actuator's range, temperatures by the *reach*, the
@@ -115,9 +115,9 @@ class Law:
             for size in (_MEANS - 1 + NEWS, _MEANS, NEWS, _MEANS - _LOADS)
         )
         self._misses = [self._means[:, :_LOADS] + LEAST_NOISE] * len(MISS_RATES)
-        self._tell(prior)
+        self._adopt(prior)
 
-    def retell(self, prior: Prior, ratio: Any, residual: Any) -> None:
+    def adopt(self, prior: Prior, ratio: Any, residual: Any) -> None:
         """Adopt new numbers of the plants, and convert the memory to them.
 
         Parameters
@@ -135,9 +135,9 @@ class Law:
         self._means = self._xp.concatenate([loads, residuals], axis=1)
         self._news = self._news * units[:, None]
         self._misses = [misses * units[:, None] for misses in self._misses]
-        self._tell(prior)
+        self._adopt(prior)
 
-    def _tell(self, prior: Prior) -> None:
+    def _adopt(self, prior: Prior) -> None:
         xp, self.prior = self._xp, prior
         self._shares = self._of_each_mean((1.0 - prior.fading) / prior.unit, prior.fading)
         numbers = [
@@ -147,7 +147,7 @@ class Law:
             prior.centre,
             3.0 * prior.uncertainty,
         ]
-        self._told = xp.stack(numbers, axis=1)
+        self._known = xp.stack(numbers, axis=1)
 
     def flow(
         self, network: Network, setpoint: Any, residual: Any, load: Any, state: Any
@@ -204,7 +204,7 @@ class Law:
         )
         compared = compared / (1.0 + abs(compared))
         level = 0.3 * xp.log(noise + DOUBT) + 1.5
-        about = xp.concatenate([level[:, None], doubts, 0.1 * against, self._told], axis=1)
+        about = xp.concatenate([level[:, None], doubts, 0.1 * against, self._known], axis=1)
         held, zero = setpoint - residual, self._zero
         seen = [10.0 * (now - before), 1.4 * setpoint, 1.4 * now, last]
         seen += [3.0 * residual, 3.0 * error]
@@ -276,7 +276,7 @@ class LawNetwork:
         ValueError
             If the file is damaged or holds something else.
         """
-        with reading(path, "told network") as file:
+        with reading(path, "network of the law") as file:
             choosing, adding = (
                 [(file[f"{part}_W{i}"], file[f"{part}_b{i}"]) for i in range(3)]
                 for part in PARTS

@@ -1,4 +1,4 @@
-"""Combine the told network with a bank of models that identifies the plant."""
+"""Combine a trained network with a bank of models that identifies the plant."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from agents.self_tuning import SelfTuningController
 
 Array = NDArray[np.float64]
 
-MOST_UNCERTAIN = 0.3  # told to the network, which was trained up to 0.4
+MOST_UNCERTAIN = 0.3  # for the network, which was trained up to 0.4
 
 
 @dataclass(eq=False, kw_only=True)
 class NeuralSelfTuningController(SelfTuningController):
     """A self-tuning controller whose control law is a trained network.
 
-    The bank of models replaces the model that a `NeuralSmithPredictor` is told, and the spread
-    of the bank replaces the uncertainty. New estimates are adopted at once: the network was
-    trained on models that are wrong, and is told how wrong they may be.
+    The bank of models replaces the nominal model of a `NeuralSmithPredictor`, and the spread of
+    the bank its uncertainty. New estimates are adopted at once: the network was trained on
+    models that are wrong, and knows how wrong they may be.
 
     The other parameters are those of `SelfTuningController`, except for
     `closed_loop_time_constant`.
@@ -81,7 +81,7 @@ class NeuralSelfTuningController(SelfTuningController):
         if self._rule is None:
             self._rule = Law(prior, haste=self.haste)
         else:
-            self._rule.retell(prior, self._reach / reach, (before - self._residual) / reach)
+            self._rule.adopt(prior, self._reach / reach, (before - self._residual) / reach)
         self._reach = reach
         return self._rule
 

@@ -1,4 +1,4 @@
-"""Implement a trained network that acts on a told model, as a Smith predictor does."""
+"""Implement a trained network that acts on a nominal model, as a Smith predictor does."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import PAPER_WINDOWS, Index, NotNegative, ToldController, Values
+from agents.controller import PAPER_WINDOWS, Index, ModelBasedController, NotNegative, Values
 from agents.neural_law import Law, LawNetwork, Prior
 
 Array = NDArray[np.float64]
@@ -19,18 +19,18 @@ SLOWEST = 45.0  # samples, the largest time constant that the network was traine
 
 
 @dataclass(eq=False, kw_only=True)
-class NeuralSmithPredictor(ToldController):
-    """A trained network that is told the plant.
+class NeuralSmithPredictor(ModelBasedController):
+    """A trained network with a nominal model of the plant.
 
     As in a Smith predictor, a model runs in parallel with the plant, so the response to past
     flows is known before the delay is over. The network sees the model's output, the part of
-    the measured output that the model does not explain, and the told numbers; see
+    the measured output that the model does not explain, and the model's numbers; see
     `agents.neural_law`. It was trained once, on many plants, and does not learn online. All its
     inputs are scaled by the plant's reach and by the sampling interval, so one set of weights
     serves plants of either sign, with any limits and any sampling interval. With a first-order
     model and a time constant of at least 90 samples, it acts every second sample or less often.
 
-    The other parameters are those of `ToldController`.
+    The other parameters are those of `ModelBasedController`.
 
     Parameters
     ----------

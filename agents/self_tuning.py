@@ -11,8 +11,8 @@ from agents.actuator import applied_flow, avoid_dead_zone
 from agents.controller import (
     PAPER_WINDOWS,
     Index,
+    ModelBasedController,
     Positive,
-    ToldController,
     Values,
     check_count,
 )
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 # Time constants in the bank, as multiples of the step test's.
 TIME_CONSTANTS = (0.5, 0.7, 1.0, 1.4, 2.0)
-# Dead zones in the bank: offsets from the told one, and their prior standard deviation, as
+# Dead zones in the bank: offsets from the given one, and their prior standard deviation, as
 # shares of the larger limit.
 ZONES = (-0.5, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
 ZONE_SPREAD = 0.2
@@ -41,7 +41,7 @@ _ROOM = 64  # samples until the histories are shifted back
 
 
 @dataclass(eq=False, kw_only=True)
-class SelfTuningController(ToldController):
+class SelfTuningController(ModelBasedController):
     """A predictive controller that identifies the plant while controlling it.
 
     *Identification.* A bank holds one model for each combination of a delay d, a time constant
@@ -75,7 +75,7 @@ class SelfTuningController(ToldController):
     - Without evidence, the controller is that of the step test. Errors below 0.02 degC are no
       evidence, and a new design is adopted gradually.
 
-    The other parameters are those of `ToldController`.
+    The other parameters are those of `ModelBasedController`.
 
     Parameters
     ----------
@@ -131,13 +131,13 @@ class SelfTuningController(ToldController):
         # Undelayed responses differ in dead zone and pole, models also in delay, the longest
         # one first, as in the history of the responses.
         self._delays = np.arange(longest, shortest - 1, -DELAY_STEP)
-        told = self.time_constant / self.sampling_interval
-        self._constants = np.tile(told * np.array(TIME_CONSTANTS), len(self._zones))
+        nominal = self.time_constant / self.sampling_interval
+        self._constants = np.tile(nominal * np.array(TIME_CONSTANTS), len(self._zones))
         self._poles = np.exp(-1.0 / self._constants)
         self._dead_zones = np.repeat(self._zones, len(TIME_CONSTANTS))
         self._fading = (self._poles ** self._delays[:, np.newaxis]).ravel()
         off_delay = (self._delays - (self._delay_samples - 1.0)) / self._delay_spread
-        off_constant = np.log(self._constants / told) / self._time_constant_spread
+        off_constant = np.log(self._constants / nominal) / self._time_constant_spread
         off_zone = (self._dead_zones - self.dead_zone) / (ZONE_SPREAD * limit)
         off = np.square(off_delay)[:, np.newaxis] + np.square(off_constant) + off_zone**2
         self._prior = -0.5 * off.ravel()  # log-probability, up to a constant

@@ -10,14 +10,14 @@ from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 
 from agents.actuator import applied_flow
-from agents.controller import Flag, Number, Positive, ToldController, Values
+from agents.controller import Flag, ModelBasedController, Number, Positive, Values
 from agents.pi import PIController
 
 Array = NDArray[np.float64]
 
 
 @dataclass(eq=False, kw_only=True)
-class SmithPredictor(ToldController, PIController):
+class SmithPredictor(ModelBasedController, PIController):
     """A PI controller on the error that an undelayed model of the plant predicts.
 
     A first-order model with a delay runs in parallel with the plant. Its undelayed output minus
@@ -28,7 +28,7 @@ class SmithPredictor(ToldController, PIController):
     The gains are SIMC's for the plant without delay, with anti-windup. The model sees the
     command as the actuator passes it, after the dead zone and the limits.
 
-    The other parameters are those of `ToldController`, and `error_index`.
+    The other parameters are those of `ModelBasedController`, and `error_index`.
 
     Parameters
     ----------

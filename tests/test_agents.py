@@ -334,7 +334,7 @@ class Harm:
 
 SAVED = {
     "weights": DirectNNController().weights,
-    "told network": LawNetwork.load(),
+    "network of the law": LawNetwork.load(),
     "policy network": replace(
         PolicyNetwork.load(PRETRAINED / "ppo-10000.npz"), u_min=-10.0, u_max=10.0
     ),

@@ -1,4 +1,4 @@
-"""The told network: what it is invariant to, what it settles to, and what it refuses."""
+"""The trained network: what it is invariant to, what it settles to, and what it refuses."""
 
 from dataclasses import asdict
 from functools import partial

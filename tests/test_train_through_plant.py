@@ -55,12 +55,12 @@ class TestLaw:
             if name.endswith("_drift"):
                 numbers[name] = torch.ones(n)
         numbers["setpoint"] = torch.where(torch.arange(samples + 1) < 70, 3.0, -4.0)[:, None]
-        told = Draw(n, samples, SMALL.spread, 4).told(numbers, exact=True)
-        told["first"] = torch.tensor([first])
-        told["uncertainty"] = torch.tensor([0.1])
+        models = Draw(n, samples, SMALL.spread, 4).models(numbers, exact=True)
+        models["first"] = torch.tensor([first])
+        models["uncertainty"] = torch.tensor([0.1])
         with torch.no_grad():
             plants = environment(n, samples)
-            errors, _ = Loops(plants, numbers, told, 0).run(net, samples)
+            errors, _ = Loops(plants, numbers, models, 0).run(net, samples)
         of = {name: values.item() for name, values in numbers.items() if values.ndim == 1}
         pole = 1.0 - loops.RATE / of["time_constant_factor"]
         alpha, scale, _ = loops.DYNAMICS.coefficients(
@@ -102,16 +102,16 @@ class TestLaw:
         assert (numbers["dead_zone"] < room).all()
         assert 0.1 < (numbers["noise_variance"] == 0.0).float().mean() < 0.7
 
-    def test_what_is_told_wrongly_is_told_to_be_uncertain(self):
+    def test_a_wrong_model_is_said_to_be_uncertain(self):
         draw = Draw(4000, 1, 0.3, 0)
         numbers = draw.plants()
-        told = draw.told(numbers)
-        off = (told["gain_factor"] / numbers["gain_factor"]).log()
+        models = draw.models(numbers)
+        off = (models["gain_factor"] / numbers["gain_factor"]).log()
         sure, unsure = (
-            off[mask] for mask in (told["uncertainty"] < 0.05, told["uncertainty"] > 0.2)
+            off[mask] for mask in (models["uncertainty"] < 0.05, models["uncertainty"] > 0.2)
         )
         assert unsure.std() > 1.5 * sure.std()
-        exact = draw.told(numbers, exact=True)
+        exact = draw.models(numbers, exact=True)
         assert torch.allclose(exact["gain_factor"], numbers["gain_factor"])
 
 
@@ -121,11 +121,11 @@ class TestGradient:
         draw = Draw(3, samples, SMALL.spread, 0)
         numbers = {name: value.double() for name, value in draw.plants().items()}
         numbers |= {"dead_zone": torch.zeros(3, dtype=torch.double)}
-        told = draw.told(numbers, exact=True)
+        models = draw.models(numbers, exact=True)
         plants = environment(3, samples, dtype=torch.double)
 
         def loss():
-            errors, applied = Loops(plants, numbers, told, 0).run(net, samples)
+            errors, applied = Loops(plants, numbers, models, 0).run(net, samples)
             return loss_of(errors, applied, numbers["small"], SMALL)
 
         torch.set_default_dtype(torch.double)

@@ -42,14 +42,14 @@ def step_test_and_data_sheet(plant: Parameters) -> dict[str, Any]:
 def with_limits(
     make: Callable[..., Made], plant: Parameters, runs: int, seed: int, **gains: Any
 ) -> Made:
-    """Return a controller that is told its gains and the limits of the flow, nothing else."""
+    """Return a controller that knows its gains and the limits of the flow, nothing else."""
     return make(**gains, **limits(plant))
 
 
 def with_step_test(
     make: Callable[..., Made], plant: Parameters, runs: int = 1, seed: int = 0
 ) -> Made:
-    """Return a controller that is told a step test and the actuator's data sheet."""
+    """Return a controller that knows a step test and the actuator's data sheet."""
     return make(**step_test_and_data_sheet(plant))
 
 
@@ -59,7 +59,7 @@ searched_pi = partial(paper_pi, **SEARCHED_GAINS)
 self_tuning = partial(with_step_test, SelfTuningController)
 nn_smith = partial(with_step_test, NeuralSmithPredictor)
 nn_self_tuning = partial(with_step_test, NeuralSelfTuningController)
-mpc = PredictiveController  # is told the whole plant
+mpc = PredictiveController  # knows the whole plant
 
 
 def simc_pi(plant: Parameters, runs: int = 1, seed: int = 0) -> PIController:
@@ -75,7 +75,7 @@ def smith(plant: Parameters, runs: int = 1, seed: int = 0) -> SmithPredictor:
 
 
 def direct_nn(plant: Parameters, runs: int, seed: int, **gains: Any) -> DirectNNController:
-    """Return the paper's network, which is told the direction of the plant's response."""
+    """Return the paper's network, which knows the direction of the plant's response."""
     direction = 1 if nominal(plant).gain > 0.0 else -1
     return DirectNNController(
         num_envs=runs, seed=seed, direction=direction, **limits(plant), **gains

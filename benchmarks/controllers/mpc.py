@@ -35,7 +35,7 @@ class PredictiveController:
     for a constant set point and inputs within the limits. A first input inside the dead zone is
     replaced by 0 or by the input at a command on the edge, whichever gives the better plan.
 
-    Where plant numbers are ranges, the controller is told those that loop i draws with seed
+    Where plant numbers are ranges, the controller knows those that loop i draws with seed
     `seed + i` in its first episode.
     """
 

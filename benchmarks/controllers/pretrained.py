@@ -15,9 +15,9 @@ from mptc_gym import Parameters
 
 
 def trained(network: PolicyNetwork, plant: Parameters, runs: int, seed: int) -> PolicyNetwork:
-    """Return a controller with the network, told the actuator's limits.
+    """Return a controller with the network for the actuator's limits.
 
-    If it compensates a dead zone, it is also told that of the plant, if that is a number.
+    If it compensates a dead zone, that is the plant's, where it is a number.
     """
     increments = network.increments
     if increments and increments.dead_zone and not isinstance(plant.dead_zone, Sequence):
@@ -25,8 +25,8 @@ def trained(network: PolicyNetwork, plant: Parameters, runs: int, seed: int) -> 
     return replace(network, increments=increments, **limits(plant))
 
 
-def told_network(make: Callable[..., Agent], cost: Cost) -> Members:
-    """Return the only member of a controller with the told network, read when it is used."""
+def law_network(make: Callable[..., Agent], cost: Cost) -> Members:
+    """Return the only member of a controller with the network of the law."""
 
     def members() -> list[Factory]:
         about = {"file": "nn-smith.npz", **LawNetwork.load().provenance}

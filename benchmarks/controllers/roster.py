@@ -140,7 +140,7 @@ _ENTRIES = (
     RosterEntry(
         "nn-smith",
         "neural Smith",
-        pretrained.told_network(
+        pretrained.law_network(
             engineered.nn_smith,
             Cost(_DATA_SHEET, _NETWORK, "one step test; 46 M, once", _SEARCH_OF_NETWORK),
         ),
@@ -149,7 +149,7 @@ _ENTRIES = (
     RosterEntry(
         "nn-self-tuning",
         "neural self-tuning",
-        pretrained.told_network(
+        pretrained.law_network(
             engineered.nn_self_tuning,
             Cost(
                 f"{_DATA_SHEET}; delay range",

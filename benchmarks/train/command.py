@@ -30,7 +30,7 @@ def execute(options: Options, console: Console) -> str:
     """Train networks, save them and show their results in validation."""
     out = out_folder(options.out)
     target = PRETRAINED if options.keep else out
-    networks, rows, said = (_told if options.network == "nn-smith" else _ppo)(options, out)
+    networks, rows, said = (_law if options.network == "nn-smith" else _ppo)(options, out)
     shown = pd.DataFrame(rows).map(lambda x: f"{x:.4g}" if isinstance(x, float) else str(x))
     console.print(on_screen(shown))
     for name, network in networks.items():
@@ -46,8 +46,8 @@ def trained(trainings: Sequence[Training], out: Path, fan_out: FanOut) -> list[L
     return [*fan_out.run(tasks, "training", kept).values()]
 
 
-def _told(options: Options, out: Path) -> Made:
-    """Train told networks, and choose one by validation.
+def _law(options: Options, out: Path) -> Made:
+    """Train networks for the law, and choose one by validation.
 
     The rows show geometric means of |e|, as shares of the reach.
     """

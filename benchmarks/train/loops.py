@@ -1,4 +1,4 @@
-"""Simulate batches of drawn plants under the told network, to train and to validate it."""
+"""Simulate batches of drawn plants under the network, to train and to validate it."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ NOMINAL = Parameters(time_constant_factor=[0.2, 5.0])  # a range, so that it can
 DYNAMICS = Dynamics(NOMINAL)
 GAIN = abs(sum(NOMINAL.b) / sum(NOMINAL.a))  # degC per t/h
 RATE = 1.0 - float(np.abs(np.roots(NOMINAL.a)).max())  # of the dominant pole
-LONGEST, BLOCK = 44, 4  # samples: told delays lie from BLOCK to LONGEST - BLOCK
+LONGEST, BLOCK = 44, 4  # samples: nominal delays lie from BLOCK to LONGEST - BLOCK
 
 Numbers = dict[str, Tensor]
 
 
 class Draw:
-    """Random draws of a batch of plants, their set points and their told numbers."""
+    """Random draws of a batch of plants, their set points and their nominal models."""
 
     def __init__(self, n: int, samples: int, spread: float, *seed: int) -> None:
         self._n, self._samples, self._spread = n, samples, spread
@@ -95,22 +95,22 @@ class Draw:
         square = torch.where((age + phase) // 300 % 2 == 0, size[0], -size[0])
         return torch.where(self.uniform(0.0, 1.0) < 0.5, square, held)
 
-    def told(self, numbers: Numbers, *, exact: bool = False) -> Numbers:
-        """Draw the told numbers: first-order models for 60 % of the plants, some wrong."""
-        told = {name: numbers[name] for name in ("u_min", "u_max", "dead_zone")}
-        told["first"] = self.uniform(0.0, 1.0) < 0.6
+    def models(self, numbers: Numbers, *, exact: bool = False) -> Numbers:
+        """Draw nominal models, of first order for 60 % of the plants, some of them wrong."""
+        models = {name: numbers[name] for name in ("u_min", "u_max", "dead_zone")}
+        models["first"] = self.uniform(0.0, 1.0) < 0.6
         k = self.some(0.0 if exact else 0.5, 0.0, self._spread)
         # Some numbers are out of date, which their uncertainty does not show.
         aged = self.some(0.0 if exact else 0.1, 0.0, 0.3)
         wrong = torch.randn(3, self._n, generator=self._generator) * k
         wrong[:2] += self.uniform(-1.5, 1.5, 2, self._n) * aged
-        told["uncertainty"] = k
-        told["gain_factor"] = numbers["gain_factor"] * torch.exp(wrong[0])
+        models["uncertainty"] = k
+        models["gain_factor"] = numbers["gain_factor"] * torch.exp(wrong[0])
         constant = numbers["time_constant_factor"] * torch.exp(1.5 * wrong[1])
-        told["time_constant_factor"] = constant.clamp(0.3, 3.3)
+        models["time_constant_factor"] = constant.clamp(0.3, 3.3)
         delay = numbers["delay"] + (20.0 * wrong[2]).round()
-        told["delay"] = delay.clamp(BLOCK, LONGEST - BLOCK)
-        return told
+        models["delay"] = delay.clamp(BLOCK, LONGEST - BLOCK)
+        return models
 
 
 def environment(
@@ -156,14 +156,14 @@ class _TorchLaw(Law):
 class Loops:
     """A batch of plants controlled by the network, starting from rest.
 
-    The law and the told models are those of `NeuralSmithPredictor`.
+    The law and the nominal models are those of `NeuralSmithPredictor`.
     """
 
     def __init__(
-        self, plants: MiddlePointTorchEnv, numbers: Numbers, told: Numbers, seed: int
+        self, plants: MiddlePointTorchEnv, numbers: Numbers, models: Numbers, seed: int
     ) -> None:
-        gain, constant = told["gain_factor"], told["time_constant_factor"]
-        low, high, first = told["u_min"], told["u_max"], told["first"]
+        gain, constant = models["gain_factor"], models["time_constant_factor"]
+        low, high, first = models["u_min"], models["u_max"], models["first"]
         self._plants, self._first = plants, first
         self._low, self._half = low, (high - low) / 2.0
         self._reach = gain * GAIN * self._half
@@ -173,16 +173,16 @@ class Loops:
         self._alpha = torch.where(first, pole, alpha[0]), torch.where(first, zero, alpha[1])
         newer, older = (unit * (b / sum(NOMINAL.b)) for b in NOMINAL.b)
         self._beta = torch.where(first, unit, newer), torch.where(first, zero, older)
-        self._delay = told["delay"].long()
+        self._delay = models["delay"].long()
         self._law = _TorchLaw(
             Prior(
                 unit=unit,
-                fading=pole ** (told["delay"] + 1.0 + 0.5 * first),
+                fading=pole ** (models["delay"] + 1.0 + 0.5 * first),
                 time_constant=constant,
-                delay=told["delay"],
-                dead_zone=told["dead_zone"] / self._half,
+                delay=models["delay"],
+                dead_zone=models["dead_zone"] / self._half,
                 centre=-(high + low) / (high - low),
-                uncertainty=told["uncertainty"],
+                uncertainty=models["uncertainty"],
             ),
         )
         self._before = torch.zeros(LONGEST + BLOCK, len(gain))  # the model's outputs

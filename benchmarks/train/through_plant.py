@@ -1,6 +1,6 @@
 """Train the network of `nn-smith` by the gradient through plants of all kinds.
 
-The network controls a batch of simulated plants, each with a model that is told its numbers.
+The network controls a batch of simulated plants, each with a nominal model of it.
 The error of the whole run is differentiated with respect to the weights, back through plant,
 actuator and law. The literature calls this differentiable predictive control (J. Drgona et al.,
 "Differentiable predictive control: deep learning alternative to explicit model predictive
@@ -68,7 +68,7 @@ class Training:
     tolerance: float = 0.003
     """Error below which the loss is quadratic (Huber), as a share of the reach."""
     spread: float = 0.4
-    """Largest uncertainty of the told numbers."""
+    """Largest uncertainty of the nominal models."""
     averaging: float = 0.98
     """Factor of the exponential mean of the weights over past steps; the mean is kept."""
 
@@ -123,7 +123,7 @@ def loss_of(errors: Tensor, applied: Tensor, small: Tensor, training: Training) 
 def validate(net: Net, training: Training) -> dict[str, float]:
     """Return the mean logarithm of the mean |e|, and the travel, for each kind of plants.
 
-    These plants do not occur in training. Their told numbers are exact.
+    These plants do not occur in training. Their nominal models are exact.
     """
     plants = environment(VALIDATION_PLANTS, VALIDATION_SAMPLES)
     found = {}
@@ -138,13 +138,13 @@ def validate(net: Net, training: Training) -> dict[str, float]:
         numbers["disturbance_interval"] = torch.full((VALIDATION_PLANTS,), 200.0)
         for name, (low, high, power) in drawn.items():
             numbers[name] = draw.uniform(low, high) * numbers["small"] ** power
-        told = draw.told(numbers, exact=True)
+        models = draw.models(numbers, exact=True)
         with torch.no_grad():
-            loops = Loops(plants, numbers, told, VALIDATION_SEED)
+            loops = Loops(plants, numbers, models, VALIDATION_SEED)
             errors, applied = loops.run(net, VALIDATION_SAMPLES)
-        each, first = errors.abs().mean(0).log(), told["first"]
+        each, first = errors.abs().mean(0).log(), models["first"]
         found[kind] = float(each.mean())
-        found[f"{kind} 1"] = float(each[first].mean())  # told a first-order model
+        found[f"{kind} 1"] = float(each[first].mean())  # with a first-order model
         found[f"{kind} 2"] = float(each[~first].mean())
         found[f"{kind}, travel"] = 10.0 * float(applied.diff(dim=0).abs().mean())
     return found
@@ -184,7 +184,7 @@ def _advance(
     length = training.stretches * training.samples
     draw = Draw(training.plants, length, training.spread, training.seed, step)
     numbers = draw.plants()
-    loops = Loops(plants, numbers, draw.told(numbers), step)
+    loops = Loops(plants, numbers, draw.models(numbers), step)
     for now in range(step, min(step + training.stretches, training.steps)):
         left = max(1.0 - now / training.steps, 0.01)
         optimiser.param_groups[0]["lr"] = training.learning_rate * left
