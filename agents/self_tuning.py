@@ -32,10 +32,8 @@ PREFILTER_POLE = 0.6
 LEAST_NOISE = 0.02  # degC; smaller errors do not distinguish models
 EXCITED = 0.05  # of half the range: the flow must have moved this far for the models to learn
 MEMORY = 20  # samples before the longest delay in which a movement still counts
-DELAY_STEP = 2  # samples between neighbouring delays in the bank
 BIAS_RATE = 0.005  # per sample, of the offset estimate
 DISTURBANCE_POLE = 0.5  # of the disturbance filter
-CLEARANCE = 0.2  # t/h by which commands clear the dead zone
 MOST_DELAY = 10_000  # samples; with more, the bank would be too large for any computer
 _ROOM = 64  # samples until the histories are shifted back
 
@@ -105,6 +103,10 @@ class SelfTuningController(ModelBasedController):
 
     observation = PAPER_WINDOWS  # for the default indices
 
+    _delay_step = 2  # samples between neighbouring delays in the bank
+    # t/h by which commands clear the dead zone, and the share of its edge below which a flow
+    # returns from there to 0.
+    _clearance, _release = 0.2, 0.5
     # How fast the control law follows the evidence.
     _every = 10  # samples between designs
     _share = 0.5  # of a new design that is adopted
@@ -130,7 +132,7 @@ class SelfTuningController(ModelBasedController):
 
         # Undelayed responses differ in dead zone and pole, models also in delay, the longest
         # one first, as in the history of the responses.
-        self._delays = np.arange(longest, shortest - 1, -DELAY_STEP)
+        self._delays = np.arange(longest, shortest - 1, -self._delay_step)
         nominal = self.time_constant / self.sampling_interval
         self._constants = np.tile(nominal * np.array(TIME_CONSTANTS), len(self._zones))
         self._poles = np.exp(-1.0 / self._constants)
@@ -209,7 +211,7 @@ class SelfTuningController(ModelBasedController):
         filtered = self._filtered[:, oldest : self._now - shortest + 1]
         squares = np.square(filtered) * gate[:, :, np.newaxis]
         for i in range(interval):
-            delayed = slice(i, i + longest - shortest + 1, DELAY_STEP)
+            delayed = slice(i, i + longest - shortest + 1, self._delay_step)
             products += filtered[:, delayed] * outputs[:, i, np.newaxis, np.newaxis]
             information += squares[:, delayed]
         self._energy *= kept
@@ -267,8 +269,11 @@ class SelfTuningController(ModelBasedController):
             self._learn()
             self._design(self._share)
 
-        edge = np.where(self._zone > 0.0, self._zone + CLEARANCE, 0.0)
-        command: Array = avoid_dead_zone(self._law(setpoint), edge)
+        edge = np.where(self._zone > 0.0, self._zone + self._clearance, 0.0)
+        wanted = self._law(setpoint)
+        was_there = wanted * self._flows[:, self._now - 1] > 0.0
+        share = np.where(was_there, self._release, 0.5)
+        command: Array = avoid_dead_zone(wanted, edge, share)
         self._apply(command)
         return command if observation.ndim == 2 else command[0]
 
