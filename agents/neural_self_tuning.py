@@ -45,6 +45,10 @@ class NeuralSelfTuningController(SelfTuningController):
     haste: NotNegative = 0.75
     closed_loop_time_constant: float = field(init=False, default=0.15)
 
+    # Each delay has its models: with every second one, a plant between two of them answers as none
+    # does, at each return of the delay, and the valve with it. The flow stays longer at the edge of
+    # the dead zone, which saves pairs of moves across it.
+    _delay_step, _clearance, _release = 1, 0.05, 0.3
     _every, _share, _caution, _noise = 2, 1.0, 1.0, 0.25
     _gain_spread, _delay_spread, _time_constant_spread = 0.25, 6.0, 0.3
     _prefilter_zero = 0.965

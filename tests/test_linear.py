@@ -1,25 +1,31 @@
-"""The linear model against the environment, and what refuses a plant that is not linear."""
+"""The linear model against the environment, its step test and its margins."""
 
+import math
 from dataclasses import replace
 
+import control
 import numpy as np
 import pytest
 from scipy import signal
 
-from agents import PIController
+from agents import PIController, SmithPredictor
+from agents.pi import SEARCHED_GAINS
 from benchmarks.bounds import __main__ as command
 from benchmarks.bounds.least import frontier, least_possible
 from benchmarks.controllers import engineered
 from benchmarks.controllers.mpc import PredictiveController
+from benchmarks.lib.command import UsageError
 from benchmarks.loop import linear
 from benchmarks.loop.linear import (
     Coefficients,
     LinearModel,
+    StepTest,
     nominal,
     step_test,
     time_varying_model,
 )
-from benchmarks.loop.margins import Loop
+from benchmarks.loop.margins import Loop, sensitivities
+from benchmarks.loop.plants import PlantOptions
 from mptc_gym import MiddlePointEnv, Parameters
 from mptc_gym.parameters import ARGUMENTS
 from mptc_gym.ranges import Ranges, numbers_of_plant
@@ -115,3 +121,158 @@ def test_every_analysis_refuses_an_argument_that_is_not_declared_linear(analysis
     ANALYSES[analysis]()
     with pytest.raises(ValueError, match=r"^temperature_span must be 50\.0 .* got 49\.0"):
         ANALYSES[analysis](temperature_span=49.0)
+
+
+def first_order(gain, time_constant, delay):
+    """Return arguments of a plant of first order, with `delay` samples until an input shows."""
+    pole = np.exp(-8.0 / time_constant)
+    return {"a": [1.0, -pole], "b": [gain * (1.0 - pole)], "delay": delay - 1}
+
+
+def test_paper_plant_shows_the_numbers_its_controllers_are_tuned_with():
+    found = step_test(Parameters())
+    # Steady-state gain -0.0496 / 0.0727, the time constant of the pole at 0.9515, 19 samples.
+    assert found == StepTest(-0.6825, 161.0, 152.0, 8.0)
+
+
+@pytest.mark.parametrize("gain", [-0.3, 0.02, 4.0])
+@pytest.mark.parametrize("time_constant", [4.0, 60.0, 900.0])
+@pytest.mark.parametrize("delay", [1, 5, 80])
+def test_plant_of_first_order_shows_its_own_numbers(gain, time_constant, delay):
+    found = step_test(Parameters(**first_order(gain, time_constant, delay)))
+    assert found.gain == pytest.approx(gain, rel=1e-3)
+    assert found.time_constant == pytest.approx(time_constant, rel=0.01, abs=1.0)
+    assert found.delay == 8.0 * delay
+
+
+def test_model_is_close_to_the_response_of_a_plant_of_higher_order():
+    a = np.poly([0.95, 0.9, 0.8])
+    plant = Parameters(a=a.tolist(), b=[0.001, 0.0005], delay=10)
+    found = step_test(plant)
+    times = 8.0 * np.arange(300)
+    model = found.gain * -np.expm1(
+        -np.maximum(times - found.delay + 8.0, 0) / found.time_constant
+    )
+    model[times < found.delay] = 0.0
+    assert np.abs(model - nominal(plant).step_response(300)).max() < 0.1 * found.gain
+
+
+def test_sampling_interval_scales_times():
+    slow = step_test(Parameters(sampling_interval=80.0))
+    assert (slow.time_constant, slow.delay) == (1610.0, 1520.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [({"a": [1.0, -1.0]}, "a"), ({"a": [1.0, -1.1]}, "a"), ({"b": [0.1, -0.1]}, "b")],
+)
+def test_plant_without_a_new_steady_state_is_refused(arguments, name):
+    with pytest.raises(ValueError, match=f"^{name} must"):
+        step_test(Parameters(**arguments))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (None, "plant.json cannot be read: No such file"),
+        ("{", "plant.json must be a JSON file"),
+        ("[1, 2]", "plant.json must hold one object"),
+        ('{"delay": -1}', "delay must be"),
+        ("[" * 100_000, "plant.json must be a JSON file"),
+    ],
+)
+def test_bad_plant_file_is_named(tmp_path, text, complaint):
+    path = tmp_path / "plant.json"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(UsageError, match=f"^--plant: .*{complaint}"):
+        PlantOptions(plant=path).chosen()
+
+
+def test_lists_of_any_depth_are_refused_by_name():
+    for depth in range(600, 1000, 5):  # what JSON still reads may be too deep to be shown
+        with pytest.raises(UsageError, match=r"^--set: delay must be an integer"):
+            PlantOptions(set=("delay=" + "[" * depth + "]" * depth,)).chosen()
+
+
+STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of the paper's plant
+PLANTS = {
+    "paper": {},
+    "long": {"delay": 35, "gain_factor": 1.1},
+    "slow": {"time_constant_factor": 2.0, "sampling_interval": 2.0},
+    "first order": {"a": [1.0, -0.9], "b": [-0.06], "delay": 4},
+}
+
+
+def linear_controllers():
+    return {
+        "simc": PIController.simc(**STEP_TEST),
+        "searched": PIController(**SEARCHED_GAINS),
+        "smith": SmithPredictor(**STEP_TEST, closed_loop_time_constant=80.0),
+        "gentle": PIController(0.5, 0.01),
+        "unstable": PIController(8.0, 0.5),
+    }
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+@pytest.mark.parametrize("name", linear_controllers())
+def test_agreement_with_python_control(plant, name):
+    parameters = Parameters(**PLANTS[plant])
+    controller = linear_controllers()[name]
+    loop = Loop(controller, nominal(parameters))
+    found, interval = loop.margins, parameters.sampling_interval
+    size = max(len(loop.numerator), len(loop.denominator))
+    system = control.tf(
+        np.pad(loop.numerator, (0, size - len(loop.numerator))),
+        np.pad(loop.denominator, (0, size - len(loop.denominator))),
+        interval,
+    )
+    poles = control.feedback(system, 1).poles()
+    assert found.stable == bool(np.all(np.abs(poles) < 1.0))
+    if not found.stable:
+        assert math.isnan(found.gain)
+        return
+    frequency = np.geomspace(1e-4, 0.9999, 4000) * math.pi / interval
+    gains, phases, distances, _, crossings, _ = control.stability_margins(
+        control.frd(system, frequency, smooth=True), returnall=True
+    )
+    assert found.sensitivity == pytest.approx(1.0 / min(distances), rel=1e-3)
+    assert found.gain == pytest.approx(min(gains[gains > 1.0]), rel=1e-3)
+    assert found.phase == pytest.approx(np.abs(phases).min(), rel=1e-3)
+    delays = np.radians(phases % 360.0) / crossings
+    assert found.delay == pytest.approx(min(delays), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", linear_controllers())
+def test_transfer_function_is_what_the_controller_does(name):
+    # Away from limits and dead zone, commands are the error, filtered.
+    controller = linear_controllers()[name]
+    errors = np.random.default_rng(0).normal(0.0, 0.1, 200)
+    commands = []
+    for error in errors:
+        controller.act([0.0, 0.0, 0.0, error])
+        commands.append(controller.command)
+    assert np.abs(commands).max() < 10.0
+    np.testing.assert_allclose(
+        commands, signal.lfilter(*controller.transfer(), errors), atol=1e-9
+    )
+
+
+def test_other_direction_has_the_same_margins():
+    mirrored = Parameters(b=[-b for b in Parameters().b])
+    shown = {**STEP_TEST, "gain": -STEP_TEST["gain"]}
+    for make in (PIController.simc, SmithPredictor):
+        more = {"closed_loop_time_constant": 80.0}
+        ours = Loop(make(**STEP_TEST, **more), nominal(Parameters())).margins
+        assert Loop(make(**shown, **more), nominal(mirrored)).margins == ours
+
+
+def test_coarse_grid_finds_the_same_sensitivities():
+    plants = [nominal(Parameters(**plant)) for plant in PLANTS.values()]
+    peaks = sensitivities(plants)
+    for controller in linear_controllers().values():
+        for plant, peak in zip(plants, peaks(controller), strict=True):
+            margins = Loop(controller, plant).margins
+            assert np.isinf(peak) == (not margins.stable)
+            if margins.stable:
+                assert peak == pytest.approx(margins.sensitivity, rel=0.01)
