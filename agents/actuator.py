@@ -48,10 +48,10 @@ def compensate_dead_zone(flow: Any, dead_zone: float, u_min: float, u_max: float
     return command
 
 
-def avoid_dead_zone(command: Any, edge: Any, share: Any = 0.5, xp: Any = np) -> Any:
-    """Move commands closer to 0 than `edge` to this edge, or to 0 if below a share of it.
+def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:
+    """Move commands closer to 0 than `edge` to this edge or to 0, whichever is nearer.
 
     `xp` is the array module, NumPy or PyTorch.
     """
     size = abs(command)
-    return xp.where(size < edge, edge * xp.sign(command) * (size >= edge * share), command)
+    return xp.where(size < edge, edge * xp.sign(command) * (size >= edge / 2.0), command)

@@ -228,7 +228,7 @@ class Law:
         """Move flows in the dead zone to its edge or 0; return them, also clipped to limits."""
         xp, zone, hard = self._xp, self.prior.dead_zone, self._stop_gradient(flow)
         edge = zone + CLEARANCE * (zone > 0.0)
-        flow = flow + (avoid_dead_zone(hard, edge, xp=xp) - hard)  # straight-through gradient
+        flow = flow + (avoid_dead_zone(hard, edge, xp) - hard)  # straight-through gradient
         return flow, xp.clip(flow, self.prior.centre - 1.0, self.prior.centre + 1.0)
 
     def _of_each_mean(self, load: Any, residual: Any) -> Any:

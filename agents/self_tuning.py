@@ -54,9 +54,10 @@ class SelfTuningController(ModelBasedController):
     *Control.* As in a Smith predictor, the model predicts the output at the end of the delay.
     The disturbance, which is the difference between the output and the model, is added. It
     decays over the delay like the plant's own response, except for its slow mean, a filter of
-    200 samples: the offset that a steady load leaves fades with that time constant. The command
-    is `u = s + K (y_d - predicted output)`, where K makes the error decay with the requested
-    time constant. The response s takes the place of an integral; it is the response to the flow
+    200 samples: the offset that a steady load leaves fades with about that time constant. What
+    remains, some hundredths of a degree, is by how much undecided models differ. The command is
+    `u = s + K (y_d - predicted output)`, where K makes the error decay with the requested time
+    constant. The response s takes the place of an integral; it is the response to the flow
     after the actuator, so nothing winds up. A command within the most likely dead zone is moved
     to its edge or to 0, whichever is nearer.
 
@@ -104,9 +105,7 @@ class SelfTuningController(ModelBasedController):
     observation = PAPER_WINDOWS  # for the default indices
 
     _delay_step = 2  # samples between neighbouring delays in the bank
-    # t/h by which commands clear the dead zone, and the share of its edge below which a flow
-    # returns from there to 0.
-    _clearance, _release = 0.2, 0.5
+    _clearance = 0.2  # t/h by which commands clear the dead zone
     # How fast the control law follows the evidence.
     _every = 10  # samples between designs
     _share = 0.5  # of a new design that is adopted
@@ -270,10 +269,7 @@ class SelfTuningController(ModelBasedController):
             self._design(self._share)
 
         edge = np.where(self._zone > 0.0, self._zone + self._clearance, 0.0)
-        wanted = self._law(setpoint)
-        was_there = wanted * self._flows[:, self._now - 1] > 0.0
-        share = np.where(was_there, self._release, 0.5)
-        command: Array = avoid_dead_zone(wanted, edge, share)
+        command: Array = avoid_dead_zone(self._law(setpoint), edge)
         self._apply(command)
         return command if observation.ndim == 2 else command[0]
 
