@@ -23,11 +23,6 @@ def draw(seed: int, calls: Path | None = None, seconds: float = 0.0) -> Rows:
     return [{"seed": seed, "sum": float(product.sum())}]
 
 
-def die(seed: int) -> Rows:
-    """Kill the own process, each time."""
-    os._exit(seed + 1)
-
-
 def die_of_memory(seed: int) -> None:
     """Kill the own process as the system does if memory runs out."""
     os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # as Windows has it

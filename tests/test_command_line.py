@@ -51,13 +51,8 @@ def test_help_is_printed_alone(name, capsys):
         assert clutter not in shown
     if "--seed " in shown:
         assert re.search(r"default: (0|1|7000000)\]", shown)  # 0 is a default, too
-
-
-def test_help_keeps_names_whole(capsys):
-    assert main_of("compare")(["--help"]) == 0
-    shown = capsys.readouterr().out
-    for name in ("nn-frozen", "dead-zone-7", "square-dead-zone-7", "constant-noise"):
-        assert name in shown
+    if name == "compare":  # names are not broken between lines
+        assert {"nn-frozen", "square-dead-zone-7"} <= {*re.split(r"[\s,]+", shown)}
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -52,18 +52,11 @@ class TestNumbers:
         one = partial(next, (os.getpid() for _ in "1"))  # which cannot be pickled
         assert run({"pid": one}) == {"pid": os.getpid()}
 
-    def test_a_bar_has_a_title(self, capsys):
-        run(work(1), jobs=1)
-        assert capsys.readouterr().err == ""
-        FanOut(jobs=1).run(work(1), "Plants")
-        assert "Plants: 100%" in capsys.readouterr().err
-
-    @pytest.mark.parametrize("jobs", [1, 2])
-    def test_a_result_that_json_cannot_hold_costs_no_other(self, tmp_path, jobs):
+    def test_a_result_that_json_cannot_hold_costs_no_other(self, tmp_path):
         with pytest.raises(
             TasksFailedError, match="a set: Its result cannot be kept"
         ) as raised:
-            run({"a set": partial(set, "a"), **work(2)}, tmp_path, jobs)
+            run({"a set": partial(set, "a"), **work(2)}, tmp_path, jobs=1)
         assert [*raised.value.errors] == ["a set"]
         assert run(work(2), tmp_path) == run(work(2))
 
@@ -123,9 +116,8 @@ class TestResume:
 
 
 class TestFailures:
-    @pytest.mark.parametrize("killed", [tasks.die, tasks.die_of_memory])
-    def test_a_killed_process_costs_the_tasks_under_way(self, tmp_path, calls, killed):
-        lossy = {**work(6, calls, 0.05), "the killer": partial(killed, 0)}
+    def test_a_killed_process_costs_the_tasks_under_way(self, tmp_path, calls):
+        lossy = {**work(6, calls, 0.05), "the killer": partial(tasks.die_of_memory, 0)}
         lossy |= {f"later {seed}": partial(tasks.draw, seed, calls, 0.05) for seed in (7, 8, 9)}
         with pytest.raises(TasksFailedError, match="the same command tries again") as error:
             run(lossy, tmp_path / "out")

@@ -24,14 +24,15 @@ HELP = (
     "sets it to 0; Page Up and Page Down move the set point, L and K the load, by 1 °C; "
     "+ and - change the speed; space pauses, Esc ends"
 )
-FLOW_STEP = 0.5  # t/h
-STEP = 1.0  # of set point and load, degC
-FASTEST = 1920  # samples per second
-EPISODES = 20  # for the bound, where plants are drawn
-
-_FLOWS = {pygame.K_UP: FLOW_STEP, pygame.K_DOWN: -FLOW_STEP}
-_SETPOINTS = {pygame.K_PAGEUP: STEP, pygame.K_PAGEDOWN: -STEP}
-_LOADS = {pygame.K_l: STEP, pygame.K_k: -STEP}
+# What keys add, by attribute of `Hands`: t/h, degC and degC.
+_ADDED = {
+    pygame.K_UP: ("flow", 0.5),
+    pygame.K_DOWN: ("flow", -0.5),
+    pygame.K_PAGEUP: ("setpoint", 1.0),
+    pygame.K_PAGEDOWN: ("setpoint", -1.0),
+    pygame.K_l: ("load", 1.0),
+    pygame.K_k: ("load", -1.0),
+}
 _SPEEDS = {"+": 2.0, "=": 2.0, "-": 0.5}  # by character, as keyboards differ
 
 Moves = dict[int, tuple[float, float]]  # k: additions to set point and load from k + 1 on
@@ -61,8 +62,8 @@ class Hands(IdleValve):
             dragged = event.type == pygame.MOUSEMOTION and event.buttons[0]
             if clicked or dragged:
                 flow = drawing.flow_at(event.pos, self.u_min, self.u_max)
-                if flow is not None:
-                    self._move(flow)
+                self.flow = self.flow if flow is None else flow
+            self.flow = min(max(self.flow, self.u_min), self.u_max)
 
     def _press(self, key: int, character: str) -> None:
         if key == pygame.K_ESCAPE:
@@ -70,15 +71,12 @@ class Hands(IdleValve):
         if key == pygame.K_SPACE:
             self.paused = not self.paused
         elif key == pygame.K_HOME:
-            self._move(0.0)
+            self.flow = 0.0
+        elif key in _ADDED:
+            name, more = _ADDED[key]
+            setattr(self, name, getattr(self, name) + more)
         elif character in _SPEEDS:
-            self.speed = min(max(self.speed * _SPEEDS[character], 1.0), float(FASTEST))
-        self._move(self.flow + _FLOWS.get(key, 0.0))
-        self.setpoint += _SETPOINTS.get(key, 0.0)
-        self.load += _LOADS.get(key, 0.0)
-
-    def _move(self, flow: float) -> None:
-        self.flow = min(max(flow, self.u_min), self.u_max)
+            self.speed = min(max(self.speed * _SPEEDS[character], 1.0), 1920.0)
 
 
 def play(
@@ -163,8 +161,7 @@ def tabulate(
             kind, longer = "preview", replace(scenario, samples=scenario.samples + 1)
             idle = replay(ROSTER["nothing"].members()[0], longer, seed, moves)
             arguments["setpoint"] = idle.setpoint[:, 0].tolist()
-        bound = least_possible(
-            samples=scenario.samples, kind=kind, episodes=EPISODES, **arguments
-        )
+        # Over few episodes, where plants are drawn: the viewer waits.
+        bound = least_possible(samples=scenario.samples, kind=kind, episodes=20, **arguments)
         rows.insert(0, ("least possible, on average", f"{bound.value:.3f}", ""))
     return pd.DataFrame(rows, columns=["", "mean |e| (°C)", "valve travel (t/h)"])
