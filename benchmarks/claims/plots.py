@@ -5,13 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
 from benchmarks.claims.runs import FIGURES
-from benchmarks.lib.drawing import COLOURS, colours, draw_actuator, drawn
+from benchmarks.lib.drawing import COLOURS, colours, draw_actuator, draw_legend, drawn, panels
 from benchmarks.lib.tables import groups
 from benchmarks.loop.metrics import METRICS
 from mptc_gym import Parameters
@@ -19,7 +20,11 @@ from mptc_gym import Parameters
 
 def plot_convergence(times: pd.DataFrame, path: Path) -> None:
     """Draw the share of networks that have converged over time, a line for each set point."""
-    with drawn(path, 9, 4) as figure:
+    shares = ", ".join(
+        f"{100 * (each <= 150).mean():.0f} % ({name})" for name, each in times.items()
+    )
+    title = f"Weights that have converged within the paper's 150 samples: {shares}"
+    with drawn(path, 3.6, title) as figure:
         axes = figure.subplots()
         for name, colour in colours(list(times.columns)).items():
             finite = times[name].replace(math.inf, np.nan).dropna().sort_values()
@@ -35,7 +40,10 @@ def plot_convergence(times: pd.DataFrame, path: Path) -> None:
 
 def plot_pi_gains(errors: pd.DataFrame, path: Path) -> None:
     """Draw the mean error of PI controllers over Kp, one line for each case."""
-    with drawn(path, 9, 4) as figure:
+    least = errors.groupby("setpoint", sort=False)["mean_error"].min()
+    each = ", ".join(f"{error:.2f} °C ({name})" for name, error in least.items())
+    title = f"With the paper's Ki no Kp brings the mean error below {each}"
+    with drawn(path, 3.6, title) as figure:
         axes = figure.subplots()
         for (name, rows), colour in zip(groups(errors, "setpoint"), COLOURS, strict=False):
             axes.plot(rows["kp"], rows["mean_error"], ".-", color=colour, label=name)
@@ -48,12 +56,14 @@ def plot_pi_gains(errors: pd.DataFrame, path: Path) -> None:
 def plot_other_plants(cells: pd.DataFrame, path: Path) -> None:
     """Draw maps of the share of networks that settle over delay and gain, for each case."""
     cases, time_constants = cells["setpoint"].unique(), cells["time_constant"].unique()
-    with drawn(path, 10, 2.8 * len(cases), grid=False) as figure:
-        panels = figure.subplots(len(cases), len(time_constants), sharex=True, squeeze=False)
+    share = (cells["settled"] >= 0.9).mean()
+    title = f"At least 90 % of the networks settle on {100 * share:.0f} % of the plants"
+    with drawn(path, 2.3 * len(cases), title, grid=False) as figure:
+        maps = figure.subplots(len(cases), len(time_constants), sharex=True, squeeze=False)
         for (i, case), (j, constant) in itertools.product(
             enumerate(cases), enumerate(time_constants)
         ):
-            axes = panels[i, j]
+            axes = maps[i, j]
             rows = cells[(cells["setpoint"] == case) & (cells["time_constant"] == constant)]
             grid = 100 * rows.pivot_table(index="gain", columns="delay", values="settled")
             image = axes.imshow(
@@ -70,11 +80,11 @@ def plot_other_plants(cells: pd.DataFrame, path: Path) -> None:
                 axes.text(
                     *reversed(place), f"{value:.0f}", ha="center", va="center", color=shade
                 )
-        for axes in panels[-1]:
+        for axes in maps[-1]:
             axes.set_xlabel("delay (samples)")
-        for axes in panels[:, 0]:
+        for axes in maps[:, 0]:
             axes.set_ylabel("gain (of the paper's)")
-        figure.colorbar(image, ax=panels, label="settled (% of draws)")
+        figure.colorbar(image, ax=maps, label="settled (% of draws)")
 
 
 SIGNALS = {
@@ -86,23 +96,23 @@ SIGNALS = {
 
 def plot_figures(curves: pd.DataFrame, path: Path) -> None:
     """Draw counterparts of Figs 5 to 12: a typical run, and the spread of all runs."""
-    panels = [
+    signals = [
         (f"Fig. {number}: {case.title}", signal, case)
         for case in FIGURES
         for number, signals in case.figures.items()
         for signal in signals
     ]
-    with drawn(path, 13, 2.4 * math.ceil(len(panels) / 2)) as sheet:
-        grid = sheet.subplots(math.ceil(len(panels) / 2), 2, sharex=True, squeeze=False)
-        for axes, (title, signal, case) in zip(grid.flat, panels, strict=False):
+    title = "The network settles without noise; the paper's PI oscillates"
+    with panels(path, [each[0] for each in signals], 1.7, 2, title) as (sheet, found, free):
+        entries: dict[str, Any] = {}
+        for axes, (_, signal, case) in zip(found, signals, strict=True):
             of_case = curves[curves["case"] == case.title]
             _draw_signal(axes, signal, of_case, Parameters(**case.arguments))
-            axes.set_title(title, loc="left", fontsize="medium")
-        for axes in grid.flat[: len(panels)][-2:]:  # the lowest of each column
-            axes.tick_params(labelbottom=True)
+            handles, names = axes.get_legend_handles_labels()
+            entries = dict(zip(names, handles, strict=True)) | entries
+        for axes in found[-2:]:  # the lowest of each column
             axes.set_xlabel("time (min)")
-        for axes in grid.flat[len(panels) :]:
-            axes.set_visible(False)
+        draw_legend(sheet, free, entries)
 
 
 def _draw_signal(axes: Axes, signal: str, curves: pd.DataFrame, plant: Parameters) -> None:
@@ -120,11 +130,8 @@ def _draw_signal(axes: Axes, signal: str, curves: pd.DataFrame, plant: Parameter
         )
     if signal == "command":
         draw_actuator(axes, plant)
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
     axes.set_xlim(0, minutes.max())
     axes.set_ylabel(name)
-    axes.legend(loc="upper right", ncols=3, fontsize="small")
 
 
 PLOTS = {

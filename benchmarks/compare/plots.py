@@ -2,119 +2,130 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
-from benchmarks.compare.estimates import Scale
-from benchmarks.controllers.roster import label
-from benchmarks.lib.drawing import colours, draw_actuator, drawn, panels
+from benchmarks.compare.estimates import Scale, Score
+from benchmarks.controllers.roster import label, looks
+from benchmarks.lib.drawing import (
+    NEAREST,
+    draw_actuator,
+    draw_legend,
+    drawn,
+    panels,
+    scale_by_excess,
+)
 from benchmarks.lib.tables import groups
 from benchmarks.loop.scenarios import Scenario
 
+MULTIPLE = "multiple of the bound (log scale of the multiple - 1)"
 
-def plot_responses(responses: pd.DataFrame, scenario: Scenario, path: Path) -> None:
-    """Draw set point, output and applied input of every agent over time.
 
-    `responses` holds the rows of `comparison.summarise_responses` for all agents.
-    """
-    palette = colours(list(responses["agent"].unique()))
-    with drawn(path, 9, 6) as figure:
-        above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
-        for agent, rows in groups(responses, "agent"):
-            minutes = rows["time_s"] / 60
-            for axes, signal, held in ((above, "output", False), (below, "applied", True)):
-                axes.fill_between(
-                    minutes, rows[f"{signal}_p10"], rows[f"{signal}_p90"],
-                    step="post" if held else None, color=palette[agent], alpha=0.2, linewidth=0,
-                )  # fmt: skip
-                axes.plot(
-                    minutes, rows[f"{signal}_median"], color=palette[agent], linewidth=1.2,
-                    drawstyle="steps-post" if held else "default", label=label(agent),
-                )  # fmt: skip
-        above.step(
-            minutes, rows["setpoint"], "k--", linewidth=1, where="post", label="set point"
+def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
+    """Draw the score of every agent, sorted, and small marks for its scenarios."""
+    style = looks([*scores])
+    with drawn(path, 0.9 + 0.3 * len(scores), _finding(scores)) as figure:
+        axes = figure.subplots()
+        for place, (agent, (overall, by_scenario)) in enumerate(scores.items()):
+            colour, marker = style[agent]
+            axes.plot(
+                [_away(score) for score in by_scenario.values()], [place] * len(by_scenario),
+                "|", color=colour, alpha=0.5,
+            )  # fmt: skip
+            axes.plot(_away(overall.value), place, marker, color=colour, markersize=8)
+            axes.annotate(
+                f"{overall.value:.3f}",
+                (1.01, place),
+                xycoords=("axes fraction", "data"),
+                va="center",
+            )
+        _list_agents(axes, [*scores])
+        axes.set_xscale("log")
+        axes.set_xlim(1.6, NEAREST / 1.3)
+        shown = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, NEAREST)
+        axes.set_xticks(shown, [f"{1 - away:g}" for away in shown])
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_xlabel(
+            "score: 0 without control, 1 at the bound (log scale of 1 - score); bars: cases"
         )
-        above.set_ylabel("temperature y (°C)")
-        above.set_title(scenario.title, loc="left")
-        figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        draw_actuator(below, scenario.parameters)
-        below.text(
-            1.005, 0.5, "dead\nzone", transform=below.transAxes, va="center", color="0.4"
-        )
-        below.set_ylabel("applied flow u_a (t/h)")
-        below.set_xlabel("time (min)")
-        below.set_xlim(0, minutes.max())
 
 
-def plot_bounds(estimates: pd.DataFrame, path: Path) -> None:
-    """Draw mean errors with 95 % intervals; each axis begins at the least possible error."""
-    with _scenario_panels(path, estimates) as (found, shades):
-        for axes, rows in found:
-            worst = max(mean.value for mean in rows["mean"])
-            for place, row in enumerate(rows.to_dict("records")):
-                mean, ends = row["mean"], None
-                if math.isfinite(mean.high):
-                    ends = [[mean.value - mean.low], [mean.high - mean.value]]
-                    worst = max(worst, mean.high)
-                colour = shades[row["agent"]]
-                axes.errorbar(mean.value, place, xerr=ends, fmt="o", capsize=3, color=colour)
-            _list_agents(axes, rows, "mean |e| (°C)")
-            limit = rows["limit"].iloc[0]
-            # Begin slightly to the left of the limit, so that a point on it is whole.
-            axes.axvline(limit, color="0.4", linewidth=1)
-            axes.set_xlim(limit - 0.02 * (worst - limit), worst + 0.05 * (worst - limit) + 1e-3)
+def _away(score: float) -> float:
+    """Return the distance of a score from 1, within the axis."""
+    return min(max(1.0 - score, NEAREST), 1.5)
 
 
-def plot_runs(runs: pd.DataFrame, path: Path) -> None:
-    """Draw the mean error of every run, so that no failure is averaged away."""
-    generator = np.random.default_rng(0)  # jitters points that would overlap
-    with _scenario_panels(path, runs) as (found, shades):
-        for axes, cases in found:
-            for place, (agent, rows) in enumerate(groups(cases, "agent")):
-                around = place + generator.uniform(-0.3, 0.3, len(rows))
-                axes.plot(
-                    rows["mae"], around, ".", markersize=3, alpha=0.4, color=shades[agent]
+def _finding(scores: Mapping[str, Score]) -> str:
+    first, *others = ((label(agent), overall.value) for agent, (overall, _) in scores.items())
+    second = f", {others[0][0]} follows with {others[0][1]:.3f}" if others else ""
+    return f"{first[0]} comes closest to the bound: its score is {first[1]:.3f}{second}"
+
+
+def plot_bounds(
+    estimates: pd.DataFrame, runs: pd.DataFrame, agents: Sequence[str], path: Path
+) -> None:
+    """Draw mean errors as multiples of the bound, with 95 % intervals and the worst runs."""
+    style = looks(agents)
+    worst = runs.groupby(["scenario", "agent"])["mae"].max()
+    best = estimates.assign(value=[mean.value for mean in estimates["mean"]])
+    best = best.loc[best.groupby("scenario", sort=False)["value"].idxmin(), "agent"]
+    name, count = best.mode()[0], (best == best.mode()[0]).sum()
+    title = f"{label(name)} has the least mean error in {count} of {len(best)} cases"
+    scenarios = dict(groups(estimates, "scenario"))
+    height = 0.7 + 0.17 * len(agents)
+    with panels(path, [*scenarios], height, 2, title) as (figure, found, free):
+        for i, (axes, (scenario, rows)) in enumerate(
+            zip(found, scenarios.items(), strict=True)
+        ):
+            ends = [NEAREST]
+            for row in rows.to_dict("records"):
+                place = agents.index(row["agent"])
+                colour, marker = style[row["agent"]]
+                ratio, end = row["ratio"], worst[scenario, row["agent"]] / row["limit"]
+                low, mean, high, end = (
+                    max(each - 1.0, NEAREST)
+                    for each in (ratio.low, ratio.value, ratio.high, end)
                 )
-            _list_agents(axes, cases, "mean |e| of a run (°C)")
-            axes.set_xlim(left=0)
+                ends += [mean, end]
+                axes.plot([mean, end], [place] * 2, color=colour, alpha=0.4, linewidth=1)
+                if math.isfinite(high):
+                    axes.plot([low, high], [place] * 2, color=colour, linewidth=3)
+                axes.plot(mean, place, marker, color=colour, markersize=5)
+            _list_agents(axes, agents)
+            axes.tick_params(labelleft=i % 2 == 0)
+            scale_by_excess(axes, "x", min(ends), max(ends))
+        figure.supxlabel(MULTIPLE, fontsize="medium")
+        grey: Any = {"color": "0.4"}
+        draw_legend(
+            figure,
+            free,
+            {
+                "mean error of all runs": Line2D([], [], marker="o", linestyle="", **grey),
+                "its 95 % interval": Line2D([], [], linewidth=3, **grey),
+                "to the worst run": Line2D([], [], linewidth=1, alpha=0.4, **grey),
+            },
+        )
 
 
-def _list_agents(axes: Axes, rows: pd.DataFrame, measure: str) -> None:
-    agents = rows["agent"].unique()
+def _list_agents(axes: Axes, agents: Sequence[str]) -> None:
     axes.set_yticks(range(len(agents)), [label(agent) for agent in agents])
-    axes.invert_yaxis()
-    axes.set_xlabel(measure)
+    axes.set_ylim(len(agents) - 0.5, -0.5)
 
 
-@contextmanager
-def _scenario_panels(
-    path: Path, table: pd.DataFrame, height: float | None = None
-) -> Iterator[tuple[list[tuple[Axes, pd.DataFrame]], dict[str, str]]]:
-    """Yield a panel and the rows of each scenario, and a colour for each agent.
-
-    The legend holds the labels of all panels.
-    """
-    shades = colours(list(table["agent"].unique()))
-    by_scenario = dict(groups(table, "scenario"))
-    height = height or 1.2 + 0.28 * len(shades)
-    with panels(path, list(by_scenario), (4.2, height), 3) as (figure, found):
-        yield list(zip(found, by_scenario.values(), strict=True)), shades
-        shown = [axes.get_legend_handles_labels() for axes in found]
-        entries = {name: handle for pair in shown for handle, name in zip(*pair, strict=True)}
-        if entries:
-            figure.legend(entries.values(), entries, loc="outside lower center", ncols=5)
-
-
-def plot_travel(summary: pd.DataFrame, scales: Mapping[str, Scale], path: Path) -> None:
+def plot_travel(
+    summary: pd.DataFrame,
+    scales: Mapping[str, Scale],
+    scores: Mapping[str, Score],
+    path: Path,
+) -> None:
     """Draw the error of every agent against its valve travel, a panel for each scenario.
 
     `summary` is what `report.summarise` returns. A valve that never moves is not drawn.
@@ -122,29 +133,69 @@ def plot_travel(summary: pd.DataFrame, scales: Mapping[str, Scale], path: Path) 
     medians = summary.pivot_table(
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
+    medians = medians[medians["total_variation"] > 0.0]
+    style, cases = looks([*scores]), dict(groups(medians, "scenario"))
+    travels = medians.groupby("agent")["total_variation"].mean()
+    enough = max(overall.value for overall, _ in scores.values()) - 0.02
+    calm = [agent for agent in travels.index if scores[agent][0].value >= enough]
+    title = ""
+    if calm:
+        least = str(travels[calm].idxmin())
+        title = (
+            f"Of those within 0.02 of the best score, {label(least)} moves the valve least: "
+            f"{travels[least]:,.0f} t/h a run"
+        )
     line: dict[str, Any] = {"color": "0.4", "linewidth": 1}
-    with _scenario_panels(path, medians, 3.0) as (found, shades):
-        # Fewer marks than hues, so that agents of similar colour have different marks.
-        marks = dict(zip(shades, itertools.cycle("osD^v"), strict=False))
-        for axes, cases in found:
-            rows = cases[cases["total_variation"] > 0.0]
-            if rows.empty:
-                continue
-            travels, errors = rows["total_variation"], rows["mae"]
-            for agent, travel, error in zip(rows["agent"], travels, errors, strict=True):
-                axes.plot(travel, error, marks[agent], color=shades[agent], label=label(agent))
-            scale = scales[rows["scenario"].iloc[0]]
-            across = np.geomspace(0.7 * travels.min(), 1.4 * travels.max(), 200)
+    with panels(path, [*cases], 2.4, 2, title) as (figure, found, free):
+        entries: dict[str, Any] = {}
+        for axes, (scenario, rows) in zip(found, cases.items(), strict=True):
+            scale, travel = scales[scenario], rows["total_variation"]
+            errors = (rows["mae"] / scale.least.value - 1.0).clip(NEAREST)
+            for agent, x, y in zip(rows["agent"], travel, errors, strict=True):
+                colour, marker = style[agent]
+                (entries[label(agent)],) = axes.plot(x, y, marker, color=colour)
+            across = np.geomspace(0.7 * travel.min(), 1.4 * travel.max(), 200)
             if scale.frontier:
-                least = np.interp(across, *np.transpose(scale.frontier[::-1]))
-                axes.plot(across, least, **line, label="least possible for this travel")
-            limit = scale.least.value
-            axes.axhline(limit, linestyle="--", **line, label="least possible for any travel")
+                least_error = np.interp(across, *np.transpose(scale.frontier[::-1]))
+                excess = (least_error / scale.least.value - 1.0).clip(1e-9)
+                (entries["bound for this travel"],) = axes.plot(across, excess, **line)
+            scale_by_excess(axes, "y", errors.min(), errors.max())
             axes.set_xscale("log")
             axes.set_xlim(across[0], across[-1])
-            axes.set_ylim(0.9 * min(limit, errors.min()), 1.1 * errors.max())
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_locator(NullLocator())
-            axes.set_xlabel("valve travel (t/h)")
-            axes.set_ylabel("mean |e| (°C)")
+        figure.supxlabel("valve travel of the median run (t/h, log scale)", fontsize="medium")
+        figure.supylabel(MULTIPLE, fontsize="medium")
+        draw_legend(figure, free, entries)
+
+
+def plot_responses(
+    responses: pd.DataFrame, errors: Mapping[str, float], scenario: Scenario, path: Path
+) -> None:
+    """Draw output and applied input over time, a row of panels for every agent, best first.
+
+    `responses` holds the rows of `comparison.summarise_responses` for all agents, `errors`
+    their mean errors.
+    """
+    agents = sorted(responses["agent"].unique(), key=errors.__getitem__)
+    style, best = looks(agents), agents[0]
+    title = f"{scenario.title}: {label(best)} errs least ({errors[best]:.3f} °C)"
+    with drawn(path, 1.0 + 1.05 * len(agents), title) as figure:
+        rows_of = figure.subplots(len(agents), 2, sharex=True, sharey="col", squeeze=False)
+        for (left, right), agent in zip(rows_of, agents, strict=True):
+            rows, (colour, _) = responses[responses["agent"] == agent], style[agent]
+            minutes = rows["time_s"] / 60
+            left.step(minutes, rows["setpoint"], "k--", linewidth=0.8, where="post")
+            left.fill_between(
+                minutes, rows["output_p10"], rows["output_p90"], color=colour, alpha=0.3,
+                linewidth=0,
+            )  # fmt: skip
+            left.plot(minutes, rows["output_median"], color=colour, linewidth=1.2)
+            left.set_title(f"{label(agent)}: {errors[agent]:.3f} °C")
+            draw_actuator(right, scenario.parameters)
+            right.step(minutes, rows["applied_median"], color=colour, linewidth=1, where="post")
+        left.set_xlim(0, minutes.max())
+        rows_of[0, 1].set_title("applied flow (t/h), median; grey: dead zone")
+        figure.supylabel("temperature (°C): median, 10th to 90th percentile", fontsize="medium")
+        figure.supxlabel("time (min)", fontsize="medium")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from tqdm import tqdm
 
 from benchmarks.compare.comparison import Comparison
-from benchmarks.compare.estimates import Scale, estimate, scale_of, score
+from benchmarks.compare.estimates import Scale, Score, estimate, scale_of, score
 from benchmarks.controllers.roster import ROSTER, label
-from benchmarks.lib.report import Section, write_report
+from benchmarks.lib.report import Best, Section, write_report
 from benchmarks.lib.statistics import Estimate
 from benchmarks.lib.tables import PERCENTILES, groups, percentiles, write_csv
 from benchmarks.loop.metrics import METRICS
@@ -44,22 +45,32 @@ def write(comparison: Comparison, folder: Path, made_by: str) -> list[Section]:
     write_numbers(folder / "summary.csv", summary)
     write_numbers(folder / "estimates.csv", estimates)
 
+    scores = {agent: score(of_agent, scales) for agent, of_agent in groups(runs, "agent")}
+    scores = dict(sorted(scores.items(), key=lambda each: -each[1][0].value))
     pictures: dict[str, Callable[[Path], None]] = {
-        "travel.png": partial(plots.plot_travel, summary, scales),
-        "bounds.png": partial(plots.plot_bounds, estimates),
-        "runs.png": partial(plots.plot_runs, runs),
+        "scores.png": partial(plots.plot_scores, scores),
+        "bounds.png": partial(plots.plot_bounds, estimates, runs, [*scores]),
+        "travel.png": partial(plots.plot_travel, summary, scales, scores),
     }
     drawn = [agent for agent in agents if agent not in ROSTER or ROSTER[agent].drawn] or agents
-    for name in names:
-        cases = [case for case in comparison.finished if case.scenario == name]
-        responses = pd.concat([case.responses for case in cases], ignore_index=True)
+    for name, cases in groups(estimates, "scenario"):
+        responses = pd.concat(
+            [case.responses for case in comparison.finished if case.scenario == name],
+            ignore_index=True,
+        )
         write_numbers(folder / f"{name}.csv", responses)
-        shown = responses[responses["agent"].isin(drawn)]
-        scenario = comparison.scenarios[name]
-        pictures[f"{name}.png"] = partial(plots.plot_responses, shown, scenario)
+        errors = {
+            agent: mean.value for agent, mean in zip(cases["agent"], cases["mean"], strict=True)
+        }
+        pictures[f"{name}.png"] = partial(
+            plots.plot_responses,
+            responses[responses["agent"].isin(drawn)],
+            errors,
+            comparison.scenarios[name],
+        )
     faults = {
         name: f"{name} could not be drawn ({fault})."
-        for name, draw in pictures.items()
+        for name, draw in tqdm(pictures.items(), "pictures")
         if (fault := _draw(draw, folder / name))
     }
     sections = [
@@ -71,7 +82,7 @@ def write(comparison: Comparison, folder: Path, made_by: str) -> list[Section]:
             ],
             pictures=[name for name in section.pictures if name not in faults],
         )
-        for section in _sections(comparison, scales, summary, estimates)
+        for section in _sections(comparison, scales, summary, estimates, scores)
     ]
     write_report(folder, "Comparison of controllers", sections, made_by)
     return sections
@@ -91,46 +102,36 @@ def _sections(
     scales: Mapping[str, Scale],
     summary: pd.DataFrame,
     estimates: pd.DataFrame,
+    scores: Mapping[str, Score],
 ) -> list[Section]:
     """Return the sections of the report, the most interesting ones first."""
     names, (reference, *others) = comparison.names, comparison.agents
     titles = [(name, comparison.scenarios[name].title) for name in names]
     paired = Section(
         f"Difference to {label(reference)} (°C), 95 % interval",
-        ["And the share of runs in which the error is smaller, in the same noise."],
+        ["Below 0 a controller is better; in % the share of runs in which it is."],
         paired_table(estimates) if others else None,
     )
     return [
         Section(
-            "Score: 0 for leaving the valve alone, 1 for the least possible error",
-            [
-                "A scenario is scored as by `mptc_gym.evaluate`. The first column is the mean "
-                "over the scenarios, with a 95 % interval over policies and runs; travel is "
-                "that of the valve in the median run.",
-                f"The picture: {titles[0][1]}. A line is the median over all runs at each "
-                "sample, a band the 10th to 90th percentile. The grey band is the dead zone.",
-            ],
-            score_table(comparison.runs, scales),
-            [f"{names[0]}.png"],
+            "Score: 0 without control, 1 at the bound",
+            ["Mean over the cases, 95 % interval; travel of the valve in the median run."],
+            score_table(comparison.runs, scores, names),
+            pictures=["scores.png"],
         ),
         Section(
-            "Mean absolute error as a multiple of the least possible error, with its 95 % "
-            "interval",
+            "Mean absolute error as a multiple of the bound, with its 95 % interval",
             [
-                "The least possible error marked * supposes that each change of the set point "
-                "finds the plant settled and is not foreseen. A controller below 1, beyond its "
-                "interval, uses the future or counts on the next change. None that reads the "
-                "transmitter comes below the second row, even with preview of the set point.",
+                "The bound is the least error without foresight. Marked *, it supposes that "
+                "each change of the set point finds the plant settled: a controller that "
+                "knows the timetable can do better, but none comes below the second row."
             ],
-            ratio_table(estimates, scales),
-            ["bounds.png"],
+            ratio_table(estimates, scales, [*scores]),
+            pictures=["bounds.png"],
         ),
         Section(
             "Error against valve travel",
-            [
-                "A point is the median run of a controller; down and left is better. The line "
-                "is the least possible error for a given travel, the dashed one for any travel."
-            ],
+            caption="Down and left is better.",
             pictures=["travel.png"],
         ),
         *([paired] if others else []),
@@ -138,20 +139,18 @@ def _sections(
             "What each controller costs",
             [
                 "Search: its trials, all their samples, and minutes of one core. Training: the "
-                "median policy. Runs: all scenarios, including measuring."
+                "median policy. Runs: all cases, including measuring."
             ],
             _costs(comparison),
         ),
-        Section("Every run", pictures=["runs.png"]),
         Section(
             f"All measures: median (10th to 90th percentile) of {comparison.count} runs",
-            ["Overshoot and settling time have no meaning in noise, which crosses every band."],
-            metrics_table(summary, comparison.scenarios),
+            table=metrics_table(summary, comparison.scenarios),
         ),
         Section(
-            "Scenarios",
-            table=pd.DataFrame(titles, columns=["scenario", "what it is"]),
-            pictures=[f"{name}.png" for name in names[1:]],
+            "Cases",
+            table=pd.DataFrame(titles, columns=["case", "what it is"]),
+            pictures=[f"{name}.png" for name in names],
         ),
     ]
 
@@ -206,30 +205,35 @@ def write_numbers(path: Path, table: pd.DataFrame) -> None:
     write_csv(path, flat.astype(object).where(flat != math.inf, NOT_SETTLED))
 
 
-def ratio_table(estimates: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
-    """Return the least possible errors, and the mean errors as multiples of them."""
-    bounds = [{"agent": "least possible (°C)"}, {"agent": "with preview (°C)"}]
+def ratio_table(
+    estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
+) -> pd.DataFrame:
+    """Return the bounds, and the mean errors as multiples of them; the least are in bold."""
+    bounds = [{"agent": "bound (°C)"}, {"agent": "bound with foresight (°C)"}]
     for name, scale in scales.items():
         mark = "*" * (scale.least.kind == "reference")
         bounds[0][name] = f"{scale.least.value:.3f}{mark}"
         bounds[1][name] = f"{scale.preview.value:.3f}"
-    table = _by_agent(estimates, estimates["ratio"].map("{:.2f}".format))
+    values = estimates["ratio"].map(lambda ratio: ratio.value)
+    least = values == values.groupby(estimates["scenario"]).transform("min")
+    cells = estimates["ratio"].map("{:.2f}".format).where(~least, lambda all_: all_.map(Best))
+    table = _by_agent(estimates, cells, agents)
     return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
 
 
-def score_table(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
-    """Return the scores and the mean travel of the median runs, the best agent first."""
-    scores = {agent: score(of_agent, scales) for agent, of_agent in groups(runs, "agent")}
+def score_table(
+    runs: pd.DataFrame, scores: Mapping[str, Score], names: Sequence[str]
+) -> pd.DataFrame:
+    """Return the scores and the mean travel of the median runs, the best in bold."""
     travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
     rows = [
         {"agent": label(agent), "score": f"{overall:.3f}"}
         | {"travel (t/h)": f"{travels[agent].mean():,.0f}"}
         | {scenario: f"{mean:.2f}" for scenario, mean in means.items()}
-        for agent, (overall, means) in sorted(
-            scores.items(), key=lambda each: each[1][0].value, reverse=True
-        )
+        for agent, (overall, means) in scores.items()
     ]
-    columns = ["agent", "score", "travel (t/h)", *scales]  # after an interruption, with gaps
+    rows[0] = {name: Best(cell) for name, cell in rows[0].items()}
+    columns = ["agent", "score", "travel (t/h)", *names]  # after an interruption, with gaps
     return pd.DataFrame(rows, columns=columns).fillna("")
 
 
@@ -237,16 +241,21 @@ def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
     """Return differences from the reference, one row for each other agent."""
     others = estimates.dropna(subset=["difference"])
     pairs = zip(others["difference"], others["improvement"], strict=True)
-    return _by_agent(
-        others, [f"{mean:+.3f}; {100 * better.value:.0f} %" for mean, better in pairs]
-    )
+    cells = [f"{mean:+.3f}; {100 * better.value:.0f} %" for mean, better in pairs]
+    return _by_agent(others, cells, [*others["agent"].unique()])
 
 
-def _by_agent(rows: pd.DataFrame, cells: Any) -> pd.DataFrame:
+def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
     table = rows.assign(cell=cells).pivot_table(
         index="agent", columns="scenario", values="cell", aggfunc="first", sort=False
     )
-    return table.fillna("").rename(index=label).reset_index().rename_axis(columns=None)
+    return (
+        table.loc[[*agents]]
+        .fillna("")
+        .rename(index=label)
+        .reset_index()
+        .rename_axis(columns=None)
+    )
 
 
 def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> pd.DataFrame:

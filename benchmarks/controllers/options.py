@@ -20,7 +20,7 @@ from cyclopts import Parameter
 from agents.policy_network import WINDOWS
 from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Cost, Factory, RosterEntry
-from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.roster import OWN, ROSTER
 from benchmarks.lib.command import Names, Repeated, UsageError, blame, known, options
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.loop.rollout import Agent
@@ -82,7 +82,7 @@ def own_entry(name: str, locations: Sequence[str]) -> RosterEntry:
             for factory in made:
                 _try_out(factory, location)
             factories += made
-    return RosterEntry(name, name, lambda: factories, drawn=True)
+    return RosterEntry(name, name, OWN[0], lambda: factories, drawn=True)
 
 
 def own_factory(location: str) -> Factory:

@@ -106,6 +106,8 @@ class RosterEntry:
     """Name in options and files."""
     label: str
     """Name in tables and plots."""
+    look: tuple[str, str]
+    """Colour and marker in plots; relatives have shades of one hue and the same marker."""
     made_by: Factory | Members
     """Its factory, or a function that returns several, for policies trained separately."""
     tuning: Tuning | None = None

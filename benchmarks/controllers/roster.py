@@ -6,6 +6,9 @@ it. A user's own controllers (`--agent NAME=MODULE:FACTORY`) also become such en
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
+
 from benchmarks.controllers import engineered, pretrained
 from benchmarks.controllers.records import Cost, Factory, RosterEntry, Tuning
 
@@ -20,6 +23,7 @@ _ENTRIES = (
     RosterEntry(
         "nothing",
         "no control",
+        ("#8C8C8C", "x"),
         Factory(engineered.nothing, Cost("nothing", "0", "none"), observation={}),
         compared=False,
         swept=False,
@@ -27,6 +31,7 @@ _ENTRIES = (
     RosterEntry(
         "nn",
         "NN (1992)",
+        ("#D55E00", "o"),
         Factory(
             engineered.direct_nn,
             Cost(f"direction; {_SEARCHED}", "25 weights, 6 gains", "none", _SEARCH_OF_NN),
@@ -47,6 +52,7 @@ _ENTRIES = (
     RosterEntry(
         "nn-frozen",
         "NN (1992), frozen",
+        ("#7A3600", "o"),
         Factory(
             engineered.frozen_nn,
             Cost(
@@ -61,6 +67,7 @@ _ENTRIES = (
     RosterEntry(
         "pi",
         "PI (1992)",
+        ("#CC79A7", "s"),
         Factory(engineered.paper_pi, Cost("gains of the paper", "2", search="not stated")),
         tuning=Tuning({"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}),
         drawn=True,
@@ -68,11 +75,13 @@ _ENTRIES = (
     RosterEntry(
         "pi-simc",
         "PI (SIMC)",
+        ("#8E3B6B", "s"),
         Factory(engineered.simc_pi, Cost(_STEP_TEST, "2", "one step test", "none: a rule")),
     ),
     RosterEntry(
         "pi-searched",
         "PI (searched)",
+        ("#4F1F3B", "s"),
         Factory(
             engineered.searched_pi,
             Cost(_SEARCHED, "2", "none", "800 trials: 566 M samples, 3 min"),
@@ -82,6 +91,7 @@ _ENTRIES = (
     RosterEntry(
         "smith",
         "Smith",
+        ("#56B4E9", "^"),
         Factory(
             engineered.smith,
             Cost(_DATA_SHEET, "2 gains, 5 of the model", "one step test", "none: a rule"),
@@ -91,6 +101,7 @@ _ENTRIES = (
     RosterEntry(
         "self-tuning",
         "self-tuning",
+        ("#00B98A", "v"),
         Factory(
             engineered.self_tuning,
             Cost(
@@ -104,6 +115,7 @@ _ENTRIES = (
     RosterEntry(
         "mpc",
         "MPC",
+        ("#000000", "*"),
         Factory(
             engineered.mpc,
             Cost("everything but the future", "all of the plant's", "none", "none"),
@@ -113,6 +125,7 @@ _ENTRIES = (
     RosterEntry(
         "ppo",
         "PPO",
+        ("#E69F00", "D"),
         pretrained.policies(
             "ppo-[0-9]*.npz",
             Cost(
@@ -127,6 +140,7 @@ _ENTRIES = (
     RosterEntry(
         "ppo-hard",
         "PPO (hard)",
+        ("#8F6200", "D"),
         pretrained.policies(
             "ppo-hard-*.npz",
             Cost(
@@ -140,6 +154,7 @@ _ENTRIES = (
     RosterEntry(
         "nn-smith",
         "neural Smith",
+        ("#0072B2", "^"),
         pretrained.law_network(
             engineered.nn_smith,
             Cost(_DATA_SHEET, _NETWORK, "one step test; 46 M, once", _SEARCH_OF_NETWORK),
@@ -149,6 +164,7 @@ _ENTRIES = (
     RosterEntry(
         "nn-self-tuning",
         "neural self-tuning",
+        ("#00664B", "v"),
         pretrained.law_network(
             engineered.nn_self_tuning,
             Cost(
@@ -164,6 +180,15 @@ _ENTRIES = (
 ROSTER = {entry.name: entry for entry in _ENTRIES}
 
 
+OWN = (("#5B3FA6", "P"), ("#A08CDB", "X"), ("#B22222", "P"), ("#F08080", "X"))
+
+
 def label(agent: str) -> str:
     """Return the name of a controller in tables and plots."""
     return ROSTER[agent].label if agent in ROSTER else agent
+
+
+def looks(agents: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Return the colour and the marker of each controller; a user's own take turns."""
+    turns = itertools.cycle(OWN)
+    return {agent: ROSTER[agent].look if agent in ROSTER else next(turns) for agent in agents}

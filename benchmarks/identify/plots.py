@@ -22,7 +22,7 @@ def plot_log(model: Model, path: Path) -> None:
     log = model.log
     stop = min(len(log.flow), SHOWN)
     minutes = np.arange(stop) * log.sampling_interval / 60.0
-    with drawn(path, 10, 6) as figure:
+    with drawn(path, 5) as figure:
         above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
         above.plot(minutes, log.temperature[:stop], color="0.5", linewidth=1, label="recorded")
         simulated = model.simulated[:stop]
@@ -48,7 +48,7 @@ def plot_residuals(model: Model, path: Path) -> None:
     correlation, limit = autocorrelation(model.errors), chance(model.errors)
     errors = model.errors[:SHOWN]
     minutes = np.arange(len(errors)) * model.plant.sampling_interval / 60.0
-    with drawn(path, 10, 3.6) as figure:
+    with drawn(path, 3) as figure:
         left, right = figure.subplots(1, 2)
         left.plot(minutes, errors, color=COLOURS[0], linewidth=0.6)
         left.set(xlabel="time (min)", ylabel=f"prediction error ({model.log.temperature_unit})")
@@ -65,7 +65,7 @@ def plot_step(model: Model, path: Path) -> None:
     samples = min(round(1.2 * settling(model.plant)), LONGEST) + 1
     low, high = band(model, samples)
     minutes = np.arange(samples) * model.plant.sampling_interval / 60.0
-    with drawn(path, 8, 4) as figure:
+    with drawn(path, 3.8) as figure:
         axes = figure.subplots()
         axes.fill_between(
             minutes, low, high, color=COLOURS[0], alpha=0.25, linewidth=0,
@@ -81,7 +81,7 @@ def plot_margins(loops: Mapping[str, Loop], path: Path) -> None:
     """Draw the frequency responses of named loops around -1, and their sensitivities."""
     palette = colours(list(loops))
     turn = np.linspace(0.0, 2.0 * np.pi, 200)
-    with drawn(path, 10, 4.2) as figure:
+    with drawn(path, 3.5) as figure:
         plane, sensitivity = figure.subplots(1, 2)
         for name, loop in loops.items():
             values, color = loop.response, palette[name]

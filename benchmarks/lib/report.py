@@ -25,11 +25,17 @@ table { border-collapse: collapse; font-size: 0.9rem; }
 th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd; }
 th:first-child, td:first-child { text-align: left; }
 .table { overflow-x: auto; }
+label input { display: none; }
+label input:checked + img { max-width: none; }
 .interval { display: block; color: #777; font-size: 0.75em; white-space: nowrap; }
 img { max-width: 100%; margin-top: 1.5rem; }
 .made { color: #666; font-size: 0.85rem; overflow-wrap: anywhere; }
 """
 _INTERVAL = re.compile(r" (\([^()]* to [^()]*\))")  # shown small, below its number
+
+
+class Best(str):
+    """Text of a cell that is set in bold."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,8 @@ class Section:
     """Table of text cells."""
     pictures: Sequence[str] = ()
     """Names of PNG files in the report's folder."""
+    caption: str = ""
+    """What the pictures show."""
 
 
 def provenance_line(command: str, origin: Mapping[str, Any]) -> str:
@@ -74,7 +82,13 @@ def _plain(text: str) -> str:
 
 
 def _cell(text: str) -> str:
-    return _plain(text).replace("|", r"\|")
+    plain = _plain(text).replace("|", r"\|")
+    return f"**{plain}**" if isinstance(text, Best) else plain
+
+
+def _html_cell(text: str) -> str:
+    plain = html.escape(text, quote=False)
+    return f"<b>{plain}</b>" if isinstance(text, Best) else plain
 
 
 def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
@@ -85,6 +99,7 @@ def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
         if section.table is not None:
             table = section.table.map(_cell).rename(columns=_cell)
             parts.append(table.to_markdown(index=False, disable_numparse=True))
+        parts += [_plain(section.caption)] * bool(section.caption)
         parts += [f"![{_plain(section.title)}]({picture})" for picture in section.pictures]
     return "\n\n".join([*parts, _plain(made)]) + "\n"
 
@@ -96,17 +111,24 @@ def _html(folder: Path, title: str, sections: Sequence[Section], made: str) -> s
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<style>{_STYLE}</style></head><body><h1>{html.escape(title)}</h1>",
     ]
-    for section in sections:
-        parts += [f"<h2>{html.escape(section.title)}</h2>"] * bool(section.title)
+    titles = [html.escape(section.title) for section in sections]
+    parts += [f'<p><a href="#{i}">{name}</a></p>' for i, name in enumerate(titles) if name]
+    for i, (section, name) in enumerate(zip(sections, titles, strict=True)):
+        parts += [f'<h2 id="{i}">{name}</h2>'] * bool(name)
         parts += [f"<p>{html.escape(paragraph)}</p>" for paragraph in section.text]
         if section.table is not None:
             with pd.option_context("display.max_colwidth", None):
-                table = section.table.to_html(index=False, border=0)
+                cells = section.table.map(_html_cell)
+                table = cells.to_html(index=False, border=0, escape=False)
             smaller = _INTERVAL.sub(r'<span class="interval">\1</span>', table)
             parts.append(f'<div class="table">{smaller}</div>')
+        parts += [f"<p>{html.escape(section.caption)}</p>"] * bool(section.caption)
         for picture in section.pictures:
             data = base64.b64encode((folder / picture).read_bytes()).decode()
             alternative = html.escape(f"{section.title}: {picture}")
-            parts.append(f'<img alt="{alternative}" src="data:image/png;base64,{data}">')
+            image = f'<img alt="{alternative}" src="data:image/png;base64,{data}">'
+            parts.append(
+                f'<label><input type="checkbox">{image}</label>'
+            )  # a click enlarges it
     parts.append(f'<p class="made">{html.escape(made)}</p>')
     return "\n".join([*parts, "</body></html>", ""])

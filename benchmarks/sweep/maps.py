@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.colors import LogNorm
 
 from benchmarks.controllers.roster import label
-from benchmarks.lib.drawing import drawn, panels
+from benchmarks.lib.drawing import draw_legend, drawn, panels, scale_by_excess
 from benchmarks.lib.tables import groups
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
@@ -24,23 +24,28 @@ _MARKS = {
 def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
     """Draw a map of each controller's errors over delay and gain, the median of each plant.
 
-    On a grid, where only delay and gain differ, it shows the ratio to the limit; on plants that
-    differ in everything, the mean error.
+    Errors are multiples of the bound. On a grid only delay and gain differ.
     """
     drift = runs.get("gain_drift", pd.Series(np.nan, runs.index))
     largest = runs["gain_factor"] * drift.fillna(1.0).clip(1.0)
     runs = runs.assign(gain=largest, drifts=drift.notna())
     names = [label(agent) for agent in runs["agent"].unique()]
-    with panels(path, names, (3.4, 3.2), 4, (1.0, 0.6), grid=not grid) as (figure, found):
+    ratios = runs.groupby(["agent", "plant"], sort=False)["ratio"].median()
+    best = str(ratios.groupby("agent").median().idxmin())
+    title = (
+        f"{label(best)} comes closest to the bound: {ratios[best].median():.2f} times in the "
+        "median plant"
+    )
+    with panels(path, names, 2.3, 3, title, grid=not grid) as (figure, found, free):
         for axes, (_, cases) in zip(found, groups(runs, "agent"), strict=True):
             plants = cases.groupby("plant")
             where = plants[["delay", "gain", "drifts"]].first()
-            errors = plants["ratio" if grid else "mae"].median()
+            excess = plants["ratio"].median().sub(1.0).clip(0.01)
             for drifts, of_kind in where.groupby("drifts"):
                 image = axes.scatter(
-                    of_kind["delay"], of_kind["gain"], 80 if grid else 34,
-                    errors[of_kind.index], marker="^" if drifts else "s", cmap="cividis_r",
-                    norm=LogNorm(1.0, 4.0), label="drifts" if drifts else "as it is",
+                    of_kind["delay"], of_kind["gain"], 26 if grid else 14,
+                    excess[of_kind.index], marker="^" if drifts else "s", cmap="cividis_r",
+                    norm=LogNorm(0.01, 3.0), label="drifts" if drifts else "as it is",
                 )  # fmt: skip
             for name, (marker, size, colour, text) in _MARKS.items():
                 often = where[plants[name].mean() >= 0.5]
@@ -52,15 +57,22 @@ def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
                 axes.plot(18, 1.0, "k+", markersize=12, label="the paper's plant")
                 # Both the set point and the dead zone are 5.
                 edge = 1.0 / abs(nominal(Parameters()).gain)
-                text = "above: 5 °C needs a flow within the dead zone"
+                text = "above: 5 °C is within the dead zone"
                 axes.axhline(edge, color="black", linestyle=":", label=text)
+        for axes in found[-3:]:
             axes.set_xlabel("delay (samples)")
-            axes.set_ylabel(f"{'' if grid else 'largest '}gain (of the paper's)")
-        text = "mean |e|, of the least possible" if grid else "mean |e| (°C)"
-        bar = figure.colorbar(image, ax=found, label=text, extend="max", format="{x:g}")
-        bar.set_ticks([1, 1.25, 1.5, 2, 3, 4])
-        bar.ax.minorticks_off()
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.supylabel(
+            "gain (of the paper's)" if grid else "largest gain (of the paper's)",
+            fontsize="medium",
+        )
+        bar = figure.colorbar(
+            image, ax=found, label="multiple of the bound (log scale of the multiple - 1)",
+            extend="both", location="bottom", shrink=0.6, aspect=40,
+        )  # fmt: skip
+        scale_by_excess(bar.ax, "x", 0.013, 3.0 / 1.3)
+        draw_legend(
+            figure, free, dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+        )
 
 
 def plot_drift(runs: pd.DataFrame, pair: tuple[str, str], path: Path) -> None:
@@ -72,7 +84,9 @@ def plot_drift(runs: pd.DataFrame, pair: tuple[str, str], path: Path) -> None:
     median = difference.median()
     spread = [median - difference.quantile(0.1), difference.quantile(0.9) - median]
     ours, theirs = map(label, pair)
-    with drawn(path, 7.5, 4.5) as figure:
+    better = (median < 0.0).sum()
+    title = f"{ours} is better than {theirs} on {better} of {len(median)} plants that drift"
+    with drawn(path, 4.2, title) as figure:
         axes = figure.subplots()
         axes.errorbar(plants["gain_drift"], median, spread, fmt="none", ecolor="0.7", zorder=1)
         image = axes.scatter(
@@ -83,11 +97,10 @@ def plot_drift(runs: pd.DataFrame, pair: tuple[str, str], path: Path) -> None:
         ticks = [-2, -1, -0.5, -0.25, 0, 0.25, 0.5, 1, 2]
         axes.set_yticks(ticks, labels=[f"{tick:g}" for tick in ticks])
         axes.set_xlabel("gain at the end, of that at the start")
-        axes.set_ylabel(f"mean |e| of {ours} - that of {theirs} (°C)")
+        axes.set_ylabel(
+            f"mean |e| of {ours} - that of {theirs}\n(°C, linear within ±0.5, then log)"
+        )
         axes.set_title(
-            f"Second half of a run; below 0, {ours} is better.\n"
-            "A point a plant: median and 10th to 90th percentile of its runs",
-            loc="left",
-            fontsize="medium",
+            "Second half of a run; a point a plant: median, 10th to 90th percentile of its runs"
         )
         figure.colorbar(image, label="delay (samples)")
