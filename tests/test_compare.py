@@ -13,7 +13,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import DEFAULT, Mock
 
@@ -21,17 +20,17 @@ import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
+from rich.console import Console
 
 from agents import PIController
 from benchmarks.bounds.least import least_possible
-from benchmarks.compare import comparison, plots, report
+from benchmarks.compare import plots, report
 from benchmarks.compare.__main__ import main
-from benchmarks.compare.estimates import estimate, scale_of, score
+from benchmarks.compare.estimates import estimate, ranked, scale_of
 from benchmarks.controllers import records
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage, tables
-from benchmarks.lib.drawing import drawn
-from benchmarks.lib.report import Section, write_report
+from benchmarks.lib.report import Best, Section, write_report
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.metrics import METRICS, measure
 from benchmarks.loop.rollout import make_plants, rollout
@@ -92,6 +91,18 @@ class TestTables:
         found = tables.percentiles(np.array([1.0, 2.0, 3.0, np.inf]))
         assert found == {"median": 3.0, "p10": 2.0, "p90": np.inf}
 
+    @pytest.mark.parametrize("width", [40, 80, 130])
+    def test_on_screen_nothing_is_cut_and_intervals_come_where_they_have_room(self, width):
+        cells = {f"square-dead-zone-{i}": ["1.00 (0.99 to 1.01)", "11.5"] for i in range(7)}
+        table = pd.DataFrame({"agent": ["neural self-tuning", "NN (1992)"], **cells})
+        console = Console(width=width, file=io.StringIO())
+        console.print(tables.on_screen(table))
+        shown = console.file.getvalue()
+        assert max(map(len, shown.splitlines())) <= width
+        assert "…" not in shown
+        assert shown.count("11.5") == shown.count("1.00") == 7
+        assert (shown.count("(0.99 to 1.01)") == 7) is (width == 130)
+
     def test_of_numbers_and_estimates_in_csv(self, tmp_path):
         columns = {
             "a": ["x", "y"],
@@ -146,10 +157,11 @@ class TestEstimates:
             runs = some_runs(a=[[idle, half]], b=[[least, half]])
             rows.append(runs.assign(scenario=name, total_variation=12.0))
         runs = pd.concat(rows)
-        overall, by_scenario = score(runs[runs["agent"] == "b"], scales)
+        scores = ranked(runs, scales)
+        overall, by_scenario = scores["b"]
         assert overall.value == pytest.approx(0.75)
         assert by_scenario == pytest.approx({"constant": 0.75, "square": 0.75})
-        best, other = report.score_table(runs, scales).to_dict("records")
+        best, other = report.score_table(runs, scores, [*scales]).to_dict("records")
         assert (best["agent"], best["travel (t/h)"], best["square"]) == ("b", "12", "0.75")
         assert (other["agent"], other["constant"]) == ("a", "0.25")
 
@@ -157,7 +169,7 @@ class TestEstimates:
 class TestReport:
     def test_pages(self, tmp_path):
         (tmp_path / "picture.png").write_bytes(b"\x89PNG")
-        table = pd.DataFrame({"name": ["a < b|c"], "value": ["1.0 (0.9 to 1.1)"]})
+        table = pd.DataFrame({"name": [Best("a < b|c")], "value": ["1.0 (0.9 to 1.1)"]})
         sections = [Section("First", ["Some text."], table, ["picture.png"]), Section("Second")]
         write_report(tmp_path, "Title", sections, "made today")
         page = (tmp_path / "report.md").read_text()
@@ -165,8 +177,9 @@ class TestReport:
         assert page.endswith("\n\nmade today\n")
         assert "![First](picture.png)" in page
         html = (tmp_path / "report.html").read_text()
-        assert "a &lt; b|c" in html
-        assert r"| a &lt; b\|c | 1.0 (0.9 to 1.1) |" in page
+        assert "<b>a &lt; b|c</b>" in html
+        assert '<a href="#0">First</a>' in html
+        assert r"| **a &lt; b\|c** | 1.0 (0.9 to 1.1) |" in page
         assert 'name="viewport"' in html
         assert "made today" in html
         assert 'src="data:image/png;base64,iVBORw=="' in html
@@ -270,7 +283,7 @@ class TestCompare:
             assert f"{pi['mae'].iloc[0] / limit:.2f}" in shown
         assert f"{nn.median():.3f}" in page
         assert "not settled" in page
-        assert page.index("| NN (1992)") < page.index("| PI (1992)")  # the best comes first
+        assert page.index("| **NN (1992)**") < page.index("| PI (1992)")  # the best comes first
 
         provenance = json.loads((out / "provenance.json").read_text())
         assert provenance["complete"] is True
@@ -281,7 +294,7 @@ class TestCompare:
         responses = pd.read_csv(out / "constant.csv")
         assert len(responses) == 2 * 600
         assert (responses["output_p10"] <= responses["output_p90"]).all()
-        for name in ("constant.png", "constant-noise.png", "bounds.png", "runs.png"):
+        for name in ("constant.png", "constant-noise.png", "bounds.png", "scores.png"):
             picture = matplotlib.image.imread(out / name)
             assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
 
@@ -488,24 +501,6 @@ class TestCompare:
         assert "0.709" in done.stdout
         assert "(?C)" in done.stdout
         assert (tmp_path / "out/report.md").exists()
-
-
-def test_a_long_legend_leaves_the_responses_their_room(tmp_path, monkeypatch):
-    widths = []
-
-    @contextmanager
-    def measured(*arguments):
-        with drawn(*arguments) as figure:
-            yield figure
-            figure.draw_without_rendering()
-            widths.extend(axes.get_position().width for axes in figure.axes)
-
-    monkeypatch.setattr(plots, "drawn", measured)
-    runs = rollout(make_plants(1, 40, setpoint=5.0), PIController(), 40, seed=0)
-    scenario = SCENARIOS["constant"]
-    responses = [comparison.summarise_responses(runs, scenario, name) for name in ROSTER]
-    plots.plot_responses(pd.concat(responses), scenario, tmp_path / "x.png")
-    assert min(widths) > 0.7
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -112,6 +112,12 @@ def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def ranked(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> dict[str, Score]:
+    """Return the scores of all agents, the best first."""
+    scores = {agent: score(of_agent, scales) for agent, of_agent in groups(runs, "agent")}
+    return dict(sorted(scores.items(), key=lambda each: -each[1][0].value))
+
+
 def score(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> Score:
     """Return an agent's score, overall and in each scenario.
 

@@ -133,8 +133,8 @@ def plot_travel(
     medians = summary.pivot_table(
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
-    medians = medians[medians["total_variation"] > 0.0]
     style, cases = looks([*scores]), dict(groups(medians, "scenario"))
+    medians = medians[medians["total_variation"] > 0.0]
     travels = medians.groupby("agent")["total_variation"].mean()
     enough = max(overall.value for overall, _ in scores.values()) - 0.02
     calm = [agent for agent in travels.index if scores[agent][0].value >= enough]
@@ -149,6 +149,9 @@ def plot_travel(
     with panels(path, [*cases], 2.4, 2, title) as (figure, found, free):
         entries: dict[str, Any] = {}
         for axes, (scenario, rows) in zip(found, cases.items(), strict=True):
+            rows = rows[rows["total_variation"] > 0.0]
+            if rows.empty:
+                continue
             scale, travel = scales[scenario], rows["total_variation"]
             errors = (rows["mae"] / scale.least.value - 1.0).clip(NEAREST)
             for agent, x, y in zip(rows["agent"], travel, errors, strict=True):

@@ -14,7 +14,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from benchmarks.compare.comparison import Comparison
-from benchmarks.compare.estimates import Scale, Score, estimate, scale_of, score
+from benchmarks.compare.estimates import Scale, Score, estimate, ranked, scale_of
 from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.lib.report import Best, Section, write_report
 from benchmarks.lib.statistics import Estimate
@@ -45,8 +45,7 @@ def write(comparison: Comparison, folder: Path, made_by: str) -> list[Section]:
     write_numbers(folder / "summary.csv", summary)
     write_numbers(folder / "estimates.csv", estimates)
 
-    scores = {agent: score(of_agent, scales) for agent, of_agent in groups(runs, "agent")}
-    scores = dict(sorted(scores.items(), key=lambda each: -each[1][0].value))
+    scores = ranked(runs, scales)
     pictures: dict[str, Callable[[Path], None]] = {
         "scores.png": partial(plots.plot_scores, scores),
         "bounds.png": partial(plots.plot_bounds, estimates, runs, [*scores]),
