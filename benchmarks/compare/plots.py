@@ -26,7 +26,7 @@ from benchmarks.lib.drawing import (
 from benchmarks.lib.tables import groups
 from benchmarks.loop.scenarios import Scenario
 
-MULTIPLE = "multiple of the bound (log scale of the multiple - 1)"
+MULTIPLE = "multiple of the least possible error (log scale of the multiple - 1)"
 
 
 def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
@@ -54,7 +54,7 @@ def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
         axes.set_xticks(shown, [f"{1 - away:g}" for away in shown])
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_xlabel(
-            "score: 0 without control, 1 at the bound (log scale of 1 - score); bars: cases"
+            "score: 0 without control, 1 at the least possible error (log scale of 1 - score); bars: cases"
         )
 
 
@@ -66,13 +66,13 @@ def _away(score: float) -> float:
 def _finding(scores: Mapping[str, Score]) -> str:
     first, *others = ((label(agent), overall.value) for agent, (overall, _) in scores.items())
     second = f", {others[0][0]} follows with {others[0][1]:.3f}" if others else ""
-    return f"{first[0]} comes closest to the bound: its score is {first[1]:.3f}{second}"
+    return f"{first[0]} comes closest to the least possible error: its score is {first[1]:.3f}{second}"
 
 
 def plot_bounds(
     estimates: pd.DataFrame, runs: pd.DataFrame, agents: Sequence[str], path: Path
 ) -> None:
-    """Draw mean errors as multiples of the bound, with 95 % intervals and the worst runs."""
+    """Draw mean errors as multiples of the least possible, with 95 % intervals and the worst runs."""
     style = looks(agents)
     worst = runs.groupby(["scenario", "agent"])["mae"].max()
     best = estimates.assign(value=[mean.value for mean in estimates["mean"]])
@@ -161,7 +161,7 @@ def plot_travel(
             if scale.frontier:
                 least_error = np.interp(across, *np.transpose(scale.frontier[::-1]))
                 excess = (least_error / scale.least.value - 1.0).clip(1e-9)
-                (entries["bound for this travel"],) = axes.plot(across, excess, **line)
+                (entries["least for this travel"],) = axes.plot(across, excess, **line)
             scale_by_excess(axes, "y", errors.min(), errors.max())
             axes.set_xscale("log")
             axes.set_xlim(across[0], across[-1])

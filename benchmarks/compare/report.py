@@ -113,17 +113,17 @@ def _sections(
     )
     return [
         Section(
-            "Score: 0 without control, 1 at the bound",
+            "Score: 0 without control, 1 at the least possible error",
             ["Mean over the cases, 95 % interval; travel of the valve in the median run."],
             score_table(comparison.runs, scores, names),
             pictures=["scores.png"],
         ),
         Section(
-            "Mean absolute error as a multiple of the bound, with its 95 % interval",
+            "Mean error as a multiple of the least possible, with its 95 % interval",
             [
-                "The bound is the least error without foresight. Marked *, it supposes that "
-                "each change of the set point finds the plant settled: a controller that "
-                "knows the timetable can do better, but none comes below the second row."
+                "Least possible without foresight; where marked *, if each change of the set "
+                "point finds the plant settled: a controller that knows the timetable can do "
+                "better, but none comes below the least with foresight."
             ],
             ratio_table(estimates, scales, [*scores]),
             pictures=["bounds.png"],
@@ -207,8 +207,8 @@ def write_numbers(path: Path, table: pd.DataFrame) -> None:
 def ratio_table(
     estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
 ) -> pd.DataFrame:
-    """Return the bounds, and the mean errors as multiples of them; the least are in bold."""
-    bounds = [{"agent": "bound (°C)"}, {"agent": "bound with foresight (°C)"}]
+    """Return the least possible and the mean errors as multiples of them; the least are in bold."""
+    bounds = [{"agent": "least possible (°C)"}, {"agent": "with foresight (°C)"}]
     for name, scale in scales.items():
         mark = "*" * (scale.least.kind == "reference")
         bounds[0][name] = f"{scale.least.value:.3f}{mark}"

@@ -24,7 +24,7 @@ _MARKS = {
 def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
     """Draw a map of each controller's errors over delay and gain, the median of each plant.
 
-    Errors are multiples of the bound. On a grid only delay and gain differ.
+    Errors are multiples of the least possible. On a grid only delay and gain differ.
     """
     drift = runs.get("gain_drift", pd.Series(np.nan, runs.index))
     largest = runs["gain_factor"] * drift.fillna(1.0).clip(1.0)
@@ -33,7 +33,7 @@ def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
     ratios = runs.groupby(["agent", "plant"], sort=False)["ratio"].median()
     best = str(ratios.groupby("agent").median().idxmin())
     title = (
-        f"{label(best)} comes closest to the bound: {ratios[best].median():.2f} times in the "
+        f"{label(best)} comes closest to the least possible error: {ratios[best].median():.2f} times in the "
         "median plant"
     )
     with panels(path, names, 2.3, 3, title, grid=not grid) as (figure, found, free):
@@ -66,7 +66,7 @@ def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
             fontsize="medium",
         )
         bar = figure.colorbar(
-            image, ax=found, label="multiple of the bound (log scale of the multiple - 1)",
+            image, ax=found, label="multiple of the least possible error (log scale of the multiple - 1)",
             extend="both", location="bottom", shrink=0.6, aspect=40,
         )  # fmt: skip
         scale_by_excess(bar.ax, "x", 0.013, 3.0 / 1.3)
