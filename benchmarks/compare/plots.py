@@ -16,6 +16,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from benchmarks.compare.estimates import Scale, Score
 from benchmarks.controllers.roster import label, looks
 from benchmarks.lib.drawing import (
+    MULTIPLE,
     NEAREST,
     draw_actuator,
     draw_legend,
@@ -25,8 +26,6 @@ from benchmarks.lib.drawing import (
 )
 from benchmarks.lib.tables import groups
 from benchmarks.loop.scenarios import Scenario
-
-MULTIPLE = "multiple of the least possible error (log scale of the multiple - 1)"
 
 
 def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
@@ -54,7 +53,7 @@ def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
         axes.set_xticks(shown, [f"{1 - away:g}" for away in shown])
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_xlabel(
-            "score: 0 without control, 1 at the least possible error (log scale of 1 - score); bars: cases"
+            "score: 0 without control, 1 at the least possible error (log scale of 1 - score)"
         )
 
 
@@ -66,13 +65,13 @@ def _away(score: float) -> float:
 def _finding(scores: Mapping[str, Score]) -> str:
     first, *others = ((label(agent), overall.value) for agent, (overall, _) in scores.items())
     second = f", {others[0][0]} follows with {others[0][1]:.3f}" if others else ""
-    return f"{first[0]} comes closest to the least possible error: its score is {first[1]:.3f}{second}"
+    return f"{first[0]} comes closest to the least possible error: {first[1]:.3f}{second}"
 
 
 def plot_bounds(
     estimates: pd.DataFrame, runs: pd.DataFrame, agents: Sequence[str], path: Path
 ) -> None:
-    """Draw mean errors as multiples of the least possible, with 95 % intervals and the worst runs."""
+    """Draw mean errors as multiples of the least possible, with intervals and worst runs."""
     style = looks(agents)
     worst = runs.groupby(["scenario", "agent"])["mae"].max()
     best = estimates.assign(value=[mean.value for mean in estimates["mean"]])
@@ -184,7 +183,12 @@ def plot_responses(
     agents = sorted(responses["agent"].unique(), key=errors.__getitem__)
     style, best = looks(agents), agents[0]
     title = f"{scenario.title}: {label(best)} errs least ({errors[best]:.3f} °C)"
-    with drawn(path, 1.0 + 1.05 * len(agents), title) as figure:
+    height = 1.0 + 1.05 * len(agents)
+    with drawn(path, height, title) as figure:
+        figure.set_layout_engine("none")  # which would take most of the time
+        figure.subplots_adjust(
+            0.09, 0.5 / height, 0.98, 1 - 0.65 / height, wspace=0.16, hspace=0.45
+        )
         rows_of = figure.subplots(len(agents), 2, sharex=True, sharey="col", squeeze=False)
         for (left, right), agent in zip(rows_of, agents, strict=True):
             rows, (colour, _) = responses[responses["agent"] == agent], style[agent]

@@ -207,7 +207,7 @@ def write_numbers(path: Path, table: pd.DataFrame) -> None:
 def ratio_table(
     estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
 ) -> pd.DataFrame:
-    """Return the least possible and the mean errors as multiples of them; the least are in bold."""
+    """Return the least possible and the mean errors as multiples; the least are in bold."""
     bounds = [{"agent": "least possible (°C)"}, {"agent": "with foresight (°C)"}]
     for name, scale in scales.items():
         mark = "*" * (scale.least.kind == "reference")

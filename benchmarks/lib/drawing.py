@@ -24,7 +24,8 @@ from benchmarks.lib.storage import replacing
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 WIDTH = 7.5  # of every figure, inches
 SHADES = 96  # colours of a picture
-NEAREST = 1e-3  # excess over the bound at which a logarithmic axis begins
+MULTIPLE = "multiple of the least possible error (log scale of the multiple - 1)"
+NEAREST = 1e-3  # excess over the least possible error at which a logarithmic axis begins
 EXCESSES = (0.001, 0.01, 0.1, 0.5, 1.0, 4.0, 9.0, 29.0)
 STYLE: Any = {
     "axes.grid": True,

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.colors import LogNorm
 
 from benchmarks.controllers.roster import label
-from benchmarks.lib.drawing import draw_legend, drawn, panels, scale_by_excess
+from benchmarks.lib.drawing import MULTIPLE, draw_legend, drawn, panels, scale_by_excess
 from benchmarks.lib.tables import groups
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
@@ -33,8 +33,8 @@ def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
     ratios = runs.groupby(["agent", "plant"], sort=False)["ratio"].median()
     best = str(ratios.groupby("agent").median().idxmin())
     title = (
-        f"{label(best)} comes closest to the least possible error: {ratios[best].median():.2f} times in the "
-        "median plant"
+        f"{label(best)} comes closest to the least possible error: "
+        f"{ratios[best].median():.2f} times in the median plant"
     )
     with panels(path, names, 2.3, 3, title, grid=not grid) as (figure, found, free):
         for axes, (_, cases) in zip(found, groups(runs, "agent"), strict=True):
@@ -66,8 +66,7 @@ def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
             fontsize="medium",
         )
         bar = figure.colorbar(
-            image, ax=found, label="multiple of the least possible error (log scale of the multiple - 1)",
-            extend="both", location="bottom", shrink=0.6, aspect=40,
+            image, ax=found, label=MULTIPLE, extend="both", location="bottom", shrink=0.6, aspect=40,
         )  # fmt: skip
         scale_by_excess(bar.ax, "x", 0.013, 3.0 / 1.3)
         draw_legend(
