@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 
 from agents import PolicyNetwork
 from agents.networks import PRETRAINED
-from benchmarks.controllers import pretrained
+from benchmarks.controllers import engineered
 from benchmarks.controllers.records import Cost
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.examples import sb3
@@ -172,18 +172,18 @@ class TestMembers:
             recipe = replace(SMALL, dead_zone=zone)
             network = ppo.export(ppo.begin(recipe, 0), recipe)
             for given, told in (*expected.items(), ((3.0, 7.0), zone)):
-                controller = pretrained.trained(network, Parameters(dead_zone=given), 1, 0)
+                controller = engineered.trained(network, Parameters(dead_zone=given), 1, 0)
                 assert controller.increments.dead_zone == told
             assert network.increments.dead_zone == zone  # is not changed by it
 
     def test_policies_of_any_learner_are_a_row_by_their_files(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(pretrained, "PRETRAINED", tmp_path)
+        monkeypatch.setattr(engineered, "PRETRAINED", tmp_path)
         layers = [(np.ones((1, 6)), np.zeros(1))]
         windows = {"setpoint_window": 3, "error_window": 3}
         network = PolicyNetwork(layers, observation=windows, input_scale=np.ones(6))
         for name in ("mine-1.npz", "mine-0.npz", "other.npz"):
             network.save(tmp_path / name)
-        first, second = pretrained.policies("mine-*.npz", Cost("nothing"))()
+        first, second = engineered.policies("mine-*.npz", Cost("nothing"))()
         assert [each.provenance["file"] for each in (first, second)] == [
             "mine-0.npz",
             "mine-1.npz",

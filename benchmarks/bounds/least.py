@@ -41,8 +41,6 @@ KINDS = {  # the controllers that cannot do better
     "of a change of the set point when it happens",
     "reference": "none: a reference, if each change finds the plant settled",
 }
-DIGITS = 6  # decimals of a bound, degC
-SAME = 1e-4  # degC; of two bounds that differ by less, the one for every controller is shown
 CACHE = ROOT / "results" / "bounds"
 PRICES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # prices of travel on the frontier
 
@@ -138,7 +136,7 @@ def least_possible(
         with suppress(ValueError):  # the plant does not settle between changes
             unaware = least_possible(kind="reference", folder=folder, **case)
             # Foresight makes no difference where nothing changes.
-            return unaware if abs(unaware.value - preview.value) >= SAME else preview
+            return unaware if abs(unaware.value - preview.value) >= 1e-4 else preview
         return preview
     kind = kind or "causal"
     if kind not in KINDS:
@@ -162,7 +160,7 @@ def _least_possible(
     """Return the fields of `LeastPossible`."""
     cases, idle = _draw(parameters, samples, episodes, seed)
     # Rounded to be the same on every machine, as solvers differ in later digits.
-    values = [round(best(kind).cost / samples, DIGITS) for best in cases]
+    values = [round(best(kind).cost / samples, 6) for best in cases]
     least, left_alone = student(values), student(idle)
     alone = {"": left_alone.value, "_low": left_alone.low, "_high": left_alone.high}
     found = {**vars(least), **{f"idle{end}": value for end, value in alone.items()}}

@@ -19,7 +19,7 @@ class Cost:
     """The cost of a controller before it runs."""
 
     prior_knowledge: str = ""
-    """What the controller is told about the plant."""
+    """What the controller knows about the plant."""
     parameters: str = ""
     """Number of its gains, and of its weights if it has any."""
     samples: str = ""

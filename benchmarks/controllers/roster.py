@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from benchmarks.controllers import engineered, pretrained
+from benchmarks.controllers import engineered
 from benchmarks.controllers.records import Cost, Factory, RosterEntry, Tuning
 
 _STEP_TEST = "gain, time constant, delay"
@@ -126,7 +126,7 @@ _ENTRIES = (
         "ppo",
         "PPO",
         ("#E69F00", "D"),
-        pretrained.policies(
+        engineered.policies(
             "ppo-[0-9]*.npz",
             Cost(
                 "dead zone; trained on the paper's plant",
@@ -141,7 +141,7 @@ _ENTRIES = (
         "ppo-hard",
         "PPO (hard)",
         ("#8F6200", "D"),
-        pretrained.policies(
+        engineered.policies(
             "ppo-hard-*.npz",
             Cost(
                 "trained on plants that vary",
@@ -155,7 +155,7 @@ _ENTRIES = (
         "nn-smith",
         "neural Smith",
         ("#0072B2", "^"),
-        pretrained.law_network(
+        engineered.law_network(
             engineered.nn_smith,
             Cost(_DATA_SHEET, _NETWORK, "one step test; 46 M, once", _SEARCH_OF_NETWORK),
         ),
@@ -165,7 +165,7 @@ _ENTRIES = (
         "nn-self-tuning",
         "neural self-tuning",
         ("#00664B", "v"),
-        pretrained.law_network(
+        engineered.law_network(
             engineered.nn_self_tuning,
             Cost(
                 f"{_DATA_SHEET}; delay range",
