@@ -173,7 +173,7 @@ class TestProgramme:
         least = best_plan(setpoint, **plant).value
         assert least * (1 - 1e-6) <= found < 1.005 * least
 
-    @pytest.mark.parametrize("period", [40, 76, 152, 200, 320])
+    @pytest.mark.parametrize("period", [40, 152, 320])
     def test_a_controller_that_knows_the_future_attains_the_bound(self, period):
         # Without a dead zone, so that every flow can be applied.
         arguments = {"setpoint_period": period, "dead_zone": 0.0}
@@ -324,12 +324,11 @@ class TestLeastPossible:
         assert [least.kind for least in found] == ["reference", "preview", "preview", "causal"]
         assert found[0].value == pytest.approx(0.9115, abs=1e-4)
 
-    @pytest.mark.parametrize("period", [20, 38, 76, 100, 160])
-    @pytest.mark.parametrize("controller", ["counting", "pi"])
-    def test_nobody_beats_it_however_short_holds_are(self, period, controller):
+    @pytest.mark.parametrize("period", [20, 38, 76, 160])
+    def test_nobody_beats_it_however_short_holds_are(self, period):
         case = {"samples": 600, "setpoint_period": period}
         least = least_possible(kind="preview", folder=None, **case)
-        assert not beats(errors(controllers()[controller], 1, **case), least)
+        assert not beats(errors(COUNTING, 1, **case), least)
         assert least.value < 0.95 * least.idle
 
     def test_they_hold_for_those_who_read_the_transmitter(self):
@@ -432,8 +431,8 @@ class TestPredictiveController:
         ],
     )
     def test_it_comes_near_the_limit_with_noise_and_does_not_beat_it(self, case, most):
-        runs = 60
-        least = least_possible(kind="reference", **case).value
+        runs = 30
+        least = least_possible(kind="reference", folder=None, **case).value
         found = mean_error(run_mpc(runs, seed=77, **case))
         error = found.std() / np.sqrt(runs)
         assert least - 3 * error < found.mean() < most * least + 3 * error
