@@ -186,10 +186,11 @@ def plot_responses(
     height = 1.0 + 1.05 * len(agents)
     with drawn(path, height, title) as figure:
         figure.set_layout_engine("none")  # which would take most of the time
-        figure.subplots_adjust(
-            0.09, 0.5 / height, 0.98, 1 - 0.65 / height, wspace=0.16, hspace=0.45
+        place = {"left": 0.09, "right": 0.98, "wspace": 0.14, "hspace": 0.5}
+        place |= {"bottom": 0.55 / height, "top": 1 - 0.7 / height}
+        rows_of = figure.subplots(
+            len(agents), 2, sharex=True, sharey="col", squeeze=False, gridspec_kw=place
         )
-        rows_of = figure.subplots(len(agents), 2, sharex=True, sharey="col", squeeze=False)
         for (left, right), agent in zip(rows_of, agents, strict=True):
             rows, (colour, _) = responses[responses["agent"] == agent], style[agent]
             minutes = rows["time_s"] / 60

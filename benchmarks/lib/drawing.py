@@ -23,7 +23,7 @@ from benchmarks.lib.storage import replacing
 # Okabe and Ito's palette for colour-blind readers, for lines that stand for no controller.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 WIDTH = 7.5  # of every figure, inches
-SHADES = 96  # colours of a picture
+SHADES = 128  # colours of a picture
 MULTIPLE = "multiple of the least possible error (log scale of the multiple - 1)"
 NEAREST = 1e-3  # excess over the least possible error at which a logarithmic axis begins
 EXCESSES = (0.001, 0.01, 0.1, 0.5, 1.0, 4.0, 9.0, 29.0)
@@ -58,16 +58,19 @@ def drawn(path: Path, height: float, title: str = "", *, grid: bool = True) -> I
     with mpl.rc_context(STYLE | {"axes.grid": grid}):
         figure = Figure(figsize=(WIDTH, height))
         if title:
-            lines = textwrap.fill(title, 84)
+            lines = textwrap.fill(title, 86)
             figure.suptitle(lines, x=0.01, ha="left", fontsize=10, weight="bold")
         yield figure
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()
         picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+        picture = picture.point(lambda value: value // 8 * 8 + value // 32)  # 5 bits a channel
+        found: Any = sorted(picture.getcolors(picture.width * picture.height) or [])
+        palette = Image.new("P", (1, 1))  # the most frequent, so that areas keep their colours
+        palette.putpalette([value for _, colour in found[-SHADES:] for value in colour])
+        few = picture.quantize(palette=palette, dither=Image.Dither.NONE)
         with replacing(path) as partial:
-            picture.quantize(SHADES, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-                partial, optimize=True
-            )
+            few.save(partial, optimize=True)
 
 
 @contextmanager

@@ -66,7 +66,7 @@ def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
             fontsize="medium",
         )
         bar = figure.colorbar(
-            image, ax=found, label=MULTIPLE, extend="both", location="bottom", shrink=0.6, aspect=40,
+            image, ax=found, label=MULTIPLE, extend="both", location="bottom", aspect=60,
         )  # fmt: skip
         scale_by_excess(bar.ax, "x", 0.013, 3.0 / 1.3)
         draw_legend(
