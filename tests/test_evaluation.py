@@ -142,8 +142,8 @@ class TestEvaluate:
             ({"max_episode_steps": 60}, "--preset paper --samples 60 --episodes 2"),
             ({"env": HARD, "seed": 3, "max_episode_steps": 60},
              "--preset hard --samples 60 --episodes 2 --seed 3"),
-            ({"delay": [5, 9], "setpoint": "random", "seed": SEED + 7},
-             "--set 'delay=[5,9]' --set setpoint=random --episodes 2 --seed 7000007"),
+            ({"delay": [5, 9], "setpoint": "random", "seed": 7, "max_episode_steps": 60},
+             "--set 'delay=[5,9]' --set setpoint=random --samples 60 --episodes 2 --seed 7"),
             ({"setpoint": [1, 2.5], "a": (1.0, -0.9), "b": (0.2,), "max_episode_steps": 30},
              "--set 'a=[1.0,-0.9]' --set 'b=[0.2]' --set 'setpoint=[1.0,2.5]' --samples 30 "
              "--episodes 2"),
