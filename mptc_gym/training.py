@@ -245,20 +245,21 @@ def acting_wrappers(wrappers: Iterable[WrapperSpec]) -> Wrappers:
 
 
 def _complete(wrapper: WrapperSpec) -> WrapperSpec:
-    """Return a wrapper with all its arguments, as far as its class is known, or refuse it."""
-    known = wrapper.kwargs
+    """Return a wrapper with all its arguments; refuse one that hides some, or itself."""
     try:
         kind = pkgutil.resolve_name(wrapper.entry_point)
-        _, *arguments = inspect.signature(kind).parameters.values()
-    except (ImportError, AttributeError, TypeError, ValueError):
-        complete = known is not None
-    else:
-        catch_all = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
-        complete = not arguments or (
-            known is not None
-            and all(each.name in known or each.kind in catch_all for each in arguments)
-        )
-    if not complete:
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"the wrapper {wrapper.entry_point} must be at the top level of its module, where "
+            f"it can be told from others of its name; or {VOUCH}"
+        ) from error
+    _, *arguments = inspect.signature(kind).parameters.values()
+    catch_all = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+    known = wrapper.kwargs
+    if arguments and (
+        known is None
+        or any(each.name not in known and each.kind not in catch_all for each in arguments)
+    ):
         raise ValueError(
             f"the wrapper {wrapper.entry_point} does not record its arguments: let it inherit "
             "from gymnasium.utils.RecordConstructorArgs, give that all of them, and make the "

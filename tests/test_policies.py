@@ -485,6 +485,7 @@ class TestModels:
             ), "trained on a batch whose wrappers are not known"),
             (lambda: Levels(MiddlePointEnv(), 3), "Levels does not record its arguments"),
             (lambda: Moves(made(), 0.3), "Moves does not record its arguments"),
+            (lambda: type("Local", (Scaled,), {})(made()), "Local must be at the top level"),
             (lambda: VecNormalize(DummyVecEnv([lambda: Blocks(made())])),
              "trained in VecNormalize on observations that are not a Box"),
             (lambda: VecFrameStack(DummyVecEnv([lambda: Blocks(made())]), 2),
