@@ -22,9 +22,8 @@ from mptc_gym.checks import MOST_PLANTS, count, reject, shorten
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
-from mptc_gym.policies import check_fit, start, training_of
+from mptc_gym.policies import Step, check_fit, rollout, start, training_of
 from mptc_gym.presets import IDS, PRESETS
-from mptc_gym.rollout import Step, rollout
 from mptc_gym.training import WINDOWS, entry_point, make_one, wrappers_of
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction

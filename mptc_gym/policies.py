@@ -1,19 +1,20 @@
-"""Find out how a policy acts, and whether it fits an environment."""
+"""Run any policy: find out whether it fits an environment and how it acts, and let it act."""
 
 from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from inspect import Parameter
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym.checks import reject
+from mptc_gym.checks import reject, shorten
 from mptc_gym.parameters import Parameters
 from mptc_gym.training import Training, wrappers_of
 
@@ -212,3 +213,57 @@ def check_fit(
             "env must not be wrapped, as policy commands the flow of the plant itself, got "
             f"{', '.join(each.name for each in wrappers_of(env))}"
         )
+
+
+class Step(NamedTuple):
+    """What a step of a batch showed; the arrays have one element per plant."""
+
+    before: dict[str, Any]
+    """The infos at sample k."""
+    after: dict[str, Any]
+    """The infos at sample k + 1."""
+    ended: NDArray[np.bool_]
+    """Whether the episodes have ended."""
+
+
+def rollout(
+    plants: VectorEnv[Any, Any, Any],
+    act: Callable[[Any], Any],
+    samples: int,
+    seed: int,
+) -> Iterator[Step]:
+    """Reset a batch with seeds from `seed` on, and step it through samples k = 0, 1, ...
+
+    This is the one loop, for scores, benchmarks and tests.
+
+    `act` is called with the observations, shape (n, size), and returns the actions.
+
+    Raises
+    ------
+    ValueError
+        If actions have the wrong shape or are not finite.
+    """
+    observations, infos = plants.reset(seed=seed)
+    for k in range(samples):
+        actions = _checked(act(observations), plants.action_space.shape, k)
+        before = infos
+        observations, _, terminated, truncated, infos = plants.step(actions)
+        yield Step(before, infos, terminated | truncated)
+
+
+def _checked(actions: Any, shape: Any, k: int) -> NDArray[Any]:
+    """Return a policy's actions at sample k as an array, if the environments can take them."""
+    try:
+        checked = np.asarray(actions)
+        finite = np.isfinite(checked)
+    except (TypeError, ValueError, RuntimeError) as error:  # the last: from tensors
+        hint = "its first element" if isinstance(actions, tuple) else f"an array ({error})"
+        raise ValueError(
+            f"policy must return an array of numbers, got {shorten(actions)}: return {hint}"
+        ) from error
+    if checked.shape != shape:
+        raise ValueError(f"policy must return actions of shape {shape}, got {checked.shape}")
+    if not finite.all():
+        wrong = checked[~finite][0]
+        raise ValueError(f"policy must return finite actions, got {wrong} at sample {k}")
+    return checked

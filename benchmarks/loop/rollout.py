@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import action_from_command
+from mptc_gym.policies import rollout as run_batch
 from mptc_gym.ranges import Ranges
-from mptc_gym.rollout import rollout as run_batch
 
 Array = NDArray[np.float64]
 
