@@ -66,7 +66,7 @@ LOG = ROOT / "benchmarks/identify/example.csv"
 REFUSED = {
     "claims": [(["everything"], "no 'everything'")],
     "compare": [
-        (["--agents", "nn", "pid"], "no 'pid'"),
+        (["--agents", "nn", "pid"], '"pid" for --agents. Choose from: .* Did you mean "pi"'),
         (["--agents"], "no controller"),
         (["--scenarios", "circle"], "no 'circle'"),
         (["--scenarios"], "--scenarios: none to run"),
@@ -108,7 +108,7 @@ REFUSED = {
         (["--device", "toaster"], "--device: device must be one that PyTorch can use"),
     ],
     "sweep": [
-        (["--agents", "nobody"], "no 'nobody'; there are nothing, nn"),
+        (["--agents", "nobody"], '"nobody" for --agents. Choose from: "nothing", "nn"'),
         (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),
     ],
     "train": [([], "--network requires an argument, one of nn-smith, ppo, ppo-hard")],

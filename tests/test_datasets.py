@@ -122,8 +122,11 @@ def test_writing_again_replaces_and_a_failure_changes_nothing(minari, monkeypatc
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["middlepoint/paper/ppo-v0"], "no 'middlepoint/paper/ppo-v0'"),
-        (["middlepoint/paper/mixed-v0", "--episodes", "3"], "episodes must be at least 4"),
+        (
+            ["middlepoint/paper/ppo-v0"],
+            '"middlepoint/paper/ppo-v0" for IDS. Choose from: "middle',
+        ),
+        (["middlepoint/paper/mixed-v0", "--episodes", "3"], "--episodes: must be at least 4"),
     ],
 )
 def test_bad_options_are_named(arguments, named, minari, refused):

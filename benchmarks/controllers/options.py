@@ -21,14 +21,12 @@ from agents.policy_network import WINDOWS
 from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Cost, Factory, RosterEntry
 from benchmarks.controllers.roster import OWN, ROSTER
-from benchmarks.lib.command import Names, Repeated, UsageError, blame, known, options
+from benchmarks.lib.command import Names, Repeated, UsageError, blame, options
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.loop.rollout import Agent
 from mptc_gym import Parameters
 
-AgentNames = Annotated[
-    Names, Parameter(help=f"Controllers to run, out of {', '.join(ROSTER)}.")
-]
+AgentNames = Annotated[Names, Parameter(help="Controllers to run.", choices=ROSTER)]
 
 
 @options
@@ -46,9 +44,9 @@ class ControllerOptions:
 def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEntry]:
     """Return controllers of the roster by name, then a user's own, as given to `--agent`.
 
-    A `UsageError` says that there is no such controller, or no controller at all.
+    A `UsageError` says what is wrong with a user's own, or that there is no controller at all.
     """
-    found = {name: ROSTER[name] for name in known("--agents", names, list(ROSTER))}
+    found = {name: ROSTER[name] for name in names}
     locations: dict[str, list[str]] = {}
     for text in own:
         name, equals, location = text.partition("=")

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from benchmarks.lib.command import Count, Names, command, options
 
 SAMPLES = 1200  # per episode
 EPISODES = 100  # per data set
+PLANTS = ("paper", "disturbed", "fouling")  # presets
+BEHAVIOURS = {
+    "pi": ("pi",),
+    "smith": ("smith",),
+    "mixed": ("pi", "pi-simc", "smith", "nn"),  # controllers take turns, episode by episode
+}
+IDS = {
+    f"middlepoint/{plant}/{behaviour}-v0": (plant, behaviour)
+    for plant in PLANTS
+    for behaviour in BEHAVIOURS
+}
 
 
 @options
@@ -18,8 +32,8 @@ class Options:
     Each includes the least possible error of its plant.
     """
 
-    ids: Names = field(default=(), kw_only=False)
-    """Data sets to write, such as middlepoint/paper/pi-v0 (default: all)."""
+    ids: Annotated[Names, Parameter(choices=IDS)] = field(default=(), kw_only=False)
+    """Data sets to write (default: all)."""
     episodes: Count = EPISODES
     """Episodes per data set, of 1,200 transitions each."""
 

@@ -14,17 +14,12 @@ import pandas as pd
 from rich.console import Console
 
 import mptc_gym
-from benchmarks.datasets.__main__ import SAMPLES, Options
-from benchmarks.datasets.history import BEHAVIOURS, PLANTS, History, arguments_of, record, scale
-from benchmarks.lib.command import UsageError, known, out_folder
+from benchmarks.datasets.__main__ import BEHAVIOURS, IDS, SAMPLES, Options
+from benchmarks.datasets.history import History, arguments_of, record, scale
+from benchmarks.lib.command import UsageError, out_folder
 from benchmarks.lib.tables import on_screen
 from mptc_gym import Evaluation
 
-IDS = {
-    f"middlepoint/{plant}/{behaviour}-v0": (plant, behaviour)
-    for plant in PLANTS
-    for behaviour in BEHAVIOURS
-}
 VARIABLE = "MINARI_DATASETS_PATH"
 DESCRIPTION = (
     "Middle-point temperature of a once-through boiler, preset {plant!r}, random set points, "
@@ -38,16 +33,17 @@ DESCRIPTION = (
 
 def execute(options: Options, console: Console) -> str:
     """Write data sets and list them."""
-    ids = known("ID", options.ids or list(IDS), list(IDS))
+    ids = dict.fromkeys(options.ids or IDS)
     import minari  # noqa: F401 (here: the first thing that needs it, which not everyone has)
 
     root = Path(os.environ.setdefault(VARIABLE, str(Path.home() / ".minari" / "datasets")))
     out_folder(root, VARIABLE)
     for name in ids:
-        needed, given = len(BEHAVIOURS[IDS[name][1]]), options.episodes
-        if given < needed:  # each controller needs one
-            text = f"episodes must be at least {needed} for {name}, got {given}"
-            raise UsageError(f"--episodes: {text}")
+        needed = len(BEHAVIOURS[IDS[name][1]])  # each controller needs one
+        if options.episodes < needed:
+            raise UsageError(
+                f"--episodes: must be at least {needed} for {name}, got {options.episodes}"
+            )
     rows = []
     for name in ids:
         history, judged_by = record(*IDS[name], options.episodes), scale(IDS[name][0])

@@ -11,16 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.datasets.__main__ import EPISODES, SAMPLES
+from benchmarks.datasets.__main__ import BEHAVIOURS, EPISODES, SAMPLES
 from benchmarks.loop.rollout import Agent, IdleValve, make_plants, rollout
 from mptc_gym import PRESETS, Evaluation, Parameters, evaluate
 
-PLANTS = ("paper", "disturbed", "fouling")  # presets
-BEHAVIOURS = {
-    "pi": ("pi",),
-    "smith": ("smith",),
-    "mixed": ("pi", "pi-simc", "smith", "nn"),  # controllers take turns, episode by episode
-}
 SEED = 9_000_000  # of the first episode; no comparison and no bound uses these seeds
 EVALUATIONS = 50  # episodes to evaluate learners on; the data holds none of them
 
