@@ -16,7 +16,7 @@ from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop import designs
 from benchmarks.loop.designs import SPANS, WIDE, around, grid, random_design
-from benchmarks.sweep import command, report
+from benchmarks.sweep import command, maps, report
 from benchmarks.sweep.__main__ import main
 from benchmarks.sweep.command import agent_task, limit_task
 from mptc_gym import Parameters
@@ -185,6 +185,23 @@ class TestSweep:
             (10, 1.0), (20, 1.0), (10, 1.2), (20, 1.2),
         }  # fmt: skip
         assert (tmp_path / "map.png").stat().st_size > 1000
+
+    def test_a_grid_marks_the_plant_that_it_is_around(self, monkeypatch, tmp_path):
+        legend = Mock()
+        monkeypatch.setattr(maps, "draw_legend", legend)
+        runs = pd.DataFrame({"agent": "pi", "plant": [0, 1], "delay": [18, 9]}).assign(
+            gain_factor=[1.0, 2.0], ratio=2.0, oscillates=False, useless=False
+        )
+        for centre, name, place in (
+            (Parameters(), "the paper's plant", (18, 1.0)),
+            (Parameters(delay=9, gain_factor=2.0), "the nominal plant", (9, 2.0)),
+        ):
+            maps.plot_maps(runs, tmp_path / "map.png", centre)
+            marks = legend.call_args.args[2]
+            assert marks[name].get_xydata().tolist() == [list(place)]
+            # Where the set point is 5 °C, as is the dead zone: 1 / 0.6825 degC per t/h.
+            (edge,) = (marks[text] for text in marks if "5 °C is within" in text)
+            assert edge.get_ydata()[0] == pytest.approx(1.4652, abs=1e-3)
 
     def test_a_nominal_plant_with_a_list_and_a_controller_of_any_name(
         self, tmp_path, monkeypatch

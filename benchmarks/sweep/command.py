@@ -73,7 +73,8 @@ def execute(options: Options, console: Console) -> str:
     seconds = time.perf_counter() - began
 
     runs = table(differing, list(controllers), limits, results)
-    sections = report(runs, out, options.design, options.told)
+    centre = Parameters(**nominal) if options.design == "grid" else None
+    sections = report(runs, out, centre, options.told)
     write_csv(out / "runs.csv", runs)
     about = {"seconds": round(seconds, 1), "options": asdict(options)}
     write_json(out / "provenance.json", {**made, **about, "policies": provenances(members)})

@@ -21,11 +21,13 @@ _MARKS = {
 }
 
 
-def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
+def plot_maps(runs: pd.DataFrame, path: Path, centre: Parameters | None) -> None:
     """Draw a map of each controller's errors over delay and gain, the median of each plant.
 
-    Errors are multiples of the least possible. On a grid only delay and gain differ.
+    Errors are multiples of the least possible. `centre` is the plant around which the others
+    are, if they are a grid: then only delay and gain differ, and the map marks it.
     """
+    grid = centre is not None
     drift = runs.get("gain_drift", pd.Series(np.nan, runs.index))
     largest = runs["gain_factor"] * drift.fillna(1.0).clip(1.0)
     runs = runs.assign(gain=largest, drifts=drift.notna())
@@ -53,18 +55,22 @@ def plot_maps(runs: pd.DataFrame, path: Path, *, grid: bool) -> None:
                     often["delay"], often["gain"], size, marker=marker, color=colour,
                     edgecolor="black", linewidth=0.8, label=text,
                 )  # fmt: skip
-            if grid:
-                axes.plot(18, 1.0, "k+", markersize=12, label="the paper's plant")
-                # Both the set point and the dead zone are 5.
-                edge = 1.0 / abs(nominal(Parameters()).gain)
-                text = "above: 5 °C is within the dead zone"
-                axes.axhline(edge, color="black", linestyle=":", label=text)
+            if centre is not None:
+                delay, factor, zone = (
+                    sum(centre.range_of(name)) / 2.0
+                    for name in ("delay", "gain_factor", "dead_zone")
+                )
+                text = "the paper's plant" if centre == Parameters() else "the nominal plant"
+                axes.plot(delay, factor, "k+", markersize=12, label=text)
+                # The gain at which the least effective flow makes a set point.
+                degrees = centre.setpoint_amplitude
+                edge = factor * degrees / max(zone * abs(nominal(centre).gain), 1e-9)
+                text = f"above: {degrees:g} °C is within the dead zone"
+                if edge <= where["gain"].max():
+                    axes.axhline(edge, color="black", linestyle=":", label=text)
         for axes in found[-3:]:
             axes.set_xlabel("delay (samples)")
-        figure.supylabel(
-            "gain (of the paper's)" if grid else "largest gain (of the paper's)",
-            fontsize="medium",
-        )
+        figure.supylabel("gain factor" if grid else "largest gain factor", fontsize="medium")
         bar = figure.colorbar(
             image, ax=found, label=MULTIPLE, extend="both", location="bottom", aspect=60,
         )  # fmt: skip

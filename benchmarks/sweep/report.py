@@ -14,6 +14,7 @@ from benchmarks.lib.statistics import bootstrap, improvement
 from benchmarks.lib.tables import groups
 from benchmarks.loop.designs import SPANS, Arguments
 from benchmarks.sweep import maps
+from mptc_gym import Parameters
 
 SEED = 0  # seed of the bootstraps
 OSCILLATES = 1.0  # degC by which the swing must exceed that without control
@@ -89,13 +90,15 @@ def table(
     return pd.concat(rows, ignore_index=True)
 
 
-def report(runs: pd.DataFrame, out: Path, design: str, told: str) -> list[Section]:
-    """Draw the maps of a "grid", "random" or "wide" design, and return the report.
+def report(
+    runs: pd.DataFrame, out: Path, centre: Parameters | None, told: str
+) -> list[Section]:
+    """Draw the maps of a grid around the plant `centre`, or of another design, and report.
 
     `QUESTIONS` are asked unless the design is a grid or controllers are `told` each plant.
     """
-    picture = "map.png" if design == "grid" else "plants.png"
-    maps.plot_maps(runs, out / picture, grid=design == "grid")
+    picture = "map.png" if centre else "plants.png"
+    maps.plot_maps(runs, out / picture, centre)
     title = "How many plants each controller works on"
     spans = ", ".join(
         f"{name} {runs[name].min():.4g} to {runs[name].max():.4g}"
@@ -103,7 +106,7 @@ def report(runs: pd.DataFrame, out: Path, design: str, told: str) -> list[Sectio
     )  # fmt: skip
     about = [f"The plants have: {spans}.", OVERVIEW_TEXT]
     sections = [Section(title, about, overview(runs), [picture])]
-    if design == "grid" or told == "each":
+    if centre or told == "each":
         return sections
     for title, text, pairs, picture in QUESTIONS:
         asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
