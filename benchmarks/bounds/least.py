@@ -73,15 +73,8 @@ class LeastPossible(Estimate):
     def score(self, errors: ArrayLike) -> Array:
         """Return scores: 0 for the mean error with the valve left alone, 1 for `value`.
 
-        Parameters
-        ----------
-        errors
-            Mean |e| of runs, degC, any shape. The score of a single run may exceed 1 by chance.
-
-        Raises
-        ------
-        ValueError
-            If nothing is better than leaving the valve alone.
+        `errors` are mean |e| of runs, degC, of any shape; a single run may exceed 1 by chance.
+        A ValueError is raised if nothing is better than leaving the valve alone.
         """
         room = self.idle - self.value
         if room <= 1e-9 * max(self.idle, 1.0):
@@ -190,18 +183,9 @@ def frontier(
     dead zone: a mean of such flows travels no more than they do on average. The bound is loose
     where noise requires moves that the mean does not show.
 
-    Parameters
-    ----------
-    samples, kind, episodes, seed, **arguments
-        See `least_possible`. With "reference", the condition of that kind applies.
-    prices
-        Prices per t/h of travel, degC times samples.
-
-    Returns
-    -------
-    list of tuple of float
-        Travel, t/h per sample (the sum of |u_a(k) - u_a(k-1)| divided by `samples`), and error,
-        degC, by descending travel; the last point is a valve that does not move.
+    Prices are in degC times samples for each t/h; for the other arguments see `least_possible`.
+    Returned are travel, t/h per sample (the sum of |u_a(k) - u_a(k-1)| divided by `samples`),
+    and error, degC, by descending travel; the last point is a valve that does not move.
     """
     parameters = Parameters(**arguments)
     kind = kind or theorem(parameters)

@@ -80,34 +80,13 @@ def plan(
     the two sides of a limit: the mean of 0 and 5 t/h is 2.5 t/h, and the mean of what the noise
     requires may lie within limits that single demands exceed.
 
-    Parameters
-    ----------
-    model
-        The plant, for at least as many samples as there are set points.
-    unknown
-        What no command can counteract in time.
-    setpoint
-        y_d(k), degC, shape (samples,).
-    before, start
-        Outputs up to sample `start`, and flows before it, are those of the plan `before`.
-        Without one, the plant has been at rest before k = 0, and `start` is 0.
-    price
-        Price of valve travel, degC times samples for each t/h.
-    penalty
-        Additional cost of each t/h of u_a(k), shape (samples,).
-    least_slope
-        Least slope of the bounds of E|m - n|, while planning. As these are level near 0, a
-        least slope above 0 selects, of equally good plans, one that comes to the set point.
-
-    Returns
-    -------
-    Plan
-        `value` counts the samples from `start` on.
-
-    Raises
-    ------
-    NotSolvedError
-        If all attempts fail or take too long.
+    The model covers at least the samples of `setpoint`, y_d(k) in degC. Outputs up to sample
+    `start`, and flows before it, are those of the plan `before`; without one, the plant has
+    been at rest. The value counts the samples from `start` on, with a `price` of valve travel,
+    degC times samples for each t/h, and a `penalty` for each t/h of u_a(k), shape (samples,).
+    The bounds of E|m - n| are level near 0: while planning, a `least_slope` above 0 selects, of
+    equally good plans, one that comes to the set point. `NotSolvedError` is raised if all
+    attempts fail or take too long.
     """
     samples = len(setpoint)
     penalty = np.zeros(samples) if penalty is None else penalty
@@ -229,21 +208,10 @@ def reference(
     for one given sequence any controller may have the times of its changes built in. The
     reference holds under a condition. At each change the controller takes, from where it is,
     the flow that is best if the new set point stays. If the plant has settled by the next
-    change, each change costs the least that is possible without preview; see `plan`.
+    change, each change costs the least that is possible without preview; see `plan`. If it has
+    not settled, a ValueError is raised.
 
-    Parameters
-    ----------
-    model, unknown
-        The plant and what is unknown, for `model.lag + TAIL` samples more than set points.
-    setpoint
-        y_d(k), degC, shape (samples,).
-    price
-        Price of valve travel, degC times samples for each t/h.
-
-    Raises
-    ------
-    ValueError
-        If the plant has not settled at a change.
+    The model covers `model.lag + TAIL` samples more than `setpoint`.
     """
     settled = SETTLED * (model.high - model.low)
     error = np.zeros(len(setpoint))

@@ -213,11 +213,7 @@ FIGURES = (
 def typical(trajectory: Trajectory) -> pd.DataFrame:
     """Return the set point, and each signal's typical run and percentiles, a row per sample.
 
-    Returns
-    -------
-    DataFrame
-        `time_s`, `setpoint`, and for `output`, `command` and `noise`: `_typical`, the run with
-        the median mean error (the better of two middle runs), `_p10` and `_p90`.
+    The typical run is that with the median mean error, the better of two middle runs.
     """
     error = mean_error(trajectory)
     middle = np.argsort(error, kind="stable")[(len(error) - 1) // 2]

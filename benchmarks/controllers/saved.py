@@ -24,13 +24,9 @@ from mptc_gym.wrappers import NUMBERS, Actuator, IncrementalAction
 def policies(location: str) -> list[Factory]:
     """Return a factory for each saved policy at a location, such as `PPO:model.zip`.
 
-    The file may be a pattern, such as `runs/*.zip`. Loading a zip runs the code in it.
-
-    Raises
-    ------
-    ValueError
-        If there is no such file, if a file does not say how its policy was trained, or if that
-        was with another algorithm or with wrappers that a comparison cannot give.
+    The file may be a pattern, such as `runs/*.zip`. Loading a zip runs the code in it. A
+    ValueError says if there is no such file, if it does not say how its policy was trained, or
+    if that was with another algorithm or with wrappers that a comparison cannot give.
     """
     algorithm, _, pattern = location.partition(":")
     if not pattern:

@@ -76,12 +76,8 @@ class LinearModel:
     def step_response(self, samples: int | None = None) -> Array:
         """Return y(0), y(1), ... after a step of u_a from 0 to 1 t/h at k = 0, degC per t/h.
 
-        By default, it is as long as the response takes to settle.
-
-        Raises
-        ------
-        ValueError
-            If `samples` is None and the response never settles, or settles at 0.
+        By default, it is as long as the response takes to settle. A ValueError is then raised
+        if it never settles, or settles at 0.
         """
         if samples is None:
             slowest = float(np.max(np.abs(self.poles), initial=0.0))
@@ -194,12 +190,8 @@ def step_test(parameters: Parameters) -> StepTest:
     digits, the time constant three, and the delay is a whole number of samples.
 
     A range is replaced by its middle, and a drifting plant is tested at k = 0. The flow moves
-    outside the dead zone, and noise and load disturbances average out.
-
-    Raises
-    ------
-    ValueError
-        If the plant is not stable and so reaches no new steady state, or if its gain is 0.
+    outside the dead zone, and noise and load disturbances average out. A ValueError is raised
+    if the plant reaches no new steady state, or if its gain is 0.
     """
     return read_off(nominal(parameters))
 

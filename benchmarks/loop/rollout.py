@@ -96,18 +96,10 @@ def rollout(
     seed: int,
     before: Callable[[int], object] | None = None,
 ) -> Trajectory:
-    """Run one episode of every plant in a batch.
+    """Run a controller on a batch of plants for k = 0 to samples - 1. Both are reset first.
 
-    Parameters
-    ----------
-    plants, agent
-        Batch of plants and its controller. Both are reset first.
-    samples
-        Number of samples, k = 0 to samples - 1, at most the length of an episode.
-    seed
-        Run i has the noise and the set point of seed `seed + i`.
-    before
-        Called with k before the controller acts at sample k, to observe or to damage it.
+    Run i has the noise and the set point of seed `seed + i`. `before` is called with k before
+    the controller acts at sample k, to observe or to damage it.
     """
     shape = samples, plants.num_envs
     trajectory = Trajectory(*(np.empty(shape) for _ in fields(Trajectory)))
