@@ -63,14 +63,25 @@ def drawn(path: Path, height: float, title: str = "", *, grid: bool = True) -> I
         yield figure
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()
-        picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-        picture = picture.point(lambda value: value // 8 * 8 + value // 32)  # 5 bits a channel
-        found: Any = sorted(picture.getcolors(picture.width * picture.height) or [])
-        palette = Image.new("P", (1, 1))  # the most frequent, so that areas keep their colours
-        palette.putpalette([value for _, colour in found[-SHADES:] for value in colour])
-        few = picture.quantize(palette=palette, dither=Image.Dither.NONE)
+        (picture,) = with_few_colours(
+            [Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")], SHADES
+        )
         with replacing(path) as partial:
-            few.save(partial, optimize=True)
+            picture.save(partial, optimize=True)
+
+
+def with_few_colours(
+    pictures: Sequence[Image.Image], shades: int, lines: Sequence[tuple[int, ...]] = ()
+) -> list[Image.Image]:
+    """Return pictures with the most frequent colours of the last, and those of thin lines."""
+    coarse = [  # 5 bits a channel
+        picture.point(lambda value: value // 8 * 8 + value // 32) for picture in pictures
+    ]
+    found: Any = sorted(coarse[-1].getcolors(coarse[-1].width * coarse[-1].height) or [])
+    palette = Image.new("P", (1, 1))
+    frequent = [colour for _, colour in found[-shades:]]
+    palette.putpalette([value for colour in [*lines, *frequent] for value in colour])
+    return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in coarse]
 
 
 @contextmanager

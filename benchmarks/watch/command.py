@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pygame
-from PIL import Image
+from PIL import Image, ImageDraw
 from rich.console import Console
 
 from benchmarks.controllers.options import own_entry
 from benchmarks.controllers.records import Factory, RosterEntry
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import UsageError
+from benchmarks.lib.drawing import with_few_colours
 from benchmarks.lib.storage import replacing
 from benchmarks.lib.tables import on_screen
 from benchmarks.loop.metrics import mean_error
@@ -22,11 +24,15 @@ from benchmarks.loop.rollout import Trajectory
 from benchmarks.loop.scenarios import SCENARIOS, Scenario, scenarios_of
 from benchmarks.watch import game
 from benchmarks.watch.__main__ import YOU, Options
-from mptc_gym import MiddlePointEnv
+from mptc_gym import MiddlePointEnv, drawing
 from mptc_gym.drawing import SIZE
 
-COLOURS = 48  # of a GIF: lines, areas and the shades between them
+LINES = (drawing.SETPOINT, drawing.TEMPERATURE, drawing.APPLIED, drawing.COMMAND)
+COLOURS = 20  # of a GIF: lines, areas and the shades between them
 FASTEST = 10  # pictures a second of a GIF
+HEADER = 67  # rows of a picture that hold the readings, which a film leaves out
+SHOWN = 560, 7 * (SIZE[1] - HEADER) // 12  # size of one half of the run
+CAPTION = 28  # height of its caption
 OUT = Path("results/watch")
 
 
@@ -73,26 +79,35 @@ def write_film(
 ) -> Trajectory:
     """Run a controller, and write what a window would show as an animated GIF.
 
-    It shows every n-th sample, as viewers play at most some 10 pictures a second.
+    Both halves of the run are shown at once, the first above the second, with the mean error of
+    each. Of the samples every n-th is shown, as viewers play at most some 10 pictures a second.
     """
     every = math.ceil(speed / FASTEST)
     arguments = factory.arguments(scenario.arguments)
     plant = MiddlePointEnv(render_mode="rgb_array", **arguments)
-    frames: list[bytes] = []  # compressed: a minute of raw frames takes a gigabyte of memory
+    half = math.ceil(scenario.samples / 2)
+    frames: list[list[bytes]] = [[], []]  # compressed: raw frames take a gigabyte of memory
 
     def keep(k: int) -> None:
-        if k % every == 0:
-            frames.append(zlib.compress(np.asarray(plant.render()).tobytes(), 1))
-
-    def picture(frame: bytes) -> Image.Image:
-        return Image.frombytes("RGB", SIZE, zlib.decompress(frame))
+        if k % half % every == 0:
+            picture = Image.fromarray(np.asarray(plant.render())[HEADER:])
+            small = picture.resize(SHOWN, Image.Resampling.LANCZOS)
+            frames[k // half].append(zlib.compress(small.tobytes(), 1))
 
     trajectory = game.run(plant, factory(arguments, 1, seed), scenario.samples, seed, keep)
-    # One palette for all frames, taken from the last, which shows a bit of everything.
-    palette = picture(frames[-1]).quantize(COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=1)
-    first, *others = (
-        picture(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames
-    )
+    errors = [np.abs(part).mean() for part in np.split(trajectory.error, [half])]
+    sheet = Image.new("RGB", (SHOWN[0], 2 * (SHOWN[1] + CAPTION)), "white")
+    places = [(0, CAPTION), (0, SHOWN[1] + 2 * CAPTION)]
+    for name, error, (x, y) in zip(("first", "second"), errors, places, strict=True):
+        text = f"{name} half of the run: mean error {error:.2f} °C"
+        ImageDraw.Draw(sheet).text((x + 12, y - 22), text, "black", font_size=16)
+    pictures = []
+    for pair in itertools.zip_longest(*frames):
+        for frame, place in zip(pair, places, strict=True):
+            if frame:
+                sheet.paste(Image.frombytes("RGB", SHOWN, zlib.decompress(frame)), place)
+        pictures.append(sheet.copy())
+    first, *others = with_few_colours(pictures, COLOURS, LINES)
     duration = 1000 * every / speed  # of a frame, ms
     with replacing(path) as partial:
         first.save(partial, save_all=True, append_images=others, duration=duration, loop=0)
