@@ -29,8 +29,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from mptc_gym.checks import MOST_PLANTS, count, plain, reject
 from mptc_gym.evaluation import EPISODES, SEED, Evaluation, evaluate, native_batch
-from mptc_gym.sb3_training import restored, training_of
-from mptc_gym.sb3_vec_env import GymnasiumVecEnv
+from mptc_gym.sb3_training import GymnasiumVecEnv, restored, training_of
 from mptc_gym.training import MEMBER, Training, make_one, zip_path
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
