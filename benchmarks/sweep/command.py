@@ -66,13 +66,9 @@ def execute(options: Options, console: Console) -> str:
                 agent_task, *given, options.samples, options.runs
             )
     found = options.controllers.fan_out.run(tasks, "sweep", Kept(out / "tasks"))
-    limits = [found[f"plant {i}"] for i in range(len(plants))]
-    results = {
-        name: [found[f"plant {i}, {name}"] for i in range(len(plants))] for name in members
-    }
     seconds = time.perf_counter() - began
 
-    runs = table(differing, list(controllers), limits, results)
+    runs = table(differing, list(controllers), found)
     centre = Parameters(**nominal) if options.design == "grid" else None
     sections = report(runs, out, centre, options.told)
     write_csv(out / "runs.csv", runs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -64,24 +65,21 @@ DIFFERENCES_TEXT = (
 
 
 def table(
-    plants: Sequence[Arguments],
-    agents: Sequence[str],
-    limits: Sequence[float | None],
-    results: Mapping[str, Sequence[dict[str, list[float]]]],
+    plants: Sequence[Arguments], agents: Sequence[str], found: Mapping[str, Any]
 ) -> pd.DataFrame:
     """Return one row for each run: its plant, its measures, and how they compare.
 
-    A plant holds the arguments in which it differs from the nominal one. There is a limit for
-    each plant, and by name a result of each agent and of "nothing" on each plant.
+    A plant holds the arguments in which it differs from the nominal one. Found are, by the
+    names of the tasks, the limit of each plant and the measures of each agent on it, and of
+    "nothing".
     """
     rows = []
-    for i, (plant, limit) in enumerate(zip(plants, limits, strict=True)):
-        nothing = pd.DataFrame(results["nothing"][i])
+    for i, plant in enumerate(plants):
+        nothing = pd.DataFrame(found[f"plant {i}, nothing"])
         for agent in agents:
-            measures = results[agent][i]
-            numbers = range(len(measures["mae"]))
-            task = pd.DataFrame({"plant": i, "agent": agent, "run": numbers, **measures})
-            task["limit"] = np.nan if limit is None else limit
+            task = pd.DataFrame({"plant": i, "agent": agent, **found[f"plant {i}, {agent}"]})
+            task.insert(2, "run", range(len(task)))
+            task["limit"] = found[f"plant {i}"] or np.nan  # None where it does not settle
             task["ratio"] = task["mae"] / task["limit"]
             # Doing nothing in the same noise sets both scales.
             task["oscillates"] = task["swing"] > nothing["swing"] + OSCILLATES
