@@ -72,10 +72,8 @@ REFUSED = {
         (["--scenarios"], "--scenarios: none to run"),
         (["--runs", "0"], 'value "0" for --runs. Must be >= 1'),
         (["--runs", "2.5"], "--runs: invalid literal for int.. with base 10: '2.5'"),
-        (["--runs", "99999999999"], 'value "99999999999" for --runs. Must be <= 100000'),
         (["--backend", "cloud"], "--backend"),
         (["--preset", "harder"], '"harder" for --preset. Choose from: "paper", "dead-z'),
-        (["--out"], "--out requires an argument"),
         (["--rusn", "3"], "Unknown option: --rusn. Did you mean --runs?"),
         (["stray"], "stray"),
         (["--plant", "nowhere.json"], "nowhere.json"),
@@ -85,7 +83,6 @@ REFUSED = {
         (["--set", "a=[1,-1.5]"], "--set: a must not have a root beyond the unit circle"),
         (["--set", "a=[1,-1]", "--agents", "pi-simc"], "pi-simc on .*: a must be of a stable"),
         (["--set", "u_min=5"], "constant set point, u_min=5: there is nothing to gain: doing"),
-        (["--set", "time_constant_factor=100"], "square wave, time_constant_factor=100: there"),
         (["--set", "render_mode=human"], "--set: render_mode is not an argument of the plant"),
         (["--agent", "PI=agents:PIController"], "'PI' is taken"),
         (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
@@ -93,18 +90,13 @@ REFUSED = {
     "identify": [
         (["none.csv"], "none.csv cannot be read: No such file"),
         ([LOG, "--u-min", "nan"], 'value "nan" for --u-min. Must be < inf'),
-        ([LOG, "--u-max", "full"], '--u-max: unable to convert "full" into float'),
-        ([LOG, "--operating-flow", "inf"], 'value "inf" for --operating-flow. Must be < inf'),
         ([LOG, "--operating-flow", "1e9"], "operating_flow must be near the flows of the log"),
         ([LOG, "--sampling-interval", "0"], 'value "0.0" for --sampling-interval. Must be > 0'),
     ],
     "bounds": [
         (["--cache", __file__], "--cache: "),
-        (["--samples", "0"], "--samples"),
     ],
     "speed": [
-        (["--rounds", "0"], "--rounds"),
-        (["--rounds", "many"], "--rounds"),
         (["--device", "toaster"], "--device: device must be one that PyTorch can use"),
     ],
     "sweep": [
@@ -118,7 +110,6 @@ REFUSED = {
         (["--scenario", "triangle"], "--scenario.*constant-noise"),
         (["--video", "film.avi"], "--video: must end in .gif"),
         (["--seed", "-1"], "--seed. Must be >= 0"),
-        (["--speed", "0"], "--speed. Must be >= 1"),
         # Of a machine without a screen.
         (["--agent", "you"], "--agent you: needs a screen"),
         (["--agent", "you", "--video", "film.gif"], "--agent you: needs a screen"),

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.datasets.__main__ import BEHAVIOURS, EPISODES, SAMPLES
-from benchmarks.loop.rollout import Agent, IdleValve, make_plants, rollout
+from benchmarks.loop.rollout import Agent, IdleValve, make_plants
 from mptc_gym import PRESETS, Evaluation, Parameters, evaluate
+from mptc_gym.policies import rollout
 
 SEED = 9_000_000  # of the first episode; no comparison and no bound uses these seeds
 EVALUATIONS = 50  # episodes to evaluate learners on; the data holds none of them
@@ -84,15 +85,31 @@ def record(plant: str, behaviour: str, episodes: int = EPISODES, seed: int = SEE
         own = slice(j, episodes, len(names))
         seeds = history.seeds[own]
         (factory,) = ROSTER[name].members()
-        controller = _Recorder(factory.in_service(arguments, len(seeds), seed))
-        # One more sample, for the final observation.
-        plants = make_plants(len(seeds), SAMPLES + 1, **arguments)
-        trajectory = rollout(plants, controller, SAMPLES + 1, seeds)  # type: ignore[arg-type]
-        plants.close()
-        history.observations[own] = np.stack(controller.observations, axis=1)
-        history.actions[own] = np.stack(controller.actions[:-1], axis=1)
-        history.rewards[own] = -np.abs(trajectory.error[:-1].T)
+        controller = factory.in_service(arguments, len(seeds), seed)
+        logged = _log(controller, arguments, seeds)
+        history.observations[own], history.actions[own], history.rewards[own] = logged
     return history
+
+
+def _log(controller: Agent, arguments: dict[str, Any], seeds: list[int]) -> tuple[Any, ...]:
+    """Return the observations, actions and rewards of a batch of episodes; see `History`."""
+    observations: list[NDArray[np.float32]] = []
+    actions: list[NDArray[np.float32]] = []
+
+    def act(observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        observations.append(observation)
+        # Beyond +-1 the actuator saturates, so clipping does not change what the plant does.
+        action = np.clip(controller.act(observation), -1.0, 1.0)
+        actions.append(action.astype(np.float32))
+        return actions[-1]
+
+    # One more sample, for the final observation.
+    plants = make_plants(len(seeds), SAMPLES + 1, **arguments)
+    controller.reset()
+    steps = rollout(plants, act, SAMPLES + 1, seeds)  # type: ignore[arg-type]
+    errors = [after["error"] for _, after, _ in steps]
+    plants.close()
+    return np.stack(observations, 1), np.stack(actions[:-1], 1), -np.abs(errors[:-1]).T
 
 
 def scale(plant: str, episodes: int = EVALUATIONS) -> Evaluation:
@@ -102,20 +119,3 @@ def scale(plant: str, episodes: int = EVALUATIONS) -> Evaluation:
     any policy on the same environment.
     """
     return evaluate(IdleValve(), episodes=episodes, **arguments_of(plant))
-
-
-class _Recorder:
-    """A controller that records its observations and actions."""
-
-    def __init__(self, controller: Agent) -> None:
-        self._controller = controller
-        self.reset = controller.reset
-        self.observations: list[NDArray[np.float32]] = []
-        self.actions: list[NDArray[np.float32]] = []
-
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        self.observations.append(observation)
-        # Beyond +-1 the actuator saturates, so clipping does not change what the plant does.
-        action = np.clip(self._controller.act(observation), -1.0, 1.0)
-        self.actions.append(action.astype(np.float32))
-        return self.actions[-1]
