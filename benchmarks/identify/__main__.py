@@ -1,12 +1,77 @@
 """Identify a plant from a log and tune controllers: `python -m benchmarks.identify --help`."""
 
+from __future__ import annotations
+
 import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from benchmarks.lib.command import Count, Finite, Folder, Positive, Repeated, command, options
 
 # NumPy reads it when it is imported. Threads for small matrices only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from benchmarks.identify.options import Options
-from benchmarks.lib.command import command
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Columns:
+    """The columns of a log and their units."""
+
+    time: str = "time"
+    """Column of the times, numbers or dates."""
+    flow: str = "flow"
+    """Column of the flow."""
+    temperature: str = "temperature"
+    """Column of the temperature."""
+    disturbance: Repeated = ()
+    """Column of a measured disturbance (repeatable)."""
+    sampling_interval: Positive | None = None
+    """Time from one row to the next, s; the column of the times is then not read."""
+    time_unit: str | None = None
+    """Unit of the times: ms, s, min or h (default: that in the heading, else s)."""
+    flow_unit: str | None = None
+    """Unit of the flow, for the report (default: that in the heading, else t/h)."""
+    temperature_unit: str | None = None
+    """Unit of the temperature, for the report (default: that in the heading, else °C)."""
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Knowledge:
+    """Prior knowledge of the plant, and what to look for."""
+
+    longest_delay: Count = 60
+    """Longest delay to look for, samples."""
+    applied: bool = False
+    """The flow was measured after the actuator, so no dead zone is looked for."""
+    u_min: Finite | None = None
+    """Smallest flow that the actuator can apply, from the operating point (default: the
+    log's smallest)."""
+    u_max: Finite | None = None
+    """Largest flow that the actuator can apply, from the operating point (default: the
+    log's largest)."""
+    operating_flow: Finite | None = None
+    """Flow at the operating point, around which a dead zone lies (default: 0 or the first flow
+    if it is well inside the range of the flows, else the middle of the range)."""
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Fit the plant's equations to a recorded log, and tune controllers for it.
+
+    The log is a table with a heading; each row holds the temperature at its time and the flow
+    commanded from that time on.
+    """
+
+    log: Path = field(kw_only=False)
+    """The log, a CSV file."""
+    out: Folder = Path("results/identify")
+    columns: Columns = field(default_factory=Columns)
+    rows: Count = 20_000
+    """Largest number of rows to fit; of a longer log, the last ones are used."""
+    knowledge: Knowledge = field(default_factory=Knowledge)
+
 
 main = command(Options, "benchmarks.identify.command", interrupted="nothing is written.")
 

@@ -14,11 +14,6 @@ from scipy import linalg, optimize, signal
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Largest positive real root of C with which xi can be recovered, and largest magnitude of the
-# other roots: nearer to the unit circle, they cancel poles that fit a log by chance.
-LARGEST, LARGEST_OTHER = 0.998, 0.8
-MOST_LEVELS = 12  # longest stretches, in which a random walk has a level of its own
-
 
 @dataclass(frozen=True)
 class Orders:
@@ -45,10 +40,13 @@ class Orders:
 
 
 def invertible(c: Array) -> bool:
-    """Return whether the roots of C allow xi to be recovered."""
+    """Return whether the roots of C allow xi to be recovered.
+
+    Roots near the unit circle cancel poles that fit a log by chance, but for a slow real one.
+    """
     roots = np.roots([1.0, *c])
     slow = (np.abs(roots.imag) < 1e-3) & (roots.real > 0.0)
-    return bool(np.all(np.abs(roots) <= np.where(slow, LARGEST, LARGEST_OTHER)))
+    return bool(np.all(np.abs(roots) <= np.where(slow, 0.998, 0.8)))
 
 
 class Rows:
@@ -76,7 +74,7 @@ class Rows:
         if not orders.walk:
             return np.ones((len(self.index), 1))
         # The walk restarts in the first row of a stretch, at an unknown level from the next on.
-        longest = sorted(self._stretches, key=lambda ends: ends[0] - ends[1])[:MOST_LEVELS]
+        longest = sorted(self._stretches, key=lambda ends: ends[0] - ends[1])[:12]
         columns = np.zeros((len(self.index), len(longest)))
         for i, (start, stop) in enumerate(longest):
             columns[start + 1 : stop, i] = 1.0

@@ -9,21 +9,10 @@ import numpy as np
 import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
+from benchmarks.identify.__main__ import Knowledge
 from benchmarks.identify.armax import Array, Orders
 from benchmarks.identify.likelihood import Likelihood
 from benchmarks.identify.log import Log
-from benchmarks.identify.options import Knowledge
-
-SPIKE = 8.0  # robust deviations from its neighbours beyond which a sample is suspected
-STANDSTILL = 20  # equal temperatures in a row that show a stuck sensor
-MOST_SPIKES = 0.03  # largest share of rows that are suspected
-FLOW_JUMP = 8.0  # deviations of its noise beyond which a change of a held flow is a step
-STEP = 5.0  # standard errors beyond which a difference of means is a step
-SHORTEST_HOLD = 10  # samples
-RATES = range(2, 61)  # rows per temperature
-TO_FORESEE = Orders(2, 6, 2)  # B is long, so that a fast response does not look like a spike
-OUTLYING = 6.0  # robust deviations of prediction errors beyond which a suspect is a spike
-PLAIN = 24.0  # deviations beyond which a suspect without a prediction is a spike
 
 
 def cleaned(log: Log, knowledge: Knowledge) -> Log:
@@ -39,7 +28,7 @@ def _at_one_rate(log: Log) -> Log:
         return log
     rate = int(np.median(np.diff(known)))
     first = int(np.bincount(known % rate).argmax())
-    if rate not in RATES or np.mean(known % rate == first) < 0.95:
+    if rate == 1 or np.mean(known % rate == first) < 0.95:
         return log
 
     def mean(values: Array) -> Array:
@@ -58,7 +47,7 @@ def _at_one_rate(log: Log) -> Log:
     )
 
 
-def deviation(values: Array) -> float:
+def _deviation(values: Array) -> float:
     """Return a standard deviation of values around 0 that is robust to outliers."""
     return 1.4826 * float(np.nanmedian(np.abs(values)))
 
@@ -67,11 +56,11 @@ def without_noise_of_held_flow(log: Log) -> Log:
     """Return the log with a held but noisy flow replaced by its mean over each hold."""
     flow = log.flow
     moves = np.diff(flow)
-    spread = deviation(moves) / math.sqrt(2.0) if np.isfinite(moves).any() else 0.0
+    spread = _deviation(moves) / math.sqrt(2.0) if np.isfinite(moves).any() else 0.0
     if spread == 0.0:  # the flow is constant in most samples
         return log
     holds = np.split(flow, _steps(flow, spread))
-    long = [len(hold) for hold in holds if len(hold) >= SHORTEST_HOLD]
+    long = [len(hold) for hold in holds if len(hold) >= 10]  # means of fewer are no better
     means = np.concatenate([np.full(len(hold), hold.mean()) for hold in holds])
     left = flow - means
     left = left[np.isfinite(left)]
@@ -95,28 +84,31 @@ def _steps(flow: Array, spread: float) -> list[int]:
     Binary segmentation (A. J. Scott and M. Knott, Biometrics 30, 1974, 507-512): a stretch is
     split where the means before and after differ most in standard errors, until none differ.
     """
-    moves = np.diff(flow)
-    found = (np.flatnonzero(~(np.abs(moves) < FLOW_JUMP * spread)) + 1).tolist()
-    open_ones = list(itertools.pairwise([0, *found, len(flow)]))
-    while open_ones:
-        start, stop = open_ones.pop()
+    # Eight deviations do not occur by chance, nor do five among the means of a long log.
+    found = (np.flatnonzero(~(np.abs(np.diff(flow)) < 8.0 * spread)) + 1).tolist()
+    stretches = list(itertools.pairwise([0, *found, len(flow)]))
+    while stretches:
+        start, stop = stretches.pop()
         part, before = flow[start:stop], np.arange(1, stop - start)
         sums = np.cumsum(part - part.mean())[:-1]
         scores = np.abs(sums) / np.sqrt(before * before[::-1] / len(part))
-        if len(scores) and scores.max() > STEP * spread:
+        if len(scores) and scores.max() > 5.0 * spread:
             place = start + 1 + int(scores.argmax())
             found.append(place)
-            open_ones += [(start, place), (place, stop)]
+            stretches += [(start, place), (place, stop)]
     return sorted(found)
 
 
 def without_standstill(log: Log) -> Log:
-    """Return the log without the temperatures of a sensor that was stuck for a while."""
+    """Return the log without the temperatures of a sensor that was stuck.
+
+    A sensor is stuck where it repeats a temperature 20 times and moves elsewhere.
+    """
     temperature = log.temperature
     ends = np.concatenate([[True], np.diff(temperature) != 0.0])
     run = np.cumsum(ends) - 1
     lengths = np.bincount(run)
-    still = lengths >= STANDSTILL
+    still = lengths >= 20
     if not still.any() or still.all() or np.mean(lengths[~still] == 1) < 0.9:
         return log  # a coarse sensor, or one that was never stuck
     stuck = still[run] & ~ends  # the first of each run may be right
@@ -127,35 +119,30 @@ def without_standstill(log: Log) -> Log:
     )
 
 
-def _protrusion(log: Log) -> Array:
-    """Return how far temperatures stick out from their neighbours, in robust deviations.
+def _without_spikes(log: Log, knowledge: Knowledge) -> Log:
+    """Return the log without its spikes.
 
-    It is 0 for all but the largest, a share of `MOST_SPIKES`, and for those below `SPIKE`.
+    They stick out from their neighbours, and no response to the flow explains them.
     """
     series = pd.Series(log.temperature)
-    apart = (series - series.rolling(7, center=True, min_periods=3).median()).abs()
+    apart = (series - series.rolling(7, center=True, min_periods=3).median()).abs().fillna(0.0)
     known = np.unique(log.temperature[np.isfinite(log.temperature)])
-    finest = float(np.min(np.diff(known))) if len(known) > 1 else 0.0
-    scale = max(deviation(apart.to_numpy()), finest, 1e-3 * float(np.ptp(known)))
-    found = apart.fillna(0.0).to_numpy(dtype=np.float64) / max(scale, 1e-300)
-    least = np.sort(found)[-max(int(MOST_SPIKES * len(found)), 1)]
-    return np.where(found >= max(least, SPIKE), found, 0.0)
-
-
-def _without_spikes(log: Log, knowledge: Knowledge) -> Log:
-    """Return the log without its spikes: suspects that no response to the flow explains."""
-    apart = _protrusion(log)
-    found = apart > 0.0
-    if not found.any():
+    finest = float(np.min(np.diff(known), initial=np.inf)) if len(known) > 1 else 0.0
+    scale = max(_deviation(apart.to_numpy()), finest, 1e-3 * float(np.ptp(known)), 1e-300)
+    # At most 3 % of the rows, those from eight deviations on.
+    suspects = np.asarray(apart >= max(float(apart.quantile(0.97)), 8.0 * scale))
+    if not suspects.any():
         return log
     likelihood = Likelihood(log, knowledge)
-    errors = np.abs(likelihood.errors(likelihood.first_fits([TO_FORESEE])[0]))
-    # The first rows have no prediction: they count as spikes if all other suspects do. The
-    # second sample of a spike may be predicted from the first.
-    outlying, known = errors > OUTLYING * deviation(errors), np.isfinite(errors)
-    outlying |= ~known & (apart > PLAIN) & bool(outlying[found & known].all())
-    runs = np.cumsum(np.diff(found, prepend=False))
-    spikes = found & np.isin(runs, runs[found & outlying])
+    # B is long, so that a fast response does not look like a spike.
+    errors = np.abs(likelihood.errors(likelihood.first_fits([Orders(2, 6, 2)])[0]))
+    # The first rows have no prediction: what sticks out much further there is a spike if all
+    # other suspects are. The second sample of a spike may be predicted from the first.
+    outlying, foreseen = errors > 6.0 * _deviation(errors), np.isfinite(errors)
+    alone = ~foreseen & np.asarray(apart > 24.0 * scale)
+    outlying |= alone & bool(outlying[suspects & foreseen].all())
+    runs = np.cumsum(np.diff(suspects, prepend=False))
+    spikes = suspects & np.isin(runs, runs[suspects & outlying])
     rows = [str(row + 1) for row in np.flatnonzero(spikes)]
     if not rows:
         return log

@@ -6,9 +6,9 @@ import time
 
 from rich.console import Console
 
+from benchmarks.identify.__main__ import Options
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import read_log
-from benchmarks.identify.options import Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import recommendations, report
 from benchmarks.identify.tuning import recommended

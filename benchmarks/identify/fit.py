@@ -10,31 +10,20 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
+from benchmarks.identify.__main__ import Knowledge
 from benchmarks.identify.armax import Array, Orders
 from benchmarks.identify.cleaning import cleaned
 from benchmarks.identify.guards import doubts
 from benchmarks.identify.likelihood import Fit, Likelihood
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError, HeldOut, Model
-from benchmarks.identify.options import Knowledge
 from benchmarks.identify.plant import noise_of
 from benchmarks.identify.posterior import posterior
 from benchmarks.identify.simulation import explained, of_impulse_response
 from benchmarks.identify.valve import valve_fault
 
-FIRST_ORDERS = Orders(2, 1, 2)  # orders of the first search for the delay
-OF_A, OF_B, OF_C = (1, 2, 3), (1, 2, 3, 6, 12), (0, 1, 3)  # up to `likelihood.LONGEST`
-LONG = 3  # coefficients of B beyond which the response may have any shape
-WORTH_A_FIT = 7  # orders that are fitted: the best with a common C
-WORTH_A_TRIAL = 4  # fits that are tried on the last part: the best
-WORSE = 1.2  # multiple of the least unexplained share beyond which orders are dropped
-BORNE_OUT = 0.95  # most that a fault of the valve may leave unexplained, as a share
-FAR = 1.5  # multiple of what an impulse response leaves unexplained that is far behind it
-CLOSE = 25.0  # difference of the Bayesian criterion beyond which orders are improbable, e^-12
-WEAK = 100.0  # gain in twice the log likelihood below which the columns may be swapped
-CHANCE = 0.01  # probability that a flow without effect is accepted
-HELPFUL = 0.05  # share of the variance from which on another column is worth a mention
-SLOW = 3.0  # time constants that a log should cover
+FIRST_ORDERS = Orders(2, 1, 2)  # of the first search for the delay
+EVIDENT = 100.0  # gain in twice the log likelihood from which on an effect is beyond doubt
 
 
 def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
@@ -59,16 +48,14 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
     fits = _fits(likelihood)
     _check_answer(likelihood, fits[0])
     rival = _of_impulse_response(likelihood)
-    tried = _tried(likelihood, fits, rival)
     fault = valve_fault(likelihood, fits)
     if fault:
-        passed = replace(log, flow=fault.passed + likelihood.operating_flow)
-        other = Likelihood(passed, replace(knowledge, operating_flow=likelihood.operating_flow))
-        with_fault = _tried(other, _fits(other), rival)
-        if 1.0 - max(with_fault.values()) < BORNE_OUT * (1.0 - max(tried.values())):
-            log, likelihood, tried = passed, other, with_fault
-        else:  # the last part of the log does not bear it out
-            fault = None
+        log = replace(log, flow=fault.passed + likelihood.operating_flow)
+        likelihood = Likelihood(
+            log, replace(knowledge, operating_flow=likelihood.operating_flow)
+        )
+        fits = _fits(likelihood)
+    tried = _tried(likelihood, fits, rival)
     chosen, possible, estimates = posterior(likelihood, list(tried))
     share = next(share for fit, share in tried.items() if fit.orders == chosen.orders)
     plant, *of_known = likelihood.models(chosen)
@@ -84,32 +71,35 @@ def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
         u_min=likelihood.u_min, u_max=likelihood.u_max,
         operating_flow=likelihood.operating_flow, operating_temperature=level,
         orders=chosen.orders, errors=likelihood.errors(chosen, bridged=False),
-        held_out=HeldOut(share, rival),
+        held_out=HeldOut(share, rival), held_out_rows=likelihood.last,
         log=log, simulated=level + simulated, fault=fault,
     )  # fmt: skip
-    return replace(model, warnings=doubts(model), notes=_notes(model, likelihood))
+    longest = likelihood.knowledge.longest_delay
+    return replace(model, warnings=doubts(model, longest), notes=_notes(model, likelihood))
 
 
 def _fits(likelihood: Likelihood) -> list[Fit]:
     """Return fits of promising orders, the best first."""
     scanned = []
     for base in likelihood.first_fits([FIRST_ORDERS, replace(FIRST_ORDERS, walk=True)]):
-        for a, b in itertools.product(OF_A, OF_B):
+        finer = likelihood.gaps(base.place.gap)
+        gap = likelihood.scan(base.orders, base.c, finer)[0].gap
+        for a, b in itertools.product((1, 2, 3), (1, 2, 3, 6, 12)):
             orders = Orders(a, b, 2, base.orders.walk)
-            place = likelihood.scan(orders, base.c, [base.place.gap])[0]
+            place = likelihood.scan(orders, base.c, [gap])[0]
             scanned.append((orders, place, base.c))
     scanned.sort(key=lambda each: likelihood.criterion(each[0], each[1].deviance))
     # Keep at least one of each kind: a common C does not suit all of them.
     of_kinds = [
-        next(each for each in scanned if (each[0].walk, each[0].b > LONG) == kind)
+        next(each for each in scanned if (each[0].walk, each[0].b > 3) == kind)
         for kind in itertools.product((False, True), repeat=2)
     ]
     fits: dict[Orders, Fit] = {}
-    for orders, place, c in [*scanned[:WORTH_A_FIT], *of_kinds]:
+    for orders, place, c in [*scanned[:7], *of_kinds]:
         if orders not in fits:
             fits[orders] = likelihood.best_fit(place, orders, c)
     for fit in likelihood.ranked(fits.values())[:3]:
-        for of_c in OF_C:
+        for of_c in (0, 1, 3):
             orders = replace(fit.orders, c=of_c)
             if orders not in fits:
                 fits[orders] = likelihood.best_fit(fit.place, orders, fit.c)
@@ -127,7 +117,7 @@ def _from_impulse_response(likelihood: Likelihood, best: Fit) -> list[Fit]:
     """
     inputs = [likelihood.applied(best.place.gap), *likelihood.known]
     smooth = copy(likelihood)
-    smooth.smooth(of_impulse_response(inputs, likelihood.output, likelihood.known_rows)[0])
+    smooth.smooth(of_impulse_response(inputs, likelihood.output, likelihood.known_rows))
     found = []
     for b in (1, 2, 3):
         orders = Orders(2, b, 0)
@@ -149,7 +139,7 @@ def _tried(likelihood: Likelihood, fits: list[Fit], rival: float) -> dict[Fit, f
     """
     last, start = likelihood.last, likelihood.first()
     mild = likelihood.ranked(fits, mild=True)
-    long = [fit for fit in fits if fit.orders.b > LONG]
+    long = [fit for fit in fits if fit.orders.b > 3]  # with a response of any shape
     shares: dict[Fit, float] = {}
 
     def simulate(tried: Iterable[Fit]) -> None:
@@ -157,31 +147,33 @@ def _tried(likelihood: Likelihood, fits: list[Fit], rival: float) -> dict[Fit, f
             simulated = start.simulated(start.fit(fit.place, fit.orders, fit.c))
             shares[fit] = explained(likelihood.output, simulated, last)
 
-    simulate(dict.fromkeys([*fits[:WORTH_A_TRIAL], *mild[:2], *long[:1]]))
-    far_behind = 1.0 - max(shares.values()) > FAR * (1.0 - rival)
-    least = likelihood.criterion(fits[0].orders, fits[0].place.deviance)
+    simulate(dict.fromkeys([*fits[:4], *mild[:2], *long[:1]]))
+    far_behind = 1.0 - max(shares.values()) > 1.5 * (1.0 - rival)
+    # What is worse by 25 in the Bayesian criterion is improbable: e^-12.
+    most = 25.0 + likelihood.criterion(fits[0].orders, fits[0].place.deviance)
     simulate(
         fit for fit in _from_impulse_response(likelihood, fits[0])
-        if far_behind or likelihood.criterion(fit.orders, fit.place.deviance) < least + CLOSE
+        if far_behind or likelihood.criterion(fit.orders, fit.place.deviance) < most
     )  # fmt: skip
-    # The share that the best simulation leaves unexplained, with a margin for the noise.
+    # What the best simulation leaves unexplained, with a margin for the noise of a fifth.
     left = 1.0 - max(shares.values())
-    most = max(WORSE * left, left + 0.005)
-    good = {fit: share for fit, share in shares.items() if 1.0 - share <= most}
+    good = {
+        f: share for f, share in shares.items() if 1.0 - share <= max(1.2 * left, left + 0.005)
+    }
     return good or dict(list(shares.items())[:1])
 
 
 def _of_impulse_response(likelihood: Likelihood, *more: Array) -> float:
     """Return the share of the last part that an impulse response explains, of more inputs."""
     inputs = [likelihood.command, *likelihood.known, *more]
-    impulse, _ = of_impulse_response(inputs, likelihood.output, ~likelihood.last)
+    impulse = of_impulse_response(inputs, likelihood.output, ~likelihood.last)
     return explained(likelihood.output, impulse, likelihood.last)
 
 
 def _check_answer(likelihood: Likelihood, best: Fit) -> None:
     """Refuse a log in which the effect of the flow cannot be distinguished from noise."""
     gained = likelihood.gained(best)
-    if gained < WEAK and _gained_when_swapped(likelihood) > WEAK:
+    if gained < EVIDENT < _gained_when_swapped(likelihood):
         raise CannotTellError(
             "the direction is unusual: the flow answers the temperature rather than the "
             "temperature the flow. The two columns seem to be swapped; name them with "
@@ -190,7 +182,7 @@ def _check_answer(likelihood: Likelihood, best: Fit) -> None:
         )
     # Many delays and dead zones have been tried, so the best of them gains by chance.
     tried = len(likelihood.delays) * len(likelihood.gaps())
-    least = float(stats.chi2.isf(CHANCE / tried, best.orders.b))
+    least = float(stats.chi2.isf(0.01 / tried, best.orders.b))
     if gained < least:
         raise CannotTellError(
             "the temperature does not answer the flow in this log: a model without the "
@@ -218,26 +210,23 @@ def _of_other_columns(likelihood: Likelihood) -> str:
         f"--disturbance {name}"
         for name, each in likelihood.log.others.items()
         if np.isfinite(each).all() and np.mean(np.diff(each) == 0.0) > 0.5 and np.ptp(each)
-        and _of_impulse_response(likelihood, each) > alone + HELPFUL
+        and _of_impulse_response(likelihood, each) > alone + 0.05
     ]  # fmt: skip
     return f"More is explained with {' or '.join(names)}: try that." if names else ""
 
 
 def _notes(model: Model, likelihood: Likelihood) -> list[str]:
     """Return remarks for the user about the log and the fit."""
-    longest, log = likelihood.knowledge.longest_delay, model.log
+    log = model.log
     walk = model.noise["disturbance_walk_variance"]
     constants = len(log.flow) * log.sampling_interval / model.estimates["time_constant"].value
     notes = [
-        (model.estimates["delay"].high >= longest - 1,
-         f"The delay may be as long as was looked for, {longest} samples: try a longer "
-         "--longest-delay, or a longer sampling interval."),
         (walk > likelihood.resolution,
          f"The base line wanders by {np.sqrt(walk):.2g} {log.temperature_unit} a sample, as a "
          "random walk: `disturbance_walk_variance`. What the plant settles at is known less "
          "well."),
-        (constants < SLOW,
-         f"The log holds less than {SLOW:g} time constants of the plant. Its gain rests on "
+        (constants < 3.0,
+         "The log holds less than three time constants of the plant. Its gain rests on "
          "how the response goes on, which no one has seen."),
     ]  # fmt: skip
     others = _of_other_columns(likelihood)

@@ -9,43 +9,42 @@ from benchmarks.identify.model import Model
 from benchmarks.identify.plant import settling
 from benchmarks.lib.statistics import ENDS
 
-POOR = 0.5  # least share that a model should explain: of less, noise is the larger part
-# Most that an impulse response may leave less unexplained: as a share of what the model leaves,
-# and of the variance. The impulse response has fewer assumptions and more noise.
-BEHIND, SLACK = 0.5, 0.02
-OUTSIDE = 0.1  # largest share of a step response outside its own band
 LAGS = 40  # largest lag of the autocorrelation, samples
-COLOURED, STRONG = (
-    0.25,
-    0.1,
-)  # share of autocorrelations that may be larger than chance and this
 
 
-def doubts(model: Model) -> list[str]:
-    """Return why no controller should be tuned on a model, a sentence each; none if it may."""
+def doubts(model: Model, longest_delay: int) -> list[str]:
+    """Return why no controller should be tuned on a model, a sentence each; none if it may.
+
+    `longest_delay` is the longest that was looked for, samples.
+    """
     share, rival = model.held_out
     gain, constant = model.estimates["gain"], model.estimates["time_constant"]
     outside = [name for name, (value, low, high) in model.estimates.items()
                if not low <= value <= high]  # fmt: skip
-    large = np.mean(np.abs(autocorrelation(model.errors)) > max(STRONG, chance(model.errors)))
+    # Autocorrelations that are larger than chance allows, and large enough to matter.
+    large = np.mean(np.abs(autocorrelation(model.errors)) > max(0.1, chance(model.errors)))
     found = [
         (bool(model.fault), model.fault and f"{model.fault.what} {model.fault.advice}"),
         (gain.low < 0.0 < gain.high,
          "Not even the direction is known in which the temperature answers the flow. Move the "
          "flow further and hold it longer."),
-        (share < POOR,
+        (model.estimates["delay"].high >= longest_delay - 1,
+         f"The delay may be longer than was looked for, {longest_delay} samples: try a longer "
+         "--longest-delay, or a longer sampling interval."),
+        (share < 0.5,
          "The model leaves more than half open: the noise hides the response, or it changes. "
          "Move the flow further, and look for other inputs (--disturbance)."),
-        (1.0 - rival < (1.0 - BEHIND) * (1.0 - share) - SLACK,
-         "The model explains clearly less than an impulse response: its form does not fit. "
-         "Make a test with steps that are held until the temperature has settled."),
+        # An impulse response has fewer assumptions, and more noise: 2 % of the variance.
+        (1.0 - rival < 0.5 * (1.0 - share) - 0.02,
+         "The model leaves more than twice as much open as an impulse response: its form does "
+         "not fit. Make a test with steps that are held until the temperature has settled."),
         (bool(outside) or not constant.low <= constant.high < np.inf,
          f"The most likely {' and '.join(outside).replace('_', ' ')} lies outside its own "
          "interval: the log supports several models that differ. Record a longer log."),
-        (outside_band(model) > OUTSIDE,
-         "The step response of the model leaves its own band: the log supports several models "
-         "that differ. Record a longer log."),
-        (large > COLOURED,
+        (outside_band(model) > 0.1,
+         "More than a tenth of the model's step response is outside its own band: the log "
+         "supports several models that differ. Record a longer log."),
+        (large > 0.25,
          f"The prediction errors are far from white ({100 * large:.0f} % of their "
          "autocorrelations are large): the plant or its disturbances are not of the model's "
          "form."),

@@ -14,24 +14,14 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage
 
+from agents.actuator import applied_flow
+from benchmarks.identify.__main__ import Knowledge
 from benchmarks.identify.armax import Array, Flags, Orders, Rows
-from benchmarks.identify.log import Log
+from benchmarks.identify.log import LEAST_SAMPLES, Log
 from benchmarks.identify.model import CannotTellError
-from benchmarks.identify.options import Knowledge
 from benchmarks.identify.simulation import from_rest, held
 from benchmarks.loop.linear import LinearModel
 
-SEEN = 4  # longest delays for which the response to a move is watched
-QUIET = 8 / 9  # share of the moves in two thirds of a log from which on the rest is quiet
-LEAST_SAMPLES = 100  # not counting those that the longest delay takes
-FOLLOWS = 0.98  # explained share of the flow's moves above which feedback alone moves it
-COARSE = 40  # edges of the gaps that are tried first
-FINEST = 1e-6  # resolution of the temperature, as a share of its standard deviation
-MIDDLE = 0.25  # of the range of the flow, by which an operating point may be off its middle
-BRIDGE = 10  # longest run of missing temperatures that is filled in, for xi to go on
-SHORTEST = 30  # rows of a stretch without a gap
-STILL = 0.99  # root of C' above which it cancels the random walk
-NEARBY = 8  # samples by which a fault of the valve may move the delay
 LONGEST = Orders(3, 12, 3)  # orders that are tried
 OF_KNOWN = 4  # coefficients of B for a known disturbance
 
@@ -71,9 +61,9 @@ class Fit:
 
     @property
     def walks_nowhere(self) -> bool:
-        """Whether the variance of the random walk is (nearly) 0."""
+        """Whether the variance of the random walk is (nearly) 0: a root of C' cancels it."""
         roots = np.roots([1.0, *self.c])
-        return self.orders.walk and bool(np.max(roots.real, initial=0.0) > STILL)
+        return self.orders.walk and bool(np.max(roots.real, initial=0.0) > 0.99)
 
 
 class Likelihood:
@@ -100,7 +90,7 @@ class Likelihood:
         self.lags = [0] * len(self.known)  # samples
         self.delays = range(knowledge.longest_delay + 1)
         # A smaller mean square of the errors is rounding, and no reason for higher orders.
-        self.resolution = FINEST**2 * float(np.nanvar(self.output))
+        self.resolution = 1e-12 * float(np.nanvar(self.output))
         magnitudes = np.unique(np.abs(self.command[np.isfinite(self.command)]))
         self.magnitudes = magnitudes[magnitudes > 0.0]
         self._find_rows()
@@ -118,14 +108,18 @@ class Likelihood:
         missing = ~np.isfinite(self.output)
         filled = pd.Series(self.output).interpolate(limit_direction="both")
         self._filled = np.asarray(filled, np.float64)
-        bridged = missing & ~_runs(missing, BRIDGE + 1)
+        bridged = missing & ~_runs(missing, 11)  # a short gap is filled in, for xi to go on
         self._usable = _all_of_last(~missing | bridged, LONGEST.a + 1)
         for each, lags in [(self.command, reach), *((d, reach + OF_KNOWN) for d in self.known)]:
             self._usable[1:] &= _all_of_last(np.isfinite(each), lags)[:-1]
             self._usable[:lags] = False
         self._usable[: LONGEST.a] = False
         self._counted = _all_of_last(~missing, LONGEST.a + 1)
-        self.rows = Rows(_runs(self._usable, SHORTEST), self._counted)
+        self.rows = self._rows(self._usable)
+
+    def _rows(self, usable: Flags) -> Rows:
+        """Return rows in stretches of at least 30: in shorter ones xi does not settle."""
+        return Rows(_runs(usable, 30), self._counted)
 
     @property
     def known_rows(self) -> Flags:
@@ -140,16 +134,16 @@ class Likelihood:
     def last(self) -> Flags:
         """Where models are judged that were fitted before: from two thirds of the log on.
 
-        If little moves there, it is from two thirds of the moves on; and it ends where the
-        response to the last move has long been seen.
+        If less than a ninth of the moves is there, it is from two thirds of the moves on; and
+        it ends four longest delays after the last move, when the response has been seen.
         """
         rows, flow = self.rows.index, held(self.command)
         moves = np.abs(np.diff(flow, prepend=flow[:1]))
         shares = np.cumsum(moves[rows]) / max(float(moves[rows].sum()), 1e-300)
         place = 2 * len(rows) // 3
-        if shares[place] > QUIET:
+        if shares[place] > 8 / 9:
             place = max(int(np.searchsorted(shares, 2.0 / 3.0)), LEAST_SAMPLES)
-        end = np.flatnonzero(moves)[-1] + SEEN * len(self.delays)
+        end = np.flatnonzero(moves)[-1] + 4 * len(self.delays)
         samples = np.arange(len(flow))
         return np.asarray((samples >= rows[min(place, len(rows) - 1)]) & (samples <= end))
 
@@ -157,12 +151,12 @@ class Likelihood:
         """Return the likelihood of what is before the last part alone."""
         samples = np.arange(len(self.output))
         part, usable = copy(self), self._usable & (samples < np.argmax(self.last))
-        part.rows = Rows(_runs(usable, SHORTEST), self._counted)
+        part.rows = self._rows(usable)
         return part
 
     def applied(self, gap: Gap) -> Array:
         """Return u_a for a dead zone that ends within a gap."""
-        return np.where(np.abs(self.command) <= gap.low, 0.0, self.command)
+        return dead_within(gap, self.command, self.u_min, self.u_max)
 
     def table(self, orders: Orders, place: Place | None = None, but: int = -1) -> Array:
         """Return y(k) and its regressors: -y(k-1) ..., u_a(k-d-1) ..., disturbances, levels.
@@ -247,12 +241,14 @@ class Likelihood:
             fits, key=lambda fit: self.criterion(fit.orders, fit.place.deviance, mild=mild)
         )
 
-    def gaps(self) -> list[Gap]:
-        """Return the coarse gaps with which the search for the dead zone begins."""
+    def gaps(self, within: Gap | None = None) -> list[Gap]:
+        """Return up to 39 gaps between commands, or between those within a gap."""
         if self.knowledge.applied:
             return [Gap(0.0, 0.0)]
         edges = np.concatenate([[0.0], self.magnitudes])
-        places = np.linspace(0, len(edges) - 1, min(len(edges), COARSE)).round().astype(int)
+        if within:
+            edges = edges[(edges >= within.low) & (edges <= within.high)]
+        places = np.linspace(0, len(edges) - 1, min(len(edges), 40)).round().astype(int)
         return [Gap(*ends) for ends in itertools.pairwise(edges[places].tolist())]
 
     def scan(
@@ -273,8 +269,7 @@ class Likelihood:
 
     def of_flows(self, flows: list[Array], fit: Fit) -> float:
         """Return the least deviance with flows in place of the command, near a fit's delay."""
-        start = max(fit.place.delay - NEARBY, 0)
-        delays = range(start, min(fit.place.delay + NEARBY, self.delays[-1]) + 1)
+        delays = self.delays[max(fit.place.delay - 8, 0) : fit.place.delay + 9]
         table = self.table(fit.orders)
         found = self._profile(table, fit.orders, fit.c, flows, delays)
         return min(float(np.min(deviances)) for deviances in found)
@@ -340,21 +335,27 @@ class Likelihood:
         return float(self.deviance(self.rows.square(errors))) - best.place.deviance
 
 
+def dead_within(gap: Gap, flow: Array, low: float = -np.inf, high: float = np.inf) -> Array:
+    """Return the flow past limits and a dead zone that ends within a gap, (29)."""
+    return applied_flow(flow, np.nextafter(gap.low, np.inf), low, high)
+
+
 def _operating_flow(flow: Array, knowledge: Knowledge) -> float:
     known = flow[np.isfinite(flow)]
-    if knowledge.operating_flow is not None:
-        low, high = known.min(initial=np.inf), known.max(initial=-np.inf)
-        if not 11.0 * low - 10.0 * high <= knowledge.operating_flow <= 11.0 * high - 10.0 * low:
-            raise ValueError(
-                f"operating_flow must be near the flows of the log, {low:g} to {high:g} t/h, "
-                f"got {knowledge.operating_flow:g}"
-            )
-        return knowledge.operating_flow
     if not len(known):
         return 0.0
     low, high = float(known.min()), float(known.max())
+    given = knowledge.operating_flow
+    if given is not None:
+        if not low <= given <= high:
+            raise ValueError(
+                f"operating_flow must be among the flows of the log, {low:g} to {high:g} t/h, "
+                f"got {given:g}"
+            )
+        return given
+    # 0 or the first flow, with room on both sides: a quarter of the range and more.
     for guess in (0.0, float(known[0])):
-        if abs(guess - (low + high) / 2.0) <= MIDDLE * (high - low):
+        if abs(guess - (low + high) / 2.0) <= 0.25 * (high - low):
             return guess
     return float(f"{(low + high) / 2.0:.4g}")
 
@@ -387,7 +388,7 @@ def _check_excitation(command: Array, output: Array) -> None:
             "name another column"
         )
     share = _explained_by_feedback(pd.Series(command), pd.Series(output))
-    if share > FOLLOWS:
+    if share > 0.98:
         raise CannotTellError(
             f"the flow follows from the temperature alone ({100 * share:.1f} % of its moves): "
             "the loop is closed and nothing else moves, so that the plant cannot be told from "

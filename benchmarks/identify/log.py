@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import io
 import re
 import warnings
 from dataclasses import dataclass, field, replace
@@ -13,16 +13,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.identify.options import Columns
+from benchmarks.identify.__main__ import Columns
 
 Array = NDArray[np.float64]
 
-JITTER = 0.35  # tolerance of a time, samples: a quarter, and a margin for its rounding
-GAP = 5  # samples from which on a gap may be of any length
-LONGEST_GAP = 2_000  # most rows that a gap is filled with: the past is forgotten by then
-LARGEST = 1e30  # bound of a number, so that its square is finite
-LEAST_KNOWN = 0.5  # least share of flows that must be known
-LEAST_TEMPERATURES = 100
+LEAST_SAMPLES = 100  # of flow and temperature: a tenth of what makes a good log
 
 
 @dataclass(frozen=True)
@@ -60,17 +55,26 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = 20_000) -> 
     if interval is not None and not interval > 0:
         raise ValueError(f"sampling_interval must be above 0, got {interval}")
     table, decimal = _table(path)
-    flow, temperature = (_find(table, o, getattr(columns, o)) for o in ("flow", "temperature"))
-    disturbances = [_find(table, "disturbance", each) for each in columns.disturbance]
-    time = None if interval else _find(table, "time", columns.time)
-    used = [name for name in (time, flow, temperature, *disturbances) if name]
-    if len(set(used)) < len(used):
-        raise ValueError(f"each column can be one thing only, got {', '.join(used)}")
-    others = table.drop(columns=used).select_dtypes("number").astype(np.float64)
-    kept = pd.DataFrame({name: _numbers(table[name], decimal) for name in used if name != time})
+    inputs = dict.fromkeys(columns.disturbance, "disturbance")
+    options = {columns.flow: "flow", columns.temperature: "temperature", **inputs}
+    if not interval:
+        options[columns.time] = "time"
+    for name, option in options.items():
+        if name not in table.columns:
+            advice = ", or give --sampling-interval if there are no times" * (option == "time")
+            raise ValueError(
+                f"the log has no column {name!r}; it has "
+                f"{', '.join(map(repr, table.columns))}. Name the right one with "
+                f"--{option}{advice}"
+            )
+    if len(options) < 2 + len(columns.disturbance) + (not interval):
+        raise ValueError(f"each column can be one thing only, got {', '.join(options)}")
+    others = table.drop(columns=list(options)).select_dtypes("number").astype(np.float64)
+    used = [name for name, option in options.items() if option != "time"]
+    kept = pd.DataFrame({name: _numbers(table[name], decimal) for name in used})
     kept, notes = pd.concat([kept, others], axis=1), list[str]()
-    if time:
-        times, unit = _times(table[time], decimal, columns.time_unit)
+    if not interval:
+        times, unit = _times(table[columns.time], decimal, columns.time_unit)
         interval, places = _sampled(times, notes)
         kept = kept.set_index(places).reindex(range(places[-1] + 1))
         notes.insert(0, f"The times are in {unit}.")
@@ -78,32 +82,32 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = 20_000) -> 
         notes.append(f"Of the {len(kept):,} rows, the last {rows:,} are used (--rows).")
         kept = kept[-rows:]
     log = Log(
-        _held(kept[flow]),
-        kept[temperature].to_numpy(),
-        float(interval or 1.0),
-        disturbances={name: _held(kept[name]) for name in disturbances},
+        _held(kept[columns.flow]),
+        kept[columns.temperature].to_numpy(),
+        float(interval),
+        disturbances={name: _held(kept[name]) for name in columns.disturbance},
         others={str(name): _held(kept[name]) for name in others},
-        flow_unit=columns.flow_unit or _unit(flow) or "t/h",
-        temperature_unit=columns.temperature_unit or _unit(temperature) or "°C",
+        flow_unit=columns.flow_unit or _unit(columns.flow) or "t/h",
+        temperature_unit=columns.temperature_unit or _unit(columns.temperature) or "°C",
     )
-    notes.insert(0, (
-        f"Read {len(table):,} rows: the flow from {flow!r}, {log.flow_unit}; the "
-        f"temperature from {temperature!r}, {log.temperature_unit}; a row every "
+    read = (
+        f"Read {len(table):,} rows: the flow from {columns.flow!r}, {log.flow_unit}; the "
+        f"temperature from {columns.temperature!r}, {log.temperature_unit}; a row every "
         f"{log.sampling_interval:g} s."
-    ))  # fmt: skip
+    )
     missing = _missing({"flow": log.flow, "temperature": log.temperature, **log.disturbances})
-    return replace(log, notes=notes + missing)
+    return replace(log, notes=[read, *notes, *missing])
 
 
 def _table(path: Path) -> tuple[pd.DataFrame, str]:
     """Return a file's table and its decimal mark."""
     try:
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            heading, *lines = itertools.islice(file, 50)
-    except ValueError as error:
-        raise ValueError(f"{path} is empty") from error
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    if not text:
+        raise ValueError(f"{path} is empty")
+    heading, *lines = text[:10_000].splitlines()
     separator = next((mark for mark in ";\t" if mark in heading), ",")
     comma = r'"-?\d+,\d+"' if separator == "," else r"\d,\d"
     decimal = "," if any(re.search(comma, line) for line in lines) else "."
@@ -111,9 +115,8 @@ def _table(path: Path) -> tuple[pd.DataFrame, str]:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = pd.read_csv(
-                path, sep=separator, decimal=decimal, encoding="utf-8-sig",
-                encoding_errors="replace", skipinitialspace=True, skip_blank_lines=False,
-                index_col=False, low_memory=False,
+                io.StringIO(text), sep=separator, decimal=decimal, skipinitialspace=True,
+                skip_blank_lines=False, index_col=False, low_memory=False,
             )  # fmt: skip
     except (pd.errors.EmptyDataError, pd.errors.ParserError, pd.errors.ParserWarning) as error:
         long = isinstance(error, pd.errors.ParserWarning)
@@ -127,26 +130,6 @@ def _table(path: Path) -> tuple[pd.DataFrame, str]:
     return table.set_axis([str(name) for name in table.columns], axis=1), decimal
 
 
-def _find(table: pd.DataFrame, option: str, name: str) -> str:
-    """Return the column with a name; if none matches, ignore case and units in brackets."""
-    names = list(table.columns)
-    if name in names:
-        return name
-    alike = [n for n in names if re.sub(r"[\[(].*", "", n).strip().lower() == name.lower()]
-    if len(alike) != 1:
-        what = "no column" if not alike else "several columns"
-        raise ValueError(
-            f"the log has {what} {name!r}; it has {', '.join(map(repr, names))}. Name the "
-            f"right one with --{option}"
-            + (
-                ", or give --sampling-interval if there are no times"
-                if option == "time"
-                else ""
-            )
-        )
-    return alike[0]
-
-
 def _unit(name: str) -> str:
     """Return the unit that stands in brackets at the end of a heading, if any."""
     bracket = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", name)
@@ -158,7 +141,7 @@ def _numbers(column: pd.Series[Any], decimal: str, *, is_time: bool = False) -> 
     if not pd.api.types.is_numeric_dtype(column) and decimal == ",":
         texts = column.astype(str).str.replace(",", ".")  # pandas has left it all as text
     values = pd.to_numeric(texts, errors="coerce").astype(np.float64)
-    bad = ~(values.abs() < LARGEST) & (column.notna() | is_time)
+    bad = ~(values.abs() < 1e30) & (column.notna() | is_time)  # so that squares are finite
     if bad.any():
         number, advice = "a number", ". Leave the cell empty where it is not known"
         if is_time:
@@ -173,14 +156,14 @@ def _numbers(column: pd.Series[Any], decimal: str, *, is_time: bool = False) -> 
 def _times(column: pd.Series[Any], decimal: str, unit: str | None) -> tuple[Array, str]:
     """Return times in seconds, and their unit."""
     if not pd.api.types.is_numeric_dtype(column):
-        dates = pd.to_datetime(column, errors="coerce", format="ISO8601", utc=True)
-        if dates.isna().any():
+        forms: list[Any] = [{"format": "ISO8601"}, {"dayfirst": True}]
+        for form in forms:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # of a format that is not known
-                dates = pd.to_datetime(column, errors="coerce", dayfirst=True, utc=True)
-        if dates.notna().all():
-            seconds = (dates - dates.iloc[0]) / pd.Timedelta(seconds=1)
-            return np.asarray(seconds, np.float64), "dates"
+                dates = pd.to_datetime(column, errors="coerce", utc=True, **form)
+            if dates.notna().all():
+                seconds = (dates - dates.iloc[0]) / pd.Timedelta(seconds=1)
+                return np.asarray(seconds, np.float64), "dates"
     unit = unit or _unit(str(column.name)) or "s"
     try:
         factor = pd.Timedelta(1, unit=unit).total_seconds()  # type: ignore[arg-type]
@@ -206,12 +189,13 @@ def _sampled(times: Array, notes: list[str]) -> tuple[float, NDArray[np.intp]]:
     interval = float(f"{np.mean(steps[np.abs(steps / usual - 1.0) < 0.5]):.6g}")
     ratio = steps / interval
     whole = np.maximum(np.round(ratio), 1.0)
-    # How early or late the rows are, beside those around them: an interval that is not exact,
-    # and the length of a long gap, do not count.
-    late = pd.Series(np.cumsum(np.where(whole >= GAP, 0.0, ratio - whole)))
+    # How early or late the rows are, in samples, beside those around them: an interval that is
+    # not exact does not count, and a gap of five samples or more may be of any length.
+    late = pd.Series(np.cumsum(np.where(whole >= 5, 0.0, ratio - whole)))
     late -= late.rolling(25, center=True, min_periods=1).median()
-    if late.abs().max() > JITTER:
-        row = int(np.argmax(late.abs() > JITTER))
+    off = late.abs() > 0.35  # a quarter, and a margin for the rounding of the times
+    if off.any():
+        row = int(np.argmax(off))
         raise ValueError(
             f"line {row + 3}: the time steps are unequal, {steps[row]:g} s here where most are "
             f"{interval:g} s. Resample the log to equal steps"
@@ -222,7 +206,8 @@ def _sampled(times: Array, notes: list[str]) -> tuple[float, NDArray[np.intp]]:
     ]
     if len(gaps) > 3:
         notes.append("More rows are missing later.")
-    places = np.cumsum(np.minimum(whole, LONGEST_GAP)).astype(np.intp)
+    # Over a gap of 2,000 rows the past is forgotten: a longer one need not be filled.
+    places = np.cumsum(np.minimum(whole, 2_000)).astype(np.intp)
     return interval, np.concatenate([[0], places])
 
 
@@ -231,7 +216,7 @@ def _missing(columns: dict[str, Array]) -> list[str]:
     counts = {name: int(np.isnan(each).sum()) for name, each in columns.items()}
     rows = len(columns["flow"])
     for name, count in counts.items():
-        least = LEAST_TEMPERATURES if name == "temperature" else LEAST_KNOWN * rows
+        least = LEAST_SAMPLES if name == "temperature" else rows / 2
         if count and rows - count < min(least, rows):
             raise ValueError(
                 f"{count} of {rows} rows have no {name}: too many are missing. Name another "

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from benchmarks.identify.armax import Array, Orders
+from benchmarks.identify.armax import Array, Flags, Orders
 from benchmarks.identify.log import Log
 from benchmarks.loop.linear import LinearModel
 
@@ -71,6 +71,8 @@ class Model:
     errors: Array
     """Prediction errors xi, degC, one per row of the log, NaN where unknown."""
     held_out: HeldOut
+    held_out_rows: Flags
+    """The rows of the log on which models fitted to the rows before them are judged."""
     log: Log
     """The cleaned log that was fitted."""
     simulated: Array

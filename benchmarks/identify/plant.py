@@ -14,14 +14,6 @@ from benchmarks.loop.linear import LinearModel
 from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
 
-LARGEST_FACTOR = 10.0  # bound of the factors on gain and time constant in a range
-REACH = 0.8  # largest set point, as a share of the temperature that the flow can hold
-SETTLED = 0.02  # share of a transient that is left when it counts as settled
-LONGEST = 100_000  # longest transient, samples
-POINTS = 1024  # length of the Fourier transforms of noise
-MOSTLY = 0.5  # least share of the noise that must be white to be the transmitter's
-OF_C = 3  # coefficients of C after the noise has been split
-
 
 def noise_of(
     plant: LinearModel, orders: Orders, variance: float
@@ -33,27 +25,27 @@ def noise_of(
     walk. The white part of the rest is the transmitter's noise if it is at least half;
     otherwise (28) cannot separate the two.
     """
-    a, c = np.array(plant.a), np.array(plant.c)
-    of_a = np.abs(np.fft.rfft(a, POINTS)) ** 2
-    left = variance * np.abs(np.fft.rfft(c, POINTS)) ** 2
+    a, c, points = np.array(plant.a), np.array(plant.c), 1024
+    of_a = np.abs(np.fft.rfft(a, points)) ** 2
+    left = variance * np.abs(np.fft.rfft(c, points)) ** 2
     walk = 0.0
     if orders.walk:
         walk = float(variance * c.sum() ** 2 / a.sum() ** 2)
-        step = np.abs(np.fft.rfft([1.0, -1.0], POINTS)) ** 2
+        step = np.abs(np.fft.rfft([1.0, -1.0], points)) ** 2
         left = (left - left[0]) / np.maximum(step, 1e-12)
         left[0] = left[1]
         left = np.maximum(left, 1e-6 * float(np.mean(np.abs(left))))
     white = float(np.min(left / of_a))
-    if white < MOSTLY * float(np.mean(left / of_a)):
+    if white < 0.5 * float(np.mean(left / of_a)):
         white = 0.0
     if white or orders.walk:
-        # The rest is C xi: C is the spectral factor with all zeros inside the unit circle.
+        # The rest is C xi: C is the spectral factor with all zeros inside the unit circle, of
+        # which four coefficients are kept.
         left = np.maximum(left - white * of_a, 1e-4 * left)
         cepstrum = np.fft.irfft(np.log(left))
         variance = float(np.exp(cepstrum[0]))
-        c = np.zeros(OF_C + 1)
-        c[0] = 1.0
-        for i in range(1, OF_C + 1):  # exp of the causal part, term by term
+        c = np.array([1.0, 0.0, 0.0, 0.0])
+        for i in range(1, 4):  # exp of the causal part, term by term
             c[i] = sum(j * cepstrum[j] * c[i - j] for j in range(1, i + 1)) / i
     names = "noise_variance", "measurement_noise_variance", "disturbance_walk_variance"
     return dict(zip(names, (variance, white, walk), strict=True)), tuple(c.tolist())
@@ -67,7 +59,7 @@ def plant_arguments(model: Model) -> dict[str, Any]:
     """
     plant, defaults = model.plant, Parameters()
     gain, limits = abs(plant.gain), (abs(model.u_min), abs(model.u_max))
-    reach, span = REACH * gain * (min(limits) or max(limits)), 1.5 * gain * max(limits)
+    reach, span = 0.8 * gain * (min(limits) or max(limits)), 1.5 * gain * max(limits)
     arguments: dict[str, Any] = {
         "a": list(plant.a),
         "b": list(plant.b),
@@ -99,7 +91,7 @@ def plant_ranges(model: Model) -> dict[str, Any]:
         "delay": [int(delay.low), int(delay.high)],
         "dead_zone": [zone.low, zone.high],
         "noise_variance": [level * noise.low, level * noise.high],
-        "gain_factor": np.clip(factors, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR).tolist(),
+        "gain_factor": np.clip(factors, 0.1, 10.0).tolist(),
     }
     pole = complex(slowest_pole(plant.a) or 0.0)
     if pole.imag == 0.0 and 0.0 < pole.real < 1.0:
@@ -108,7 +100,7 @@ def plant_ranges(model: Model) -> dict[str, Any]:
         fast, slow = np.maximum(-np.expm1(-plant.sampling_interval / times), 1e-12).tolist()
         ranges["time_constant_factor"] = [
             min(max(rate / fast, rate * 1.000001), 1.0),
-            max(min(rate / slow, LARGEST_FACTOR), 1.0),
+            max(min(rate / slow, 10.0), 1.0),
         ]
     arguments |= {name: ends for name, ends in ranges.items() if ends[0] < ends[1]}
     arguments = _rounded(arguments)
@@ -133,5 +125,5 @@ def _rounded(arguments: dict[str, Any]) -> dict[str, Any]:
 def settling(plant: LinearModel) -> int:
     """Return how long a step response takes to settle within 2 %, samples."""
     size = float(np.max(np.abs(plant.poles), initial=0.0))
-    own = math.log(SETTLED) / math.log(size) if 0.0 < size < 1.0 else 0.0
-    return plant.delay + len(plant.b) + min(math.ceil(own), LONGEST)
+    own = math.log(0.02) / math.log(size) if 0.0 < size < 1.0 else 0.0
+    return plant.delay + len(plant.b) + min(math.ceil(own), 100_000)

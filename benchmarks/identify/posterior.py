@@ -21,10 +21,7 @@ from benchmarks.loop.linear import LinearModel
 # chance: without it the intervals of plants with a lag miss the delay in every third log.
 TEMPER = 0.5
 NEAR = 25.0  # deviance behind the best at which the probability is negligible, e^-12.5
-MOST_GAPS = 250  # gaps beyond which none is split further, for speed
-MOST_FITS = 8  # delays, roughly, for which the C of a fit is found anew, for speed
 WALKS = [0.0, *np.geomspace(0.001, 0.512, 10)]  # distances of the walk's root of C' from 1
-PLACES, DRAWS_EACH = 60, 6  # entries drawn, and coefficients drawn for each
 
 
 class Entry(NamedTuple):
@@ -76,8 +73,8 @@ def _entries(likelihood: Likelihood, fits: list[Fit]) -> list[Entry]:
             gaps = _refined(likelihood, fit, places, delays)
             at_its_own = range(fit.place.delay, fit.place.delay + 1)
             gap = likelihood.scan(fit.orders, fit.c, gaps, at_its_own)[0].gap
-        # The best C depends on the delay.
-        stride = max(len(delays) // MOST_FITS, 1)
+        # The best C depends on the delay. It is found anew for eight delays, roughly.
+        stride = max(len(delays) // 8, 1)
         for around in (delays[k : k + stride] for k in range(0, len(delays), stride)):
             refit = likelihood.fit(Place(around[len(around) // 2], gap), fit.orders, fit.c)
             places = likelihood.scan(fit.orders, refit.c, gaps, around)
@@ -91,7 +88,7 @@ def _refined(likelihood: Likelihood, fit: Fit, places: list[Place], delays: rang
     best: dict[Gap, float] = {}
     for place in places:
         best.setdefault(place.gap, place.deviance)  # places are sorted, the best first
-    while len(best) < MOST_GAPS:
+    while len(best) < 250:  # for speed
         gaps, limit, middles = sorted(best), min(best.values()) + NEAR, {}
         for gap, above in zip(gaps, [*gaps[1:], gaps[-1]], strict=True):
             inside = magnitudes[(magnitudes > gap.low) & (magnitudes < gap.high)]
@@ -144,19 +141,19 @@ def _choose(
 
 
 def _draw(likelihood: Likelihood, entries: list[Entry], weights: Array) -> list[LinearModel]:
-    """Draw plants: entries by systematic sampling, walks and coefficients at random.
+    """Draw 360 plants: 60 entries by systematic sampling, walks and coefficients at random.
 
     Those that do not settle are left out; if they are the most, the log is refused.
     """
     generator = np.random.default_rng(0)
-    points = (np.arange(PLACES) + generator.random()) / PLACES
+    points = (np.arange(60) + generator.random()) / 60
     picked = np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
     fits = dict.fromkeys(entries[i].fit for i in picked)
     walks = {fit: _walks(likelihood, fit) for fit in fits}
     draws = []
     for i, times in zip(*np.unique(picked, return_counts=True), strict=True):
         likely, shares = walks[entries[i].fit]
-        counts = generator.multinomial(times * DRAWS_EACH, shares)
+        counts = generator.multinomial(6 * times, shares)
         for (orders, c), count in zip(likely, counts, strict=True):
             if not count:
                 continue

@@ -17,8 +17,7 @@ from benchmarks.identify.tuning import Recommended
 from benchmarks.lib.report import Section
 from mptc_gym import Parameters
 
-LONGEST = 6_000  # longest run for which the bounds are computed, samples
-LABELS = {"pi-simc": "PI, SIMC", "smith": "Smith"}
+LABELS = {"pi-simc": "PI (SIMC)", "smith": "Smith"}
 
 
 def report(model: Model, found: list[Recommended], out: Path) -> list[Section]:
@@ -27,27 +26,18 @@ def report(model: Model, found: list[Recommended], out: Path) -> list[Section]:
     plots.plot_residuals(model, out / "residuals.png")
     plots.plot_step(model, out / "step.png")
     beyond = 100 * (abs(autocorrelation(model.errors)) > chance(model.errors)).mean()
-    sections = [
+    white = (
+        "The errors of predictions one sample ahead would be white noise if the model were "
+        f"right. Of their first {LAGS} autocorrelations, {beyond:.0f} % are beyond the band of "
+        "chance (5 % expected)."
+    )
+    return [
         _found(model, found),
-        Section(
-            "The log and the model",
-            ["The model is given the flow alone, over the whole log."],
-            pictures=["log.png"],
-        ),
-        Section(
-            "What the model leaves",
-            [
-                "The errors of predictions one sample ahead would be white noise if the model "
-                f"were right. Of their first {LAGS} autocorrelations, {beyond:.0f} % are "
-                "beyond the band of chance (5 % expected)."
-            ],
-            pictures=["residuals.png"],
-        ),
+        Section("The log and the model", pictures=["log.png"]),
+        Section("Prediction errors", [white], pictures=["residuals.png"]),
         Section("Step response", pictures=["step.png"]),
+        *([_controllers(model, found, out)] if found else []),
     ]
-    if found:
-        sections += [_controllers(model, found, out), _on_the_plant(model, found)]
-    return sections
 
 
 def recommendations(model: Model, found: list[Recommended]) -> dict[str, Any]:
@@ -84,10 +74,13 @@ def headline(model: Model) -> list[str]:
     ]
 
 
+def _units(model: Model) -> tuple[str, str]:
+    return model.log.flow_unit, model.log.temperature_unit
+
+
 def _typed(model: Model, each: Recommended) -> str:
     """Return a controller as it is typed into a control system."""
-    flow, temperature = model.log.flow_unit, model.log.temperature_unit
-    told = each.told
+    (flow, temperature), told = _units(model), each.told
     inside = (
         f" It acts on the error minus what its model foresees: {told.gain:g} {temperature} per "
         f"{flow}, {told.time_constant:g} s, a delay of {told.delay:g} s."
@@ -99,12 +92,11 @@ def _typed(model: Model, each: Recommended) -> str:
 
 
 def _found(model: Model, found: list[Recommended]) -> Section:
-    flow, temperature = model.log.flow_unit, model.log.temperature_unit
+    (flow, temperature), rest, orders = _units(model), model.operating_flow, model.orders
     units = {
         "delay": "samples", "dead_zone": flow, "gain": f"{temperature} per {flow}",
         "time_constant": "s", "noise_variance": f"{temperature}²",
     }  # fmt: skip
-    rest, orders = model.operating_flow, model.orders
     rows = [
         (name, f"{each.value:.4g}", f"[{each.low:.4g}, {each.high:.4g}]", units[name])
         for name, each in model.estimates.items()
@@ -130,12 +122,13 @@ def _found(model: Model, found: list[Recommended]) -> Section:
 
 
 def _controllers(model: Model, found: list[Recommended], out: Path) -> Section:
-    flow, temperature = model.log.flow_unit, model.log.temperature_unit
+    (flow, temperature), arguments = _units(model), plant_arguments(model)
+    least, bound = _bound(arguments, found[0].samples, temperature)
     text = [
         "u is Kp times the sum of r - y and its integral over time divided by Ti, where u is "
         f"the flow, {flow}, r the set point and y the temperature, {temperature}, all from "
-        "the operating point. Reverse "
-        "acting: the flow falls when the temperature rises; direct acting: it rises.",
+        "the operating point. Reverse acting: the flow falls when the temperature rises; "
+        "direct acting: it rises.",
         *(
             f"{LABELS[each.name]} is de-tuned: its closed loop is {each.slowed:.2g} times "
             "slower than by the rule, for Ms to be at most 2 with 95 % of the plants that the "
@@ -145,59 +138,34 @@ def _controllers(model: Model, found: list[Recommended], out: Path) -> Section:
         "By rule, SIMC's PI has its closed-loop time constant at the delay, Smith's predictor "
         "at half the plant's. The margins hold while no limit and no dead zone is met: by what "
         "factor the gain may rise, and by how much phase and delay may shift, until the loop "
-        "is unstable. Ms is the most that the loop amplifies a disturbance; the last column "
-        "has what 95 % of the possible plants stay below.",
+        "is unstable. Ms is the most that the loop amplifies a disturbance; 95 % of the "
+        "possible plants stay below the second number.",
+        "The mean |e| is that of a square wave of "
+        f"±{Parameters(**arguments).setpoint_amplitude:g} {temperature} over "
+        f"{found[0].samples} samples on the identified plant, with the noise of the log, the "
+        f"same for all controllers, {found[0].error.runs} runs; brackets are 95 % intervals. "
+        f"{bound} More controllers: `python -m benchmarks.compare --plant plant.json`.",
     ]  # fmt: skip
     rows = []
     for each in found:
         margins = each.loop.margins
         rows.append({
             "controller": LABELS[each.name],
-            f"Kp ({flow} per {temperature})": f"{each.kp:.4g}",
-            "Ti (s)": f"{each.ti:.4g}",
-            "action": _action(each),
             "gain margin": f"{margins.gain:.2f}",
             "phase margin (°)": f"{margins.phase:.1f}",
             "delay margin (s)": f"{margins.delay:.0f}",
-            "Ms": f"{margins.sensitivity:.2f}",
-            "Ms, 95 %": f"{each.worst:.2f}",
+            "Ms": f"{margins.sensitivity:.2f} to {each.worst:.2f}",
+            f"mean |e| ({temperature})": f"{each.error:.4g}",
+            "of the least possible": f"{each.error.scaled(1.0 / least):.2f}" if least else "",
+            f"valve travel ({flow})": f"{each.travel:.0f}",
         })  # fmt: skip
     plots.plot_margins({LABELS[each.name]: each.loop for each in found}, out / "margins.png")
     return Section("Recommended controllers", text, pd.DataFrame(rows), ["margins.png"])
 
 
-def _on_the_plant(model: Model, found: list[Recommended]) -> Section:
-    flow, temperature = model.log.flow_unit, model.log.temperature_unit
-    arguments = plant_arguments(model)
-    amplitude = Parameters(**arguments).setpoint_amplitude
-    samples, runs = found[0].samples, found[0].error.runs
-    least, bound = _bound(arguments, samples, temperature)
-    rows = [
-        {
-            "controller": LABELS[each.name],
-            f"mean |e| ({temperature})": f"{each.error:.4g}",
-            "of the least possible": (
-                f"{each.error.scaled(1.0 / least):.2f}" if least else ""
-            ),
-            f"valve travel ({flow})": f"{each.travel:.0f}",
-        }
-        for each in found
-    ]  # fmt: skip
-    return Section(
-        "On the identified plant",
-        [
-            f"A square wave of ±{amplitude:g} {temperature} over {samples} samples, with the "
-            f"noise of the log, the same for all controllers, {runs} runs; brackets are 95 % "
-            f"intervals. {bound} More controllers: `python -m benchmarks.compare --plant "
-            "plant.json`."
-        ],
-        pd.DataFrame(rows),
-    )
-
-
 def _bound(arguments: dict[str, Any], samples: int, unit: str) -> tuple[float, str]:
     """Return the least possible mean error, 0 if unknown, and a sentence about it."""
-    if samples > LONGEST:
+    if samples > 6_000:  # it would take minutes
         return 0.0, f"For {samples} samples, the least possible mean error is not computed."
     try:
         bound = least_possible(samples=samples, folder=None, **arguments)

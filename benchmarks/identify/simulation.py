@@ -9,10 +9,6 @@ from scipy import linalg, signal
 from benchmarks.identify.armax import Array, Flags
 from benchmarks.loop.linear import LinearModel
 
-LAGS = 60  # length of the impulse response, samples
-TAILS = (30.0, 60.0, 120.0, 240.0)  # time constants of its slow tail, samples
-RIDGES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # shares of the largest singular value
-
 
 def held(values: Array) -> Array:
     """Return values with gaps filled from the last known value, or at first from the next."""
@@ -42,21 +38,19 @@ def explained(output: Array, simulated: Array, rows: Flags) -> float:
     return 1.0 - float(np.mean((error - line) ** 2)) / total if total else -np.inf
 
 
-def of_impulse_response(
-    inputs: list[Array], output: Array, fitted: Flags
-) -> tuple[Array, float]:
-    """Return the simulation by a finite impulse response with a slow tail, degC, and its gain.
+def of_impulse_response(inputs: list[Array], output: Array, fitted: Flags) -> Array:
+    """Return the simulation by a finite impulse response with a slow tail, degC.
 
-    `LAGS` coefficients and four slow exponentials for each input are fitted to the given rows
-    by ridge regression; generalised cross-validation chooses the ridge (G. H. Golub, M. Heath
-    and G. Wahba, Technometrics 21, 1979, 215-223). The gain is that of the first input.
+    60 coefficients and four slow exponentials for each input are fitted to the given rows by
+    ridge regression; generalised cross-validation chooses the ridge (G. H. Golub, M. Heath and
+    G. Wahba, Technometrics 21, 1979, 215-223).
     """
-    columns = []
+    lags, time_constants, columns = 60, (30.0, 60.0, 120.0, 240.0), []  # samples
     for each in map(held, inputs):
         moved = each - each[0]
-        columns.append(linalg.toeplitz(moved, np.zeros(LAGS + 1))[:, 1:])
-        for pole in np.exp(-1.0 / np.array(TAILS)):
-            tail = signal.lfilter([0.0] * (LAGS + 1) + [1.0 - pole], [1.0, -pole], moved)
+        columns.append(linalg.toeplitz(moved, np.zeros(lags + 1))[:, 1:])
+        for pole in np.exp(-1.0 / np.array(time_constants)):
+            tail = signal.lfilter([0.0] * (lags + 1) + [1.0 - pole], [1.0, -pole], moved)
             columns.append(tail[:, np.newaxis])
     table = np.hstack(columns)
     known = fitted & np.isfinite(output)
@@ -64,8 +58,10 @@ def of_impulse_response(
     left, sizes, right = np.linalg.svd(table[known] - centre, full_matrices=False)
     target = output[known] - level
     shares = left.T @ target
-    kept = sizes**2 / (sizes**2 + (np.outer(RIDGES, sizes[0])) ** 2 + 1e-300)
+    ridges = np.outer([1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0], sizes[0])
+    kept = sizes**2 / (sizes**2 + ridges**2 + 1e-300)
     squares = np.sum((target - (kept * shares) @ left.T) ** 2, axis=1)
     scores = squares / (1.0 - kept.sum(axis=1) / len(target)) ** 2
     best = right.T @ (kept[np.argmin(scores)] * shares / np.maximum(sizes, 1e-300))
-    return (table - centre) @ best + level, float(best[: LAGS + len(TAILS)].sum())
+    simulated: Array = (table - centre) @ best + level
+    return simulated

@@ -20,12 +20,12 @@ from rich.console import Console
 from scipy import signal
 
 from benchmarks.controllers.engineered import simc_pi
+from benchmarks.identify.__main__ import Knowledge
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import CannotTellError
-from benchmarks.identify.options import Knowledge
+from benchmarks.identify.study.__main__ import Options
 from benchmarks.identify.study.faults import FAULTS, HARMFUL, faulty
-from benchmarks.identify.study.options import Options
 from benchmarks.identify.tuning import MOST_SENSITIVE, recommended
 from benchmarks.lib.command import out_folder
 from benchmarks.lib.statistics import share
@@ -36,15 +36,8 @@ from benchmarks.loop.linear import LinearModel, nominal
 from benchmarks.loop.margins import Loop
 from mptc_gym import Parameters
 
-NOISE = 0.02, 0.5  # range of R in the logs, degC^2
-HELD = 30, 120  # samples between two steps of the flow
 LEVELS = -10.0, 10.0  # range of the flow, t/h
-LONG, SHORT = (15.0, 40.0), (5.0, 15.0)  # time constants of second-order plants, samples
-DATA_SHEET = Knowledge(operating_flow=0.0, u_min=LEVELS[0], u_max=LEVELS[1])  # of the actuator
-METER = 0.1  # standard deviation of a flow meter's noise, t/h
-DRIFT = 0.05  # standard deviation of a step of the base line's random walk, degC
 KINDS = ("steps", "loop", "meter", "drift", "second order")  # of logs
-TELLING = 2.0  # smallest dead zone that is counted, t/h
 EXPLAINED = "explained by the model, median", "explained by an impulse response, median"
 PARTS = ("true", "found", "low", "high")  # of each estimate
 # Random plants for the loops: magnitude of the slowest pole, by kind.
@@ -54,8 +47,6 @@ POLES = {
     "integrating": (0.99, 0.999),
     "slow": (0.9, 0.98),
 }
-OF_LOOPS, HELD_FOR_LOOPS = 1200, (8, 60)  # rows of a log; samples between two steps
-SHARES = 0.01, 0.1  # standard deviation of the noise, as a share of the response's
 # The estimate and how far off it may be; None asks whether its interval covers the truth.
 QUESTIONS: dict[str, tuple[str, float | None]] = {
     "delay within one sample": ("delay", 1.0),
@@ -72,28 +63,37 @@ QUESTIONS: dict[str, tuple[str, float | None]] = {
 def synthetic_plants(
     count: int, seed: int, samples: int, kind: str = "steps"
 ) -> list[Arguments]:
-    """Return plants of the random sweep that do not drift, with noise in the range `NOISE`.
+    """Return plants of the random sweep that do not drift, with noise of 0.02 to 0.5 degC^2.
 
-    Plants of the kind "second order" have two time constants, within `LONG` and `SHORT`.
+    Plants of the kind "second order" have two time constants, of 15 to 40 and 5 to 15 samples.
     """
-    low, high = NOISE
     plants = [
-        {**plant, "noise_variance": round(low + (high - low) * plant["noise_variance"], 6)}
+        {**plant, "noise_variance": round(0.02 + 0.48 * plant["noise_variance"], 6)}
         for plant in random_design(2 * count, seed, samples)[:count]
     ]
     if kind != "second order":
         return plants
     generator = np.random.default_rng(seed)
     for plant in plants:
-        slow, fast = generator.uniform(*LONG), generator.uniform(*SHORT)
+        slow, fast = generator.uniform(15.0, 40.0), generator.uniform(5.0, 15.0)
         gain = -0.6825 * plant.pop("gain_factor", 1.0)
         plant.pop("time_constant_factor", None)
         continuous = signal.zpk2ss([], [-1.0 / slow, -1.0 / fast], gain / (slow * fast))
-        sampled = signal.cont2discrete(continuous, 1.0)
-        b, a = signal.ss2tf(*sampled[:4])
+        b, a = signal.ss2tf(*signal.cont2discrete(continuous, 1.0)[:4])
         c = [1.0, -float(np.exp(-1.0 / fast))]  # first-order noise with the slow pole
         plant |= {"a": a.tolist(), "b": b[0, 1:].tolist(), "c": c}
     return plants
+
+
+def steps(
+    generator: np.random.Generator, samples: int, shortest: int, longest: int
+) -> list[float]:
+    """Return a flow that moves in steps, and is held between them."""
+    levels: list[float] = []
+    while len(levels) < samples:
+        held = int(generator.integers(shortest, longest, endpoint=True))
+        levels += [float(generator.uniform(*LEVELS))] * held
+    return levels[:samples]
 
 
 def synthetic_log(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> Log:
@@ -103,25 +103,22 @@ def synthetic_log(plant: Arguments, samples: int, seed: int, kind: str = "steps"
     in steps. "meter" adds noise to the flow, and "drift" a random walk to the temperature.
     """
     generator = np.random.default_rng(seed)
-    levels: list[float] = []
-    while len(levels) < samples:
-        held = int(generator.integers(HELD[0], HELD[1], endpoint=True))
-        levels += [float(generator.uniform(*LEVELS))] * held
+    levels = steps(generator, samples, 30, 120)
     moving: dict[str, Any] = {"setpoint": "random", "setpoint_amplitude": 5.0}
     arguments = plant | moving if kind == "loop" else plant
     env = gymnasium.make("MiddlePoint-v0", max_episode_steps=samples, **arguments)
     observation, info = env.reset(seed=int(generator.integers(2**31)))
     controller = simc_pi(Parameters(**plant))
     flow, temperature = np.empty(samples), np.empty(samples)
-    for k, level in enumerate(levels[:samples]):
+    for k, level in enumerate(levels):
         temperature[k] = info["output"]
-        action = controller.act(observation) if kind == "loop" else [level / 10.0]
+        action = controller.act(observation) if kind == "loop" else [level / LEVELS[1]]
         observation, *_, info = env.step(np.array(action, np.float32))
         flow[k] = info["command"]
     if kind == "meter":
-        flow += generator.normal(0.0, METER, samples)
+        flow += generator.normal(0.0, 0.1, samples)
     if kind == "drift":
-        temperature += np.cumsum(generator.normal(0.0, DRIFT, samples))
+        temperature += np.cumsum(generator.normal(0.0, 0.05, samples))
     return Log(flow, temperature, Parameters(**plant).sampling_interval)
 
 
@@ -141,22 +138,23 @@ def task(plant: Arguments, samples: int, seed: int, kind: str = "steps") -> dict
         "dead_zone": float(plant["dead_zone"]),
         "gain": true.gain,
         "time_constant": -true.sampling_interval / float(np.log(np.max(true.poles.real))),
-        "noise_variance": float(plant["noise_variance"]),
     }
     log = synthetic_log(plant, samples, seed, kind)
+    actuator = Knowledge(operating_flow=0.0, u_min=LEVELS[0], u_max=LEVELS[1])
     began = time.process_time()
     try:
-        model, refused = identify(log, DATA_SHEET), ""
+        model, refused = identify(log, actuator), ""
     except CannotTellError as error:
         model, refused = None, str(error)
-    result = {"kind": kind, **plant, "seconds": time.process_time() - began, "refused": refused}
+    of_plant = {name: plant[name] for name in sorted(plant) if name not in "abc"}
+    result = {"kind": kind, **of_plant, "seconds": time.process_time() - began}
     if model is None:
-        return result
+        return result | {"refused": refused}
     for name, truth in truths.items():
         for part, value in zip(PARTS, (truth, *model.estimates[name]), strict=True):
             result[f"{name}_{part}"] = value
     shares = dict(zip(EXPLAINED, model.held_out, strict=True))
-    return {**result, **shares, "warnings": " ".join(model.warnings)}
+    return {**result, **shares, "refused": "", "warnings": " ".join(model.warnings)}
 
 
 def random_plant(number: int, seed: int) -> dict[str, Any]:
@@ -177,25 +175,27 @@ def random_plant(number: int, seed: int) -> dict[str, Any]:
     return {"a": a.tolist(), "b": b.tolist(), "delay": delay, "dead_zone": 0.0}
 
 
-def task_of_loops(number: int, seed: int) -> dict[str, Any]:
+def task_of_loops(number: int, seed: int, samples: int) -> dict[str, Any]:
     """Try the loops that are recommended from a log of a random plant; see `tried`."""
     plant = random_plant(number, seed)
     generator = np.random.default_rng([seed, number, 1])
-    flow: list[float] = []
-    while len(flow) < OF_LOOPS:
-        level = float(generator.uniform(*LEVELS))
-        flow += [level] * int(generator.integers(*HELD_FOR_LOOPS))
-    u = np.array(flow[:OF_LOOPS])
+    u = np.array(steps(generator, samples, 8, 60))
     driven = signal.lfilter([0.0] * (plant["delay"] + 1) + plant["b"], plant["a"], u)
-    xi = signal.lfilter([1.0], plant["a"], generator.normal(size=OF_LOOPS))
-    noise = generator.uniform(*SHARES) * np.std(driven) * xi / np.std(xi)
-    return tried(Log(u, driven + noise, 1.0), nominal(Parameters(**plant)))
+    xi = signal.lfilter([1.0], plant["a"], generator.normal(size=samples))
+    noise = generator.uniform(0.01, 0.1) * np.std(driven) * xi / np.std(xi)
+    kind, sound = "random plant", {"fault": False, "harmful": False}
+    return {
+        "kind": kind,
+        **sound,
+        **tried(Log(u, driven + noise, 1.0), nominal(Parameters(**plant))),
+    }
 
 
 def task_of_faults(kind: str, number: int, seed: int) -> dict[str, Any]:
     """Try the loops that are recommended from a log of a faulty valve; see `tried`."""
     log, size, plant = faulty(kind, number, seed)
-    return {"kind": kind, "harmful": size >= HARMFUL[kind], **tried(log, plant)}
+    faults = {"fault": size > 0.0, "harmful": size >= HARMFUL[kind]}
+    return {"kind": kind, **faults, **tried(log, plant)}
 
 
 def tried(log: Log, plant: LinearModel) -> dict[str, Any]:
@@ -220,69 +220,57 @@ def tried(log: Log, plant: LinearModel) -> dict[str, Any]:
     }
 
 
-def counted(found: list[dict[str, Any]], what: str) -> str:
-    """Return in words how many loops were recommended and how well they do."""
-    peaks = np.concatenate([each["peaks"] for each in found])
-    refused = sum(bool(each["refused"]) for each in found)
-    return (
-        f"Of {len(found)} {what}, {refused} are refused, and {len(peaks)} loops are "
-        f"recommended. On the true plants, {np.sum(peaks > MOST_SENSITIVE)} of them have Ms "
-        f"above {MOST_SENSITIVE:g}, and {np.sum(np.isinf(peaks))} are unstable."
-    )
-
-
-def table_of_faults(found: list[dict[str, Any]]) -> pd.DataFrame:
+def table_of_loops(found: list[dict[str, Any]]) -> pd.DataFrame:
     """Return how many logs of each kind are refused, and the Ms of the recommended loops."""
+    logs = pd.DataFrame(found)
+    kinds = {"all of these": logs, **dict(groups(logs, "kind"))}
     rows = []
-    for kind, logs in groups(pd.DataFrame(found), "kind"):
-        peaks = np.concatenate(logs["peaks"].to_list())
-        refused, harmful = logs["refused"] != "", logs["harmful"]
+    for kind, each in kinds.items():
+        refused, peaks = each["refused"] != "", np.concatenate(each["peaks"].to_list())
         rows.append({
             "plant or valve": kind,
-            "logs": str(len(logs)),
-            "refused": str(refused.sum()),
-            "with a harmful fault": str(harmful.sum()),
-            "of these refused": str((refused & harmful).sum()),
+            "logs": str(len(each)),
+            "harmful fault": str(each["harmful"].sum()),
+            "of these refused": str((refused & each["harmful"]).sum()),
+            "no fault": str((~each["fault"]).sum()),
+            "of these refused ": str((refused & ~each["fault"]).sum()),
             "loops": str(len(peaks)),
             "Ms above 2": str(np.sum(peaks > MOST_SENSITIVE)),
             "largest Ms": f"{peaks.max():.2f}" if len(peaks) else "",
         })  # fmt: skip
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows[1:] + rows[:1])
 
 
 def execute(options: Options, console: Console) -> str:
     """Run the study and print its tables."""
-    out = out_folder(options.out)
+    out, seed = out_folder(options.out), options.seed
     tasks: dict[str, Callable[[], Any]] = {
-        f"{kind} {i}": partial(task, plant, options.samples, options.seed * 1_000_000 + i, kind)
+        f"{kind} {i}": partial(task, plant, options.samples, seed * 1_000_000 + i, kind)
         for kind in KINDS
-        for i, plant in enumerate(
-            synthetic_plants(options.logs, options.seed, options.samples, kind)
-        )
+        for i, plant in enumerate(synthetic_plants(options.logs, seed, options.samples, kind))
     }
     logs = list(tasks)
-    for i in range(options.plants or 0):
-        tasks[f"plant {i}"] = partial(task_of_loops, i, options.seed)
-    for kind in FAULTS:
-        for i in range(options.faults or 0):
-            tasks[f"{kind} valve {i}"] = partial(task_of_faults, kind, i, options.seed)
+    tasks |= {
+        f"plant {i}": partial(task_of_loops, i, seed, options.samples)
+        for i in range(options.plants or 0)
+    }
+    tasks |= {
+        f"{kind} valve {i}": partial(task_of_faults, kind, i, seed)
+        for kind in FAULTS
+        for i in range(options.faults or 0)
+    }
     results = options.fan_out.run(tasks, "logs", Kept(out / "tasks"))
     found = pd.DataFrame([results.pop(name) for name in logs])
-    write_csv(out / "identify_study.csv", _rounded(found))
+    write_csv(out / "identify_study.csv", found.map(_rounded))
+    tables = [table(found)]
+    for random in (True, False):
+        some = [each for each in results.values() if (each["kind"] == "random plant") == random]
+        tables += [table_of_loops(some)] if some else []
     closing = (
-        f"{options.logs} logs a kind of {options.samples} samples, seed {options.seed}. Those "
-        "that are refused are wrong estimates. Processor time of a log: median "
+        f"{options.logs} logs a kind of {options.samples} samples, seed {seed}. Those that are "
+        "refused are wrong estimates. Processor time of a log: median "
         f"{found['seconds'].median():.1f} s, longest {found['seconds'].max():.1f} s."
     )
-    tables = [table(found)]
-    with_faults = [each for each in results.values() if "kind" in each]
-    random = [each for each in results.values() if "kind" not in each]
-    if with_faults:
-        tables.append(table_of_faults(with_faults))
-        closing = f"{counted(with_faults, 'logs of valves')}\n\n{closing}"
-    if random:
-        kinds = f"random plants ({', '.join(POLES)})"
-        closing = f"{counted(random, kinds)}\n\n{closing}"
     text = [each.to_markdown(index=False, disable_numparse=True) for each in tables]
     write_text(out / "identify_study.md", "\n\n".join([*text, f"{closing}\n"]))
     for each in tables:
@@ -290,20 +278,16 @@ def execute(options: Options, console: Console) -> str:
     return f"{closing} The tables are in {out}/"
 
 
-def _rounded(found: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns that are kept, rounded to meaningful digits."""
-    kept = found.drop(columns=["a", "b", "c"], errors="ignore")
-    for digits, names in ((6, f"_({'|'.join(PARTS)})$"), (4, "^explained ")):
-        for name, values in kept.filter(regex=names).items():
-            kept[name] = [float(f"{value:.{digits}g}") for value in values]
-    return kept
+def _rounded(value: Any) -> Any:
+    """Return a number rounded to meaningful digits."""
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def table(found: pd.DataFrame) -> pd.DataFrame:
     """Return how often estimates are right and intervals cover the truth, by kind of log.
 
-    Dead zones below `TELLING` are not counted. A refused log counts as a wrong estimate, and
-    has no interval.
+    Dead zones below 2 t/h are not counted. A refused log counts as a wrong estimate, and has
+    no interval.
     """
     shown = {
         kind: [
@@ -321,7 +305,7 @@ def table(found: pd.DataFrame) -> pd.DataFrame:
 def _share(name: str, limit: float | None, found: pd.DataFrame) -> str:
     """Return how often an estimate is right, with a confidence interval."""
     truth, value, low, high = (found[f"{name}_{part}"] for part in PARTS)
-    counted = truth.notna() & ((name != "dead_zone") | (truth >= TELLING))
+    counted = truth.notna() & ((name != "dead_zone") | (truth >= 2.0))
     if limit is None:
         slack = 1e-9 * truth.abs()
         right = (low - slack <= truth) & (truth <= high + slack)
