@@ -23,9 +23,9 @@ WIDTHS = np.geomspace(0.15, 0.6, 12)
 CENTRES, ZONES = (-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (0.05, 0.1, 0.15, 0.2, 0.25)
 RATIOS = (0.5, 0.625, 0.8, 1.25, 1.6, 2.0)  # of the gain above a flow to that below
 # Least gain in twice the log likelihood for a fault to be reported. The log of a sound valve
-# excludes backlash of these widths, so what explains it as well is reported. The other faults
-# show in fewer samples, and the best of many sizes gains by chance.
-LEAST = {"backlash": -1.0, "stiction": 6.0, "gain": 8.0, "zone": 10.0}
+# excludes backlash of these widths, so that little is asked for. The other faults show in fewer
+# samples, and the best of many sizes gains by chance.
+LEAST = {"backlash": 1.0, "stiction": 6.0, "gain": 8.0, "zone": 10.0}
 
 
 def valve_fault(likelihood: Likelihood, fits: list[Fit]) -> Fault | None:
@@ -60,7 +60,7 @@ def _faults(likelihood: Likelihood) -> Iterator[tuple[str, Fault]]:
     )
     for width, passed in zip(span * WIDTHS, _backlash(flow, span * WIDTHS), strict=True):
         what = f"The flow depends on the direction of the last move: backlash of {width:.2g}"
-        yield "backlash", Fault(f"{what} {unit} explains the log as well.", repair, passed)
+        yield "backlash", Fault(f"{what} {unit} explains the log better.", repair, passed)
     for least, passed in zip(
         span * WIDTHS / 2, _stiction(flow, span * WIDTHS / 2), strict=True
     ):
