@@ -70,7 +70,7 @@ def _entries(likelihood: Likelihood, fits: list[Fit]) -> list[Entry]:
         near = [p.delay for p in places if p.deviance < places[0].deviance + 2.0 * NEAR]
         delays = range(min(near), max(near) + 1)
         if i == 0:
-            gaps = _refined(likelihood, fit, places, delays)
+            gaps = _refined(likelihood, places)
             at_its_own = range(fit.place.delay, fit.place.delay + 1)
             gap = likelihood.scan(fit.orders, fit.c, gaps, at_its_own)[0].gap
         # The best C depends on the delay. It is found anew for eight delays, roughly.
@@ -82,27 +82,19 @@ def _entries(likelihood: Likelihood, fits: list[Fit]) -> list[Entry]:
     return found
 
 
-def _refined(likelihood: Likelihood, fit: Fit, places: list[Place], delays: range) -> list[Gap]:
-    """Return the gaps near the best, split at the commands inside them."""
-    magnitudes = likelihood.magnitudes
+def _refined(likelihood: Likelihood, places: list[Place]) -> list[Gap]:
+    """Return the gaps near the best, split at the commands inside them unless they are many."""
     best: dict[Gap, float] = {}
     for place in places:
         best.setdefault(place.gap, place.deviance)  # places are sorted, the best first
-    while len(best) < 250:  # for speed
-        gaps, limit, middles = sorted(best), min(best.values()) + NEAR, {}
-        for gap, above in zip(gaps, [*gaps[1:], gaps[-1]], strict=True):
-            inside = magnitudes[(magnitudes > gap.low) & (magnitudes < gap.high)]
-            if len(inside) and min(best[gap], best[above]) < limit:
-                middles[gap] = float(inside[len(inside) // 2])
-        if not middles:
-            break
-        # The lower half has the same commands in the dead zone as the whole.
-        for gap, middle in middles.items():
-            best[Gap(gap.low, middle)] = best.pop(gap)
-        upper = [Gap(middle, gap.high) for gap, middle in middles.items()]
-        for place in likelihood.scan(fit.orders, fit.c, upper, delays):
-            best.setdefault(place.gap, place.deviance)
-    return sorted(gap for gap in best if best[gap] < min(best.values()) + NEAR)
+    # A gap has the deviance of its lower end, and the one above that of its upper end.
+    gaps, limit = sorted(best), min(best.values()) + NEAR
+    near = [
+        gap
+        for gap, above in zip(gaps, [*gaps[1:], gaps[-1]], strict=True)
+        if min(best[gap], best[above]) < limit
+    ]
+    return [finer for gap in near for finer in likelihood.gaps(gap)] if len(near) < 7 else near
 
 
 def _weights(likelihood: Likelihood, entries: list[Entry], *, mild: bool) -> Array:
