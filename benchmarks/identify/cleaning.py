@@ -1,4 +1,4 @@
-"""Repair faults of a log: two rates, a stuck sensor, noise on a held flow, and spikes."""
+"""Repair faults of a log: a stuck sensor, noise on a held flow, and spikes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pandas as pd
-from numpy.lib.stride_tricks import sliding_window_view
 
 from benchmarks.identify.__main__ import Knowledge
 from benchmarks.identify.armax import Array, Orders
@@ -17,34 +16,8 @@ from benchmarks.identify.log import Log
 
 def cleaned(log: Log, knowledge: Knowledge) -> Log:
     """Return the log ready to be fitted, with a note on each repair."""
-    log = without_noise_of_held_flow(_at_one_rate(without_standstill(log)))
+    log = without_noise_of_held_flow(without_standstill(log))
     return _without_spikes(log, knowledge)
-
-
-def _at_one_rate(log: Log) -> Log:
-    """Return the log at the rate of its temperatures, if only every n-th row has one."""
-    known = np.flatnonzero(np.isfinite(log.temperature))
-    if len(known) < 2 or 2 * len(known) > len(log.temperature) + 1:
-        return log
-    rate = int(np.median(np.diff(known)))
-    first = int(np.bincount(known % rate).argmax())
-    if rate == 1 or np.mean(known % rate == first) < 0.95:
-        return log
-
-    def mean(values: Array) -> Array:
-        """Return the means from each temperature to the next."""
-        means: Array = sliding_window_view(values, rate)[first::rate].mean(axis=1)
-        return means
-
-    interval = rate * log.sampling_interval
-    return log.mended(
-        f"Only one row in {rate} has a temperature. The log is fitted at these rows, "
-        f"{interval:g} s apart, with the mean of the flow between them.",
-        flow=mean(log.flow),
-        temperature=log.temperature[first : len(log.flow) - rate + 1 : rate],
-        sampling_interval=interval,
-        disturbances={name: mean(each) for name, each in log.disturbances.items()},
-    )
 
 
 def _deviation(values: Array) -> float:

@@ -117,7 +117,9 @@ def _from_impulse_response(likelihood: Likelihood, best: Fit) -> list[Fit]:
     """
     inputs = [likelihood.applied(best.place.gap), *likelihood.known]
     smooth = copy(likelihood)
-    smooth.smooth(of_impulse_response(inputs, likelihood.output, likelihood.known_rows))
+    smooth.smooth(
+        of_impulse_response(inputs, likelihood.output, np.isfinite(likelihood.output))
+    )
     found = []
     for b in (1, 2, 3):
         orders = Orders(2, b, 0)

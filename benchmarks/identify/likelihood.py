@@ -121,11 +121,6 @@ class Likelihood:
         """Return rows in stretches of at least 30: in shorter ones xi does not settle."""
         return Rows(_runs(usable, 30), self._counted)
 
-    @property
-    def known_rows(self) -> Flags:
-        """Where the temperature is known."""
-        return np.isfinite(self.output)
-
     def smooth(self, output: Array) -> None:
         """Put a simulated output in the place of the temperature."""
         self._filled = output
@@ -299,12 +294,6 @@ class Likelihood:
             yield self.deviance(
                 float(target @ target) - np.sum(shares * solved[:, :, 0], axis=1)
             )
-
-    def covariance(self, fit: Fit) -> Array:
-        """Return the covariance of the linear coefficients and C."""
-        return self.rows.covariance(
-            self.table(fit.orders, fit.place), fit.orders, fit.c, fit.errors
-        )
 
     def models(self, fit: Fit) -> list[LinearModel]:
         """Return the models of the responses to the flow and to each known disturbance."""

@@ -150,8 +150,10 @@ def _draw(likelihood: Likelihood, entries: list[Entry], weights: Array) -> list[
             if not count:
                 continue
             found = likelihood.with_c(entries[i].place, orders, c)
-            size = len(found.linear)
-            covariance = likelihood.covariance(found)[:size, :size]
+            table, size = likelihood.table(orders, found.place), len(found.linear)
+            covariance = likelihood.rows.covariance(table, orders, c, found.errors)[
+                :size, :size
+            ]
             drawn = generator.multivariate_normal(
                 found.linear, covariance, count, method="eigh"
             )

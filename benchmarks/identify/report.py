@@ -36,7 +36,7 @@ def report(model: Model, found: list[Recommended], out: Path) -> list[Section]:
         Section("The log and the model", pictures=["log.png"]),
         Section("Prediction errors", [white], pictures=["residuals.png"]),
         Section("Step response", pictures=["step.png"]),
-        *([_controllers(model, found, out)] if found else []),
+        *([_controllers(model, found)] if found else []),
     ]
 
 
@@ -121,7 +121,7 @@ def _found(model: Model, found: list[Recommended]) -> Section:
     return Section("What the log shows", text, table.replace("_", " ", regex=True))
 
 
-def _controllers(model: Model, found: list[Recommended], out: Path) -> Section:
+def _controllers(model: Model, found: list[Recommended]) -> Section:
     (flow, temperature), arguments = _units(model), plant_arguments(model)
     least, bound = _bound(arguments, found[0].samples, temperature)
     text = [
@@ -159,8 +159,7 @@ def _controllers(model: Model, found: list[Recommended], out: Path) -> Section:
             "of the least possible": f"{each.error.scaled(1.0 / least):.2f}" if least else "",
             f"valve travel ({flow})": f"{each.travel:.0f}",
         })  # fmt: skip
-    plots.plot_margins({LABELS[each.name]: each.loop for each in found}, out / "margins.png")
-    return Section("Recommended controllers", text, pd.DataFrame(rows), ["margins.png"])
+    return Section("Recommended controllers", text, pd.DataFrame(rows))
 
 
 def _bound(arguments: dict[str, Any], samples: int, unit: str) -> tuple[float, str]:
