@@ -147,14 +147,14 @@ class TestRealLogs:
         log = read_log(TCLAB, Columns(flow="heater1", temperature="temperature1",
                                       disturbance=("heater2",)))  # fmt: skip
         known = log.flow, log.disturbances["heater2"], log.temperature
-        heater, other, warm = (each[::4] for each in known)
-        model = identify(Log(heater, warm, 4.0, disturbances={"heater2": other}))
+        heater, other, warm = (each[::3] for each in known)
+        model = identify(Log(heater, warm, 3.0, disturbances={"heater2": other}))
         assert 0.95 < model.held_out.model < 1.0
         assert model.held_out.impulse_response > 0.9
         assert not model.warnings
         assert 0.0 < model.known["heater2"].gain < 0.3 * model.plant.gain
         others = {"heater2": other, "twice": 2.0 * warm}
-        alone = identify(Log(heater, warm, 4.0, others=others))
+        alone = identify(Log(heater, warm, 3.0, others=others))
         assert alone.held_out.model < model.held_out.model - 0.02
         advice = [note for note in alone.notes if "--disturbance" in note]
         assert "--disturbance heater2" in advice[0]
