@@ -111,7 +111,7 @@ def test_the_network_does_not_hunt_beside_a_dead_zone(told, dead_zone, setpoint)
 
 
 def test_behind_the_bank_the_network_takes_no_load_for_a_gain():
-    plant = PRESETS["disturbed"] | {"setpoint_amplitude": 4.5, "delay": 14, "runs": 40}
+    plant = PRESETS["disturbed"] | {"setpoint_amplitude": 4.5, "delay": 14, "runs": 20}
     ours, theirs = (
         mean_error(control(make(**{**STEP_TEST, "delay": 120.0}), **plant))
         for make in (NeuralSelfTuningController, SelfTuningController)
@@ -152,16 +152,16 @@ def test_haste_is_paid_for_in_valve_travel():
     assert travelled(haste=0.0) < 0.75 * travelled()
 
 
-def test_ten_thousand_quiet_samples_teach_nothing():
+def test_thousands_of_quiet_samples_teach_nothing():
     controller, estimates = SelfTuningController(**STEP_TEST), []
     setpoint = [0.0] + [5.0] * 300 + [-5.0] * 300 + [0.0]  # the last one is held
-    plants = make_plants(1, 12_000, setpoint=setpoint, delay=26, gain_factor=1.3)
+    plants = make_plants(1, 6_000, setpoint=setpoint, delay=26, gain_factor=1.3)
 
     def watch(k):
-        if k in (1500, 11_999):
+        if k in (1500, 5_999):
             estimates.append(controller.estimates)
 
-    trajectory = rollout(plants, controller, 12_000, 0, watch)
+    trajectory = rollout(plants, controller, 6_000, 0, watch)
     assert not trajectory.applied[1500:].any()
     before, after = estimates
     assert before["delay"] == pytest.approx(8.0 * 27, abs=16.0)
