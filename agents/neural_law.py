@@ -1,7 +1,7 @@
 """Implement the control law of a network, from the signals of a nominal model to a flow.
 
 The law is written once for NumPy and PyTorch, so that the law in use is the one trained. All
-quantities are scaled: flows by half the actuator's range, temperatures by the *reach*, the
+quantities are scaled: flows by half the actuator's range, temperatures by the *authority*, the
 steady-state effect of such a flow on the plant, and times by the sampling interval.
 """
 
@@ -25,25 +25,24 @@ Array = NDArray[np.float64]
 # of the residual itself. A weight of 1 keeps the newest sample alone.
 LOAD_RATES: Final = (1.0, 0.5, 0.2, 0.07, 0.025, 0.008, 0.002)
 RESIDUAL_RATES: Final = (1.0, 0.5, 0.2)
-REFERENCE: Final = 2  # index of the load mean whose innovations are the news
-NEWS: Final = 7  # latest samples of news that the network sees
-LEAST_NOISE: Final = 0.002  # of the reach
-DOUBT: Final = 0.0002  # of the reach, added to the noise before its logarithm is taken
+REFERENCE: Final = 2  # index of the load mean whose innovations the network sees
+INNOVATIONS: Final = 7  # how many of them, the latest first
+LEAST_NOISE: Final = 0.002  # of the authority
+DOUBT: Final = 0.0002  # of the authority, added to the noise before its logarithm is taken
 # The misses of the means are averaged over 20 and over 100 samples, to distinguish load from
 # noise. The logarithms of their ratios are evidence, weighted by `TRUST` and saturated.
 MISS_RATES: Final = (0.05, 0.01)  # per sample
 TRUST: Final = (5.0, 30.0)
 SATURATION: Final = 0.07
-CALM: Final = 0.004  # of the reach, noise at which half of the haste is used
+CALM: Final = 0.004  # of the authority, noise at which half of the aggressiveness is used
 CLEARANCE: Final = 0.005  # of half the range, by which commands clear the dead zone
 MOST_ADDED: Final = 0.45  # of half the range
-MOST_WEIGHT: Final = 40.0  # largest logarithm of a weight, in absolute value
 # Logarithms of the means' prior weights, up to a constant: without evidence, no jump of the
 # load is expected. The network tilts those of the load means.
 PREFERENCE: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.5, 2.5, 0.0, 1.0, 0.0)
 TILT: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
 _LOADS, _MEANS = len(LOAD_RATES), len(LOAD_RATES) + len(RESIDUAL_RATES)
-INPUTS: Final = _MEANS - 2 + NEWS + 1 + 6 + 6 + 2 * _LOADS
+INPUTS: Final = _MEANS - 2 + INNOVATIONS + 1 + 6 + 6 + 2 * _LOADS
 OUTPUTS: Final = 1 + len(RESIDUAL_RATES) + 1
 PARTS: Final = "choosing", "adding"  # the two networks
 
@@ -89,7 +88,7 @@ class Law:
     ----------
     prior
         What is known of the plants.
-    haste
+    aggressiveness
         How much quicker the law is than the network asks for: it tilts the load means to newer
         samples, and is added to the logit of the rate.
     """
@@ -101,18 +100,18 @@ class Law:
     def _stop_gradient(value: Any) -> Any:
         return value
 
-    def __init__(self, prior: Prior, haste: float = 0.0) -> None:
+    def __init__(self, prior: Prior, aggressiveness: float = 0.0) -> None:
         zero = self._zero = prior.unit * 0.0
         self._rates = self._array(LOAD_RATES + RESIDUAL_RATES)
-        self._tilt, self._haste = self._array(TILT), haste
+        self._tilt, self._aggressiveness = self._array(TILT), aggressiveness
         self._preference = self._array(PREFERENCE)
         self._sharpness = self._array([1.0, *(rate**-0.5 for rate in LOAD_RATES[1:-1])])
         groups = np.zeros((_MEANS, _MEANS))
         groups[:_LOADS, :_LOADS] = groups[_LOADS:, _LOADS:] = 1.0
         self._groups = self._array(groups)
-        self._nothing, self._means, self._news, self._plain = (
+        self._nothing, self._means, self._innovations, self._plain = (
             zero[:, None] + self._array([0.0] * size)
-            for size in (_MEANS - 1 + NEWS, _MEANS, NEWS, _MEANS - _LOADS)
+            for size in (_MEANS - 1 + INNOVATIONS, _MEANS, INNOVATIONS, _MEANS - _LOADS)
         )
         self._misses = [self._means[:, :_LOADS] + LEAST_NOISE] * len(MISS_RATES)
         self._adopt(prior)
@@ -125,15 +124,15 @@ class Law:
         prior
             What is known of the plants from now on.
         ratio
-            Ratio of the old reach to the new one.
+            Ratio of the old authority to the new one.
         residual
-            Change of the last residual, as a multiple of the new reach.
+            Change of the last residual, as a multiple of the new authority.
         """
         units = ratio * prior.unit / self.prior.unit
         loads = self._means[:, :_LOADS] * units[:, None] + (prior.unit * residual)[:, None]
         residuals = self._means[:, _LOADS:] * ratio[:, None] + residual[:, None]
         self._means = self._xp.concatenate([loads, residuals], axis=1)
-        self._news = self._news * units[:, None]
+        self._innovations = self._innovations * units[:, None]
         self._misses = [misses * units[:, None] for misses in self._misses]
         self._adopt(prior)
 
@@ -166,63 +165,77 @@ class Law:
             The model's undelayed output, the one before it, and the last flow that passed.
         """
         xp = self._xp
-        now, before, last = state
+        noise, misses, evidence = self._judge(load)
+        newest = self._of_each_mean(load, residual)
+        means = self._means = self._means + self._rates * (newest - self._means)
+        level = 0.3 * xp.log(noise + DOUBT) + 1.5
+        about = xp.concatenate([level[:, None], misses, 0.1 * evidence, self._known], axis=1)
+        outputs, added = network(*self._inputs(setpoint, residual, noise, about, state))
+
+        preferred = xp.concatenate([-evidence, self._plain], axis=1) + self._preference
+        # On a calm plant it would amplify what the model misses at each return of the delay.
+        hurry = self._aggressiveness * noise / (noise + CALM)
+        tilted = (2.0 * outputs[:, :1] - hurry[:, None]) * self._tilt
+        weights = xp.concatenate([tilted, 3.0 * outputs[:, 1:-1]], axis=1) + preferred
+        weights = xp.exp(xp.clip(weights, -40.0, 40.0))  # never beyond a float
+        weights = weights / (weights @ self._groups)
+        target = setpoint - (weights * means * self._shares).sum(1)
+        rate = 1.0 / (1.0 + xp.exp(0.5 - hurry - outputs[:, -1]))
+        return target + rate / self.prior.unit * (target - state[0]) + added
+
+    def _judge(self, load: Any) -> tuple[Any, Any, Any]:
+        """Compare the load means with the load's newest sample.
+
+        Returned are the noise, and for each mean the logarithm of its misses in relation to
+        those of the reference, and the evidence against it.
+        """
+        xp = self._xp
         missed = load[:, None] - self._means[:, :_LOADS]
-        news, size = missed[:, REFERENCE], abs(self._stop_gradient(missed))
+        latest = missed[:, REFERENCE : REFERENCE + 1]
+        self._innovations = xp.concatenate([latest, self._innovations[:, :-1]], axis=1)
+        size = abs(self._stop_gradient(missed))
         size = xp.clip(size, None, 4.0 * self._misses[0] + LEAST_NOISE)  # limits outliers
         self._misses = [
             misses + rate * (size - misses)
             for rate, misses in zip(MISS_RATES, self._misses, strict=True)
         ]
-        noise = self._misses[0][:, REFERENCE]
-        doubts, slow = (
+        quick, slow = (
             xp.log((misses + DOUBT) / (misses[:, REFERENCE] + DOUBT)[:, None])
             for misses in self._misses
         )
-        against = TRUST[0] * doubts + TRUST[1] * slow
-        against = against / (1.0 + SATURATION * abs(against))
-        newest = self._of_each_mean(load, residual)
-        means = self._means = self._means + self._rates * (newest - self._means)
-        self._news = xp.concatenate([news[:, None], self._news[:, :-1]], axis=1)
+        evidence = TRUST[0] * quick + TRUST[1] * slow
+        evidence = evidence / (1.0 + SATURATION * abs(evidence))
+        return self._misses[0][:, REFERENCE], quick, evidence
 
-        # Signals relative to the noise, squashed into (-1, 1).
+    def _inputs(
+        self, setpoint: Any, residual: Any, noise: Any, about: Any, state: Any
+    ) -> tuple[Any, Any]:
+        """Return the inputs of the network, now and at rest."""
+        xp, means, zero = self._xp, self._means, self._zero
+        now, before, last = state
         foreseen = (
             self._shares[:, REFERENCE] * means[:, REFERENCE] + self.prior.fading * residual
         )
         error = setpoint - foreseen - now
+        signals = [
+            (means[:, : _LOADS - 1] - means[:, 1:_LOADS]) * self._sharpness,
+            residual[:, None] - means[:, _LOADS + 1 :],
+            self._innovations,
+            0.5 * error[:, None],
+        ]
+        # In relation to the noise, squashed into (-1, 1).
         compared = (
-            xp.concatenate(
-                [
-                    (means[:, : _LOADS - 1] - means[:, 1:_LOADS]) * self._sharpness,
-                    residual[:, None] - means[:, _LOADS + 1 :],
-                    self._news,
-                    0.5 * error[:, None],
-                ],
-                axis=1,
-            )
-            * (0.5 / (2.0 * noise + LEAST_NOISE))[:, None]
+            xp.concatenate(signals, axis=1) * (0.5 / (2.0 * noise + LEAST_NOISE))[:, None]
         )
         compared = compared / (1.0 + abs(compared))
-        level = 0.3 * xp.log(noise + DOUBT) + 1.5
-        about = xp.concatenate([level[:, None], doubts, 0.1 * against, self._known], axis=1)
-        held, zero = setpoint - residual, self._zero
+        held = setpoint - residual
         seen = [10.0 * (now - before), 1.4 * setpoint, 1.4 * now, last]
         seen += [3.0 * residual, 3.0 * error]
         resting = [zero, 1.4 * setpoint, 1.4 * held, held, 3.0 * residual, zero]
-        outputs, added = network(
+        return (
             xp.concatenate([compared, xp.stack(seen, axis=1), about], axis=1),
             xp.concatenate([self._nothing, xp.stack(resting, axis=1), about], axis=1),
         )
-        preferred = xp.concatenate([-against, self._plain], axis=1) + self._preference
-        # In calm, haste would amplify what the model misses at each return of the delay.
-        haste = self._haste * noise / (noise + CALM)
-        chosen = [(2.0 * outputs[:, :1] - haste[:, None]) * self._tilt, 3.0 * outputs[:, 1:-1]]
-        weights = xp.concatenate(chosen, axis=1) + preferred
-        weights = xp.exp(xp.clip(weights, -MOST_WEIGHT, MOST_WEIGHT))
-        weights = weights / (weights @ self._groups)
-        target = setpoint - (weights * means * self._shares).sum(1)
-        rate = 1.0 / (1.0 + xp.exp(0.5 - haste - outputs[:, -1]))
-        return target + rate / self.prior.unit * (target - now) + added
 
     def applied(self, flow: Any) -> tuple[Any, Any]:
         """Move flows in the dead zone to its edge or 0; return them, also clipped to limits."""

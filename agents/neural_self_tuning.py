@@ -33,7 +33,7 @@ class NeuralSelfTuningController(SelfTuningController):
     ----------
     network
         The weights; by default those that come with the project.
-    haste
+    aggressiveness
         How much quicker the law is than the network asks for, see `agents.neural_law.Law`. The
         network was trained with fixed models; the residual of a changing model is sooner out of
         date. It fades where the plant is calm, as it would only move the valve there. 0 halves
@@ -42,7 +42,7 @@ class NeuralSelfTuningController(SelfTuningController):
 
     forgetting: Positive = 0.999
     network: LawNetwork = field(default_factory=LawNetwork.load, repr=False)
-    haste: NotNegative = 0.75
+    aggressiveness: NotNegative = 0.75
     closed_loop_time_constant: float = field(init=False, default=0.15)
 
     # Chosen by error and valve travel on drawn plants. What moves the valve of a calm plant is
@@ -57,7 +57,7 @@ class NeuralSelfTuningController(SelfTuningController):
         super().__post_init__()
         self._half = (self.u_max - self.u_min) / 2.0
         self._flow = self._half * np.sign(self.gain)  # t/h at a flow of 1
-        self._reach: Array  # of the bank's model, degC
+        self._authority: Array  # of the bank's model, degC
         self._rule: Law | None = None
 
     def reset(self) -> None:
@@ -68,7 +68,7 @@ class NeuralSelfTuningController(SelfTuningController):
     def _informed(self, before: Array) -> Law:
         """Return the law, updated with the bank's estimates."""
         gain = self._sums.sum(1)
-        reach = np.abs(gain) * self._half
+        authority = np.abs(gain) * self._half
         unit = (self._sums * (1.0 - self._poles)).sum(1) / gain
         delay = self.estimates["delay"] / self.sampling_interval - 1.0
         prior = Prior(
@@ -81,10 +81,12 @@ class NeuralSelfTuningController(SelfTuningController):
             uncertainty=np.minimum(self._spread(delay), MOST_UNCERTAIN),
         )
         if self._rule is None:
-            self._rule = Law(prior, haste=self.haste)
+            self._rule = Law(prior, aggressiveness=self.aggressiveness)
         else:
-            self._rule.adopt(prior, self._reach / reach, (before - self._residual) / reach)
-        self._reach = reach
+            self._rule.adopt(
+                prior, self._authority / authority, (before - self._residual) / authority
+            )
+        self._authority = authority
         return self._rule
 
     def _spread(self, delay: Array) -> Array:
@@ -108,16 +110,16 @@ class NeuralSelfTuningController(SelfTuningController):
         load = residual - (1.0 - rule.prior.unit) * before
         self._residual = residual
         now, last = (
-            np.einsum("ij,ij->i", self._sums, self._units[:, self._now - ago]) / self._reach
+            np.einsum("ij,ij->i", self._sums, self._units[:, self._now - ago]) / self._authority
             for ago in range(2)
         )
         flow = self._flows[:, self._now - 1]
         passed = applied_flow(flow, self._zone, self.u_min, self.u_max) / self._flow
         wanted = rule.flow(
             self.network,
-            setpoint / self._reach,
-            residual / self._reach,
-            load / self._reach,
+            setpoint / self._authority,
+            residual / self._authority,
+            load / self._authority,
             (now, last, passed),
         )
         command: Array = self._flow * wanted

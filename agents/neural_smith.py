@@ -26,9 +26,10 @@ class NeuralSmithPredictor(ModelBasedController):
     flows is known before the delay is over. The network sees the model's output, the part of
     the measured output that the model does not explain, and the model's numbers; see
     `agents.neural_law`. It was trained once, on many plants, and does not learn online. All its
-    inputs are scaled by the plant's reach and by the sampling interval, so one set of weights
-    serves plants of either sign, with any limits and any sampling interval. With a first-order
-    model and a time constant of at least 90 samples, it acts every second sample or less often.
+    inputs are scaled by the flow's authority and by the sampling interval, so one set of
+    weights serves plants of either sign, with any limits and any sampling interval. With a
+    first-order model and a time constant of at least 90 samples, it acts every second sample or
+    less often.
 
     The other parameters are those of `ModelBasedController`.
 
@@ -73,7 +74,7 @@ class NeuralSmithPredictor(ModelBasedController):
         gain = self._b.sum() / self._a.sum()
         half = (self.u_max - self.u_min) / 2.0
         self._flow = math.copysign(half, gain)  # t/h at a flow of 1
-        self._reach = abs(gain) * half
+        self._authority = abs(gain) * half
         self._b = self._b / gain
         self._delay = max(round(self._delay_samples / self._every) - 1, 0)
         self._about = {
@@ -110,8 +111,8 @@ class NeuralSmithPredictor(ModelBasedController):
         return command if observation.ndim == 2 else np.float64(command[0])
 
     def _decide(self, law: Law, rows: Array) -> Array:
-        setpoint = rows[:, self.setpoint_index] / self._reach
-        output = setpoint - rows[:, self.error_index] / self._reach
+        setpoint = rows[:, self.setpoint_index] / self._authority
+        output = setpoint - rows[:, self.error_index] / self._authority
         model, residual, flows = self._model, self._residual, self._flows
         residual[1:] = residual[:-1].copy()
         off = output - model[self._delay]

@@ -412,7 +412,7 @@ BAD = {
         ("shortest_delay", -1), ("longest_delay", 5), ("longest_delay", 10.0),
         ("longest_delay", 10**9), ("forgetting", 0.0), ("forgetting", 1.1), ("u_min", 10.0),
     ],
-    partial(NeuralSelfTuningController, **PLANT): [("haste", -1)],
+    partial(NeuralSelfTuningController, **PLANT): [("aggressiveness", -1)],
 }  # fmt: skip
 
 

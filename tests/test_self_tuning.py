@@ -145,11 +145,11 @@ def test_no_dead_zone_is_assumed_unless_told():
 
 
 def test_haste_is_paid_for_in_valve_travel():
-    def travelled(**haste):
-        controller = NeuralSelfTuningController(**STEP_TEST, **haste)
+    def travelled(**aggressiveness):
+        controller = NeuralSelfTuningController(**STEP_TEST, **aggressiveness)
         return travel(control(controller, 500, 6, noise_variance=0.5)).mean()
 
-    assert travelled(haste=0.0) < 0.75 * travelled()
+    assert travelled(aggressiveness=0.0) < 0.75 * travelled()
 
 
 def test_thousands_of_quiet_samples_teach_nothing():

@@ -49,7 +49,7 @@ def trained(trainings: Sequence[Training], out: Path, fan_out: FanOut) -> list[L
 def _law(options: Options, out: Path) -> Made:
     """Train networks for the law, and choose one by validation.
 
-    The rows show geometric means of |e|, as shares of the reach.
+    The rows show geometric means of |e|, as shares of the authority.
     """
     first = Training()
     first = replace(first, steps=options.steps or first.steps)

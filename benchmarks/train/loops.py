@@ -47,7 +47,7 @@ class Draw:
         """Draw the numbers of the plants for `MiddlePointTorchEnv`, and `small`.
 
         `small` is a factor of set point, dead zone, noise and load: the same problem within a
-        fraction of the plant's reach.
+        fraction of the plant's authority.
         """
         one = torch.ones(self._n)
         gain, constant = (
@@ -166,7 +166,7 @@ class Loops:
         low, high, first = models["u_min"], models["u_max"], models["first"]
         self._plants, self._first = plants, first
         self._low, self._half = low, (high - low) / 2.0
-        self._reach = gain * GAIN * self._half
+        self._authority = gain * GAIN * self._half
         alpha, _, unit = DYNAMICS.coefficients(gain, constant)
         pole, zero = 1.0 - RATE / constant, torch.zeros_like(gain)
         unit = torch.where(first, 1.0 - pole, unit)
@@ -193,7 +193,7 @@ class Loops:
         self._observations, _ = plants.reset(seed=seed, options={"signals": signals})
 
     def run(self, net: Network, samples: int) -> tuple[Tensor, Tensor]:
-        """Continue; return e(k + 1) as multiples of the reach, u_a(k) of half the range.
+        """Continue; return e(k + 1) as multiples of the authority, u_a(k) of half the range.
 
         Both have the shape (samples, n). Gradients do not reach back beyond this call.
         """
@@ -208,11 +208,11 @@ class Loops:
             self._observations, _, _, _, infos = self._plants.step(self._act(net))
             errors.append(infos["error"])
             applied.append(infos["applied"])
-        return torch.stack(errors) / self._reach, torch.stack(applied) / self._half
+        return torch.stack(errors) / self._authority, torch.stack(applied) / self._half
 
     def _act(self, net: Network) -> Tensor:
         """Return actions, shape (n, 1)."""
-        setpoint, output = (self._observations / self._reach[:, None]).unbind(1)
+        setpoint, output = (self._observations / self._authority[:, None]).unbind(1)
         k = len(self._new) % BLOCK
         if k == 0:  # looked up a block at a time, which is cheaper
             if self._new:

@@ -64,9 +64,9 @@ class Training:
     learning_rate: float = 2e-3
     """Initial learning rate of Adam; it falls linearly to a hundredth."""
     move_price: float = 0.007
-    """Price of valve travel by half the range per sample, as a multiple of the reach."""
+    """Price of valve travel by half the range per sample, as a multiple of the authority."""
     tolerance: float = 0.003
-    """Error below which the loss is quadratic (Huber), as a share of the reach."""
+    """Error below which the loss is quadratic (Huber), as a share of the authority."""
     spread: float = 0.4
     """Largest uncertainty of the nominal models."""
     averaging: float = 0.98
