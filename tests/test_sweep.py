@@ -179,12 +179,14 @@ class TestSweep:
     def test_grid(self, tmp_path, monkeypatch):
         monkeypatch.setitem(designs.GRID, "delay", range(10, 22, 10))
         monkeypatch.setitem(designs.GRID, "gain_factor", np.array([1.0, 1.2]))
-        assert run_sweep(tmp_path, "--design grid --agents pi-simc") == 0
+        report = Mock(return_value=[])
+        monkeypatch.setattr(command, "report", report)
+        assert run_sweep(tmp_path, "--agents pi-simc") == 0
         runs = pd.read_csv(tmp_path / "runs.csv")
         assert set(zip(runs["delay"], runs["gain_factor"], strict=True)) == {
             (10, 1.0), (20, 1.0), (10, 1.2), (20, 1.2),
         }  # fmt: skip
-        assert (tmp_path / "map.png").stat().st_size > 1000
+        assert report.call_args.args[2] == Parameters()  # the plant that the grid is around
 
     def test_a_grid_marks_the_plant_that_it_is_around(self, monkeypatch, tmp_path):
         legend = Mock()
