@@ -58,7 +58,7 @@ def execute(options: Options, console: Console) -> str:
     }
 
     def show(name: str, cells: list[str]) -> None:
-        line = f"{name:18}" + "".join(f"{cell:>26}" for cell in cells)
+        line = f"{name:20}" + "".join(f"{cell:>26}" for cell in cells)
         console.print(line.rstrip(), soft_wrap=True)
 
     console.print(f"Mean |e| in °C, {plant.name}:" if one else "Mean |e| in °C:")
