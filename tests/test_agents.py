@@ -202,20 +202,13 @@ class TestDirectNN:
             lambda seed: DirectNNController(seed=seed).weights.W
         )
 
-    def test_weights_are_copies(self):
-        nn = DirectNNController()
-        given = nn.weights
-        nn.weights = given
-        given.W[:] = 7.0
-        nn.weights.W_1[:] = 7.0
-        assert np.abs(nn.weights.W).max() <= nn.weight_scale
-        assert np.abs(nn.weights.W_1).max() <= nn.weight_scale
-
-    def test_weights_of_one_network_set_a_batch(self):
-        weights = DirectNNController(seed=3).weights
+    def test_weights_are_copied_and_those_of_one_network_set_a_batch(self):
+        given = DirectNNController(seed=3).weights
         batch = DirectNNController(num_envs=2)
-        batch.weights = weights
-        assert np.array_equal(batch.weights.W, [weights.W, weights.W])
+        batch.weights = given
+        kept = given.W.copy()
+        given.W[:] = batch.weights.W[:] = 7.0
+        assert np.array_equal(batch.weights.W, [kept, kept])
 
     @pytest.mark.parametrize(
         ("field", "value"),
@@ -348,19 +341,14 @@ class TestFiles:
         loaded = SAVED[kind].load(tmp_path / "kept.npz")
         assert data_equivalence(vars(loaded), vars(SAVED[kind]), exact=True)
 
-    def test_one_that_was_cut_off(self, tmp_path, kind):
-        path = tmp_path / "cut.npz"
-        SAVED[kind].save(path)
-        data = path.read_bytes()
-        for kept in (0, 1, 20, 200, len(data) // 2, int(0.99 * len(data)), -1):
-            path.write_bytes(data[:kept])
-            with pytest.raises(ValueError, match=rf"cut\.npz holds no {kind}"):
-                SAVED[kind].load(path)
-
-    def test_one_with_a_changed_byte_loads_or_says_so(self, tmp_path, kind):
-        path = tmp_path / "changed.npz"
+    def test_one_that_was_cut_off_or_has_a_changed_byte(self, tmp_path, kind):
+        path = tmp_path / "bad.npz"
         SAVED[kind].save(path)
         data, refused = path.read_bytes(), 0
+        for kept in (0, 1, 20, 200, len(data) // 2, int(0.99 * len(data)), -1):
+            path.write_bytes(data[:kept])
+            with pytest.raises(ValueError, match=rf"bad\.npz holds no {kind}"):
+                SAVED[kind].load(path)
         places = np.linspace(0, len(data) - 1, 40, dtype=int)
         for place in places:
             damaged = bytearray(data)
@@ -394,9 +382,8 @@ class TestFiles:
 BAD = {
     DirectNNController: [
         ("n_inputs", 0), ("n_inputs", "6"), ("n_hidden", 1.5), ("eta", -0.1), ("eta", None),
-        ("eta_1", np.nan), ("eta_theta", np.inf), ("direction", 0), ("direction", 0.5),
-        ("weight_scale", 1e308), ("num_envs", 0), ("num_envs", True), ("update_interval", 0),
-        ("seed", -1), ("error_index", -1), ("learning", "no"),
+        ("eta_1", np.nan), ("direction", 0.5), ("weight_scale", 1e308), ("num_envs", True),
+        ("update_interval", 0), ("seed", -1), ("learning", "no"),
     ],
     partial(PIController.simc, **PLANT): [
         ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),

@@ -62,7 +62,7 @@ class TestForward:
 
 
 class TestIncrements:
-    @settings(max_examples=200, deadline=None)
+    @settings(max_examples=60, deadline=None)
     @given(
         u_min=st.floats(-15, -0.5),
         u_max=st.floats(0.5, 15),
