@@ -12,11 +12,13 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 
+from mptc_gym import evaluation
 from mptc_gym.parameters import argument_table
 
 ROOT = Path(__file__).parent.parent
 SHOWN = {".csv", ".gif", ".ipynb", ".json", ".md", ".png", ".txt"}
 TABLE = markdown.markdown(argument_table(), extensions=["tables"])
+CONSTANTS = re.compile(r'<span class="n">(SEED|EPISODES)</span>')  # in signatures
 PICTURE = re.compile(r'(<img [^>]*src="([^"]+)"[^>]*>)')
 TO_SOURCE = re.compile(r"(\]\((?!https?:)[^)#]+\.py)\)")
 
@@ -47,10 +49,11 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 
 def on_page_content(html: str, **_: object) -> str:
-    """Link each picture to its full-size version, for small screens.
+    """Link each picture to its full-size version, for small screens; show values of constants.
 
     Remove the `::` before literal blocks in docstrings, which Markdown does not know, and put
     in the table of arguments, which the environment's docstring gets when it is imported.
     """
     html = html.replace("<p>::</p>\n", "").replace("<p><arguments></p>", TABLE)
+    html = CONSTANTS.sub(lambda name: f"{getattr(evaluation, name[1]):_}", html)
     return PICTURE.sub(r'<a href="\2">\1</a>', html)
