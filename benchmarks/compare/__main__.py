@@ -13,12 +13,14 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Names, Runs, command, options
 from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS
+from mptc_gym import PRESETS
 
 COMPARED = tuple(name for name, controller in ROSTER.items() if controller.compared)
 RUNS = 100
 _CASES = (
-    f"Cases to run, out of {', '.join(SCENARIOS)}; with --presets the presets, on a plant of "
-    f"your own {', '.join(name for name, *_ in SETPOINTS)} (default: all)."
+    f"Cases to run (default: all). Of the paper: {', '.join(SCENARIOS)}. With --presets: "
+    f"{', '.join(PRESETS)}. With --plant, --preset or --set: "
+    f"{', '.join(name for name, *_ in SETPOINTS)}."
 )
 
 
