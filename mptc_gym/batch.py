@@ -6,7 +6,7 @@ PyTorch tensors.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -193,38 +193,24 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array]):
 
     _where: Any  # numpy.where or torch.where
     _zeros: Array  # one per plant, read-only
+    # A mask as a new array of the environment's library.
+    _flags: Callable[[Mask], Array]
+    # Check the other arguments of `reset`, seed and options, then apply them.
+    _prepare: Callable[[Mask, Any, Mapping[str, Any]], None]
+    # The actions, shape (num_envs,); 0 where they are ignored.
+    _checked_actions: Callable[[Any], Array]
+    # Begin an episode of some plants; return their infos at k = 0 that are not 0.
+    _begin: Callable[[Mask], dict[str, Array]]
+    # Move all plants by one sample, and return what `step` returns if no episode ends.
+    _advance: Callable[[Array], tuple[Array, Array, Array, Array, Infos]]
+    # The current observations, which the caller may overwrite.
+    _observations: Callable[[], Array]
+    # `final_obs`, given the plants whose episode has ended, and the observations.
+    _final: Callable[[Mask, Array], Array]
 
     def _on_host(self, mask: Any) -> Any:
         """Return a mask as a NumPy array if it is an array of the environment's library."""
         return mask
-
-    def _flags(self, mask: Mask) -> Array:
-        """Return a mask as a new array of the environment's library."""
-        raise NotImplementedError
-
-    def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Check the other arguments of `reset`, then apply them."""
-        raise NotImplementedError
-
-    def _checked_actions(self, actions: Any) -> Array:
-        """Return the actions, shape (num_envs,); 0 where they are ignored."""
-        raise NotImplementedError
-
-    def _begin(self, mask: Mask) -> dict[str, Array]:
-        """Begin an episode of some plants; return their infos at k = 0 that are not 0."""
-        raise NotImplementedError
-
-    def _advance(self, a: Array) -> tuple[Array, Array, Array, Array, Infos]:
-        """Move all plants by one sample, and return what `step` returns if no episode ends."""
-        raise NotImplementedError
-
-    def _observations(self) -> Array:
-        """Return the current observations, which the caller may overwrite."""
-        raise NotImplementedError
-
-    def _final(self, ended: Mask, observations: Array) -> Array:
-        """Return `final_obs`."""
-        raise NotImplementedError
 
 
 def _checked_count(num_envs: int, parameters: Parameters) -> int:
