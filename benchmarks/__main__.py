@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ImportError as error:
         stop(error)
     page = FOLDER.joinpath("README.md").read_text(encoding="utf-8")
-    table = "\n".join(line for line in page.splitlines() if line.startswith("|"))
+    table = page[page.index("|") :].partition("\n\n")[0]  # the first one
     console = Console(width=None if sys.stdout.isatty() else 150, highlight=False)
     console.print(Markdown(table), "Each command has --help.")
     return 0

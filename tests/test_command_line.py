@@ -166,6 +166,7 @@ def test_the_map_shows_questions_and_commands_as_text(capsys):
     assert {name for name in COMMANDS if f"benchmarks.{name} " in shown} >= {"tune", "bounds"}
     assert "`" not in shown
     assert "](" not in shown
+    assert ":--" not in shown  # the glossary is another table
 
 
 def test_the_map_names_a_missing_package_and_the_command_that_was_meant(monkeypatch, refused):

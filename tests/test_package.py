@@ -179,6 +179,12 @@ import mptc_gym.torch_env
 def test_what_a_page_links_to_is_there(page):
     targets = re.findall(r"\]\(([^)]*)\)", page.read_text("utf-8"))
     for target in targets:
-        file, _, _ = target.partition("#")
+        file, _, place = target.partition("#")
         unknown = target == "ADDRESS"  # the project's own, in the text for Gymnasium's list
-        assert unknown or target.startswith("https://") or (page.parent / file).exists(), target
+        if unknown or target.startswith("https://"):
+            continue
+        there = page.parent / file if file else page
+        assert there.exists(), target
+        if place:
+            text = re.sub(r"[^\w\n# -]", "", there.read_text("utf-8")).lower().replace(" ", "-")
+            assert re.search(f"^#+-{place}$", text, re.MULTILINE), target
