@@ -365,12 +365,14 @@ def _same_episodes(steps: Iterable[Step], plants: Any, seed: int) -> Iterator[St
 
 def _check_infos(infos: dict[str, Any], expected: dict[str, Any], k: int) -> None:
     """Refuse infos at sample k that are not those expected, but for rounding."""
+    names = [name for name in expected if not name.startswith("_")]
+    values = np.array([expected[name] for name in names])
+    found = np.array([infos.get(name, np.full_like(values[0], np.nan)) for name in names])
+    right = np.isclose(found, values, 1e-6, 1e-6, equal_nan=True).all(axis=1)
     follow = "output", "error", "command", "applied"  # from the others, which tell more
-    for name in sorted(expected, key=lambda name: name in follow):
-        found, value = infos.get(name, np.nan), expected[name]
-        if not name.startswith("_") and not np.allclose(found, value, 1e-6, 1e-6, True):
-            raise ValueError(
-                f"env must run the episodes of its seeds, whose {name} by sample {k} is "
-                f"{shorten(value)}, got {shorten(infos.get(name))}: it must not reset with "
-                "another seed, skip or repeat samples, or change the plant or info"
-            )
+    for name in sorted(np.array(names)[~right], key=lambda name: name in follow):
+        raise ValueError(
+            f"env must run the episodes of its seeds, whose {name} by sample {k} is "
+            f"{shorten(expected[name])}, got {shorten(infos.get(name))}: it must not reset "
+            "with another seed, skip or repeat samples, or change the plant or info"
+        )
