@@ -67,9 +67,9 @@ def execute(options: Options, console: Console) -> str:
         state = {"complete": complete, "seconds": seconds}
         write_json(folder / "provenance.json", {**state, **made, **about})
 
-    def write() -> list[Section]:
+    def write(jobs: int | None = 1) -> list[Section]:
         save()
-        return report.write(comparison, folder, provenance_line("compare", made))
+        return report.write(comparison, folder, provenance_line("compare", made), jobs)
 
     try:
         comparison.run(options.controllers.fan_out, Kept(folder / "tasks"))
@@ -77,7 +77,7 @@ def execute(options: Options, console: Console) -> str:
         if comparison.cases:
             write()
         raise
-    sections = write()
+    sections = write(options.controllers.fan_out.jobs)
     save(complete=True)
     show(sections[:2], console)
     return f"The report, tables, data and plots are in {out}/"

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from tqdm import tqdm
 
 from benchmarks.compare.comparison import Comparison
 from benchmarks.compare.estimates import Scale, Score, estimate, ranked, scale_of
 from benchmarks.controllers.roster import ROSTER, label
+from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.report import Best, Section, write_report
 from benchmarks.lib.statistics import Estimate
 from benchmarks.lib.tables import PERCENTILES, groups, percentiles, write_csv
@@ -27,8 +27,13 @@ NO_MEASURE = "not measured"
 STEP_METRICS = ("overshoot", "settling_time")  # meaningless in noise
 
 
-def write(comparison: Comparison, folder: Path, made_by: str) -> list[Section]:
-    """Write the report of all finished cases, with tables and pictures, and return it."""
+def write(
+    comparison: Comparison, folder: Path, made_by: str, jobs: int | None = 1
+) -> list[Section]:
+    """Write the report of all finished cases, with tables and pictures, and return it.
+
+    So many pictures are drawn at once.
+    """
     from benchmarks.compare import plots  # here, so that only drawing loads Matplotlib
 
     runs, names, agents = comparison.runs, comparison.names, comparison.agents
@@ -67,19 +72,13 @@ def write(comparison: Comparison, folder: Path, made_by: str) -> list[Section]:
             errors,
             comparison.scenarios[name],
         )
-    faults = {
-        name: f"{name} could not be drawn ({fault})."
-        for name, draw in tqdm(pictures.items(), "pictures")
-        if (fault := _draw(draw, folder / name))
-    }
+    tasks = {name: partial(_draw, draw, folder / name) for name, draw in pictures.items()}
+    faults = FanOut(jobs=jobs).run(tasks, "pictures")
     sections = [
         replace(
             section,
-            text=[
-                *section.text,
-                *(faults[name] for name in section.pictures if name in faults),
-            ],
-            pictures=[name for name in section.pictures if name not in faults],
+            text=[*section.text, *filter(None, map(faults.get, section.pictures))],
+            pictures=[name for name in section.pictures if not faults[name]],
         )
         for section in _sections(comparison, scales, summary, estimates, scores)
     ]
@@ -92,7 +91,7 @@ def _draw(draw: Callable[[Path], None], path: Path) -> str:
     try:
         draw(path)
     except (ValueError, ArithmeticError) as error:  # what a plant gives may fit no axis
-        return f"{type(error).__name__}: {error}"
+        return f"{path.name} could not be drawn ({type(error).__name__}: {error})."
     return ""
 
 
