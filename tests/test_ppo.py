@@ -5,6 +5,7 @@ import pickle
 from dataclasses import asdict, replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from stable_baselines3.common.buffers import RolloutBuffer
@@ -19,6 +20,7 @@ from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.train import ppo
 from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
+from tests.conftest import ROOT
 
 SMALL = replace(
     ppo.RECIPES["ppo"],
@@ -164,6 +166,15 @@ class TestPolicy:
             np.testing.assert_allclose(run.applied[k], info["applied"], atol=1e-3)
         assert np.ptp(run.applied) > 1.0
         assert (np.abs(moves).max() == 1.0) == (scale > 1.0)
+
+
+@pytest.mark.parametrize("name", ppo.RECIPES)
+def test_the_budget_of_the_search_is_that_of_its_log(name):
+    log = pd.read_csv(ROOT / "benchmarks/published/ppo_trials.csv")
+    trials = log[log.policy == name]
+    samples, minutes = trials.samples.sum() / 1e6, trials.cpu_seconds.sum() / 60
+    said = f"{len(trials)} trials: {samples:.0f} M samples, {minutes:.0f} min"
+    assert ROSTER[name].members()[0].cost.search == said
 
 
 class TestMembers:

@@ -84,7 +84,7 @@ _RANDOM = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
 
 RECIPES = {
     "ppo": Recipe(
-        plants=((152, _RANDOM), (360, {**_RANDOM, "noise_variance": 0.5})),
+        plants=((152, _RANDOM), (360, {**_RANDOM, "noise_variance": 0.6})),
         cases={
             "calm": {"setpoint_amplitude": 5.4, "setpoint_period": 500},
             "noise": {
@@ -96,7 +96,7 @@ RECIPES = {
         dead_zone=5.0,
         levels=False,
         hidden=(),
-        memory=320,
+        memory=192,
         steps=5_000_000,
         log_std=(-1.2, -4.0),
     ),
