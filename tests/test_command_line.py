@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -167,6 +168,19 @@ def test_the_map_shows_questions_and_commands_as_text(capsys):
     assert "`" not in shown
     assert "](" not in shown
     assert ":--" not in shown  # the glossary is another table
+
+
+@pytest.mark.parametrize(
+    "page",
+    [ROOT / "README.md", *(ROOT / "benchmarks").rglob("*.md")],
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
+def test_a_command_on_a_page_can_be_typed_as_it_stands(page):
+    text = page.read_text("utf-8").replace("\\\n", "")
+    for name, options in re.findall(r"python -m benchmarks\.([\w.]+)([^`|#\n]*)", text):
+        if name in COMMANDS:  # an example takes no options
+            declared = importlib.import_module(f"benchmarks.{name}.__main__").Options
+            assert read(declared, name, shlex.split(options)), name
 
 
 def test_the_map_names_a_missing_package_and_the_command_that_was_meant(monkeypatch, refused):
