@@ -18,7 +18,7 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import mptc_gym.sb3
-from benchmarks.datasets.history import arguments_of, record
+from benchmarks.datasets.command import arguments_of, record
 from benchmarks.examples import offline, sb3
 from mptc_gym import evaluate
 from mptc_gym.sb3 import load, spec_of

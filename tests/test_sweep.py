@@ -205,28 +205,6 @@ class TestSweep:
             (edge,) = (marks[text] for text in marks if "5 °C is within" in text)
             assert edge.get_ydata()[0] == pytest.approx(1.4652, abs=1e-3)
 
-    def test_a_nominal_plant_with_a_list_and_a_controller_of_any_name(
-        self, tmp_path, monkeypatch
-    ):
-        monkeypatch.setattr(command, "report", lambda *_: [])
-        given = "--design random --set b=[-0.03,-0.02,-0.01] --plants 2 --agents pi"
-        assert run_sweep(tmp_path, f"{given} --agent limit=agents:PIController") == 0
-        runs = pd.read_csv(tmp_path / "runs.csv").set_index("agent")
-        assert (len(runs.loc["pi"]), len(runs.loc["limit"])) == (4, 4)
-        assert list(runs.loc["pi", "ratio"]) == list(runs.loc["limit", "ratio"])
-        assert (runs["ratio"] != 1.0).all()
-
-    def test_a_failed_task_is_named_and_the_others_are_kept(
-        self, tmp_path, capsys, monkeypatch
-    ):
-        fails = Factory(Mock(side_effect=RuntimeError("no luck")))
-        failing = replace(ROSTER["pi-simc"], made_by=fails)
-        monkeypatch.setitem(ROSTER, "pi-simc", failing)
-        assert run_sweep(tmp_path, "--design random --plants 2 --agents nn pi-simc") == 1
-        assert "plant 0, pi-simc: RuntimeError: no luck" in capsys.readouterr().out
-        # Of two plants each: the limit, nothing and nn.
-        assert len(list((tmp_path / "tasks").iterdir())) == 6
-
 
 class TestFindings:
     """What the tables say, from runs made up so that the answer is known."""

@@ -102,13 +102,6 @@ def test_interrupted(tmp_path, monkeypatch, capsys):
     assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"earlier"]
 
 
-def test_a_controller_of_one_s_own(capsys):
-    assert main(["--agent", "agents:PIController", "--video", "film.gif"]) == 0
-    own = capsys.readouterr().out
-    assert main(["--agent", "pi", "--video", "other.gif"]) == 0
-    assert own.split("error ")[1][:5] == capsys.readouterr().out.split("error ")[1][:5]
-
-
 def post(kind, **about):
     pygame.event.post(pygame.event.Event(kind, **about))
 
