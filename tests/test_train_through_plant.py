@@ -14,7 +14,7 @@ from benchmarks.controllers.roster import ROSTER  # noqa: E402
 from benchmarks.examples import through_plant as example  # noqa: E402
 from benchmarks.loop.rollout import make_plants, rollout  # noqa: E402
 from benchmarks.train import __main__ as program  # noqa: E402
-from benchmarks.train import loops, through_plant  # noqa: E402
+from benchmarks.train import command, loops, through_plant  # noqa: E402
 from benchmarks.train.loops import Draw, Loops, environment  # noqa: E402
 from benchmarks.train.through_plant import Net, Training, loss_of, train, validate  # noqa: E402
 from mptc_gym import Parameters  # noqa: E402
@@ -183,7 +183,10 @@ class TestNetworks:
     ("network", "steps", "files"),
     [("nn-smith", 1, {"nn-smith"}), ("ppo", 8, {"ppo-10000", "ppo-10001"})],
 )
-def test_the_command_lists_trainings_by_their_seeds(network, steps, files, tmp_path, capsys):
+def test_the_command_lists_trainings_by_their_seeds(
+    network, steps, files, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(command, "Training", lambda: SMALL)
     arguments = [network, "--networks", "2", "--steps", str(steps), "--jobs", "1"]
     assert program.main([*arguments, "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
