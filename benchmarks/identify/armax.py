@@ -148,12 +148,13 @@ class Rows:
         return linear, c, errors
 
     def covariance(self, table: Array, orders: Orders, c: Array, errors: Array) -> Array:
-        """Return the covariance of `linear` and C, from the curvature of the likelihood."""
+        """Return the covariance of `linear`, from the curvature of the likelihood."""
         white = self.whitened(table[:, 1:], c, orders.walk)
         jacobian = np.hstack([white, self._slopes(errors, c)])[self.counts]
         scale = np.linalg.norm(jacobian, axis=0)
         scale[scale == 0.0] = 1.0  # a flow that never leaves a dead zone
         information = (jacobian / scale).T @ (jacobian / scale)
         variance = self.square(errors) / max(len(self) - jacobian.shape[1], 1)
-        spread: Array = variance * linalg.pinvh(information) / np.outer(scale, scale)
-        return spread
+        spread = variance * linalg.pinvh(information) / np.outer(scale, scale)
+        of_linear: Array = spread[: white.shape[1], : white.shape[1]]
+        return of_linear

@@ -336,9 +336,9 @@ def _operating_flow(flow: Array, knowledge: Knowledge) -> float:
     low, high = float(known.min()), float(known.max())
     given = knowledge.operating_flow
     if given is not None:
-        if not low <= given <= high:
+        if not 2.0 * low - high <= given <= 2.0 * high - low:
             raise ValueError(
-                f"operating_flow must be among the flows of the log, {low:g} to {high:g} t/h, "
+                f"operating_flow must be near the flows of the log, {low:g} to {high:g} t/h, "
                 f"got {given:g}"
             )
         return given

@@ -18,7 +18,7 @@ def plot_log(model: Model, path: Path) -> None:
     """Draw the log, and the model's simulation of it."""
     log, shown = model.log, slice(-SHOWN, None)
     minutes = (np.arange(len(log.flow)) * log.sampling_interval / 60.0)[shown]
-    title = "What the model simulates from the flow alone, beside the recorded temperature"
+    title = "The temperature as recorded, and as the model simulates it from the flow"
     with drawn(path, 5, title) as figure:
         above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3, 2]})
         recorded, simulated = log.temperature[shown], model.simulated[shown]
@@ -41,7 +41,7 @@ def plot_log(model: Model, path: Path) -> None:
                 color="0.5", alpha=0.15, linewidth=0, label="dead zone",
             )  # fmt: skip
             below.margins(y=0.2)
-            below.legend(loc="upper right")
+            below.legend(loc="upper left")
         below.set(ylabel=f"flow ({log.flow_unit})", xlabel="time (min)")
 
 

@@ -150,12 +150,10 @@ def _draw(likelihood: Likelihood, entries: list[Entry], weights: Array) -> list[
             if not count:
                 continue
             found = likelihood.with_c(entries[i].place, orders, c)
-            table, size = likelihood.table(orders, found.place), len(found.linear)
-            covariance = likelihood.rows.covariance(table, orders, c, found.errors)[
-                :size, :size
-            ]
+            table = likelihood.table(orders, found.place)
+            covariance = likelihood.rows.covariance(table, orders, c, found.errors)
             drawn = generator.multivariate_normal(
-                found.linear, covariance, count, method="eigh"
+                found.linear, covariance, count, "ignore", method="eigh"
             )
             draws += [likelihood.models(replace(found, linear=each))[0] for each in drawn]
     stable = [each for each in draws if np.max(np.abs(each.poles), initial=0.0) < 1.0]
