@@ -39,6 +39,7 @@ from mptc_gym import Parameters
 LEVELS = -10.0, 10.0  # range of the flow, t/h
 KINDS = ("steps", "loop", "meter", "drift", "second order")  # of logs
 EXPLAINED = "explained by the model, median", "explained by an impulse response, median"
+RANDOM = "random plant"  # kind of the plants on which only loops are tried
 PARTS = ("true", "found", "low", "high")  # of each estimate
 # Random plants for the loops: magnitude of the slowest pole, by kind.
 POLES = {
@@ -183,29 +184,27 @@ def task_of_loops(number: int, seed: int, samples: int) -> dict[str, Any]:
     driven = signal.lfilter([0.0] * (plant["delay"] + 1) + plant["b"], plant["a"], u)
     xi = signal.lfilter([1.0], plant["a"], generator.normal(size=samples))
     noise = generator.uniform(0.01, 0.1) * np.std(driven) * xi / np.std(xi)
-    kind, sound = "random plant", {"fault": False, "harmful": False}
-    return {
-        "kind": kind,
-        **sound,
-        **tried(Log(u, driven + noise, 1.0), nominal(Parameters(**plant))),
-    }
+    log = Log(u, driven + noise, 1.0)
+    return {"kind": RANDOM, **tried(log, nominal(Parameters(**plant)), fault=False)}
 
 
 def task_of_faults(kind: str, number: int, seed: int) -> dict[str, Any]:
     """Try the loops that are recommended from a log of a faulty valve; see `tried`."""
     log, size, plant = faulty(kind, number, seed)
-    faults = {"fault": size > 0.0, "harmful": size >= HARMFUL[kind]}
-    return {"kind": kind, **faults, **tried(log, plant)}
+    of_size = {"fault": size > 0.0, "harmful": size >= HARMFUL[kind]}
+    return {"kind": kind, **tried(log, plant, **of_size)}
 
 
-def tried(log: Log, plant: LinearModel) -> dict[str, Any]:
+def tried(
+    log: Log, plant: LinearModel, *, fault: bool, harmful: bool = False
+) -> dict[str, Any]:
     """Try the loops that are recommended from a log on the true plant.
 
     Returns
     -------
     dict
-        `refused`, the reason if none is recommended, and `peaks`, Ms of each loop, infinite for
-        one that is not stable.
+        Whether there is a `fault`, and a `harmful` one; `refused`, the reason if no loop is
+        recommended, and `peaks`, Ms of each loop, infinite for one that is not stable.
     """
     try:
         model = identify(log)
@@ -215,6 +214,8 @@ def tried(log: Log, plant: LinearModel) -> dict[str, Any]:
         found, reason = [], str(error)
     margins = [Loop(each.controller, plant).margins for each in found]
     return {
+        "fault": fault,
+        "harmful": harmful,
         "refused": "" if found else reason,
         "peaks": [m.sensitivity if m.stable else math.inf for m in margins],
     }
@@ -223,7 +224,7 @@ def tried(log: Log, plant: LinearModel) -> dict[str, Any]:
 def table_of_loops(found: list[dict[str, Any]]) -> pd.DataFrame:
     """Return how many logs of each kind are refused, and the Ms of the recommended loops."""
     logs = pd.DataFrame(found)
-    kinds = {"all of these": logs, **dict(groups(logs, "kind"))}
+    kinds = {**dict(groups(logs, "kind")), "all of these": logs}
     rows = []
     for kind, each in kinds.items():
         refused, peaks = each["refused"] != "", np.concatenate(each["peaks"].to_list())
@@ -238,7 +239,7 @@ def table_of_loops(found: list[dict[str, Any]]) -> pd.DataFrame:
             "Ms above 2": str(np.sum(peaks > MOST_SENSITIVE)),
             "largest Ms": f"{peaks.max():.2f}" if len(peaks) else "",
         })  # fmt: skip
-    return pd.DataFrame(rows[1:] + rows[:1])
+    return pd.DataFrame(rows)
 
 
 def execute(options: Options, console: Console) -> str:
@@ -264,7 +265,7 @@ def execute(options: Options, console: Console) -> str:
     write_csv(out / "identify_study.csv", found.map(_rounded))
     tables = [table(found)]
     for random in (True, False):
-        some = [each for each in results.values() if (each["kind"] == "random plant") == random]
+        some = [each for each in results.values() if (each["kind"] == RANDOM) == random]
         tables += [table_of_loops(some)] if some else []
     closing = (
         f"{options.logs} logs a kind of {options.samples} samples, seed {seed}. Those that are "
