@@ -307,6 +307,7 @@ class TestTuning:
         assert pi["action"] == ("reverse" if direction < 0.0 else "direct")
         assert pi["ti"] == pytest.approx(161.0, rel=0.1)  # SIMC's: the time constant
         assert smith["model"]["delay"] == pytest.approx(19 * 8.0)
+        assert smith["dead_zone"] == model.estimates["dead_zone"].value
         controller = found[0].controller
         controller.reset()
         controller.act([0.0, 0.0, 0.0, 1.0])  # y is 1 degC below its set point
@@ -523,6 +524,8 @@ WAYS = {
     "ISO dates": (dated("%Y-%m-%dT%H:%M:%S"), {}),
     "dates with points": (dated("%d.%m.%Y %H:%M:%S"), {}),
     "minutes": (in_minutes(), {"time": "Time (min)", "flow": "Flow [kg/s]"}),
+    "headings named without their units": (in_minutes(), {"time": "Time", "flow": "Flow"}),
+    "days": (csv(table().assign(time=46053.5 + table()["time"] / 86400)), {"time_unit": "D"}),
     "no times": (csv(table().drop(columns="time")), {"sampling_interval": 8.0}),
 }  # fmt: skip
 # Text and options of what is no log, by what is said.
@@ -545,6 +548,9 @@ FAULTS = {
     "line 4: the time must increase, .* from 8 s by -4 s": (with_line("4,1.0,1.0"), {}),
     "line 4: the time must increase, .* from 8 s by 0 s": (with_line("8,1.0,1.0"), {}),
     "line 4: .* unequal, 11.5 s here where most are 8": (with_line("19.5,1.0,1.0"), {}),
+    "s apart: .* say --time-unit D": (
+        csv(table().assign(time=46053.5 + table()["time"] / 86400)), {},
+    ),
     "unit of the times must be .* got 'furlongs'": (csv(), {"time_unit": "furlongs"}),
     "no column 'flow'; it has 'time', 'flown', 'temp": (csv().replace("flow", "flown"), {}),
     "no column 'time'.* or give --sampling-interval": (csv().replace("time", "t"), {}),

@@ -28,7 +28,7 @@ class Columns:
     sampling_interval: Positive | None = None
     """Time from one row to the next, s; the column of the times is then not read."""
     time_unit: str | None = None
-    """Unit of the times: ms, s, min or h (default: that in the heading, else s)."""
+    """Unit of the times: ms, s, min, h or D, days (default: that in the heading, else s)."""
     flow_unit: str | None = None
     """Unit of the flow, for the report (default: that in the heading, else t/h)."""
     temperature_unit: str | None = None

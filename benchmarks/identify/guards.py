@@ -27,7 +27,8 @@ def doubts(model: Model, longest_delay: int) -> list[str]:
         (bool(model.fault), model.fault and f"{model.fault.what} {model.fault.advice}"),
         (gain.low < 0.0 < gain.high,
          "Not even the direction is known in which the temperature answers the flow. Move the "
-         "flow further and hold it longer."),
+         "flow to and fro a dozen times, further than here, and hold it until the temperature "
+         "has settled."),
         (model.estimates["delay"].high >= longest_delay - 1,
          f"The delay may be longer than was looked for, {longest_delay} samples: try a longer "
          "--longest-delay, or a longer sampling interval."),

@@ -55,6 +55,7 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = 20_000) -> 
     if interval is not None and not interval > 0:
         raise ValueError(f"sampling_interval must be above 0, got {interval}")
     table, decimal = _table(path)
+    columns = _found(columns, list(table.columns))
     inputs = dict.fromkeys(columns.disturbance, "disturbance")
     options = {columns.flow: "flow", columns.temperature: "temperature", **inputs}
     if not interval:
@@ -77,7 +78,7 @@ def read_log(path: Path, columns: Columns | None = None, rows: int = 20_000) -> 
         times, unit = _times(table[columns.time], decimal, columns.time_unit)
         interval, places = _sampled(times, notes)
         kept = kept.set_index(places).reindex(range(places[-1] + 1))
-        notes.insert(0, f"The times are in {unit}.")
+        notes.insert(0, f"The times are {unit}.")
     if len(kept) > rows:
         notes.append(f"Of the {len(kept):,} rows, the last {rows:,} are used (--rows).")
         kept = kept[-rows:]
@@ -130,9 +131,28 @@ def _table(path: Path) -> tuple[pd.DataFrame, str]:
     return table.set_axis([str(name) for name in table.columns], axis=1), decimal
 
 
+def _found(columns: Columns, headings: list[str]) -> Columns:
+    """Return columns by their whole headings, where they are named without the unit."""
+
+    def heading(name: str) -> str:
+        with_unit = [each for each in headings if _UNIT.sub("", each) == name]
+        return with_unit[0] if name not in headings and len(with_unit) == 1 else name
+
+    return replace(
+        columns,
+        time=heading(columns.time),
+        flow=heading(columns.flow),
+        temperature=heading(columns.temperature),
+        disturbance=tuple(map(heading, columns.disturbance)),
+    )
+
+
+_UNIT = re.compile(r"\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")  # in brackets, at the end of a heading
+
+
 def _unit(name: str) -> str:
-    """Return the unit that stands in brackets at the end of a heading, if any."""
-    bracket = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$", name)
+    """Return the unit that stands in a heading, if any."""
+    bracket = _UNIT.search(name)
     return bracket.group(1) if bracket else ""
 
 
@@ -169,9 +189,9 @@ def _times(column: pd.Series[Any], decimal: str, unit: str | None) -> tuple[Arra
         factor = pd.Timedelta(1, unit=unit).total_seconds()  # type: ignore[arg-type]
     except ValueError as error:
         raise ValueError(
-            f"the unit of the times must be ms, s, min or h, got {unit!r}: say --time-unit"
+            f"the unit of the times must be ms, s, min, h or D, got {unit!r}: say --time-unit"
         ) from error
-    return factor * _numbers(column, decimal, is_time=True).to_numpy(), unit
+    return factor * _numbers(column, decimal, is_time=True).to_numpy(), f"in {unit}"
 
 
 def _sampled(times: Array, notes: list[str]) -> tuple[float, NDArray[np.intp]]:
@@ -186,6 +206,11 @@ def _sampled(times: Array, notes: list[str]) -> tuple[float, NDArray[np.intp]]:
             f"{steps[row]:g} s. Sort the rows, and leave out those that are there twice"
         )
     usual = float(np.median(steps))
+    if usual < 1e-4:
+        raise ValueError(
+            f"the rows are {usual:.3g} s apart: if the times are days, as in a spreadsheet, "
+            "say --time-unit D"
+        )
     interval = float(f"{np.mean(steps[np.abs(steps / usual - 1.0) < 0.5]):.6g}")
     ratio = steps / interval
     whole = np.maximum(np.round(ratio), 1.0)

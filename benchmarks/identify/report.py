@@ -49,11 +49,16 @@ def recommendations(model: Model, found: list[Recommended]) -> dict[str, Any]:
             "ti": each.ti,
             "action": _action(each),
             "sampling_interval": each.told.sampling_interval,
-            **({"model": vars(each.told)} if each.name == "smith" else {}),
+            **(_smith(model, each) if each.name == "smith" else {}),
         }
         for each in found
     ]
     return {"recommended": listed, "warnings": model.warnings}
+
+
+def _smith(model: Model, each: Recommended) -> dict[str, Any]:
+    """Return what a Smith predictor is told besides its gains."""
+    return {"model": vars(each.told), "dead_zone": model.estimates["dead_zone"].value}
 
 
 def _action(each: Recommended) -> str:
@@ -83,7 +88,8 @@ def _typed(model: Model, each: Recommended) -> str:
     (flow, temperature), told = _units(model), each.told
     inside = (
         f" It acts on the error minus what its model foresees: {told.gain:g} {temperature} per "
-        f"{flow}, {told.time_constant:g} s, a delay of {told.delay:g} s."
+        f"{flow}, {told.time_constant:g} s, a delay of {told.delay:g} s. It is told a dead "
+        f"zone of {model.estimates['dead_zone'].value:.3g} {flow}."
     ) * (each.name == "smith")
     return (
         f"Recommended: {LABELS[each.name]} with Kp = {each.kp:.4g} {flow} per {temperature} "
@@ -128,7 +134,8 @@ def _controllers(model: Model, found: list[Recommended]) -> Section:
         "u is Kp times the sum of r - y and its integral over time divided by Ti, where u is "
         f"the flow, {flow}, r the set point and y the temperature, {temperature}, all from "
         "the operating point. Reverse acting: the flow falls when the temperature rises; "
-        "direct acting: it rises.",
+        "direct acting: it rises. Where the action is a setting of its own, type Kp without "
+        "its sign.",
         *(
             f"{LABELS[each.name]} is de-tuned: its closed loop is {each.slowed:.2g} times "
             "slower than by the rule, for Ms to be at most 2 with 95 % of the plants that the "
