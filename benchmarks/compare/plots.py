@@ -79,7 +79,7 @@ def plot_bounds(
     name, count = best.mode()[0], (best == best.mode()[0]).sum()
     title = f"{label(name)} has the least mean error in {count} of {len(best)} cases"
     scenarios = dict(groups(estimates, "scenario"))
-    height = 0.7 + 0.17 * len(agents)
+    height = 0.8 + 0.17 * len(agents)
     with panels(path, [*scenarios], height, 2, title) as (figure, found, free):
         for i, (axes, (scenario, rows)) in enumerate(
             zip(found, scenarios.items(), strict=True)
@@ -101,7 +101,8 @@ def plot_bounds(
             _list_agents(axes, agents)
             axes.tick_params(labelleft=i % 2 == 0)
             scale_by_excess(axes, "x", min(ends), max(ends))
-        figure.supxlabel(MULTIPLE, fontsize="medium")
+        for axes in found[-2:]:  # the lowest of each column
+            axes.set_xlabel(MULTIPLE)
         grey: Any = {"color": "0.4"}
         draw_legend(
             figure,
@@ -167,8 +168,10 @@ def plot_travel(
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_locator(NullLocator())
-        figure.supxlabel("valve travel of the median run (t/h, log scale)", fontsize="medium")
-        figure.supylabel(MULTIPLE, fontsize="medium")
+        for axes in found[::2]:
+            axes.set_ylabel(MULTIPLE)
+        for axes in found[-2:]:  # the lowest of each column
+            axes.set_xlabel("valve travel of the median run (t/h, log)")
         draw_legend(figure, free, entries)
 
 

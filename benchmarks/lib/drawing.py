@@ -24,7 +24,7 @@ from benchmarks.lib.storage import replacing
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 WIDTH = 7.5  # of every figure, inches
 SHADES = 128  # colours of a picture
-MULTIPLE = "multiple of the least possible error (log scale of the multiple - 1)"
+MULTIPLE = "multiple of the least possible\n(log scale of the excess over 1)"
 NEAREST = 1e-3  # excess over the least possible error at which a logarithmic axis begins
 EXCESSES = (0.001, 0.01, 0.1, 0.5, 1.0, 4.0, 9.0, 29.0)
 STYLE: Any = {
@@ -100,7 +100,7 @@ def panels(
     """
     columns = min(columns, len(names))
     rows = math.ceil(len(names) / columns)
-    with drawn(path, height * rows + 0.5, title, grid=grid) as figure:
+    with drawn(path, height * rows + 0.9, title, grid=grid) as figure:
         axes = list(figure.subplots(rows, columns, squeeze=False).flat)
         for panel, name in zip(axes, names, strict=False):
             panel.set_title(name)
