@@ -218,7 +218,7 @@ def test_a_window_keeps_time(monkeypatch):
     assert paces == [30, 7]
 
 
-def test_what_has_no_window_closes_nobodys():
+def test_close_without_window_is_a_no_op():
     env = MiddlePointEnv(render_mode="human")
     env.reset(seed=0)
     for mode in (None, "rgb_array", "human"):

@@ -2,7 +2,7 @@
 
 First, `python -m benchmarks.datasets` writes the data. `python -m benchmarks.examples.offline`
 then learns from one data set, without a plant, and evaluates the policies on episodes that are
-not in the data. A score of 1 is the least possible mean error, 0 that of an idle valve.
+not in the data. A score of 1 is the least possible mean error, 0 that without control.
 """
 
 from __future__ import annotations
