@@ -28,6 +28,16 @@ def die_of_memory(seed: int) -> None:
     os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # as Windows has it
 
 
+def hears_ctrl_c() -> bool:
+    """Return whether Ctrl-C interrupts the own process."""
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
 def until(condition: Callable[[], object], seconds: float = 30.0) -> bool:
     """Wait until a condition holds, but not for ever."""
     end = time.monotonic() + seconds

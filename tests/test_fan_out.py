@@ -52,6 +52,12 @@ class TestNumbers:
         one = partial(next, (os.getpid() for _ in "1"))  # which cannot be pickled
         assert run({"pid": one}) == {"pid": os.getpid()}
 
+    @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT to another process")
+    def test_ctrl_c_is_heard_by_one_process(self):
+        # The others would show tracebacks of their own, one of them perhaps while it starts.
+        for jobs, heard in ((1, True), (2, False)):
+            assert run({"a": tasks.hears_ctrl_c}, jobs=jobs) == {"a": heard}
+
     def test_a_result_that_json_cannot_hold_costs_no_other(self, tmp_path):
         with pytest.raises(
             TasksFailedError, match="a set: Its result cannot be kept"

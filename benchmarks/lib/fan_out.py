@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import socket
+import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -165,11 +167,32 @@ def _on_this_machine(tasks: Tasks, jobs: int | None) -> Iterator[Answer]:
     at_once = min(jobs, len(tasks))
     one_thread = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
     pool = partial(get_reusable_executor, at_once, env=one_thread)  # anew if it is broken
+
+    def submit(*task: Any) -> Any:
+        with _without_interruption():
+            return pool().submit(_attempt, *task)
+
     try:
-        yield from _answers(tasks, lambda *task: pool().submit(_attempt, *task), at_once)
+        yield from _answers(tasks, submit, at_once)
     except BaseException:  # including Ctrl-C
         pool().shutdown(kill_workers=True)
         raise
+
+
+@contextmanager
+def _without_interruption() -> Iterator[None]:
+    """Put Ctrl-C off, and keep it from processes that start here: the first one ends them."""
+    if sys.platform == "win32":
+        yield
+        return
+    from multiprocessing import resource_tracker  # which Windows lacks
+
+    resource_tracker.ensure_running()  # as its start lets Ctrl-C through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _on_cluster(tasks: Tasks, jobs: int | None) -> Iterator[Answer]:
