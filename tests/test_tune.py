@@ -1,5 +1,6 @@
 """The search for gains, on small budgets."""
 
+import logging
 from dataclasses import replace
 from unittest.mock import DEFAULT, Mock
 
@@ -17,8 +18,6 @@ from benchmarks.loop import scenarios
 from benchmarks.tune import command as tune
 from benchmarks.tune.__main__ import TUNED, main
 from tests.conftest import ROOT
-
-optuna.logging.set_verbosity(optuna.logging.WARNING)
 
 
 class TestScore:
@@ -94,8 +93,9 @@ class TestSearch:
             assert best["in the search"] in set(trials["objective"])
 
     def test_a_stopped_search_ends_where_it_would_have_ended(
-        self, tmp_path, monkeypatch, capsys
+        self, tmp_path, monkeypatch, capsys, caplog
     ):
+        monkeypatch.setattr(logging.getLogger("optuna"), "propagate", True)
         search(tmp_path / "whole")
         at_the_fifth = [*[DEFAULT] * 4 * len(tune.SCENARIOS), KeyboardInterrupt]
         with monkeypatch.context() as patch:
@@ -103,6 +103,7 @@ class TestSearch:
             patch.setattr(tune, "mean_error", judged)
             assert len(search(tmp_path / "halves", status=130)) == 4
         assert "Interrupted" in capsys.readouterr().out
+        assert not caplog.records  # no traceback of the trial that was interrupted
         search(tmp_path / "halves")
         for name in ("pi.csv", "pi.md"):
             one, other = ((tmp_path / part / name).read_text() for part in ("whole", "halves"))

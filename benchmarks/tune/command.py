@@ -53,7 +53,7 @@ SCENARIOS: tuple[tuple[Scenario, int], ...] = (
 
 def execute(options: Options, console: Console) -> str:
     """Run the search, and write and print its results."""
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)  # no traceback after Ctrl-C
     name, out = options.controller, out_folder(options.out)
     tuning = tuning_of(name)
     judge = partial(score, name, options.plant.chosen().arguments)
