@@ -159,6 +159,12 @@ class TestOwnControllers:
             "num_envs", "seed", "u_min", "u_max", "parameters",
         }  # fmt: skip
 
+    @pytest.mark.parametrize("code", ["def Mine(:", "Mine = unknown", "raise SystemExit(3)"])
+    def test_a_module_that_cannot_be_imported_is_named(self, written, code):
+        location = written(code)
+        with pytest.raises(UsageError, match=rf"--agent: '{location}' cannot be imported: \w+"):
+            chosen([], [f"mine={location}"])
+
     def test_those_of_the_project_ask_for_their_windows(self):
         factory = own_factory("agents:PIController")
         assert errors(factory, 1, 60, setpoint_window=7) == errors(factory, 1, 60)

@@ -90,8 +90,9 @@ def own_factory(location: str) -> Factory:
     """
     try:
         found: Any = pkgutil.resolve_name(location)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"{location!r} cannot be imported: {error}") from error
+    except (Exception, SystemExit) as error:  # whatever the code of a user raises
+        text = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{location!r} cannot be imported: {text}") from error
     if not callable(found):
         raise ValueError(f"{location!r} must be MODULE:FACTORY, got {found!r}")
     observation = getattr(found, "observation", {})
