@@ -74,6 +74,8 @@ REFUSED = {
         (["--runs", "0"], 'value "0" for --runs. Must be >= 1'),
         (["--runs", "2.5"], "--runs: invalid literal for int.. with base 10: '2.5'"),
         (["--backend", "cloud"], "--backend"),
+        (["--preset", "paper", "--presets"], "--presets: goes without --plant, --preset and"),
+        (["--preset", "paper", "--scenarios", "load"], "no 'load'; there are square, constant"),
         (["--preset", "harder"], '"harder" for --preset. Choose from: "paper", "dead-z'),
         (["--rusn", "3"], "Unknown option: --rusn. Did you mean --runs?"),
         (["stray"], "stray"),
@@ -109,6 +111,7 @@ REFUSED = {
         (["--agent", "lqr"], "--agent: no 'lqr'; there are nothing, nn"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
         (["--scenario", "triangle"], "--scenario.*constant-noise"),
+        (["--preset", "paper", "--scenario", "load"], "no 'load' on this plant"),
         (["--video", "film.avi"], "--video: must end in .gif"),
         (["--seed", "-1"], "--seed. Must be >= 0"),
         # Of a machine without a screen.

@@ -21,6 +21,7 @@ from benchmarks.controllers.records import Factory, provenances
 from benchmarks.lib.command import UsageError, blame, known, out_folder
 from benchmarks.lib.report import Section, provenance_line, show
 from benchmarks.lib.storage import Kept, origin, write_json
+from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
 from mptc_gym.evaluation import SEED
 
@@ -28,11 +29,11 @@ from mptc_gym.evaluation import SEED
 def execute(options: Options, console: Console) -> str:
     """Run the comparison and write its results."""
     controllers = chosen(options.agents, options.controllers.agent)
-    plant = options.plant.chosen()
-    if options.presets and plant.arguments:
+    plant, another = options.plant.chosen(), options.plant != PlantOptions()
+    if options.presets and another:
         raise UsageError("--presets: goes without --plant, --preset and --set")
     known_cases = PRESET_SCENARIOS if options.presets else SCENARIOS
-    if plant.arguments:
+    if another:
         known_cases = scenarios_of(plant.name, plant.arguments)
     given = list(known_cases) if options.scenarios is None else options.scenarios
     names = known("--scenarios", given, list(known_cases))
@@ -40,12 +41,12 @@ def execute(options: Options, console: Console) -> str:
         raise UsageError("--scenarios: none to run")
     scenarios = {name: known_cases[name] for name in names}
     members = {name: entry.members() for name, entry in controllers.items()}
-    if plant.arguments:
+    if another:
         _try_out(members, scenarios.values(), options.runs)
     out = options.out or _folder(
         [*controllers] if (*controllers,) != COMPARED else [],
         names if names != [*known_cases] else [],
-        [plant.name] if plant.arguments else ["presets"] if options.presets else [],
+        [plant.name] if another else ["presets"] if options.presets else [],
         [f"{options.runs}-runs"] if options.runs != RUNS else [],
     )
     folder, made = out_folder(out), origin()

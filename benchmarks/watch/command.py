@@ -20,6 +20,7 @@ from benchmarks.lib.drawing import with_few_colours
 from benchmarks.lib.storage import replacing
 from benchmarks.lib.tables import on_screen
 from benchmarks.loop.metrics import mean_error
+from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.rollout import Trajectory
 from benchmarks.loop.scenarios import SCENARIOS, Scenario, scenarios_of
 from benchmarks.watch import game
@@ -43,8 +44,8 @@ def execute(options: Options, console: Console) -> str:
         raise UsageError(f"--video: must end in .gif, got {path}")
     controller = None if options.agent == YOU else _controller(options.agent)
     label = controller.label if controller else YOU
-    plant = options.plant.chosen()
-    scenarios = scenarios_of(plant.name, plant.arguments) if plant.arguments else SCENARIOS
+    plant, another = options.plant.chosen(), options.plant != PlantOptions()
+    scenarios = scenarios_of(plant.name, plant.arguments) if another else SCENARIOS
     scenario = scenarios.get(options.scenario)
     if scenario is None:
         raise UsageError(
