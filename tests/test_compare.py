@@ -162,8 +162,8 @@ class TestEstimates:
         assert overall.value == pytest.approx(0.75)
         assert by_scenario == pytest.approx({"constant": 0.75, "square": 0.75})
         best, other = report.score_table(runs, scores, [*scales]).to_dict("records")
-        assert (best["agent"], best["travel (t/h)"], best["square"]) == ("b", "12", "0.75")
-        assert (other["agent"], other["constant"]) == ("a", "0.25")
+        assert (best["controller"], best["travel (t/h)"], best["square"]) == ("b", "12", "0.75")
+        assert (other["controller"], other["constant"]) == ("a", "0.25")
 
 
 class TestReport:

@@ -235,5 +235,5 @@ class TestFindings:
 
     def test_overview(self):
         table = report.overview(self.runs()).set_index("controller")
-        assert table.loc["NN (1992), frozen", "ratio, median"] == "2.000"
+        assert table.loc["NN (1992), frozen", "multiple, median"] == "2.000"
         assert table.loc["NN (1992)", "oscillates (%)"] == "5.0"

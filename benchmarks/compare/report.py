@@ -166,7 +166,7 @@ def _costs(comparison: Comparison) -> pd.DataFrame:
         runs = [case.seconds for case in comparison.finished if case.agent == name]
         rows.append(
             {
-                "agent": label(name),
+                "controller": label(name),
                 "prior knowledge": cost.prior_knowledge,
                 "parameters": cost.parameters,
                 "search for its settings": cost.search,
@@ -210,7 +210,7 @@ def ratio_table(
     estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
 ) -> pd.DataFrame:
     """Return the least possible and the mean errors as multiples; the least are in bold."""
-    bounds = [{"agent": "least possible (°C)"}, {"agent": "with foresight (°C)"}]
+    bounds = [{"controller": "least possible (°C)"}, {"controller": "with foresight (°C)"}]
     for name, scale in scales.items():
         mark = "*" * (scale.least.kind == "reference")
         bounds[0][name] = f"{scale.least.value:.3f}{mark}"
@@ -228,13 +228,18 @@ def score_table(
     """Return the scores and the mean travel of the median runs, the best in bold."""
     travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
     rows = [
-        {"agent": label(agent), "score": f"{overall:.3f}"}
+        {"controller": label(agent), "score": f"{overall:.3f}"}
         | {"travel (t/h)": f"{travels[agent].mean():,.0f}"}
         | {scenario: f"{mean:.2f}" for scenario, mean in means.items()}
         for agent, (overall, means) in scores.items()
     ]
     rows[0] = {name: Best(cell) for name, cell in rows[0].items()}
-    columns = ["agent", "score", "travel (t/h)", *names]  # after an interruption, with gaps
+    columns = [
+        "controller",
+        "score",
+        "travel (t/h)",
+        *names,
+    ]  # after an interruption, with gaps
     return pd.DataFrame(rows, columns=columns).fillna("")
 
 
@@ -250,13 +255,8 @@ def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataF
     table = rows.assign(cell=cells).pivot_table(
         index="agent", columns="scenario", values="cell", aggfunc="first", sort=False
     )
-    return (
-        table.loc[[*agents]]
-        .fillna("")
-        .rename(index=label)
-        .reset_index()
-        .rename_axis(columns=None)
-    )
+    table = table.loc[[*agents]].fillna("").rename(index=label)
+    return table.rename_axis(index="controller", columns=None).reset_index()
 
 
 def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> pd.DataFrame:
@@ -271,7 +271,7 @@ def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> p
                 )
                 for row in group.to_dict("records")
             }
-            rows.append({"scenario": name, "agent": label(agent)} | cells)
+            rows.append({"case": name, "controller": label(agent)} | cells)
     return pd.DataFrame(rows)
 
 

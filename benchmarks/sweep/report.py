@@ -51,11 +51,11 @@ QUESTIONS = (
     ),
 )
 OVERVIEW_TEXT = (
-    "Ratio: mean error as a multiple of the least possible error, median and 90th percentile "
-    "over the plants (the median run of each). Travel: of the valve in a run, the median. "
+    "Multiple: mean error / least possible error, the median and 90th percentile over the "
+    "plants (the median run of each). Travel: of the valve in a run, the median. "
     "Oscillates: on steady stretches the standard deviation of the error is "
-    f"{OSCILLATES:g} °C larger than with no control at all. Useless: the mean error is no "
-    "smaller than with no control. Both are shares of the runs."
+    f"{OSCILLATES:g} °C larger than without control. This, and no better than no control, are "
+    "shares of the runs."
 )
 DIFFERENCES_TEXT = (
     "Differences of the mean error (°C), run by run in the same noise, with 95 % intervals "
@@ -131,11 +131,11 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
         rows.append(
             {
                 "controller": label(agent),
-                "ratio, median": f"{ratio.median():.3f}",
-                "ratio, 90 %": f"{ratio.quantile(0.9):.3f}",
+                "multiple, median": f"{ratio.median():.3f}",
+                "multiple, 90 %": f"{ratio.quantile(0.9):.3f}",
                 "travel (t/h)": f"{group['total_variation'].median():,.0f}",
                 "oscillates (%)": f"{100 * group['oscillates'].mean():.1f}",
-                "useless (%)": f"{100 * group['useless'].mean():.1f}",
+                "no better than no control (%)": f"{100 * group['useless'].mean():.1f}",
             }
         )
     return pd.DataFrame(rows)
