@@ -390,7 +390,7 @@ class TestCompare:
 
     @staticmethod
     def assert_the_first_are_kept(out, count):
-        kept = ["constant", "square", "constant"][:count]
+        kept = ["constant", "square", "square"][:count]
         assert list(pd.read_csv(out / "runs.csv")["scenario"]) == kept
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
 
@@ -419,7 +419,7 @@ class TestCompare:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(records, "rollout", runs)
             out = compared(given)
-        assert runs.call_count == 1  # nn on the square wave
+        assert runs.call_count == 1  # nn at the constant set point
         for name in ("runs.csv", "summary.csv", "estimates.csv"):
             assert (out / name).read_bytes() == (whole / name).read_bytes()
 
