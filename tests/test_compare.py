@@ -28,7 +28,7 @@ from benchmarks.compare import plots, report
 from benchmarks.compare.__main__ import main
 from benchmarks.compare.estimates import estimate, ranked, scale_of
 from benchmarks.controllers import records
-from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.roster import ROSTER, looks
 from benchmarks.lib import storage, tables
 from benchmarks.lib.report import Best, Section, write_report
 from benchmarks.lib.statistics import Estimate
@@ -84,6 +84,12 @@ class TestMeasures:
         assert values["total_variation"] == 6 + 6 + 5 + 15 + 0 + 10
         assert values["dead_zone_share"] == pytest.approx(100 * 2 / 6)
         assert values["saturation_share"] == pytest.approx(100 * 2 / 6)
+
+
+def test_a_controller_has_one_look_wherever_it_is_listed():
+    everyone = looks([*ROSTER, "mine", "yours"])
+    assert len(set(everyone.values())) == len(everyone)
+    assert looks(["mine", "pi"]) == {"mine": everyone["mine"], "pi": everyone["pi"]}
 
 
 class TestTables:

@@ -113,12 +113,10 @@ def _sections(
     return [
         Section(
             "Score: 0 without control, 1 at the least possible error",
-            [
-                "Mean over the cases, 95 % interval; travel of the valve in the median run. In "
-                "the picture, a tick is one case."
-            ],
+            ["Mean over the cases, 95 % interval; travel of the valve in the median run."],
             score_table(comparison.runs, scores, names),
             pictures=["scores.png"],
+            caption="A tick is one case.",
         ),
         Section(
             "Mean error as a multiple of the least possible, with its 95 % interval",
