@@ -67,7 +67,7 @@ LOG = ROOT / "benchmarks/identify/example.csv"
 REFUSED = {
     "claims": [(["everything"], "no 'everything'")],
     "compare": [
-        (["--agents", "nn", "pid"], '"pid" for --agents. Choose from: .* Did you mean "pi"'),
+        (["--agents", "nn", "pie"], '"pie" for --agents. Choose from: .* Did you mean "pi"'),
         (["--agents"], "no controller"),
         (["--scenarios", "circle"], "no 'circle'"),
         (["--scenarios"], "--scenarios: none to run"),
