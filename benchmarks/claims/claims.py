@@ -386,7 +386,7 @@ def direction_only(batch: Batch, claim: Claim) -> None:
         ask(f"{text}, {family}", cells[alone])
     for family, those in groups(cells, "setpoint"):
         ask(f"all {len(those)} combinations, {family}", those)
-        quantity = f"combinations in which at least {OFTEN:.0%} of draws settle, {family}"
+        quantity = f"combinations in which at least {OFTEN:.0%} of runs settle, {family}"
         claim.ask(quantity, 100 * (those["settled"] >= OFTEN).mean(), "%")
 
 

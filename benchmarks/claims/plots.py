@@ -34,7 +34,7 @@ def plot_convergence(times: pd.DataFrame, path: Path) -> None:
         axes.set_xlim(left=0)
         axes.set_ylim(0, 100)
         axes.set_xlabel("samples since the start")
-        axes.set_ylabel("weights have converged (% of draws)")
+        axes.set_ylabel("weights have converged (% of runs)")
         axes.legend()
 
 
@@ -84,7 +84,7 @@ def plot_other_plants(cells: pd.DataFrame, path: Path) -> None:
             axes.set_xlabel("delay (samples)")
         for axes in maps[:, 0]:
             axes.set_ylabel("gain (of the paper's)")
-        figure.colorbar(image, ax=maps, label="settled (% of draws)")
+        figure.colorbar(image, ax=maps, label="settled (% of runs)")
 
 
 SIGNALS = {

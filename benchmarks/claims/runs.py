@@ -173,14 +173,14 @@ class Claim:
     def ask_share(
         self, quantity: str, found: NDArray[np.bool_], *, often: bool = False
     ) -> None:
-        """Record the share of draws in which `found` is true; `often` requires `OFTEN`."""
+        """Record the share of runs in which `found` is true; `often` requires `OFTEN`."""
         at_least = 100 * OFTEN if often else -math.inf
-        self.ask(quantity, share(found).scaled(100), "% of draws", at_least=at_least)
+        self.ask(quantity, share(found).scaled(100), "% of runs", at_least=at_least)
 
     def ask_time(self, quantity: str, samples: ArrayLike) -> None:
         """Record the 10th, 50th and 90th percentiles of a time; infinite means never."""
         for p in (0.1, 0.5, 0.9):
-            self.ask(f"{quantity}, {p:.0%} of draws", quantile(samples, p), "samples")
+            self.ask(f"{quantity}, {p:.0%} of runs", quantile(samples, p), "samples")
 
 
 @dataclass(frozen=True)
