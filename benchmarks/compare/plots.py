@@ -185,7 +185,7 @@ def plot_responses(
     """
     agents = sorted(responses["agent"].unique(), key=errors.__getitem__)
     style, best = looks(agents), agents[0]
-    title = f"{scenario.title}: {label(best)} errs least ({errors[best]:.3f} °C)"
+    title = f"{scenario.title}: {label(best)} errs least"
     height = 1.0 + 1.05 * len(agents)
     with drawn(path, height, title) as figure:
         figure.set_layout_engine("none")  # which would take most of the time
@@ -207,6 +207,8 @@ def plot_responses(
             draw_actuator(right, scenario.parameters)
             right.step(minutes, rows["applied_median"], color=colour, linewidth=1, where="post")
         left.set_xlim(0, minutes.max())
-        rows_of[0, 1].set_title("applied flow (t/h), median; grey: dead zone")
-        figure.supylabel("temperature (°C): median, 10th to 90th percentile", fontsize="medium")
-        figure.supxlabel("time (min)", fontsize="medium")
+        rows_of[0, 1].set_title("applied flow (t/h); grey: dead zone")
+        figure.supylabel("temperature (°C)", fontsize="medium")
+        figure.supxlabel(
+            "time (min); lines: medians, bands: 10th to 90th percentile", fontsize="medium"
+        )
