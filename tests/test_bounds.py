@@ -489,3 +489,9 @@ def test_command_prints_each_row_once_it_is_finished(capsys, tmp_path, monkeypat
     for name in (*SCENARIOS, "noisy", "hard"):
         assert f"\n{name} " in shown
     assert "0.9114" in shown
+
+
+def test_the_note_is_as_wide_as_the_screen(capsys, tmp_path):
+    assert main(["--preset", "paper", "--cache", str(tmp_path), "--jobs", "1"]) == 0
+    *note, _ = capsys.readouterr().out.rstrip().rpartition("\n\n")[-1].splitlines()
+    assert all(130 < len(line) <= 150 for line in note)

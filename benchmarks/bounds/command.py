@@ -31,12 +31,13 @@ PACKAGED = PRESETS | {
     for name in ("paper", "disturbed", "fouling")  # for the data sets
 }
 
-NOTE = """
-With preview: no controller does better on average, even one that knows the set point
-beforehand. Without: none that learns of a change of the set point when it happens; for random
-set points alone, which have a law. Reference: the same, if each change finds the plant settled;
-a controller that counts samples can come below it. Where a set point never changes, the three
-are the same. 95 % intervals over drawn episodes."""
+NOTE = (
+    "\nWith preview: no controller does better on average, even one that knows the set point "
+    "beforehand. Without: none that learns of a change of the set point when it happens; for "
+    "random set points alone, which have a law. Reference: the same, if each change finds the "
+    "plant settled; a controller that counts samples can come below it. Where a set point "
+    "never changes, the three are the same. 95 % intervals over drawn episodes."
+)
 
 
 def execute(options: Options, console: Console) -> str:
