@@ -112,7 +112,8 @@ def _html(folder: Path, title: str, sections: Sequence[Section], made: str) -> s
         f"<style>{_STYLE}</style></head><body><h1>{html.escape(title)}</h1>",
     ]
     titles = [html.escape(section.title) for section in sections]
-    parts += [f'<p><a href="#{i}">{name}</a></p>' for i, name in enumerate(titles) if name]
+    links = [f'<a href="#{i}">{name}</a>' for i, name in enumerate(titles) if name]
+    parts.append(f"<p>{'<br>'.join(links)}</p>")
     for i, (section, name) in enumerate(zip(sections, titles, strict=True)):
         parts += [f'<h2 id="{i}">{name}</h2>'] * bool(name)
         parts += [f"<p>{html.escape(paragraph)}</p>" for paragraph in section.text]
