@@ -98,7 +98,11 @@ def faulty(kind: str, number: int, seed: int) -> Faulty:
     linear = LinearModel([1.0], (larger * np.array(response)).tolist())
     x, states[:], transit[:] = 0.0, 0.0, 0.0
 
-    noise = _noise(generator, samples, slow, gain)
+    # The noise of a transmitter, and a coloured disturbance.
+    white = generator.normal(size=samples)
+    coloured = signal.lfilter([1.0], [1.0, -math.exp(-INTERVAL / slow)], white)
+    level = generator.uniform(0.02, 0.2) * abs(gain)
+    noise = level * (coloured + generator.normal(size=samples))
     if kind == "drift":
         noise += np.cumsum(generator.normal(0.0, 0.02 * abs(gain), samples))
     other = _steps(generator, samples, slow, LEVEL)
@@ -130,12 +134,3 @@ def _steps(generator: np.random.Generator, samples: int, slow: float, level: flo
         held = int(generator.uniform(1.0, 4.0) * slow / INTERVAL)
         levels += [float(generator.uniform(-level, level))] * held
     return np.array(levels[:samples])
-
-
-def _noise(generator: np.random.Generator, samples: int, slow: float, gain: float) -> Array:
-    """Return the noise of a transmitter and a coloured disturbance."""
-    pole = math.exp(-INTERVAL / slow)
-    coloured = signal.lfilter([1.0], [1.0, -pole], generator.normal(size=samples))
-    level = generator.uniform(0.02, 0.2) * abs(gain)
-    noise: Array = level * (coloured + generator.normal(size=samples))
-    return noise
