@@ -104,6 +104,8 @@ class TestSearch:
             assert len(search(tmp_path / "halves", status=130)) == 4
         assert "Interrupted" in capsys.readouterr().out
         assert not caplog.records  # no traceback of the trial that was interrupted
+        with (tmp_path / "halves/trials.log").open("a") as log:
+            log.write('{"op_code": 5, "wor')  # as where a disk is full
         search(tmp_path / "halves")
         for name in ("pi.csv", "pi.md"):
             one, other = ((tmp_path / part / name).read_text() for part in ("whole", "halves"))

@@ -89,9 +89,13 @@ def search(tuning: Tuning, judge: Callable[[Row], Row], count: int, path: Path) 
     Each trial has a sampler of its own, seeded with the search's seed and the number of trials
     before, so that an interrupted search continues exactly as it would have.
     """
+    log = path.with_name("trials.log")
+    if log.exists() and not (lines := log.read_bytes()).endswith(b"\n"):
+        # Its writer was killed, or the disk was full: Optuna could not read an unfinished line.
+        log.write_bytes(lines[: lines.rfind(b"\n") + 1])
     study = optuna.create_study(
         study_name=key(judge, tuning),  # of everything that shapes the trials
-        storage=JournalStorage(JournalFileBackend(str(path.with_name("trials.log")))),
+        storage=JournalStorage(JournalFileBackend(str(log))),
         load_if_exists=True,
     )
 
