@@ -220,25 +220,35 @@ class SelfTuningController(ModelBasedController):
 
     def _design(self, share: float) -> None:
         """Weight the models by the evidence, and adopt a share of the resulting design."""
+        # Arrays of all models are reused, as memory takes most of the time.
         prior = self._variance / (self._gain_spread * self.gain) ** 2
         information = self._information + prior
         products = self._products + prior * self.gain
         gains = products / information
-        errors = self._energy + prior * self.gain**2 - products * gains  # sums of squares
-        weights = self._prior - (0.5 * self._caution) * errors / self._variance
+        errors = np.multiply(products, gains, out=products)
+        np.subtract(self._energy + prior * self.gain**2, errors, out=errors)  # sums of squares
+        least = np.maximum(errors.min(1, keepdims=True), LEAST_NOISE**2 * self._seen)
+        weights = np.multiply(errors, 0.5 * self._caution, out=errors)
+        weights /= self._variance
+        np.subtract(self._prior, weights, out=weights)
         weights -= weights.max(1, keepdims=True)
         np.exp(weights, out=weights)
         weights /= weights.sum(1, keepdims=True)
-        least = np.maximum(errors.min(1, keepdims=True), LEAST_NOISE**2 * self._seen)
         self._variance = (least + NOISE_SAMPLES * self._noise**2) / (self._seen + NOISE_SAMPLES)
 
-        gains = np.clip(gains / self.gain, *GAINS) * self.gain  # keeps the sign
-        spread = np.square(gains) + self._variance / information
-        mean = (weights * gains).sum(1)
+        gains /= self.gain
+        np.clip(gains, *GAINS, out=gains)
+        gains *= self.gain  # keeps the sign
+        spread = np.divide(self._variance, information, out=information)
+        spread += np.square(gains)
+        spread *= weights
+        gains *= weights
         # Variance over all gains, as a share of the square of their mean.
-        self._gain_variance = (weights * spread).sum(1) / np.square(mean) - 1.0
-        self._weights += share * (weights - self._weights)
-        self._gains += share * (weights * gains - self._gains)
+        self._gain_variance = spread.sum(1) / np.square(gains.sum(1)) - 1.0
+        for adopted, design in ((self._weights, weights), (self._gains, gains)):
+            design -= adopted
+            design *= share
+            adopted += design
 
         # Averages over the models, for the control law.
         self._faded = self._gains * self._fading
