@@ -112,9 +112,10 @@ def panels(
 def draw_legend(figure: Figure, free: Sequence[Axes], entries: dict[str, Any]) -> None:
     """Put a legend of handles by label in a free place, or else below the panels."""
     if free:
-        free[0].legend(
+        legend = free[0].legend(
             entries.values(), entries, loc="center left", ncols=1 + (len(entries) > 7)
         )
+        legend.set_in_layout(len(free) < 2)  # with room beside it, it may be wider than a panel
     elif entries:
         figure.legend(entries.values(), entries, loc="outside lower center", ncols=4)
 
