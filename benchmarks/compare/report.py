@@ -17,7 +17,7 @@ from benchmarks.compare.estimates import Scale, Score, estimate, ranked, scale_o
 from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.report import Best, Section, write_report
-from benchmarks.lib.statistics import Estimate
+from benchmarks.lib.statistics import Estimate, written
 from benchmarks.lib.tables import PERCENTILES, groups, percentiles, write_csv
 from benchmarks.loop.metrics import METRICS
 from benchmarks.loop.scenarios import Scenario
@@ -228,7 +228,7 @@ def score_table(
     rows = [
         {"controller": label(agent), "score": f"{overall:.3f}"}
         | {"travel (t/h)": f"{travels[agent].mean():,.0f}"}
-        | {scenario: f"{mean:.2f}" for scenario, mean in means.items()}
+        | {scenario: written(mean, ".2f") for scenario, mean in means.items()}
         for agent, (overall, means) in scores.items()
     ]
     rows[0] = {name: Best(cell) for name, cell in rows[0].items()}

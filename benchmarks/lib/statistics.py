@@ -33,10 +33,16 @@ class Estimate:
 
         If the interval extends to infinity, the reason takes its place.
         """
-        value, low, high = (format(end, form) for end in (self.value, self.low, self.high))
+        value, low, high = (written(end, form) for end in (self.value, self.low, self.high))
         if math.isinf(self.high):
             return f"{value} ({'one run' if self.runs == 1 else 'too few runs'})"
         return value if low == high else f"{value} ({low} to {high})"
+
+
+def written(value: float, form: str) -> str:
+    """Return a number as text, but never -0."""
+    text = format(value, form)
+    return text.lstrip("-") if set(text) <= set("-0.") else text
 
 
 def exact(value: float) -> Estimate:
