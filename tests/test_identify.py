@@ -650,7 +650,7 @@ class TestCommand:
         gymnasium.make("MiddlePoint-v0", **plant).reset(seed=0)
         gymnasium.make("MiddlePoint-v0", **json.loads((out / "ranges.json").read_text()))
         text = (out / "report.md").read_text()
-        for word in ("gain margin", "least possible", "autocorrelations", "operating point"):
+        for word in ("gain margin", "least possible", "autocorrelations", "the loops cycle"):
             assert word in text
         assert (out / "report.html").read_text().count("data:image/png") == 3
         assert re.search(r"\| gain +\| \S+ +\| \[\S+, \S+\]", text)

@@ -146,7 +146,9 @@ def _controllers(model: Model, found: list[Recommended]) -> Section:
         "at half the plant's. The margins hold while no limit and no dead zone is met: by what "
         "factor the gain may rise, and by how much phase and delay may shift, until the loop "
         "is unstable. Ms is the most that the loop amplifies a disturbance; 95 % of the "
-        "possible plants stay below the second number.",
+        "possible plants stay below the second number."
+        + " Around set points that need a flow within the dead zone the loops cycle."
+        * (model.estimates["dead_zone"].value > 0.0),
         "The mean |e| is that of a square wave of "
         f"±{Parameters(**arguments).setpoint_amplitude:g} {temperature} over "
         f"{found[0].samples} samples on the identified plant, with the noise of the log, the "

@@ -54,28 +54,29 @@ def _faults(likelihood: Likelihood) -> Iterator[tuple[str, Fault]]:
     """Yield faults of all kinds and sizes, with their kinds."""
     flow, unit = held(likelihood.command), likelihood.log.flow_unit
     span, rest = float(np.ptp(flow)), likelihood.operating_flow
-    repair = (
-        "Have the valve or its positioner repaired; to see more, move the flow up and down in "
-        "small steps, twice in each direction."
+    test = (
+        "Test the valve: move the flow up and down in small steps, twice in each direction. If "
+        "it follows them all, the plant is not of the model's form."
     )
     for width, passed in zip(span * WIDTHS, _backlash(flow, span * WIDTHS), strict=True):
-        what = f"The flow depends on the direction of the last move: backlash of {width:.2g}"
-        yield "backlash", Fault(f"{what} {unit} explains the log better.", repair, passed)
+        what = f"The flow seems to depend on its last direction: backlash of {width:.2g}"
+        yield "backlash", Fault(f"{what} {unit} explains the log better.", test, passed)
     for least, passed in zip(
         span * WIDTHS / 2, _stiction(flow, span * WIDTHS / 2), strict=True
     ):
         what = f"The valve seems to stick: stiction of ±{least:.2g}"
-        yield "stiction", Fault(f"{what} {unit} explains the log better.", repair, passed)
+        yield "stiction", Fault(f"{what} {unit} explains the log better.", test, passed)
     for centre, ratio in itertools.product(span * np.array([-0.2, 0.0, 0.2]), RATIOS):
-        what = f"The gain above {rest + centre:.4g} {unit} is {ratio:.2g} times that below"
+        what = f"The gain above {rest + centre:.4g} {unit} seems {ratio:.2g} times that below"
         advice = "Identify both sides from logs of their own."
         above, below = min(ratio, 1.0), min(1.0 / ratio, 1.0)  # so that the gain is the larger
         passed = centre + np.where(flow > centre, above, below) * (flow - centre)
         yield "gain", Fault(f"{what}, roughly.", advice, passed)
     for centre, zone in itertools.product(span * np.array(CENTRES), span * np.array(ZONES)):
         within = np.abs(flow - centre) < zone
-        what = f"There is a dead zone around {rest + centre:.4g} {unit}, not around {rest:g}"
-        advice = f"If that is the operating point, say --operating-flow {rest + centre:.4g}."
+        where = f"{rest + centre:.4g}"
+        what = f"There seems to be a dead zone around {where} {unit}, not around {rest:g}"
+        advice = f"If that is the operating point, say --operating-flow {where}. {test}"
         for inside in (0.0, centre):
             yield "zone", Fault(f"{what} {unit}.", advice, np.where(within, inside, flow))
 
