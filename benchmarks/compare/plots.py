@@ -185,7 +185,7 @@ def plot_responses(
     """
     agents = sorted(responses["agent"].unique(), key=errors.__getitem__)
     style, best = looks(agents), agents[0]
-    title = f"{scenario.title}: {label(best)} errs least"
+    title = f"{scenario.title}: {label(best)} errs least of these"
     height = 1.0 + 1.05 * len(agents)
     with drawn(path, height, title) as figure:
         figure.set_layout_engine("none")  # which would take most of the time
