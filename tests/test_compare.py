@@ -102,7 +102,7 @@ class TestTables:
         cells = {f"square-dead-zone-{i}": ["1.00 (0.99 to 1.01)", "11.5"] for i in range(7)}
         table = pd.DataFrame({"agent": ["neural self-tuning", "NN (1992)"], **cells})
         console = Console(width=width, file=io.StringIO())
-        console.print(tables.on_screen(table))
+        console.print(tables.ScreenTable(table))
         shown = console.file.getvalue()
         assert max(map(len, shown.splitlines())) <= width
         assert "…" not in shown

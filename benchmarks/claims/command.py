@@ -17,7 +17,7 @@ from benchmarks.claims.runs import Batch, Claim
 from benchmarks.lib.command import known, out_folder
 from benchmarks.lib.report import provenance_line
 from benchmarks.lib.storage import origin, write_text
-from benchmarks.lib.tables import on_screen, write_csv
+from benchmarks.lib.tables import ScreenTable, write_csv
 
 
 def execute(options: Options, console: Console) -> str:
@@ -41,7 +41,7 @@ def execute(options: Options, console: Console) -> str:
                 PLOTS[picture](drawn, out / f"{picture}.png")
     finally:
         if done:
-            console.print(on_screen(overview(claims)))
+            console.print(ScreenTable(overview(claims)))
     return f"All numbers are in {out}/claims.md and claims.csv"
 
 

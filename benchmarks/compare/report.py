@@ -232,12 +232,8 @@ def score_table(
         for agent, (overall, means) in scores.items()
     ]
     rows[0] = {name: Best(cell) for name, cell in rows[0].items()}
-    columns = [
-        "controller",
-        "score",
-        "travel (t/h)",
-        *names,
-    ]  # after an interruption, with gaps
+    # After an interruption, with gaps.
+    columns = ["controller", "score", "travel (t/h)", *names]
     return pd.DataFrame(rows, columns=columns).fillna("")
 
 

@@ -22,7 +22,7 @@ import mptc_gym
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.datasets.__main__ import BEHAVIOURS, EPISODES, IDS, SAMPLES, Options
 from benchmarks.lib.command import UsageError, out_folder
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.tables import ScreenTable
 from benchmarks.loop.rollout import Agent, IdleValve, make_plants
 from mptc_gym import PRESETS, Evaluation, Parameters, evaluate
 from mptc_gym.policies import rollout
@@ -76,7 +76,7 @@ def execute(options: Options, console: Console) -> str:
             }
         )
         console.print(f"{name} is written")
-    console.print(on_screen(pd.DataFrame(rows)))
+    console.print(ScreenTable(pd.DataFrame(rows)))
     return f"The data sets are in {root}"
 
 

@@ -18,6 +18,7 @@ from benchmarks.identify.__main__ import Columns
 Array = NDArray[np.float64]
 
 LEAST_SAMPLES = 100  # of flow and temperature: a tenth of what makes a good log
+_UNIT = re.compile(r"\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")  # in brackets, at the end of a heading
 
 
 @dataclass(frozen=True)
@@ -145,9 +146,6 @@ def _found(columns: Columns, headings: list[str]) -> Columns:
         temperature=heading(columns.temperature),
         disturbance=tuple(map(heading, columns.disturbance)),
     )
-
-
-_UNIT = re.compile(r"\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")  # in brackets, at the end of a heading
 
 
 def _unit(name: str) -> str:

@@ -16,7 +16,7 @@ import pandas as pd
 from rich.console import Console
 
 from benchmarks.lib.storage import write_text
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.tables import ScreenTable
 
 _STYLE = """
 body { font-family: sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem;
@@ -67,7 +67,7 @@ def show(sections: Sequence[Section], console: Console) -> None:
     for section in sections:
         console.print(*filter(None, [section.title, *section.text]), sep="\n")
         if section.table is not None:
-            console.print(on_screen(section.table))
+            console.print(ScreenTable(section.table))
 
 
 def write_report(folder: Path, title: str, sections: Sequence[Section], made: str) -> None:

@@ -55,7 +55,7 @@ def groups(table: pd.DataFrame, column: str) -> Iterator[tuple[str, pd.DataFrame
 
 
 @dataclass(frozen=True)
-class on_screen:  # noqa: N801 (called as a function)
+class ScreenTable:
     """A table of text for a terminal, which cuts and breaks no cell.
 
     In a narrow one it has no intervals, and comes in parts if there are too many columns.

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from agents import DirectNNController
 from benchmarks.lib.command import blame
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.tables import ScreenTable
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.speed.__main__ import Options
 from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv
@@ -60,7 +60,7 @@ def execute(options: Options, console: Console) -> str:
     torch.set_num_threads(1)  # one core, as for the others
 
     def show(title: str, table: pd.DataFrame) -> None:
-        console.print(title, on_screen(table), sep="\n")
+        console.print(title, ScreenTable(table), sep="\n")
 
     if options.device is not None:
         with blame("--device"):

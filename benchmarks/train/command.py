@@ -17,7 +17,7 @@ from agents.networks import PRETRAINED
 from benchmarks.lib.command import out_folder
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import Kept, commit, replacing
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.tables import ScreenTable
 from benchmarks.train.__main__ import Options
 from benchmarks.train.through_plant import KINDS, Training, train
 
@@ -32,7 +32,7 @@ def execute(options: Options, console: Console) -> str:
     target = PRETRAINED if options.keep else out
     networks, rows, said = (_law if options.network == "nn-smith" else _ppo)(options, out)
     shown = pd.DataFrame(rows).map(lambda x: f"{x:.4g}" if isinstance(x, float) else str(x))
-    console.print(on_screen(shown))
+    console.print(ScreenTable(shown))
     for name, network in networks.items():
         with replacing(target / name) as file:
             network.save(file)

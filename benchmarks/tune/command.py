@@ -21,7 +21,7 @@ from benchmarks.controllers.records import Tuning
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import out_folder
 from benchmarks.lib.storage import key, write_text
-from benchmarks.lib.tables import on_screen, write_csv
+from benchmarks.lib.tables import ScreenTable, write_csv
 from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.scenarios import Scenario
 from benchmarks.tune.__main__ import Options
@@ -72,7 +72,7 @@ def execute(options: Options, console: Console) -> str:
     write_text(out / f"{name}.md", _page(name, table, trials, options.runs))
     console.print(f"The best, on {FINAL_RUNS} new runs")
     shown = table[[*tuning.space, "objective"]].head(5)
-    console.print(on_screen(shown.map("{:.4g}".format)))
+    console.print(ScreenTable(shown.map("{:.4g}".format)))
     return f"All trials are in {out / name}.csv, the best in {out / name}.md"
 
 

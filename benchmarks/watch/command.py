@@ -18,7 +18,7 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import UsageError
 from benchmarks.lib.drawing import with_few_colours
 from benchmarks.lib.storage import replacing
-from benchmarks.lib.tables import on_screen
+from benchmarks.lib.tables import ScreenTable
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.rollout import Trajectory
@@ -70,7 +70,7 @@ def execute(options: Options, console: Console) -> str:
         if controller is None or moves:
             console.print("The same for the controllers ...")
             table = game.tabulate(label, trajectory, moves, scenario, options.seed)
-            console.print(on_screen(table))
+            console.print(ScreenTable(table))
     found = f"{mean_error(trajectory)[0]:.3f} °C" + (f"\nThe film is {path}" if path else "")
     return f"{label} on {scenario.title}: mean absolute error {found}"
 

@@ -30,7 +30,7 @@ from benchmarks.identify.tuning import MOST_SENSITIVE, recommended
 from benchmarks.lib.command import out_folder
 from benchmarks.lib.statistics import share
 from benchmarks.lib.storage import Kept, write_text
-from benchmarks.lib.tables import groups, on_screen, write_csv
+from benchmarks.lib.tables import ScreenTable, groups, write_csv
 from benchmarks.loop.designs import Arguments, random_design
 from benchmarks.loop.linear import LinearModel, nominal
 from benchmarks.loop.margins import Loop
@@ -275,7 +275,7 @@ def execute(options: Options, console: Console) -> str:
     text = [each.to_markdown(index=False, disable_numparse=True) for each in tables]
     write_text(out / "identify_study.md", "\n\n".join([*text, f"{closing}\n"]))
     for each in tables:
-        console.print(on_screen(each))
+        console.print(ScreenTable(each))
     return f"{closing} The tables are in {out}/"
 
 
