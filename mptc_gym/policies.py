@@ -230,11 +230,12 @@ def rollout(
     plants: VectorEnv[Any, Any, Any],
     act: Callable[[Any], Any],
     samples: int,
-    seed: int,
+    seed: int | list[int],
 ) -> Iterator[Step]:
     """Reset a batch with seeds from `seed` on, and step it through samples k = 0, 1, ...
 
-    This is the one loop, for scores, benchmarks and tests.
+    In place of a first seed, a list has that of each plant. This is the one loop, for scores,
+    benchmarks and tests.
 
     `act` is called with the observations, shape (n, size), and returns the actions.
 
@@ -243,7 +244,8 @@ def rollout(
     ValueError
         If actions have the wrong shape or are not finite.
     """
-    observations, infos = plants.reset(seed=seed)
+    # It takes a list as well, despite its annotation.
+    observations, infos = plants.reset(seed=cast("int", seed))
     for k in range(samples):
         actions = _checked(act(observations), plants.action_space.shape, k)
         before = infos

@@ -228,7 +228,7 @@ def _log(controller: Agent, arguments: dict[str, Any], seeds: list[int]) -> tupl
     # One more sample, for the final observation.
     plants = make_plants(len(seeds), SAMPLES + 1, **arguments)
     controller.reset()
-    steps = rollout(plants, act, SAMPLES + 1, seeds)  # type: ignore[arg-type]
+    steps = rollout(plants, act, SAMPLES + 1, seeds)
     errors = [after["error"] for _, after, _ in steps]
     plants.close()
     return np.stack(observations, 1), np.stack(actions[:-1], 1), -np.abs(errors[:-1]).T
