@@ -356,16 +356,6 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             self._show()
         return observation, reward, False, False, info
 
-    def disturb(self, *, setpoint: float = 0.0, load: float = 0.0) -> None:
-        """Add to the set point and to the load disturbance of the next sample, degC.
-
-        For experiments in which they change while the plant runs: call it before each `step`.
-        """
-        if not self._ahead:
-            self._look_ahead()
-        y_d, noise, w, transmitter_noise = self._ahead[-1]
-        self._ahead[-1] = y_d + setpoint, noise, w + load, transmitter_noise
-
     def render(self) -> rendering.Frame | None:
         """Draw the last minutes of the episode.
 

@@ -114,9 +114,6 @@ REFUSED = {
         (["--preset", "paper", "--scenario", "load"], "no 'load' on this plant"),
         (["--video", "film.avi"], "--video: must end in .gif"),
         (["--seed", "-1"], "--seed. Must be >= 0"),
-        # Of a machine without a screen.
-        (["--agent", "you"], "--agent you: needs a screen"),
-        (["--agent", "you", "--video", "film.gif"], "--agent you: needs a screen"),
     ],
 }  # fmt: skip
 

@@ -15,11 +15,9 @@ from benchmarks.compare.comparison import run_case
 from benchmarks.controllers.options import chosen, own_factory
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import UsageError
-from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import IdleValve
 from benchmarks.loop.scenarios import Scenario
 from benchmarks.sweep.command import agent_task
-from benchmarks.watch import game
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from mptc_gym.sb3 import load, make_vec_env, save, spec_of
@@ -50,7 +48,6 @@ def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, mo
     ways = {
         "compare": run_case(scenario, entry.name, [factory], 2)["runs"]["mae"],
         "sweep": agent_task(factory, plant, plant, 900, 2)["mae"],
-        "watch": mean_error(game.replay(factory, scenario, 0, {})),
     }
     for way, found in ways.items():
         if entry.name == "nothing":

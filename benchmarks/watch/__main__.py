@@ -1,4 +1,4 @@
-"""Watch a controller at work, or take its place: `python -m benchmarks.watch --help`."""
+"""Watch a controller at work: `python -m benchmarks.watch --help`."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS
 from mptc_gym import MiddlePointEnv
 
-YOU = "you"  # the viewer as agent, in place of a controller
 _AGENTS = (
-    f"Who controls: {', '.join(ROSTER)}, {YOU}, or a controller of your own, "
+    f"Who controls: {', '.join(ROSTER)}, or a controller of your own, "
     "NAME=MODULE:FACTORY or NAME=PPO:FILE.zip."
 )
 _CASES = (
@@ -28,7 +27,7 @@ _CASES = (
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Watch a controller at work, in a window or in a film, or take its place."""
+    """Watch a controller at work, in a window or in a film."""
 
     agent: Annotated[str, Parameter(help=_AGENTS)] = "nn"
     scenario: Annotated[str, Parameter(help=_CASES)] = "square"

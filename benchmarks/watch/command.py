@@ -1,4 +1,4 @@
-"""Run a controller as the options say, and show it."""
+"""Run a controller as the options say, and show it in a window or a film."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pygame
+from gymnasium.vector import SyncVectorEnv
 from PIL import Image, ImageDraw
 from rich.console import Console
 
@@ -18,13 +19,11 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import UsageError
 from benchmarks.lib.drawing import with_few_colours
 from benchmarks.lib.storage import replacing
-from benchmarks.lib.tables import ScreenTable
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.plants import PlantOptions
-from benchmarks.loop.rollout import Trajectory
+from benchmarks.loop.rollout import Trajectory, rollout
 from benchmarks.loop.scenarios import SCENARIOS, Scenario, scenarios_of
-from benchmarks.watch import game
-from benchmarks.watch.__main__ import YOU, Options
+from benchmarks.watch.__main__ import Options
 from mptc_gym import MiddlePointEnv, drawing
 from mptc_gym.drawing import SIZE
 
@@ -37,13 +36,16 @@ CAPTION = 28  # height of its caption
 OUT = Path("results/watch")
 
 
+class Closed(Exception):  # noqa: N818 (no error)
+    """The window has been closed."""
+
+
 def execute(options: Options, console: Console) -> str:
     """Run a controller on a scenario and show it."""
     path = options.video
     if path and path.suffix != ".gif":
         raise UsageError(f"--video: must end in .gif, got {path}")
-    controller = None if options.agent == YOU else _controller(options.agent)
-    label = controller.label if controller else YOU
+    controller = _controller(options.agent)
     plant, another = options.plant.chosen(), options.plant != PlantOptions()
     scenarios = scenarios_of(plant.name, plant.arguments) if another else SCENARIOS
     scenario = scenarios.get(options.scenario)
@@ -52,27 +54,36 @@ def execute(options: Options, console: Console) -> str:
             f"--scenario: no {options.scenario!r} on this plant; there are "
             f"{', '.join(scenarios)}"
         )
-    needs_film = path is not None or not _has_screen()
-    if controller is None and needs_film:
-        raise UsageError(f"--agent {YOU}: needs a screen to open a window on, and no --video")
-    factory = controller.members()[0] if controller else None
-    if path is None and needs_film:
+    factory = controller.members()[0]
+    if path is None and not _has_screen():
         path = OUT / f"{options.agent.replace(':', '.')}-{scenario.name}.gif"
         console.print(f"There is no screen to open a window on: writing a film, {path}")
-    if factory and path:
+    if path:
         trajectory = write_film(factory, scenario, options.seed, options.speed, path)
     else:
-        console.print(game.HELP)
         try:
-            trajectory, moves = game.play(factory, scenario, options.seed, options.speed)
-        except game.Closed:
+            trajectory = show(factory, scenario, options.seed, options.speed)
+        except Closed:
             return "The window was closed."
-        if controller is None or moves:
-            console.print("The same for the controllers ...")
-            table = game.tabulate(label, trajectory, moves, scenario, options.seed)
-            console.print(ScreenTable(table))
     found = f"{mean_error(trajectory)[0]:.3f} °C" + (f"\nThe film is {path}" if path else "")
-    return f"{label} on {scenario.title}: mean absolute error {found}"
+    return f"{controller.label} on {scenario.title}: mean absolute error {found}"
+
+
+def show(factory: Factory, scenario: Scenario, seed: int, speed: int) -> Trajectory:
+    """Run a controller in a window; closing it before the end raises `Closed`."""
+    arguments = factory.arguments(scenario.arguments)
+    plant = MiddlePointEnv(render_mode="human", **arguments)
+    plant.metadata = {**plant.metadata, "render_fps": speed}
+    envs = SyncVectorEnv([lambda: plant])
+
+    def attend(k: int) -> None:
+        if pygame.event.get(pygame.QUIT):
+            raise Closed
+
+    try:
+        return rollout(envs, factory(arguments, 1, seed), scenario.samples, seed, attend)
+    finally:
+        plant.close()
 
 
 def write_film(
@@ -95,7 +106,8 @@ def write_film(
             small = picture.resize(SHOWN, Image.Resampling.LANCZOS)
             frames[k // half].append(zlib.compress(small.tobytes(), 1))
 
-    trajectory = game.run(plant, factory(arguments, 1, seed), scenario.samples, seed, keep)
+    envs = SyncVectorEnv([lambda: plant])
+    trajectory = rollout(envs, factory(arguments, 1, seed), scenario.samples, seed, keep)
     errors = [np.abs(part).mean() for part in np.split(trajectory.error, [half])]
     sheet = Image.new("RGB", (SHOWN[0], 2 * (SHOWN[1] + CAPTION)), "white")
     places = [(0, CAPTION), (0, SHOWN[1] + 2 * CAPTION)]
@@ -121,7 +133,7 @@ def _controller(agent: str) -> RosterEntry:
         return own_entry(name, [location if equals else agent])
     if agent not in ROSTER:
         raise UsageError(
-            f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, {YOU}, and "
+            f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, and "
             "NAME=MODULE:FACTORY or NAME=PPO:FILE.zip of your own"
         )
     return ROSTER[agent]
