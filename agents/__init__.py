@@ -2,9 +2,8 @@
 
 from agents.controller import Controller
 from agents.direct_nn import DirectNNController, Weights
-from agents.neural_law import LawNetwork
+from agents.neural_law import LawNetwork, NeuralSmithPredictor
 from agents.neural_self_tuning import NeuralSelfTuningController
-from agents.neural_smith import NeuralSmithPredictor
 from agents.pi import PIController
 from agents.policy_network import Increments, PolicyNetwork
 from agents.self_tuning import SelfTuningController

@@ -28,7 +28,7 @@ ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
 
 
 def forward(layers: Layers, activation: str, x: Array) -> Array:
-    """Return the outputs, shape (..., outputs); the last layer has no activation."""
+    """Return outputs, shape (..., outputs), for inputs; the last layer has no activation."""
     *hidden, (last_W, last_b) = layers
     for W, b in hidden:
         x = ACTIVATIONS[activation](x @ W.T + b)

@@ -1,14 +1,16 @@
-"""Implement the control law of a network, from the signals of a nominal model to a flow.
+"""Implement the control law of a trained network, and the Smith predictor that runs it.
 
-The law is written once for NumPy and PyTorch, so that the law in use is the one trained. All
-quantities are scaled: flows by half the actuator's range, temperatures by the *authority*, the
-steady-state effect of such a flow on the plant, and times by the sampling interval.
+The law leads from the signals of a nominal model to a flow. It is written once for NumPy and
+PyTorch, so that the law in use is the one trained. All its quantities are scaled: flows by half
+the actuator's range, temperatures by the *authority*, the steady-state effect of such a flow on
+the plant, and times by the sampling interval.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any, Final
@@ -17,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import avoid_dead_zone
+from agents.controller import Index, ModelBasedController, NotNegative, Values
 from agents.networks import PRETRAINED, Layers, check_layers, forward, reading
 
 Array = NDArray[np.float64]
@@ -39,17 +42,17 @@ CLEARANCE: Final = 0.005  # of half the range, by which commands clear the dead 
 MOST_ADDED: Final = 0.45  # of half the range
 # Logarithms of the means' prior weights, up to a constant: without evidence, no jump of the
 # load is expected. The network tilts those of the load means.
-PREFERENCE: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.5, 2.5, 0.0, 1.0, 0.0)
+LOAD_PREFERENCE: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.5, 2.5)
+RESIDUAL_PREFERENCE: Final = (0.0, 1.0, 0.0)
 TILT: Final = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
 _LOADS, _MEANS = len(LOAD_RATES), len(LOAD_RATES) + len(RESIDUAL_RATES)
 INPUTS: Final = _MEANS - 2 + INNOVATIONS + 1 + 6 + 6 + 2 * _LOADS
 OUTPUTS: Final = 1 + len(RESIDUAL_RATES) + 1
-PARTS: Final = "choosing", "adding"  # the two networks
+NOMINAL: Final = 20.62  # samples, the time constant of the paper's plant
+SLOWEST: Final = 45.0  # samples, the largest time constant that the network was trained on
 
-
-# The networks, which the law calls at each sample with the inputs now and those at rest. They
-# return outputs, shape (n, OUTPUTS), and an addition to the flow, shape (n,), which is 0 where
-# both inputs are equal.
+# The networks: from the inputs now and those at rest, each of shape (n, INPUTS), to outputs,
+# shape (n, OUTPUTS), and an addition to the flow, shape (n,), 0 where both inputs are equal.
 Network = Callable[[Any, Any], tuple[Any, Any]]
 
 
@@ -102,17 +105,16 @@ class Law:
 
     def __init__(self, prior: Prior, aggressiveness: float = 0.0) -> None:
         zero = self._zero = prior.unit * 0.0
+        of_load = np.arange(_MEANS) < _LOADS
+        self._of_load = self._array(of_load)
+        self._alike = self._array(np.equal.outer(of_load, of_load))  # means of one kind
         self._rates = self._array(LOAD_RATES + RESIDUAL_RATES)
-        self._tilt, self._aggressiveness = self._array(TILT), aggressiveness
-        self._preference = self._array(PREFERENCE)
         self._sharpness = self._array([1.0, *(rate**-0.5 for rate in LOAD_RATES[1:-1])])
-        groups = np.zeros((_MEANS, _MEANS))
-        groups[:_LOADS, :_LOADS] = groups[_LOADS:, _LOADS:] = 1.0
-        self._groups = self._array(groups)
-        self._nothing, self._means, self._innovations, self._plain = (
-            zero[:, None] + self._array([0.0] * size)
-            for size in (_MEANS - 1 + INNOVATIONS, _MEANS, INNOVATIONS, _MEANS - _LOADS)
-        )
+        self._load_preference = self._array(LOAD_PREFERENCE)
+        self._residual_preference = self._array(RESIDUAL_PREFERENCE)
+        self._tilt, self._aggressiveness = self._array(TILT), aggressiveness
+        self._means = zero[:, None] * self._rates
+        self._innovations = zero[:, None] + self._array([0.0] * INNOVATIONS)
         self._misses = [self._means[:, :_LOADS] + LEAST_NOISE] * len(MISS_RATES)
         self._adopt(prior)
 
@@ -139,28 +141,22 @@ class Law:
     def _adopt(self, prior: Prior) -> None:
         xp, self.prior = self._xp, prior
         self._shares = self._of_each_mean((1.0 - prior.fading) / prior.unit, prior.fading)
-        numbers = [
-            xp.log(prior.time_constant),
-            prior.delay / 20.0 - 1.0,
-            prior.dead_zone,
-            prior.centre,
-            3.0 * prior.uncertainty,
-        ]
-        self._known = xp.stack(numbers, axis=1)
+        constant, delay = xp.log(prior.time_constant), prior.delay / 20.0 - 1.0
+        uncertainty = 3.0 * prior.uncertainty
+        known = [constant, delay, prior.dead_zone, prior.centre, uncertainty]
+        self._known = xp.stack(known, axis=1)
 
     def flow(
         self, network: Network, setpoint: Any, residual: Any, load: Any, state: Any
     ) -> Any:
-        """Return the wanted flow, before the actuator.
+        """Return the wanted flow, before the actuator, shape (n,).
 
         Parameters
         ----------
         network
             The two networks.
-        setpoint, residual
-            y_d(k) and r(k).
-        load
-            A(z^-1) r(k), A(1) times the load.
+        setpoint, residual, load
+            y_d(k), r(k) and A(z^-1) r(k), which is A(1) times the load; each of shape (n,).
         state
             The model's undelayed output, the one before it, and the last flow that passed.
         """
@@ -172,22 +168,23 @@ class Law:
         about = xp.concatenate([level[:, None], misses, 0.1 * evidence, self._known], axis=1)
         outputs, added = network(*self._inputs(setpoint, residual, noise, about, state))
 
-        preferred = xp.concatenate([-evidence, self._plain], axis=1) + self._preference
         # On a calm plant it would amplify what the model misses at each return of the delay.
         hurry = self._aggressiveness * noise / (noise + CALM)
         tilted = (2.0 * outputs[:, :1] - hurry[:, None]) * self._tilt
-        weights = xp.concatenate([tilted, 3.0 * outputs[:, 1:-1]], axis=1) + preferred
+        tilted = tilted + (self._load_preference - evidence)
+        chosen = 3.0 * outputs[:, 1:-1] + self._residual_preference
+        weights = xp.concatenate([tilted, chosen], axis=1)
         weights = xp.exp(xp.clip(weights, -40.0, 40.0))  # never beyond a float
-        weights = weights / (weights @ self._groups)
+        weights = weights / (weights @ self._alike)
         target = setpoint - (weights * means * self._shares).sum(1)
         rate = 1.0 / (1.0 + xp.exp(0.5 - hurry - outputs[:, -1]))
         return target + rate / self.prior.unit * (target - state[0]) + added
 
     def _judge(self, load: Any) -> tuple[Any, Any, Any]:
-        """Compare the load means with the load's newest sample.
+        """Return the noise, shape (n,), and of each load mean, shape (n, 7), two judgements.
 
-        Returned are the noise, and for each mean the logarithm of its misses in relation to
-        those of the reference, and the evidence against it.
+        They are the logarithm of its misses in relation to those of the reference, and the
+        evidence against it.
         """
         xp = self._xp
         missed = load[:, None] - self._means[:, :_LOADS]
@@ -213,10 +210,8 @@ class Law:
         """Return the inputs of the network, now and at rest."""
         xp, means, zero = self._xp, self._means, self._zero
         now, before, last = state
-        foreseen = (
-            self._shares[:, REFERENCE] * means[:, REFERENCE] + self.prior.fading * residual
-        )
-        error = setpoint - foreseen - now
+        expected = self._shares[:, REFERENCE] * means[:, REFERENCE]
+        error = setpoint - (expected + self.prior.fading * residual) - now
         signals = [
             (means[:, : _LOADS - 1] - means[:, 1:_LOADS]) * self._sharpness,
             residual[:, None] - means[:, _LOADS + 1 :],
@@ -224,17 +219,16 @@ class Law:
             0.5 * error[:, None],
         ]
         # In relation to the noise, squashed into (-1, 1).
-        compared = (
-            xp.concatenate(signals, axis=1) * (0.5 / (2.0 * noise + LEAST_NOISE))[:, None]
-        )
+        scale = 0.5 / (2.0 * noise + LEAST_NOISE)
+        compared = xp.concatenate(signals, axis=1) * scale[:, None]
         compared = compared / (1.0 + abs(compared))
         held = setpoint - residual
-        seen = [10.0 * (now - before), 1.4 * setpoint, 1.4 * now, last]
-        seen += [3.0 * residual, 3.0 * error]
-        resting = [zero, 1.4 * setpoint, 1.4 * held, held, 3.0 * residual, zero]
+        wanted, off = 1.4 * setpoint, 3.0 * residual
+        seen = [10.0 * (now - before), wanted, 1.4 * now, last, off, 3.0 * error]
+        resting = [zero, wanted, 1.4 * held, held, off, zero]
         return (
             xp.concatenate([compared, xp.stack(seen, axis=1), about], axis=1),
-            xp.concatenate([self._nothing, xp.stack(resting, axis=1), about], axis=1),
+            xp.concatenate([0.0 * compared, xp.stack(resting, axis=1), about], axis=1),
         )
 
     def applied(self, flow: Any) -> tuple[Any, Any]:
@@ -246,31 +240,23 @@ class Law:
 
     def _of_each_mean(self, load: Any, residual: Any) -> Any:
         """Return one column per mean: those of the load, then those of the residual."""
-        loads = load[:, None] + 0.0 * self._rates[:_LOADS]
-        residuals = residual[:, None] + 0.0 * self._rates[_LOADS:]
-        return self._xp.concatenate([loads, residuals], axis=1)
+        return load[:, None] * self._of_load + residual[:, None] * (1.0 - self._of_load)
 
     def _array(self, values: Any) -> Any:
-        if self._xp is np:
-            return np.asarray(values, dtype=np.float64)
-        return self._zero.new_tensor(values)
+        values = np.asarray(values, dtype=np.float64)
+        return values if self._xp is np else self._zero.new_tensor(values)
 
 
 @dataclass(frozen=True)
 class LawNetwork:
-    """The two networks of the law, in NumPy.
-
-    Attributes
-    ----------
-    choosing, adding
-        Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
-    provenance
-        Origin of the networks, JSON-serialisable.
-    """
+    """The two networks of the law, in NumPy."""
 
     choosing: Layers
+    """The network of the outputs."""
     adding: Layers
+    """The network of the addition to the flow."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    """Origin of the networks, JSON-serialisable."""
 
     def __call__(self, seen: Array, at_rest: Array) -> tuple[Array, Array]:
         """Return the outputs and the addition; see `Network`."""
@@ -280,19 +266,11 @@ class LawNetwork:
 
     @classmethod
     def load(cls, path: str | PathLike[str] = PRETRAINED / "nn-smith.npz") -> LawNetwork:
-        """Read networks written by `save`. Nothing in the file is executed.
-
-        Raises
-        ------
-        FileNotFoundError
-            If there is no such file.
-        ValueError
-            If the file is damaged or holds something else.
-        """
+        """Read networks written by `save`; errors are those of `agents.networks.reading`."""
         with reading(path, "network of the law") as file:
             choosing, adding = (
                 [(file[f"{part}_W{i}"], file[f"{part}_b{i}"]) for i in range(3)]
-                for part in PARTS
+                for part in ("choosing", "adding")
             )
             return cls(
                 check_layers(choosing, INPUTS, OUTPUTS),
@@ -302,11 +280,138 @@ class LawNetwork:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the networks to a `.npz` file."""
-        layers = {
-            f"{part}_{name}{i}": array.astype(np.float32)
-            for part in PARTS
-            for i, layer in enumerate(getattr(self, part))
-            for name, array in zip("Wb", layer, strict=True)
-        }
-        about = json.dumps(dict(self.provenance))
-        np.savez_compressed(path, provenance=about, **layers)
+        arrays: dict[str, Any] = {"provenance": json.dumps(dict(self.provenance))}
+        for part, layers in (("choosing", self.choosing), ("adding", self.adding)):
+            for i, (W, b) in enumerate(layers):
+                arrays[f"{part}_W{i}"] = W.astype(np.float32)
+                arrays[f"{part}_b{i}"] = b.astype(np.float32)
+        np.savez_compressed(path, **arrays)
+
+
+@dataclass(eq=False, kw_only=True)
+class NeuralSmithPredictor(ModelBasedController):
+    """A trained network with a nominal model of the plant.
+
+    As in a Smith predictor, a model runs in parallel with the plant, so the response to past
+    flows is known before the delay is over. The network sees the model's output, the part of
+    the measured output that the model does not explain, and the model's numbers; see `Law`. It
+    was trained once, on many plants, and does not learn online. All its inputs are scaled by
+    the flow's authority and by the sampling interval, so one set of weights serves plants of
+    either sign, with any limits and any sampling interval. With a first-order model and a time
+    constant of at least 90 samples, it acts every second sample or less often.
+
+    The other parameters are those of `ModelBasedController`.
+
+    Parameters
+    ----------
+    coefficients
+        A and B of the stable plant, if more than a first-order model is known: `a[0]` is 1, and
+        `b` begins with z^-1. Their gain replaces `gain`.
+    uncertainty
+        Standard deviation of the gain, as a share of it; 0 where the numbers are exact. It also
+        stands for the time constant, which may be wrong by half as much again, and for the
+        delay: 0.1 means two samples.
+    setpoint_index
+        Index of y_d(k), degC, in the observation.
+    error_index
+        Index of e(k), degC, in the observation.
+    network
+        The weights; by default those that come with the project.
+    """
+
+    coefficients: tuple[Sequence[float], Sequence[float]] | None = None
+    uncertainty: NotNegative = 0.0
+    setpoint_index: Index = 0
+    error_index: Index = 3
+    network: LawNetwork = field(default_factory=LawNetwork.load, repr=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.n_obs = max(self.setpoint_index, self.error_index) + 1
+        self._edge = self.dead_zone
+        constant = self.time_constant / self.sampling_interval
+        first_order = self.coefficients is None
+        # A slow plant is seen as the network knows plants, by longer sampling.
+        self._every = max(1, int(constant / SLOWEST)) if first_order else 1
+        constant /= self._every
+        pole = math.exp(-1.0 / constant)
+        if self.coefficients is None:
+            a, b = np.array([1.0, -pole]), np.array([self.gain * (1.0 - pole)])
+        else:
+            a, b = _checked(self.coefficients)
+        gain = b.sum() / a.sum()
+        half = (self.u_max - self.u_min) / 2.0
+        self._flow = math.copysign(half, gain)  # t/h at a flow of 1
+        self._authority = abs(gain) * half  # degC
+        self._a, self._b = a, b / gain
+        self._delay = max(round(self._delay_samples / self._every) - 1, 0)
+        self._about = Prior(
+            unit=a.sum(),
+            fading=pole ** (self._delay + (1.5 if first_order else 1.0)),
+            time_constant=min(max(constant / NOMINAL, 0.3), 3.3),
+            delay=min(self._delay, 44),
+            dead_zone=self.dead_zone / half,
+            centre=(self.u_max + self.u_min) / 2.0 / self._flow,
+            uncertainty=self.uncertainty,
+        )
+        self._law: Law | None = None
+
+    def reset(self) -> None:
+        """Forget the episode, and return the model to rest."""
+        super().reset()
+        self._law = None
+
+    def _control(self, observation: Array) -> Values:
+        rows = np.atleast_2d(observation)
+        if self._law is None:
+            self._law = self._start(len(rows))
+        if self._k % self._every == 0:
+            self._last = self._decide(self._law, rows)
+        self._k += 1
+        return self._last if observation.ndim == 2 else np.float64(self._last[0])
+
+    def _start(self, loops: int) -> Law:
+        """Set the model to rest, and return the law."""
+        # Undelayed outputs of the model, what it misses, residuals and flows that passed, each
+        # of shape (samples, loops), newest first.
+        self._model = np.zeros((self._delay + len(self._a) + 1, loops))
+        self._off = np.zeros((2, loops))
+        self._residual = np.zeros((len(self._a), loops))
+        self._flows = np.zeros((len(self._b), loops))
+        self._k = 0
+        return Law(Prior(**{name: np.full(loops, x) for name, x in vars(self._about).items()}))
+
+    def _decide(self, law: Law, rows: Array) -> Array:
+        """Return commands, t/h, shape (loops,), for observations."""
+        setpoint = rows[:, self.setpoint_index] / self._authority
+        output = setpoint - rows[:, self.error_index] / self._authority
+        model = self._model
+        off = self._off = _shifted(self._off, output - model[self._delay])
+        # First-order models miss fast dynamics, which the average of two samples reduces.
+        unexplained = (off[0] + off[1]) / 2.0 if self.coefficients is None else off[0]
+        residual = self._residual = _shifted(self._residual, unexplained)
+        state = model[0], model[1], self._flows[0]
+        wanted = law.flow(self.network, setpoint, residual[0], self._a @ residual, state)
+        wanted, passed = law.applied(wanted)
+        flows = self._flows = _shifted(self._flows, passed)
+        new = self._b @ flows - self._a[1:] @ model[: len(self._a) - 1]
+        self._model = _shifted(model, new)
+        command: Array = self._flow * wanted
+        return command
+
+
+def _shifted(past: Array, newest: Array) -> Array:
+    """Return the last samples, newest first, after one more."""
+    return np.concatenate([newest[np.newaxis], past[:-1]])
+
+
+def _checked(coefficients: tuple[Sequence[float], Sequence[float]]) -> tuple[Array, Array]:
+    """Return A and B if they describe a stable plant with a gain other than 0."""
+    a, b = (np.array(each, dtype=np.float64) for each in coefficients)
+    stable = a.ndim == b.ndim == 1 and len(a) and a[0] == 1.0 and np.isfinite([*a, *b]).all()
+    if not (stable and np.all(np.abs(np.roots(a)) < 1.0) and b.sum() != 0.0):
+        raise ValueError(
+            "coefficients must be A and B of a stable plant with a gain, A beginning with 1, "
+            f"got {coefficients!r}"
+        )
+    return a, b

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from agents.actuator import applied_flow
 from agents.controller import NotNegative, Positive
-from agents.neural_law import Law, LawNetwork, Prior
-from agents.neural_smith import NOMINAL
+from agents.neural_law import NOMINAL, Law, LawNetwork, Prior
 from agents.self_tuning import SelfTuningController
 
 Array = NDArray[np.float64]
