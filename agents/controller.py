@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, partial
 from numbers import Integral, Real
@@ -15,23 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.actuator import float32_action
 
-# Observation windows that the default indices assume: the paper's six inputs.
-PAPER_WINDOWS: Final[Mapping[str, int]] = {"setpoint_window": 3, "error_window": 3}
+PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}  # the paper's six inputs
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
 MOST = 1_000_000  # nodes, loops, elements or samples; a larger number is a mistake
 
 
 def check_count(name: str, value: Any, least: int, most: int | None = None) -> int:
     """Return `value` if it is an integer within bounds; otherwise raise a ValueError."""
-    if (
-        not isinstance(value, Integral)
-        or isinstance(value, bool)
-        or value < least
-        or (most is not None and int(value) > most)
-    ):
-        bound = f"of at least {least}" if most is None else f"from {least} to {most:,}"
-        raise ValueError(f"{name} must be an integer {bound}, got {value!r}")
-    return int(value)
+    counts = isinstance(value, Integral) and not isinstance(value, bool)
+    if counts and value >= least and (most is None or int(value) <= most):
+        return int(value)
+    bound = f"of at least {least}" if most is None else f"from {least} to {most:,}"
+    raise ValueError(f"{name} must be an integer {bound}, got {value!r}")
 
 
 def check_number(
@@ -96,6 +91,7 @@ Size = Annotated[int, partial(check_count, least=1, most=MOST)]
 
 @cache
 def _checks(controller: type[Controller]) -> dict[str, Callable[[str, Any], Any]]:
+    """Return the checks in the types of a controller's arguments, by argument."""
     hints = get_type_hints(controller, include_extras=True).items()
     return {name: hint.__metadata__[0] for name, hint in hints if hasattr(hint, "__metadata__")}
 
@@ -149,6 +145,50 @@ class Controller(ABC):
         self.command = np.float64(0.0)
         self._loops_before = None
 
+    def check_environment(self, parameters: Any, wrapped: Any, n: int) -> None:
+        """Refuse plants that the controller was not made for.
+
+        Scores would otherwise be wrong in silence.
+
+        Parameters
+        ----------
+        parameters
+            The plants' arguments, by name as in `mptc_gym.Parameters`.
+        wrapped
+            Whether a wrapper changes observations or actions.
+        n
+            Number of plants.
+
+        Raises
+        ------
+        ValueError
+            If limits, places in the observation or the number of loops differ, or if the plants
+            are wrapped.
+        """
+        # Where limits are drawn, the controller has the widest.
+        limits = float(np.min(parameters.u_min)), float(np.max(parameters.u_max))
+        if limits != (self.u_min, self.u_max):
+            raise ValueError(
+                f"policy must be made with the limits of env, u_min={limits[0]}, "
+                f"u_max={limits[1]}, got {self.u_min}, {self.u_max}"
+            )
+        shown = {
+            "setpoint": (0, parameters.setpoint_window),
+            "error": (parameters.setpoint_window, parameters.error_window),
+        }
+        for signal, (place, window) in shown.items():
+            index = getattr(self, f"{signal}_index", None)  # None where it is not read alone
+            if index is not None and (index != place or not window):
+                raise ValueError(
+                    f"env must show its newest {signal} as element {index} of the observation, "
+                    f"where policy reads it, got setpoint_window={parameters.setpoint_window}, "
+                    f"error_window={parameters.error_window}"
+                )
+        if wrapped:
+            raise ValueError(
+                f"env must not be wrapped, as policy commands the flow itself, got {wrapped}"
+            )
+
     def act(self, observation: ArrayLike) -> NDArray[np.float32]:
         """Return the action for an observation.
 
@@ -179,10 +219,10 @@ class Controller(ABC):
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")
         now, before = values.shape[:-1], self._loops_before
-        if now != before and before is not None:
-            was, given = (f"a batch of {n[0]}" if n else "one loop" for n in (before, now))
+        if before not in (None, now):
             raise ValueError(
-                f"observation must be of {was}, as those before it, until reset; got {given}"
+                f"observation must have shape {(*before, self.n_obs)}, as those before it, "
+                f"until reset; got {values.shape}"
             )
         self.command = self._control(values)
         if self._remembers:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import (
     MOST,
-    PAPER_WINDOWS,
     Controller,
     Count,
     Flag,
@@ -48,13 +48,7 @@ class Weights:
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Weights:
-        """Read weights written by `save`.
-
-        Raises
-        ------
-        ValueError
-            If the file is damaged or does not hold the four arrays.
-        """
+        """Read weights written by `save`; errors are those of `agents.networks.reading`."""
         with reading(path, "weights") as file:
             return cls(**{each.name: file[each.name] for each in fields(cls)})
 
@@ -76,13 +70,13 @@ class DirectNNController(Controller):
     n_hidden
         N_1, number of hidden nodes.
     eta
-        eta^y, gain factor of W, the weights from the inputs to the hidden nodes.
+        eta^y, learning rate of W, the weights from the inputs to the hidden nodes.
     eta_1
-        eta_1^y, gain factor of W_1, the weights from the hidden nodes to the output.
+        eta_1^y, learning rate of W_1, the weights from the hidden nodes to the output.
     eta_theta
-        eta_theta^y, gain factor of theta_1, the thresholds of the hidden nodes.
+        eta_theta^y, learning rate of theta_1, the thresholds of the hidden nodes.
     eta_1_theta
-        eta_1theta^y, gain factor of theta_2, the threshold of the output.
+        eta_1theta^y, learning rate of theta_2, the threshold of the output.
     direction
         D(G): -1 for a plant whose output falls when its input rises, 1 for the opposite.
     input_scale
@@ -134,8 +128,6 @@ class DirectNNController(Controller):
     num_envs: int | None = None
     learning: Flag = True
     update_interval: Count = 1
-
-    observation = PAPER_WINDOWS  # for the default indices
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -197,6 +189,15 @@ class DirectNNController(Controller):
             arrays.append(np.array(every.T, order="C"))
         # The batch axis is last, so that sums over nodes add long rows; W is (N, N_1, batch).
         self._W, self._theta_1, self._W_1, self._theta_2 = arrays
+
+    def check_environment(self, parameters: Any, wrapped: Any, n: int) -> None:
+        """Refuse plants that the controller was not made for; see `Controller`."""
+        super().check_environment(parameters, wrapped, n)
+        if self.num_envs != n:
+            raise ValueError(
+                f"policy must be made with num_envs={n}, one loop per episode, got "
+                f"{self.num_envs or 1}"
+            )
 
     def reset(self) -> None:
         """Forget the episode, but keep the weights."""

@@ -8,16 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import (
-    PAPER_WINDOWS,
-    Controller,
-    Flag,
-    Index,
-    Number,
-    Values,
-    check_gain,
-    check_number,
-)
+from agents.controller import Controller, Flag, Index, Number, Values, check_gain, check_number
 
 # From `python -m benchmarks.tune pi`.
 SEARCHED_GAINS = {"kp": 1.34, "ki": 0.0456}
@@ -50,8 +41,6 @@ class PIController(Controller):
     ki: Number = field(default=0.3, kw_only=False)
     anti_windup: Flag = False
     error_index: Index = 3
-
-    observation = PAPER_WINDOWS  # for the default indices
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -13,13 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import compensate_dead_zone
-from agents.controller import (
-    Controller,
-    Values,
-    check_count,
-    check_limits,
-    check_number,
-)
+from agents.controller import Controller, Values, check_count, check_limits, check_number
 from agents.networks import ACTIVATIONS, Layers, check_array, check_layers, forward, reading
 
 Array = NDArray[np.float64]
@@ -90,12 +84,12 @@ class PolicyNetwork(Controller):
             for name in WINDOWS
         }
         self.n_obs = sum(self.observation.values())
-        self._edge = self.increments.dead_zone if self.increments else 0.0
-        if self.activation not in [*ACTIVATIONS]:
+        if self.activation not in [*ACTIVATIONS]:  # a list: it may be unhashable
             raise ValueError(
                 f"activation must be one of {[*ACTIVATIONS]}, got {self.activation!r}"
             )
         self._remembers = self.increments is not None
+        self._edge = self.increments.dead_zone if self.increments else 0.0
         self.input_scale = check_array("input_scale", self.input_scale, (self.n_obs,))
         self.layers = check_layers(self.layers, self.n_obs, 1)
         self._flow: Values | None = None  # wanted, as a share of half the range
@@ -104,15 +98,9 @@ class PolicyNetwork(Controller):
     def load(
         cls, path: str | PathLike[str], *, u_min: float = -10.0, u_max: float = 10.0
     ) -> PolicyNetwork:
-        """Read a network written by `save`. Nothing in the file is executed.
+        """Read a network written by `save`; errors are those of `agents.networks.reading`.
 
-        Raises
-        ------
-        FileNotFoundError
-            If there is no such file.
-        ValueError
-            If the file is damaged or does not hold a network, or if the limits are not finite
-            and in order.
+        Limits that are not finite and in order are a ValueError, too.
         """
         check_limits(u_min, u_max)  # here: `reading` would report a damaged file
         with reading(path, "policy network") as file:
@@ -146,6 +134,15 @@ class PolicyNetwork(Controller):
             arrays |= {f"W{i}": W, f"b{i}": b}
         with Path(path).open("wb") as file:
             np.savez_compressed(file, **arrays)
+
+    def check_environment(self, parameters: Any, wrapped: Any, n: int) -> None:
+        """Refuse plants that the network was not made for; see `Controller`."""
+        super().check_environment(parameters, wrapped, n)
+        given = {name: getattr(parameters, name) for name in WINDOWS}
+        if given != self.observation:
+            raise ValueError(
+                f"env must have the windows that policy wants, {self.observation}, got {given}"
+            )
 
     def reset(self) -> None:
         """Forget the episode, which is the wanted flow in velocity form."""
