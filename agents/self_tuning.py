@@ -8,34 +8,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import applied_flow, avoid_dead_zone
-from agents.controller import (
-    PAPER_WINDOWS,
-    Index,
-    ModelBasedController,
-    Positive,
-    Values,
-    check_count,
-)
+from agents.controller import Count, Index, ModelBasedController, Positive, Values, check_count
 
 Array = NDArray[np.float64]
 
-# Time constants in the bank, as multiples of the step test's.
+# Time constants in the bank, as multiples of the step test's: what lies between two of them is
+# their average.
 TIME_CONSTANTS = (0.5, 0.7, 1.0, 1.4, 2.0)
 # Dead zones in the bank: offsets from the given one, and their prior standard deviation, as
-# shares of the larger limit.
+# shares of the larger limit. A data sheet says what was once, and valves stick with age.
 ZONES = (-0.5, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
 ZONE_SPREAD = 0.2
-NOISE_SAMPLES = 30.0  # weight of the expected noise, in samples
-GAINS = (0.3, 3.0)  # estimates stay between these multiples of the step test's gain
+NOISE_SAMPLES = (
+    30.0  # weight of the expected noise, in samples: some, as the first ones are calm
+)
+GAINS = (0.3, 3.0)  # multiples of the step test's gain that estimates stay between
 # Pole of the prefilter, which removes dynamics that are too fast for first-order models.
 PREFILTER_POLE = 0.6
-LEAST_NOISE = 0.02  # degC; smaller errors do not distinguish models
+LEAST_NOISE = 0.02  # degC; smaller errors do not distinguish models, which are of first order
 EXCITED = 0.05  # of half the range: the flow must have moved this far for the models to learn
-MEMORY = 20  # samples before the longest delay in which a movement still counts
-BIAS_RATE = 0.005  # per sample, of the offset estimate
-DISTURBANCE_POLE = 0.5  # of the disturbance filter
+MEMORY = (
+    20  # samples before the longest delay in which a movement still counts: a time constant
+)
+BIAS_RATE = (
+    0.005  # per sample, of the offset estimate: slower than the loop, so as not to fight it
+)
+DISTURBANCE_POLE = 0.5  # of the disturbance filter: noise of single samples moves no valve
 MOST_DELAY = 10_000  # samples; with more, the bank would be too large for any computer
-_ROOM = 64  # samples until the histories are shifted back
+_ROOM = 64  # samples until the histories are shifted back, which would cost much at each sample
 
 
 @dataclass(eq=False, kw_only=True)
@@ -81,10 +81,11 @@ class SelfTuningController(ModelBasedController):
     dead_zone
         Best guess of the half width of the actuator's dead zone, t/h. The bank holds this one
         and up to seven around it; for the default of 0, three above it.
-    shortest_delay
-        Shortest delay d that the plant may have, samples; an input shows after d + 1.
-    longest_delay
-        Longest delay d that the plant may have, samples; at most 10,000.
+    shortest_delay_samples
+        Shortest delay that the plant may have, in samples; like `delay`, it includes the one
+        sample that any input takes to show.
+    longest_delay_samples
+        Longest delay that the plant may have, in samples; at most 10,001.
     closed_loop_time_constant
         Time constant of the closed loop, as a share of the identified one of the plant.
     forgetting
@@ -95,14 +96,12 @@ class SelfTuningController(ModelBasedController):
         Index of e(k), degC, in the observation.
     """
 
-    shortest_delay: Index = 6
-    longest_delay: Index = 36
+    shortest_delay_samples: Count = 7
+    longest_delay_samples: Count = 37
     closed_loop_time_constant: Positive = 0.15
     forgetting: Positive = 0.996
     setpoint_index: Index = 0
     error_index: Index = 3
-
-    observation = PAPER_WINDOWS  # for the default indices
 
     _delay_step = 2  # samples between neighbouring delays in the bank
     _clearance = 0.2  # t/h by which commands clear the dead zone
@@ -121,8 +120,13 @@ class SelfTuningController(ModelBasedController):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
-        shortest = self.shortest_delay
-        longest = check_count("longest_delay", self.longest_delay, shortest, MOST_DELAY)
+        shortest, name = (
+            self.shortest_delay_samples - 1,
+            "longest_delay_samples",
+        )  # as d in (28)
+        longest = (
+            check_count(name, self.longest_delay_samples, shortest + 1, MOST_DELAY + 1) - 1
+        )
         if self.forgetting > 1.0:
             raise ValueError(f"forgetting must be above 0, up to 1, got {self.forgetting!r}")
         limit = max(abs(self.u_min), abs(self.u_max))
@@ -220,35 +224,24 @@ class SelfTuningController(ModelBasedController):
 
     def _design(self, share: float) -> None:
         """Weight the models by the evidence, and adopt a share of the resulting design."""
-        # Arrays of all models are reused, as memory takes most of the time.
         prior = self._variance / (self._gain_spread * self.gain) ** 2
         information = self._information + prior
         products = self._products + prior * self.gain
         gains = products / information
-        errors = np.multiply(products, gains, out=products)
-        np.subtract(self._energy + prior * self.gain**2, errors, out=errors)  # sums of squares
+        errors = self._energy + prior * self.gain**2 - products * gains  # sums of squares
         least = np.maximum(errors.min(1, keepdims=True), LEAST_NOISE**2 * self._seen)
-        weights = np.multiply(errors, 0.5 * self._caution, out=errors)
-        weights /= self._variance
-        np.subtract(self._prior, weights, out=weights)
-        weights -= weights.max(1, keepdims=True)
-        np.exp(weights, out=weights)
+        scores = self._prior - errors * (0.5 * self._caution) / self._variance
+        weights = np.exp(scores - scores.max(1, keepdims=True))
         weights /= weights.sum(1, keepdims=True)
         self._variance = (least + NOISE_SAMPLES * self._noise**2) / (self._seen + NOISE_SAMPLES)
 
-        gains /= self.gain
-        np.clip(gains, *GAINS, out=gains)
-        gains *= self.gain  # keeps the sign
-        spread = np.divide(self._variance, information, out=information)
-        spread += np.square(gains)
-        spread *= weights
-        gains *= weights
+        gains = np.clip(gains / self.gain, *GAINS) * self.gain  # keeps the sign
+        squares = self._variance / information + np.square(gains)
+        mean = (gains * weights).sum(1)
         # Variance over all gains, as a share of the square of their mean.
-        self._gain_variance = spread.sum(1) / np.square(gains.sum(1)) - 1.0
-        for adopted, design in ((self._weights, weights), (self._gains, gains)):
-            design -= adopted
-            design *= share
-            adopted += design
+        self._gain_variance = (squares * weights).sum(1) / np.square(mean) - 1.0
+        self._weights += (weights - self._weights) * share
+        self._gains += (gains * weights - self._gains) * share
 
         # Averages over the models, for the control law.
         self._faded = self._gains * self._fading

@@ -27,6 +27,7 @@ from agents import (
 )
 from agents.networks import PRETRAINED
 from benchmarks.loop.rollout import make_plants, rollout
+from mptc_gym import Parameters
 from tests.conftest import assert_the_seed_is_all_that_differs, run_closed
 
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
@@ -89,6 +90,10 @@ def make(request):
     return MAKERS[request.param]
 
 
+def one_loop(make):
+    return {"num_envs": 1} if make.func is DirectNNController else {}
+
+
 BAD_OBSERVATIONS = [
     np.zeros(3), np.zeros((2, 2, 6)), np.full(6, np.nan), "text", None, ["1"] * 6,
     np.zeros(6) * 1j, [10**400] * 6, (np.zeros(6), {}),  # the last is what `reset` returns
@@ -135,6 +140,45 @@ class TestEveryController:
         controller.reset()
         with pytest.raises(ValueError, match="observation must"):
             controller.act(np.zeros((0, 6)))
+
+
+REFUSED = [  # arguments of the environment, whether it is wrapped, and what is named
+    ({"u_max": 12.0}, None, r"u_max=12\.0, got -10\.0, 10\.0"),
+    ({"u_min": [-12.0, -8.0]}, None, r"u_min=-12\.0"),
+    ({"setpoint_window": 2}, None, "newest error as element 3"),
+    ({"error_window": 0}, None, "newest error as element 3"),
+    ({}, "a wrapper", "not be wrapped.*a wrapper"),
+]
+
+
+class TestEnvironment:
+    def test_plants_that_it_was_made_for_are_taken(self, make):
+        drawn = Parameters(u_min=[-10.0, -8.0], output_window=2)
+        make(**one_loop(make)).check_environment(drawn, None, 1)
+
+    @pytest.mark.parametrize(("arguments", "wrapped", "message"), REFUSED)
+    def test_others_are_refused(self, make, arguments, wrapped, message):
+        with pytest.raises(ValueError, match=message):
+            make(**one_loop(make)).check_environment(Parameters(**arguments), wrapped, 1)
+
+    def test_a_set_point_that_is_not_shown_is_missed_where_it_is_read(self):
+        plants = Parameters(setpoint_window=0)
+        PIController(error_index=0).check_environment(plants, None, 5)
+        with pytest.raises(ValueError, match="newest setpoint as element 0"):
+            NeuralSmithPredictor(**PLANT, error_index=0).check_environment(plants, None, 5)
+
+    @pytest.mark.parametrize("num_envs", [None, 2])
+    def test_a_network_that_learns_has_one_loop_for_each(self, num_envs):
+        with pytest.raises(ValueError, match="num_envs=3, one loop per episode"):
+            DirectNNController(num_envs=num_envs).check_environment(Parameters(), None, 3)
+
+    def test_a_trained_network_asks_for_all_its_windows(self):
+        network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
+        network.check_environment(Parameters(**network.observation), None, 5)
+        with pytest.raises(ValueError, match="windows that policy wants"):
+            network.check_environment(
+                Parameters(**network.observation | {"output_window": 3}), None, 5
+            )
 
 
 class TestDirectNN:
@@ -396,8 +440,9 @@ BAD = {
         ("coefficients", ([1.0, -1.0], [0.1])), ("coefficients", ([1.0, 0.0], [0.1, -0.1])),
     ],
     partial(SelfTuningController, **PLANT): [
-        ("shortest_delay", -1), ("longest_delay", 5), ("longest_delay", 10.0),
-        ("longest_delay", 10**9), ("forgetting", 0.0), ("forgetting", 1.1), ("u_min", 10.0),
+        ("shortest_delay_samples", 0), ("longest_delay_samples", 6),
+        ("longest_delay_samples", 10.0), ("longest_delay_samples", 10**9),
+        ("forgetting", 0.0), ("forgetting", 1.1), ("u_min", 10.0),
     ],
     partial(NeuralSelfTuningController, **PLANT): [("aggressiveness", -1)],
 }  # fmt: skip

@@ -78,7 +78,9 @@ class TestDesigns:
         ]
         assert 0.9 < np.mean(beyond) < 1.0
         given = inspect.signature(self_tuning.SelfTuningController).parameters
-        delays = given["shortest_delay"].default, given["longest_delay"].default
+        delays = tuple(
+            given[f"{most}_delay_samples"].default - 1 for most in ("shortest", "longest")
+        )
         constants, zones = self_tuning.TIME_CONSTANTS, 5.0 + 10.0 * np.array(self_tuning.ZONES)
         assert delays == SPANS["delay"]
         assert (min(constants), max(constants)) == SPANS["time_constant_factor"]
