@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,26 +11,32 @@ from pathlib import Path
 from benchmarks.lib.command import stop
 
 FOLDER = Path(__file__).parent
-COMMANDS = sorted(
-    ".".join(path.parent.relative_to(FOLDER).parts) for path in FOLDER.glob("*/**/__main__.py")
-)
+
+
+def commands() -> dict[str, str]:
+    """Return the module of each command: of a file in this folder, or a `__main__` below it."""
+    files = {path.stem: f"benchmarks.{path.stem}" for path in FOLDER.glob("[a-z]*.py")}
+    for path in FOLDER.glob("*/**/__main__.py"):
+        name = ".".join(path.parent.relative_to(FOLDER).parts)
+        files[name] = f"benchmarks.{name}.__main__"
+    return dict(sorted(files.items()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table of questions from README.md in this folder."""
-    for name in sys.argv[1:] if arguments is None else arguments:
-        close = difflib.get_close_matches(name, COMMANDS, n=1)
-        meant = f"did you mean benchmarks.{close[0]}?" if close else "none is like it"
+    """Run the command that is named, or print the questions in README.md in this folder."""
+    name, *given = [*(sys.argv[1:] if arguments is None else arguments), ""]
+    modules = commands()
+    if name in modules:
+        return int(importlib.import_module(modules[name]).main(given[:-1]))
+    if name not in ("", "-h", "--help", "help"):
+        close = difflib.get_close_matches(name, modules, n=1)
+        meant = f"did you mean {close[0]}?" if close else f"there are {', '.join(modules)}"
         stop(ValueError(f"no command {name!r}; {meant}"))
-    try:
-        from rich.console import Console
-        from rich.markdown import Markdown
-    except ImportError as error:
-        stop(error)
     page = FOLDER.joinpath("README.md").read_text(encoding="utf-8")
-    table = page[page.index("|") :].partition("\n\n")[0]  # the first one
-    console = Console(width=None if sys.stdout.isatty() else 150, highlight=False)
-    console.print(Markdown(table), "Each command has --help.")
+    for row in page[page.index("|") :].partition("\n\n")[0].splitlines()[2:]:
+        question, command, _ = (cell.strip(" `") for cell in row.strip("|").split("|"))
+        print(f"{question.lstrip('[').partition('](')[0]}\n    {command}")
+    print("\nEach command has --help.")
     return 0
 
 

@@ -60,7 +60,7 @@ def test_help_is_printed_alone(name, capsys):
 def test_an_unknown_option_is_named_in_one_line(name, refused):
     (line,) = refused(main_of(name), ["--nonsense"]).splitlines()
     assert line.startswith(f"python -m benchmarks.{name}: error: ")
-    assert "--nonsense" in line or "requires an argument" in line
+    assert "--nonsense" in line or " is missing: name " in line
 
 
 LOG = ROOT / "benchmarks/identify/example.csv"
@@ -72,7 +72,7 @@ REFUSED = {
         (["--scenarios", "circle"], "no 'circle'"),
         (["--scenarios"], "--scenarios: none to run"),
         (["--runs", "0"], 'value "0" for --runs. Must be >= 1'),
-        (["--runs", "2.5"], "--runs: invalid literal for int.. with base 10: '2.5'"),
+        (["--runs", "2.5"], "--runs must be a whole number, got '2.5'"),
         (["--backend", "cloud"], "--backend"),
         (["--preset", "paper", "--presets"], "--presets: goes without --plant, --preset and"),
         (["--preset", "paper", "--scenarios", "load"], "no 'load'; there are square, constant"),
@@ -106,7 +106,7 @@ REFUSED = {
         (["--agents", "nobody"], '"nobody" for --agents. Choose from: "nothing", "nn"'),
         (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),
     ],
-    "train": [([], "--network requires an argument, one of nn-smith, ppo, ppo-hard")],
+    "train": [([], "NETWORK is missing: name what to train, one of nn-smith, ppo, ppo-hard")],
     "watch": [
         (["--agent", "lqr"], "--agent: no 'lqr'; there are nothing, nn"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
@@ -164,7 +164,7 @@ def test_the_map_shows_questions_and_commands_as_text(capsys):
     assert show_map([]) == 0
     shown = capsys.readouterr().out
     assert "Which gains are best?" in shown
-    assert {name for name in COMMANDS if f"benchmarks.{name} " in shown} >= {"tune", "bounds"}
+    assert {name for name in COMMANDS if f"benchmarks.{name}" in shown} >= {"tune", "bounds"}
     assert "`" not in shown
     assert "](" not in shown
     assert ":--" not in shown  # the glossary is another table
@@ -183,14 +183,8 @@ def test_a_command_on_a_page_can_be_typed_as_it_stands(page):
             assert read(declared, name, shlex.split(options)), name
 
 
-def test_the_map_names_a_missing_package_and_the_command_that_was_meant(monkeypatch, refused):
-    assert "no command 'comprae'; did you mean benchmarks.compare?" in refused(
-        show_map, ["comprae"]
-    )
-    monkeypatch.setitem(sys.modules, "rich.markdown", None)
-    assert refused(show_map, []).startswith(
-        "python -m benchmarks: error: rich is not installed"
-    )
+def test_the_map_names_the_command_that_was_meant(refused):
+    assert "no command 'comprae'; did you mean compare?" in refused(show_map, ["comprae"])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT to another process")

@@ -231,7 +231,7 @@ class TestBounds:
         kept = json.loads((ROOT / "mptc_gym/bounds.json").read_text(encoding="utf-8"))
         assert {name: case["arguments"] for name, case in kept["cases"].items()} == CASES
         assert (kept["samples"], kept["seed"], kept["episodes"]) == (1200, SEED, 120)
-        assert set(kept) >= {"command", "commit", "code", "versions", "unit"}
+        assert set(kept) >= {"command", "commit", "versions", "unit"}
 
     def test_what_an_agent_sees_and_is_paid_changes_no_bound(self):
         seen = evaluate(idle, episodes=2, action_window=9, reward="absolute", move_weight=0.1)

@@ -14,6 +14,7 @@ from agents import self_tuning
 from benchmarks.controllers.engineered import simc_pi
 from benchmarks.controllers.records import Factory
 from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib import storage
 from benchmarks.loop import designs
 from benchmarks.loop.designs import SPANS, WIDE, around, grid, random_design
 from benchmarks.sweep import command, maps, report
@@ -129,6 +130,7 @@ def run_sweep(out, options):
 
 class TestSweep:
     def test_random_design(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.setattr(storage, "commit", lambda: "abc")
         given = "--design random --plants 4 --agents nn nn-frozen pi-simc"
         assert run_sweep(tmp_path, given) == 0
         runs = pd.read_csv(tmp_path / "runs.csv")
@@ -143,7 +145,7 @@ class TestSweep:
         assert json.loads((tmp_path / "provenance.json").read_text())["seconds"] > 0
 
         # Again: nothing is run, and nothing changes.
-        saved = {file: file.stat().st_mtime_ns for file in (tmp_path / "tasks").rglob("*.json")}
+        saved = {file: file.stat().st_mtime_ns for file in (tmp_path / "tasks").rglob("*.pkl")}
         assert len(saved) == 4 * (3 + 2)
         monkeypatch.setattr(command, "report", lambda *_: [])
         assert run_sweep(tmp_path, given) == 0
@@ -151,6 +153,7 @@ class TestSweep:
         pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "runs.csv"), runs)
 
     def test_tasks_of_other_options_are_not_taken(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(storage, "commit", lambda: "abc")
         monkeypatch.setattr(command, "report", lambda *_: [])  # which takes its time to draw
         given = "--design random --plants 2 --samples 60"
         changes = [  # and how many tasks are new, for each of two plants: of the limit, of
@@ -160,14 +163,14 @@ class TestSweep:
             ("--agents pi", 1), ("", 0),
         ]  # fmt: skip
         for options, anew in changes:
-            kept = len(list(tmp_path.glob("tasks/*")))
+            kept = len(list(tmp_path.glob("tasks/*/*")))
             run_sweep(tmp_path, f"{given} --agents pi-simc {options}")
-            assert len(list(tmp_path.glob("tasks/*"))) == kept + 2 * anew
+            assert len(list(tmp_path.glob("tasks/*/*"))) == kept + 2 * anew
         # Neither are those of another training.
         trained = Factory(simc_pi, provenance={"file": "b"})
         monkeypatch.setitem(ROSTER, "pi-simc", replace(ROSTER["pi-simc"], made_by=trained))
         run_sweep(tmp_path, f"{given} --agents pi-simc")
-        assert len(list(tmp_path.glob("tasks/*"))) == kept + 2
+        assert len(list(tmp_path.glob("tasks/*/*"))) == kept + 2
 
     def test_told_each_plant_a_controller_does_better(self, tmp_path, monkeypatch):
         monkeypatch.setattr(command, "report", lambda *_: [])

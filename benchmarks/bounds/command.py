@@ -15,7 +15,7 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import blame, out_folder
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.statistics import Estimate, bootstrap
-from benchmarks.lib.storage import ROOT, code, commit, versions, write_json
+from benchmarks.lib.storage import ROOT, commit, versions, write_json
 from benchmarks.loop.linear import check_linear
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.plants import PlantOptions
@@ -107,7 +107,6 @@ def write_package(kept: Mapping[str, Any], fan_out: FanOut) -> None:
     about = {
         "command": "python -m benchmarks.bounds --package",
         "commit": commit(),
-        "code": code(),
         "versions": versions(),
         "unit": "degC, mean of |e(k)| over k = 1 to samples",
     }

@@ -143,7 +143,8 @@ def least_possible(
         try:
             found = Kept(folder).load(task)
         except LookupError:
-            found = Kept(folder).save(task, task())
+            found = task()
+            Kept(folder).save(task, found)
     return LeastPossible(**{**found, "episodes": tuple(found["episodes"])})
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from benchmarks.controllers.options import AgentNames, ControllerOptions
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Names, Runs, command, options
+from benchmarks.lib.command import Folder, Names, Runs, command, options
 from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS
 from mptc_gym import PRESETS
@@ -40,7 +39,7 @@ class Options:
     """Run the environment's presets instead of the paper's cases."""
     runs: Runs = RUNS
     """Runs of each controller in each case."""
-    out: Path | None = None
+    out: Folder | None = None
     """Folder to write to (default: results/compare, or for other controllers or cases a folder
     beside it that is named after them)."""
 

@@ -20,7 +20,7 @@ from benchmarks.controllers.options import chosen
 from benchmarks.controllers.records import Factory, provenances
 from benchmarks.lib.command import UsageError, blame, known, out_folder
 from benchmarks.lib.report import Section, provenance_line, show
-from benchmarks.lib.storage import Kept, origin, write_json
+from benchmarks.lib.storage import origin, write_json
 from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
 from mptc_gym.evaluation import SEED
@@ -73,7 +73,7 @@ def execute(options: Options, console: Console) -> str:
         return report.write(comparison, folder, provenance_line("compare", made), jobs)
 
     try:
-        comparison.run(options.controllers.fan_out, Kept(folder / "tasks"))
+        comparison.run(options.controllers.fan_out)
     except BaseException:  # including Ctrl-C
         if comparison.cases:
             write()

@@ -15,7 +15,6 @@ import pandas as pd
 from benchmarks.compare.estimates import Scale, bounds
 from benchmarks.controllers.records import Factory
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.storage import Kept
 from benchmarks.lib.tables import percentiles
 from benchmarks.loop.metrics import join, measure
 from benchmarks.loop.rollout import Trajectory
@@ -73,7 +72,7 @@ class Comparison:
     scales: dict[str, Scale] = field(default_factory=dict)
     """The bounds that errors are measured against, by scenario."""
 
-    def run(self, fan_out: FanOut, kept: Kept | None = None) -> None:
+    def run(self, fan_out: FanOut) -> None:
         """Run everything, and raise at the end if any case failed; see `FanOut.stream`."""
         # Short tasks last, so that no core waits long at the end; the bounds of drawn plants
         # are the longest of all.
@@ -84,7 +83,7 @@ class Comparison:
         }
         for (agent, members), each in itertools.product(self.controllers.items(), scenarios):
             tasks[f"{agent}, {each.name}"] = partial(run_case, each, agent, members, self.count)
-        for _, result in fan_out.stream(tasks, "compare", kept):
+        for _, result in fan_out.stream(tasks, "compare"):
             if "agent" in result:
                 frames = {each: pd.DataFrame(result[each]) for each in ("runs", "responses")}
                 case = CaseResult(**{**result, **frames})

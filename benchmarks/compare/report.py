@@ -78,7 +78,9 @@ def write(
         replace(
             section,
             text=[*section.text, *filter(None, map(faults.get, section.pictures))],
-            pictures=[name for name in section.pictures if not faults[name]],
+            pictures={
+                name: shown for name, shown in section.pictures.items() if not faults[name]
+            },
         )
         for section in _sections(comparison, scales, summary, estimates, scores)
     ]
@@ -115,8 +117,7 @@ def _sections(
             "Score: 0 without control, 1 at the least possible error",
             ["Mean over the cases, 95 % interval; travel of the valve in the median run."],
             score_table(comparison.runs, scores, names),
-            pictures=["scores.png"],
-            caption="A tick is one case.",
+            pictures={"scores.png": "Scores, a tick for each case"},
         ),
         Section(
             "Mean error as a multiple of the least possible, with its 95 % interval",
@@ -126,12 +127,11 @@ def _sections(
                 "better, but none comes below the least with foresight."
             ],
             ratio_table(estimates, scales, [*scores]),
-            pictures=["bounds.png"],
+            pictures={"bounds.png": "Mean errors as multiples of the least possible"},
         ),
         Section(
             "Error against valve travel",
-            caption="Down and left is better.",
-            pictures=["travel.png"],
+            pictures={"travel.png": "Error against valve travel; down and left is better"},
         ),
         *([paired] if others else []),
         Section(
@@ -149,7 +149,7 @@ def _sections(
         Section(
             "Cases",
             table=pd.DataFrame(titles, columns=["case", "what it is"]),
-            pictures=[f"{name}.png" for name in names],
+            pictures={f"{name}.png": f"Responses, {title}" for name, title in titles},
         ),
     ]
 

@@ -104,7 +104,7 @@ def own_factory(location: str) -> Factory:
     cost = Cost(*(str(getattr(found, each.name, "")) for each in fields(Cost)))
     source = getattr(sys.modules[found.__module__], "__file__", None)
     code = hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
-    return Factory(partial(_made, found), cost, dict(observation), code=code)
+    return Factory(partial(_made, location), cost, dict(observation), code=code)
 
 
 def _try_out(factory: Factory, location: str) -> None:
@@ -120,8 +120,9 @@ def _try_out(factory: Factory, location: str) -> None:
         ) from error
 
 
-def _made(made_by: Callable[..., Agent], plant: Parameters, runs: int, seed: int) -> Agent:
+def _made(location: str, plant: Parameters, runs: int, seed: int) -> Agent:
     """Call a user's factory with the arguments that it accepts, by name."""
+    made_by: Callable[..., Agent] = pkgutil.resolve_name(location)
     offered = {"parameters": plant, "num_envs": runs, "seed": seed, **limits(plant)}
     accepted = inspect.signature(made_by).parameters
     if any(each.kind is each.VAR_KEYWORD for each in accepted.values()):

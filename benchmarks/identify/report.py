@@ -33,9 +33,9 @@ def report(model: Model, found: list[Recommended], out: Path) -> list[Section]:
     )
     return [
         _found(model, found),
-        Section("The log and the model", pictures=["log.png"]),
-        Section("Prediction errors", [white], pictures=["residuals.png"]),
-        Section("Step response", pictures=["step.png"]),
+        Section("The log and the model", pictures={"log.png": "The log and the model"}),
+        Section("Prediction errors", [white], pictures={"residuals.png": "Prediction errors"}),
+        Section("Step response", pictures={"step.png": "Step response"}),
         *([_controllers(model, found)] if found else []),
     ]
 

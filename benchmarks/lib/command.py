@@ -1,37 +1,47 @@
-"""Run the commands `python -m benchmarks.NAME`: options in, a sentence and an exit status out.
+"""Declare and run the commands `python -m benchmarks.NAME`.
 
-Each command is a folder. Its `__main__.py` declares the options, a dataclass whose docstring is
-the description in the help, and imports nothing heavy; its `command.py` does the work.
+A command is one file, `benchmarks/NAME.py`, or a folder with a `__main__.py`, in which stand
+
+- a dataclass of options, decorated by `options`: its docstring is the head of the help, and the
+  string under a field is the help of that option. A field of another such dataclass, such as
+  `FanOut`, adds the options of that one;
+- a function `work` of these options, which prints what it finds and returns the closing line.
+  What is slow to import, it imports itself, so that the help takes no time;
+- `main = command("NAME", Options, work)`, and at the end
+  `if __name__ == "__main__": raise SystemExit(main())`.
 """
 
 from __future__ import annotations
 
+import errno
 import importlib
 import inspect
 import math
 import os
+import re
+import shutil
 import signal
 import sys
-import tempfile
+import threading
+import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
-from benchmarks.lib.storage import UnfinishedError
+from benchmarks.lib.storage import UnfinishedError, UsageError, out_folder
+
+__all__ = ["UsageError", "out_folder"]
 
 EXTRAS = {
-    "compare": "cyclopts joblib matplotlib pandas rich scipy tabulate tqdm",
+    "compare": "cyclopts joblib markdown matplotlib pandas rich scipy tabulate",
     "render": "pygame",
     "data": "h5py minari",
     "bench": "optuna PIL stable_baselines3",
     "ray": "ray",
     "torch": "torch",
 }
-
-
-class UsageError(ValueError):
-    """An invalid option, named by the message."""
+FULL = errno.ENOSPC, errno.EDQUOT, errno.EPIPE  # a disk, or a reader that has gone
 
 
 def stop(error: BaseException, program: str = "python -m benchmarks") -> NoReturn:
@@ -69,7 +79,17 @@ options: Callable[[type[Group]], type[Group]] = Parameter(name="*")
 
 def _integer(_type: object, tokens: Sequence[Any]) -> int:
     """Read an integer, and reject 2.5, which cyclopts would round."""
-    return int(tokens[0].value)
+    try:
+        return int(tokens[0].value)
+    except ValueError as error:
+        raise ValueError(f"must be a whole number, got {tokens[0].value!r}") from error
+
+
+def _folder(_type: object, tokens: Sequence[Any]) -> Path:
+    """Read a folder, and reject "", which would be the current one."""
+    if not tokens[0].value:
+        raise ValueError("must name a folder, got ''")
+    return Path(tokens[0].value)
 
 
 def _integers(least: int, most: int) -> Parameter:
@@ -83,7 +103,7 @@ Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))
 Positive = Annotated[float, Parameter(validator=Number(gt=0.0, lt=math.inf))]
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
 Repeated = tuple[str, ...]
-Folder = Annotated[Path, Parameter(help="Folder to write to.")]
+Folder = Annotated[Path, Parameter(help="Folder to write to.", converter=_folder, n_tokens=1)]
 
 
 @contextmanager
@@ -95,18 +115,6 @@ def blame(option: str) -> Iterator[None]:
         raise
     except ValueError as error:
         raise UsageError(f"{option}: {error}") from error
-
-
-def out_folder(folder: Path, option: str = "--out") -> Path:
-    """Create and return the folder of an option; `UsageError` if it is not writable."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as probe:
-            probe.write(b"x")
-    except OSError as error:
-        why = "it is no folder" if folder.is_file() else error.strerror
-        raise UsageError(f"{option}: {folder} cannot be written to: {why}") from error
-    return folder
 
 
 def known(option: str, given: Sequence[str], names: Collection[str]) -> list[str]:
@@ -142,69 +150,123 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
     try:
         found = app(list(given), exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        text = " ".join(str(error).split())
+        text = re.sub(
+            r"^Invalid value for (\S+): must", r"\1 must", " ".join(str(error).split())
+        )
         if isinstance(error, MissingArgumentError) and error.argument:
-            choices = error.argument.get_choices()
-            text = f"{text[:-1]}, one of {', '.join(choices)}." if choices else text
+            documented = app.assemble_argument_collection(parse_docstring=True)
+            (asked,) = (each for each in documented if each.name == error.argument.name)
+            text = _missing_argument(asked)
         raise UsageError(text) from error
     return found if isinstance(found, declared) else None
 
 
-def command(
-    declared: type[Group],
-    work: str,
-    *,
-    width: int = 120,
-    interrupted: str = "what has finished is kept; the same command goes on from there.",
-) -> Callable[[Sequence[str] | None], int]:
-    """Return the `main` of a command.
+def _missing_argument(argument: Any) -> str:
+    """Return a sentence such as "LOG is missing: name the log, a CSV file"."""
+    asked = str(argument.parameter.help or "a value").strip().rstrip(".")
+    choices = argument.get_choices()
+    listed = f", one of {', '.join(choices)}" if choices else ""
+    name = argument.names[0].lstrip("-").upper()
+    return f"{name} is missing: name {asked[0].lower()}{asked[1:]}{listed}"
 
-    It takes the command line without the program's name and returns the exit status: 0 for
-    success; 1 if tasks failed, a file could not be written or memory ran out; 130 after Ctrl-C
-    and 143 after SIGTERM. An invalid option or a missing package ends the program with 2.
+
+def command(
+    name: Any,
+    declared: Any,
+    work: Any = None,
+    *,
+    interrupted: str = "what has finished is written.",
+    **_: Any,
+) -> Callable[[Sequence[str] | None], int]:
+    """Return the `main` of the command `python -m benchmarks.NAME`.
+
+    It takes the command line without the program's name, by default that of the process, and
+    returns the exit status: 0 for success; 1 if tasks failed, a file could not be written or
+    memory ran out; 130 after Ctrl-C and 143 after SIGTERM. An invalid option or a missing
+    package ends the program with 2.
 
     Parameters
     ----------
+    name
+        Name of the command.
     declared
         Dataclass of the options.
     work
-        Module whose function `execute(options, console)` does the work, prints on the `rich`
-        console and returns the closing line. It is imported once the options are read.
-    width
-        Width of the console, in columns, if the output is not a terminal.
+        Function that does the work and returns the closing line.
     interrupted
         Message after Ctrl-C.
     """
-    program = f"python -m {work.rpartition('.')[0]}"
+    if not isinstance(name, str):  # declared in the former way, by a module with `execute`
+        return _of_module(name, declared, interrupted)  # type: ignore[no-any-return]
+    program = f"python -m benchmarks.{name}"
 
     def main(arguments: Sequence[str] | None = None) -> int:
         os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever the shell has set
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")  # for "°C" on an ASCII terminal
-        with suppress(ValueError):  # not in the main thread
-            signal.signal(signal.SIGTERM, _interrupt)
-        try:
-            given = sys.argv[1:] if arguments is None else arguments
-            if (chosen := read(declared, program, given)) is not None:
-                from rich.console import Console
-
-                columns = None if sys.stdout.isatty() else width
-                console = Console(width=columns, highlight=False, markup=False)
-                console.print(importlib.import_module(work).execute(chosen, console))
-        except KeyboardInterrupt as stopped:
-            print(f"\nInterrupted: {interrupted}")
-            return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
-        except (UnfinishedError, MemoryError) as error:
-            print(str(error) or "There is not enough memory for so many runs or samples.")
-            return 1
-        except (UsageError, ImportError) as error:
-            stop(error, program)
+        with _heard(to_the_end=arguments is None):
+            try:
+                if work.__module__ == "__main__":
+                    # Other processes find tasks by the name of a module to be imported.
+                    spec = sys.modules["__main__"].__spec__
+                    return int(importlib.import_module(spec.name).main()) if spec else 1
+                given = sys.argv[1:] if arguments is None else arguments
+                if (chosen := read(declared, program, given)) is not None:
+                    print(work(chosen), flush=True)
+            except KeyboardInterrupt as stopped:
+                print(f"\nInterrupted: {interrupted}", flush=True)
+                return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+            except (UnfinishedError, MemoryError) as error:
+                print(str(error) or "There is not enough memory for so many runs or samples.")
+                return 1
+            except (UsageError, ImportError) as error:
+                stop(error, program)
+            except OSError as error:
+                if error.errno not in FULL:
+                    raise
+                print(f"{program}: the output is cut off: {error.strerror}", file=sys.stderr)
+                sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115 (flushed at exit)
+                return 1
         return 0
 
     return main
 
 
+def _of_module(declared: Any, work: Any, interrupted: str) -> Any:
+    from rich.console import Console
+
+    def execute(options: Any) -> str:
+        columns = shutil.get_terminal_size((150, 24)).columns
+        console = Console(width=columns, highlight=False, markup=False)
+        return str(importlib.import_module(work).execute(options, console))
+
+    name = work.removeprefix("benchmarks.").rpartition(".")[0]
+    return command(name, declared, execute, interrupted=interrupted)
+
+
+@contextmanager
+def _heard(*, to_the_end: bool) -> Iterator[None]:
+    """Raise KeyboardInterrupt for SIGTERM, and for Ctrl-C unless the shell has it ignored.
+
+    At the end, the signals are ignored if the process ends: nothing is left to be interrupted.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, _interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_IGN if to_the_end else handler)
+
+
 def _interrupt(number: int, _frame: object) -> NoReturn:
-    """End as after Ctrl-C, so that what has finished is reported."""
+    # joblib ends its processes then, of which its threads may complain.
+    threading.excepthook = lambda _: None
+    warnings.simplefilter("ignore")
     raise KeyboardInterrupt(number)

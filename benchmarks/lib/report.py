@@ -1,4 +1,4 @@
-"""Write a report as Markdown, and as one HTML page with the pictures embedded."""
+"""Write a report as Markdown, and as one HTML page with its pictures; print its tables."""
 
 from __future__ import annotations
 
@@ -6,32 +6,29 @@ import base64
 import html
 import re
 import shlex
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from rich.console import Console
 
 from benchmarks.lib.storage import write_text
-from benchmarks.lib.tables import ScreenTable
 
 _STYLE = """
+:root { color-scheme: light dark; }
 body { font-family: sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem;
-       color: #222; line-height: 1.4; }
-table { border-collapse: collapse; font-size: 0.9rem; }
-th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd; }
+       color: light-dark(#222, #ddd); background: light-dark(#fff, #181818); line-height: 1.4; }
+table { border-collapse: collapse; font-size: 0.9rem; display: block; overflow-x: auto; }
+th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #8885; }
 th:first-child, td:first-child { text-align: left; }
-.table { overflow-x: auto; }
-label input { display: none; }
-label input:checked + img { max-width: none; }
-.interval { display: block; color: #777; font-size: 0.75em; white-space: nowrap; }
-img { max-width: 100%; margin-top: 1.5rem; }
-.made { color: #666; font-size: 0.85rem; overflow-wrap: anywhere; }
+small { display: block; opacity: 0.7; white-space: nowrap; }
+img { max-width: 100%; background: #fff; }
 """
-_INTERVAL = re.compile(r" (\([^()]* to [^()]*\))")  # shown small, below its number
+_INTERVAL = re.compile(r" (\([^()]* to [^()]*\))</td>")  # shown small, below its number
+_PICTURE = re.compile(r'src="([\w.-]+\.png)"')
 
 
 class Best(str):
@@ -48,10 +45,25 @@ class Section:
     """Paragraphs."""
     table: pd.DataFrame | None = None
     """Table of text cells."""
-    pictures: Sequence[str] = ()
-    """Names of PNG files in the report's folder."""
-    caption: str = ""
-    """What the pictures show."""
+    pictures: Mapping[str, str] = field(default_factory=dict)
+    """Names of PNG files in the report's folder, and for each what it shows, in a sentence."""
+
+
+def write_report(folder: Path, title: str, sections: Sequence[Section], made: str) -> None:
+    """Write `report.md` and `report.html`; `made` is their provenance line."""
+    import markdown
+
+    page = _markdown(title, sections, made)
+    write_text(folder / "report.md", page)
+    body = markdown.markdown(page, extensions=["tables", "toc"])
+    body = _INTERVAL.sub(r" <small>\1</small></td>", body)
+    body = _PICTURE.sub(lambda found: f'src="{_embedded(folder / found[1])}"', body)
+    head = (
+        '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style>"
+    )
+    page = f'<!doctype html><html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
+    write_text(folder / "report.html", page)
 
 
 def provenance_line(command: str, origin: Mapping[str, Any]) -> str:
@@ -62,18 +74,37 @@ def provenance_line(command: str, origin: Mapping[str, Any]) -> str:
     return f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}"
 
 
-def show(sections: Sequence[Section], console: Console) -> None:
+def show(sections: Sequence[Section], _console: Any = None) -> None:
     """Print sections, without their pictures."""
     for section in sections:
-        console.print(*filter(None, [section.title, *section.text]), sep="\n")
+        print(*filter(None, ["", section.title, *section.text]), sep="\n")
         if section.table is not None:
-            console.print(ScreenTable(section.table))
+            print(on_screen(section.table))
 
 
-def write_report(folder: Path, title: str, sections: Sequence[Section], made: str) -> None:
-    """Write `report.md` and `report.html`; `made` is their provenance line."""
-    write_text(folder / "report.md", _markdown(title, sections, made))
-    write_text(folder / "report.html", _html(folder, title, sections, made))
+def on_screen(table: pd.DataFrame) -> str:
+    """Return a table of text for the terminal, or as wide as COLUMNS says.
+
+    Nothing is cut: columns that find no room follow below, beside the first column again.
+    """
+    width = shutil.get_terminal_size((150, 24)).columns
+    cells = table.astype(str).set_index(table.columns[0])
+    cells.index.name = None
+    with pd.option_context("display.max_colwidth", None):
+        shown = cells.to_string(line_width=width + 2, max_rows=None)
+    return re.sub(r"[ \\]+$", "", shown, flags=re.MULTILINE)  # pandas marks what goes on below
+
+
+def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
+    parts = [f"# {_plain(title)}"]
+    for section in sections:
+        parts += [f"## {_plain(section.title)}"] * bool(section.title)
+        parts += map(_plain, section.text)
+        if section.table is not None:
+            table = section.table.map(_cell).rename(columns=_cell)
+            parts.append(table.to_markdown(index=False, disable_numparse=True))
+        parts += [f"![{_plain(shown)}]({name})" for name, shown in section.pictures.items()]
+    return "\n\n".join([*parts, _plain(made)]) + "\n"
 
 
 def _plain(text: str) -> str:
@@ -86,50 +117,5 @@ def _cell(text: str) -> str:
     return f"**{plain}**" if isinstance(text, Best) else plain
 
 
-def _html_cell(text: str) -> str:
-    plain = html.escape(text, quote=False)
-    return f"<b>{plain}</b>" if isinstance(text, Best) else plain
-
-
-def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
-    parts = [f"# {_plain(title)}"]
-    for section in sections:
-        parts += [f"## {_plain(section.title)}"] * bool(section.title)
-        parts += map(_plain, section.text)
-        if section.table is not None:
-            table = section.table.map(_cell).rename(columns=_cell)
-            parts.append(table.to_markdown(index=False, disable_numparse=True))
-        parts += [_plain(section.caption)] * bool(section.caption)
-        parts += [f"![{_plain(section.title)}]({picture})" for picture in section.pictures]
-    return "\n\n".join([*parts, _plain(made)]) + "\n"
-
-
-def _html(folder: Path, title: str, sections: Sequence[Section], made: str) -> str:
-    parts = [
-        "<!doctype html>",
-        f'<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<style>{_STYLE}</style></head><body><h1>{html.escape(title)}</h1>",
-    ]
-    titles = [html.escape(section.title) for section in sections]
-    links = [f'<a href="#{i}">{name}</a>' for i, name in enumerate(titles) if name]
-    parts.append(f"<p>{'<br>'.join(links)}</p>")
-    for i, (section, name) in enumerate(zip(sections, titles, strict=True)):
-        parts += [f'<h2 id="{i}">{name}</h2>'] * bool(name)
-        parts += [f"<p>{html.escape(paragraph)}</p>" for paragraph in section.text]
-        if section.table is not None:
-            with pd.option_context("display.max_colwidth", None):
-                cells = section.table.map(_html_cell)
-                table = cells.to_html(index=False, border=0, escape=False)
-            smaller = _INTERVAL.sub(r'<span class="interval">\1</span>', table)
-            parts.append(f'<div class="table">{smaller}</div>')
-        parts += [f"<p>{html.escape(section.caption)}</p>"] * bool(section.caption)
-        for picture in section.pictures:
-            data = base64.b64encode((folder / picture).read_bytes()).decode()
-            alternative = html.escape(f"{section.title}: {picture}")
-            image = f'<img alt="{alternative}" src="data:image/png;base64,{data}">'
-            parts.append(
-                f'<label><input type="checkbox">{image}</label>'
-            )  # a click enlarges it
-    parts.append(f'<p class="made">{html.escape(made)}</p>')
-    return "\n".join([*parts, "</body></html>", ""])
+def _embedded(picture: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(picture.read_bytes()).decode()

@@ -1,18 +1,21 @@
-"""Estimate quantities from several runs, with 95 % confidence intervals."""
+"""Estimate quantities from several runs, with 95 % confidence intervals, and percentiles."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 import scipy  # loads its modules on first use
 from numpy.typing import ArrayLike, NDArray
 
 CONFIDENCE = 0.95
 ENDS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)  # quantiles at the ends of an interval
 RESAMPLES = 2000  # bootstrap resamples
+PERCENTILES = {"median": 50, "p10": 10, "p90": 90}
 
 
 @dataclass(frozen=True)
@@ -148,3 +151,24 @@ def improvement(
     """
     better = (errors < reference) + 0.5 * (errors == reference)
     return bootstrap(better, seed=seed)
+
+
+def percentiles(
+    values: NDArray[np.float64], method: Literal["linear", "nearest", "higher"] = "linear"
+) -> dict[str, Any]:
+    """Return the median, 10th and 90th percentiles along the last axis.
+
+    Infinite values ("not settled") cannot be interpolated. If there are any, the next higher
+    value is used.
+    """
+    method = method if np.isfinite(values).all() else "higher"
+    return {
+        name: np.percentile(values, percentile, axis=-1, method=method)
+        for name, percentile in PERCENTILES.items()
+    }
+
+
+def groups(table: pd.DataFrame, column: str) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield each name in a column with its rows, in order of first appearance."""
+    for name, rows in table.groupby(column, sort=False):
+        yield str(name), rows

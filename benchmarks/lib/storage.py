@@ -1,12 +1,16 @@
-"""Write files completely or not at all, and record the provenance of results."""
+"""Write files completely or not at all, keep results of tasks, and tell where they are from.
+
+Also the two errors by which a command ends with a sentence: `UsageError` and `UnfinishedError`.
+"""
 
 from __future__ import annotations
 
-import hashlib
+import errno
 import json
 import os
 import platform
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -14,13 +18,20 @@ from datetime import datetime, timezone
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # pandas is slow to import
+    import pandas as pd
 
 ROOT = Path(__file__).resolve().parent.parent.parent  # the checkout
 
 
+class UsageError(ValueError):
+    """An option that does not fit, named by the message: the exit status is 2."""
+
+
 class UnfinishedError(RuntimeError):
-    """A command could not do all of its work, or write a file; the message says why."""
+    """A command could not do all of its work, or write a file: the exit status is 1."""
 
 
 @contextmanager
@@ -29,8 +40,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
     `path` is left as it was if there is an error or the process is killed.
     """
-    # The suffix stays last, since some writers choose the format by it or append it.
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    # Short, as names may have 255 bytes. The suffix stays last, since some writers choose the
+    # format by it or append it.
+    partial = path.with_name(f".{os.getpid()}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -55,59 +67,62 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, default=str) + "\n")
 
 
+def write_csv(path: Path, table: pd.DataFrame) -> None:
+    """Write a table without its index, completely or not at all, the same on every system."""
+    with replacing(path) as partial:
+        table.to_csv(partial, index=False, lineterminator="\n")
+
+
+def out_folder(folder: Path, option: str = "--out") -> Path:
+    """Create and return the folder of an option; `UsageError` if it is not writable."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(b"x")
+    except OSError as error:
+        why = "it is no folder" if error.errno == errno.EEXIST else error.strerror
+        raise UsageError(f"{option}: {folder} cannot be written to: {why}") from error
+    return folder
+
+
 @dataclass(frozen=True)
 class Kept:
-    """Results in a folder, each in a file named after all that shapes it; see `key`."""
+    """Results of tasks in a folder, a file each, below a folder named after the commit.
+
+    Nothing is kept or found while files of the checkout differ from the commit.
+    """
 
     folder: Path
-    suffix: str = ".json"
-    write: Callable[[Any, Path], object] = lambda x, file: file.write_text(json.dumps(x))
-    """Writes a result. JSON gives floats back to the last digit, and tuples as lists."""
-    read: Callable[[Path], Any] = lambda file: json.loads(file.read_bytes())
-    """Reads it; raises a ValueError or OSError if the file is damaged or missing."""
+
+    def path(self, task: Callable[[], Any]) -> Path | None:
+        """Return the file of a task, named after its function and arguments."""
+        import joblib  # here: slow to import
+
+        name = commit()
+        if not name.isalnum():  # no commit, or a dirty one
+            return None
+        return self.folder / name[:12] / f"{joblib.hash(task)}.pkl"
 
     def load(self, task: Callable[[], Any]) -> Any:
         """Return the result of a task; raise a `LookupError` if it is missing or damaged."""
+        import joblib
+
+        path = self.path(task)
         try:
-            return self.read(self.folder / f"{key(task)}{self.suffix}")
-        except (ValueError, OSError) as error:
+            if path and path.exists():
+                return joblib.load(path)
+        except Exception as error:  # whatever a damaged file raises
             raise LookupError(str(error)) from error
+        raise LookupError("it is not kept")
 
-    def save(self, task: Callable[[], Any], result: Any) -> Any:
-        """Write a result, completely or not at all, and return it as it is read.
+    def save(self, task: Callable[[], Any], result: Any) -> None:
+        """Write the result of a task, completely or not at all."""
+        import joblib
 
-        That of a task without a key is not written.
-        """
-        if not (name := key(task)):
-            return result
-        with replacing(self.folder / f"{name}{self.suffix}") as partial:
-            self.write(result, partial)
-        return self.load(task)
-
-
-def key(*task: Any) -> str | None:
-    """Return a hash of everything that shapes the result of a task.
-
-    That is the task, the versions of packages and the code of the checkout. None stands for a
-    task that cannot be hashed, such as a lambda.
-    """
-    import joblib  # here: slow to import
-
-    try:
-        return str(joblib.hash((task, versions(), code())))
-    except Exception:  # whatever the pickling of an object raises
-        return None
-
-
-@cache
-def code() -> str:
-    """Return a hash of the code and the networks of the checkout."""
-    packages = (ROOT / name for name in ("agents", "benchmarks", "mptc_gym"))
-    files = (file for package in packages for file in package.rglob("*.*"))
-    digest = hashlib.sha256()
-    for file in sorted(file for file in files if file.suffix in (".py", ".npz")):
-        digest.update(file.relative_to(ROOT).as_posix().encode() + file.read_bytes())
-    return digest.hexdigest()
+        path = self.path(task)
+        if path:
+            with replacing(path) as partial:
+                joblib.dump(result, partial)
 
 
 @cache
@@ -128,11 +143,15 @@ def origin() -> dict[str, Any]:
     return {"started": started, "versions": versions(), "commit": commit()}
 
 
+@cache
 def commit() -> str:
-    """Return the checkout's commit, with "-dirty" if files differ; "unknown" without git."""
-    describe = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
+    """Return the checkout's commit, with "-dirty" if files differ; "" without git."""
+    hashed, differing = ["git", "rev-parse", "HEAD"], ["git", "status", "--porcelain"]
     try:
-        done = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True, check=True)
+        name, changes = (
+            subprocess.run(each, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+            for each in (hashed, differing)
+        )
     except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return done.stdout.strip()
+        return ""
+    return name.strip() + "-dirty" * bool(changes)

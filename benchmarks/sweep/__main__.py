@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 from benchmarks.controllers.options import AgentNames, ControllerOptions
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Runs, Seed, command, options
+from benchmarks.lib.command import Folder, Runs, Seed, command, options
 from benchmarks.loop.plants import PlantOptions
 
 SWEPT = tuple(name for name, controller in ROSTER.items() if controller.swept)
@@ -40,7 +39,7 @@ class Options:
     agents: AgentNames = SWEPT
     controllers: ControllerOptions = field(default_factory=ControllerOptions)
     plant: PlantOptions = field(default_factory=PlantOptions)
-    out: Path | None = None
+    out: Folder | None = None
     """Folder to write to (default: results/sweep-DESIGN)."""
 
 

@@ -103,7 +103,7 @@ def report(
         for name in SPANS if name in runs
     )  # fmt: skip
     about = [f"The plants have: {spans}.", OVERVIEW_TEXT]
-    sections = [Section(title, about, overview(runs), [picture])]
+    sections = [Section(title, about, overview(runs), {picture: title})]
     if centre or told == "each":
         return sections
     for title, text, pairs, picture in QUESTIONS:
@@ -116,7 +116,7 @@ def report(
                 f"{title} Mean error {when}",
                 [text, DIFFERENCES_TEXT],
                 differences(runs, asked, measure),
-                [picture] if measure == "late" else [],
+                {picture: title} if measure == "late" else {},
             )
             for measure, when in MEASURES.items()
         ]

@@ -42,7 +42,7 @@ def execute(options: Options, console: Console) -> str:
 def trained(trainings: Sequence[Training], out: Path, fan_out: FanOut) -> list[LawNetwork]:
     """Train in parallel the networks that `out` does not hold yet, and return all of them."""
     tasks = {f"seed {each.seed}": partial(train, each, commit()) for each in trainings}
-    kept = Kept(out / "tasks", ".npz", LawNetwork.save, LawNetwork.load)
+    kept = Kept(out / "tasks")
     return [*fan_out.run(tasks, "training", kept).values()]
 
 
@@ -77,7 +77,7 @@ def _ppo(options: Options, out: Path) -> Made:
     recipe = replace(recipe, steps=options.steps or recipe.steps)
     seeds = range(SEED, SEED + (options.networks or 5))
     tasks = {f"seed {seed}": partial(ppo.train, recipe, seed) for seed in seeds}
-    kept = Kept(out / "tasks", ".npz", PolicyNetwork.save, PolicyNetwork.load)
+    kept = Kept(out / "tasks")
     policies, rows = {}, []
     found = options.fan_out.run(tasks, "training", kept)
     for seed, policy in zip(seeds, found.values(), strict=True):

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from agents.neural_law import INPUTS, MOST_ADDED, OUTPUTS, LawNetwork
-from benchmarks.lib.storage import code, versions
+from benchmarks.lib.storage import versions
 from benchmarks.train.loops import Draw, Loops, environment
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
@@ -166,7 +166,6 @@ def train(training: Training, source: str = "") -> LawNetwork:
         training=asdict(training),
         validation={"seed": VALIDATION_SEED, **validate(mean, training)},
         cpu_seconds=round(seconds, 1),
-        code=code(),
         versions=versions(),
         commit=source,
     )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import joblib
 import numpy as np
 import optuna
 import pandas as pd
@@ -15,12 +17,12 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 from rich.console import Console
-from tqdm import tqdm
 
 from benchmarks.controllers.records import Tuning
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import out_folder
-from benchmarks.lib.storage import key, write_text
+from benchmarks.lib.fan_out import progress_bar
+from benchmarks.lib.storage import commit, write_text
 from benchmarks.lib.tables import ScreenTable, write_csv
 from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.scenarios import Scenario
@@ -94,7 +96,8 @@ def search(tuning: Tuning, judge: Callable[[Row], Row], count: int, path: Path) 
         # Its writer was killed, or the disk was full: Optuna could not read an unfinished line.
         log.write_bytes(lines[: lines.rfind(b"\n") + 1])
     study = optuna.create_study(
-        study_name=key(judge, tuning),  # of everything that shapes the trials
+        # Of everything that shapes the trials.
+        study_name=_name(judge, tuning, commit()),
         storage=JournalStorage(JournalFileBackend(str(log))),
         load_if_exists=True,
     )
@@ -115,16 +118,25 @@ def search(tuning: Tuning, judge: Callable[[Row], Row], count: int, path: Path) 
 
     try:
         done = len(rows())
-        for number in tqdm(range(done, count), path.stem, count, initial=done):
-            study.sampler = optuna.samplers.TPESampler(
-                seed=SEED * 1_000_000 + number,
-                n_startup_trials=tuning.startup,
-                multivariate=True,
-            )
-            study.optimize(attempt, n_trials=1)
+        with progress_bar(path.stem, count - done) as advance:
+            for number in range(done, count):
+                study.sampler = optuna.samplers.TPESampler(
+                    seed=SEED * 1_000_000 + number,
+                    n_startup_trials=tuning.startup,
+                    multivariate=True,
+                )
+                study.optimize(attempt, n_trials=1)
+                advance()
     finally:
         write_csv(path, pd.DataFrame(rows()))
     return pd.DataFrame(rows())
+
+
+def _name(*search: object) -> str | None:
+    """Return a name for a search, None if its parts have none."""
+    with suppress(Exception):  # whatever pickling raises
+        return str(joblib.hash(search))
+    return None
 
 
 def score(name: str, plant: Mapping[str, Any], runs: int, first_run: int, gains: Row) -> Row:
