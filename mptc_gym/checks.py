@@ -17,13 +17,15 @@ LARGEST: Final[Any] = 10**9
 # Far more than any plant needs. Without these limits, a mistyped number could fill the memory.
 LONGEST: Final = 10_000  # samples of a delay or of a window
 MOST_COEFFICIENTS: Final = 1_000
-COEFFICIENTS: Final = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
 MOST_PLANTS: Final = 10_000_000  # in one environment
 MOST_NUMBERS: Final = 1_000_000_000  # kept by all plants of one environment together
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
+_COEFFICIENTS = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
 _FLOAT64 = np.dtype(np.float64)  # faster to pass than the type
 _SHOWN = 80  # characters of a value shown in an error message
+# What arrays, tensors and Python raise if a value is no number.
+_NO_NUMBER = TypeError, ValueError, OverflowError, RuntimeError
 
 Number = float | Sequence[float]  # or a range, [low, high]
 Check = Callable[[str, Any], Any]
@@ -45,9 +47,7 @@ def shorten(value: object) -> str:
     size = f" ({len(value)} elements)" if isinstance(value, list | tuple) else ""
     if hasattr(value, "shape"):  # an array or a tensor, printed in several lines
         text, size = " ".join(text.split()), f" (shape {tuple(value.shape)})"
-    if len(text) <= _SHOWN:
-        return text
-    return f"{text[:_SHOWN]}...{size}"
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...{size}"
 
 
 def reject_action(action: object) -> NoReturn:
@@ -60,7 +60,7 @@ def one_action(action: Any) -> float:
     try:
         value = action.item() if hasattr(action, "item") else np.asarray(action).item()
         return float(value - 0.0)  # text is not a number, even if float() parses it
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last: from tensors
+    except _NO_NUMBER:
         reject_action(action)
 
 
@@ -75,7 +75,7 @@ def many_actions(
             given = np.array((given - 0.0).tolist())
         # Text is not a number, even if NumPy parses it.
         given = given.astype(_FLOAT64, casting="same_kind")
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last: from tensors
+    except _NO_NUMBER:
         given = np.empty(0)
     if given.shape != (num_envs, 1):
         reject("actions", actions, f"numbers, shape ({num_envs}, 1)")
@@ -141,7 +141,7 @@ duration = partial(count, minimum=1, maximum=LARGEST)  # in samples
 
 
 def numbers(
-    name: str, value: Any, allowed: str = COEFFICIENTS, most: float = MOST_COEFFICIENTS
+    name: str, value: Any, allowed: str = _COEFFICIENTS, most: float = MOST_COEFFICIENTS
 ) -> tuple[float, ...]:
     """Return the numbers of a list that has 1 to `most`."""
     if not isinstance(value, list | tuple) or not value:
@@ -152,31 +152,16 @@ def numbers(
             raise ValueError(f"{name} must be {allowed}, got {where}")
     if len(value) > most:
         reject(name, value, allowed)
-    return tuple(float(element) for element in value)
-
-
-coefficients = numbers
+    return tuple(map(float, value))
 
 
 def polynomial(name: str, value: Any) -> tuple[float, ...]:
     """Return coefficients, the first of which is 1."""
-    allowed = f"{COEFFICIENTS}, the first of them 1"
+    allowed = f"{_COEFFICIENTS}, the first of them 1"
     checked = numbers(name, value, allowed)
     if checked[0] != 1.0:
         reject(name, value, allowed)
     return checked
-
-
-def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
-    """Return a kind of set point, a constant, or one number per sample."""
-    allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
-    if isinstance(value, list | tuple):
-        return numbers(name, value, allowed, math.inf)
-    if is_number(value):
-        return number(name, value)
-    if not isinstance(value, str) or value not in SETPOINTS:
-        reject(name, value, allowed)
-    return value
 
 
 def one_of(name: str, value: Any, choices: Sequence[str | None]) -> Any:
@@ -187,6 +172,16 @@ def one_of(name: str, value: Any, choices: Sequence[str | None]) -> Any:
 
 
 reward = partial(one_of, choices=REWARDS)
+
+
+def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
+    """Return a kind of set point, a constant, or one number per sample."""
+    allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
+    if isinstance(value, list | tuple):
+        return numbers(name, value, allowed, math.inf)
+    if isinstance(value, str) and value in SETPOINTS:
+        return value
+    return _number_that(lambda value: True, allowed)(name, value)
 
 
 def or_range(check: Check) -> Callable[[str, Any], Number]:

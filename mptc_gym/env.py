@@ -40,8 +40,9 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
     They depend on the set point only if it exceeds the transmitter's range, so that a policy
     trained on one set point can run on another.
     """
-    span = parameters.temperature_span
-    setpoint_limit = max(span, parameters.largest_setpoint)
+    span, setpoint = parameters.temperature_span, parameters.setpoint
+    levels = parameters.setpoint_amplitude if isinstance(setpoint, str) else setpoint
+    setpoint_limit = max(span, np.abs(levels).max())
     limits = np.array([setpoint_limit, setpoint_limit + span, span, 1.0], np.float32)
     high = np.repeat(limits, parameters.windows)
     return Box(-high, high, dtype=np.float32)

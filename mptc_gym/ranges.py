@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import ARGUMENTS, DRAWS, PLANT_NUMBERS, Parameters, PlantNumbers
+from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, Parameters, PlantNumbers
 from mptc_gym.signals import EpisodeStream
 
 Values = NDArray[np.float64]  # shape (episodes,), or () where all episodes share one value
+DRAWS = 32  # per episode: enough for every plant number, and for future ones
 
 
 class Ranges:

@@ -1,7 +1,6 @@
 """The linear model against the environment, its step test and its margins."""
 
 import math
-from dataclasses import replace
 
 import control
 import numpy as np
@@ -10,12 +9,7 @@ from scipy import signal
 
 from agents import PIController, SmithPredictor
 from agents.pi import SEARCHED_GAINS
-from benchmarks.bounds import __main__ as command
-from benchmarks.bounds.least import frontier, least_possible
-from benchmarks.controllers import engineered
-from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.lib.command import UsageError
-from benchmarks.loop import linear
 from benchmarks.loop.linear import (
     Coefficients,
     LinearModel,
@@ -27,7 +21,6 @@ from benchmarks.loop.linear import (
 from benchmarks.loop.margins import Loop, sensitivities
 from benchmarks.loop.plants import PlantOptions
 from mptc_gym import MiddlePointEnv, Parameters
-from mptc_gym.parameters import ARGUMENTS
 from mptc_gym.ranges import Ranges, numbers_of_plant
 from tests.conftest import run
 
@@ -87,40 +80,6 @@ def test_responses_of_many_plants_at_once(a):
         noise.append(state[0])
         state = F[0] @ state
     np.testing.assert_allclose(noise, signal.lfilter(c, a, np.eye(1, 30)[0]), atol=1e-12)
-
-
-ANALYSES = {
-    "bound": lambda **p: least_possible(samples=30, folder=None, **p),
-    "frontier": lambda **p: frontier(samples=30, **p),
-    "step test": lambda **p: step_test(Parameters(**p)),
-    "NN": lambda **p: engineered.direct_nn(Parameters(**p), 1, 0),
-    "PI": lambda **p: engineered.simc_pi(Parameters(**p), 1, 0),
-    "Smith": lambda **p: engineered.smith(Parameters(**p), 1, 0),
-    "self-tuning": lambda **p: engineered.self_tuning(Parameters(**p), 1, 0),
-    "MPC": lambda **p: PredictiveController(Parameters(**p), 1),
-    "margins": lambda **p: Loop(PIController(), nominal(Parameters(**p))),
-}
-
-
-@pytest.fixture
-def nonlinear_span(monkeypatch):
-    """As if the span were declared as more than (28) and (29)."""
-    span = replace(ARGUMENTS["temperature_span"], linear=False)
-    monkeypatch.setattr(linear, "ARGUMENTS", {**ARGUMENTS, "temperature_span": span})
-
-
-@pytest.mark.usefixtures("nonlinear_span")
-def test_the_command_for_bounds_says_that_a_plant_is_not_linear(refused):
-    said = refused(command.main, ["--set", "temperature_span=49"])
-    assert "temperature_span=49: temperature_span must be 50.0" in said
-
-
-@pytest.mark.usefixtures("nonlinear_span")
-@pytest.mark.parametrize("analysis", ANALYSES)
-def test_every_analysis_refuses_an_argument_that_is_not_declared_linear(analysis):
-    ANALYSES[analysis]()
-    with pytest.raises(ValueError, match=r"^temperature_span must be 50\.0 .* got 49\.0"):
-        ANALYSES[analysis](temperature_span=49.0)
 
 
 def first_order(gain, time_constant, delay):

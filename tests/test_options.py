@@ -44,10 +44,6 @@ class TestDeclarations:
         assert info["delay"] == 3 + int(4 * draws[0])
         assert info["time_constant_drift"] == 1.0 + 2.0 * draws[12]
 
-    def test_the_page_names_every_argument(self):
-        page = (Path(presets.__file__).parent / "README.md").read_text("utf-8")
-        assert [name for name in parameters.ARGUMENTS if f"`{name}`" not in page] == []
-
     def test_every_argument_is_tried_in_all_combinations(self):
         assert set(STRATEGIES) == set(parameters.ARGUMENTS)
 

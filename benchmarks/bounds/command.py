@@ -12,15 +12,14 @@ from rich.console import Console
 from benchmarks.bounds.__main__ import Options
 from benchmarks.bounds.least import CACHE, least_possible
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import blame, out_folder
+from benchmarks.lib.command import out_folder
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.statistics import Estimate, bootstrap
 from benchmarks.lib.storage import ROOT, commit, versions, write_json
-from benchmarks.loop.linear import check_linear
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
-from mptc_gym import PRESETS, Parameters
+from mptc_gym import PRESETS
 from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
 
 HEADINGS = {"preview": "with preview", "causal": "without preview", "reference": "reference"}
@@ -49,8 +48,6 @@ def execute(options: Options, console: Console) -> str:
         return f"Written to {PACKAGE}"
     cases = {**SCENARIOS, **PRESET_SCENARIOS}
     if one:
-        with blame(plant.name):
-            check_linear(Parameters(**plant.arguments))
         cases = scenarios_of(plant.name, plant.arguments)
     drawn = {"episodes": options.episodes, "seed": options.seed, "folder": cache}
     tasks: dict[str, Callable[[], list[str]]] = {

@@ -5,8 +5,6 @@ Between the limits of the actuator (29) the plant is
     (28)  y(k) = sum_i alpha_i y(k-1-i) + sum_i beta_i u_a(k-d-1-i) + C xi(k) + A(1) w(k),
 
 where w is the load. Gain and time-constant factors and their drifts are part of alpha and beta.
-Arguments that take the plant beyond this model are rejected by name; `mptc_gym.parameters`
-declares which arguments do.
 """
 
 from __future__ import annotations
@@ -20,21 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mptc_gym import Parameters
-from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, PlantNumbers
+from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
 
 Array = NDArray[np.float64]
-
-
-def check_linear(parameters: Parameters) -> None:
-    """Raise ValueError for a plant that is more than (28) and (29), naming the argument."""
-    for name, argument in ARGUMENTS.items():
-        value = getattr(parameters, name)
-        if not argument.linear and value != argument.default:
-            raise ValueError(
-                f"{name} must be {argument.default!r} where the plant is taken as linear, got "
-                f"{value!r}"
-            )
 
 
 @dataclass(frozen=True)
@@ -134,12 +121,11 @@ class Coefficients:
 def coefficients(
     parameters: Parameters, numbers: PlantNumbers[Any], k: int | NDArray[np.int64]
 ) -> Coefficients:
-    """Return the coefficients of the step to sample k; see `check_linear` for its ValueError.
+    """Return the coefficients of the step to sample k.
 
     The plant numbers are floats for one plant, or arrays for many; k is a single sample or, for
     one plant, an array of samples.
     """
-    check_linear(parameters)
     dynamics = Dynamics(parameters)
     gain, time_constant = dynamics.factors(numbers, k // DRIFT_INTERVAL * DRIFT_INTERVAL)
     alpha, scale, load = dynamics.coefficients(gain, time_constant)
@@ -152,10 +138,7 @@ def coefficients(
 
 
 def nominal(parameters: Parameters) -> LinearModel:
-    """Return the model of a plant: ranges at their midpoints, drifts at k = 0.
-
-    See `check_linear` for its ValueError.
-    """
+    """Return the model of a plant: ranges at their midpoints, drifts at k = 0."""
     middle = {name: sum(parameters.range_of(name)) / 2 for name in PLANT_NUMBERS}
     at_start = coefficients(parameters, PlantNumbers(**middle), 0)
     return LinearModel(
@@ -260,7 +243,7 @@ class TimeVaryingModel(Coefficients):
 def time_varying_model(
     parameters: Parameters, numbers: PlantNumbers[float], samples: int
 ) -> TimeVaryingModel:
-    """Return the model of an episode; see `check_linear` for its ValueError."""
+    """Return the model of an episode."""
     flows = [numbers.u_min, numbers.u_max]
     if numbers.dead_zone > 0.0:
         flows.append(0.0)
