@@ -11,7 +11,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
@@ -43,9 +42,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         v < 0:   u = -z + (u_min + z) v / u_min
 
     Then every change of v has an effect, and every flow that the actuator can apply can still
-    be reached. The flow moves 1 - z / u_max times as much as v above 0, and 1 + z / u_min times
-    as much below. Where v changes sign, it jumps between -z and z. The command stays 0 from
-    `reset` until the first nonzero action.
+    be reached. The command stays 0 from `reset` until the first nonzero action.
 
     The action space is `Box(-1, 1, (1,), float32)`; actions beyond it are clipped. Observation,
     reward (with `move_weight`) and info are those of the environment, which receives absolute
@@ -58,21 +55,16 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     env
         A `MiddlePointEnv`, wrapped or not.
     max_move
-        Change of the wanted flow by an action of 1, as a share of half the range: above 0, up
-        to 2.
+        Change of the wanted flow by an action of 1, as a share of half the range, up to 2.
     compensate_dead_zone
-        False leaves the dead zone as it is. True compensates the plant's own; if that is a
-        range, the one drawn for the episode, from the info of `reset`. A number compensates a
-        dead zone of that half width in t/h, whatever the plant's. Drawn limits are also the
-        episode's.
+        False leaves the dead zone as it is. True compensates the plant's own, as drawn for the
+        episode where it is a range. A number compensates a dead zone of that half width, t/h.
 
     Raises
     ------
     ValueError
-        From the constructor, if an argument is out of range. From `step`, if the action is not
-        one finite number; the wrapper and the environment are then unchanged.
-    ResetNeeded
-        From `step`, if the environment has never been reset.
+        If an argument is out of range; from `step`, if the action is not one finite number.
+        The wrapper and the environment are then unchanged.
 
     Examples
     --------
@@ -103,7 +95,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         self._arguments = max_move, compensate_dead_zone
         self._numbers = {name: parameters.range_of(name)[0] for name in NUMBERS}
         self._actuator = Actuator(self._numbers, *self._arguments)
-        self._flow: float | None = None
+        self._flow = 0.0  # wanted, t/h
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -117,13 +109,11 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
 
     def action(self, action: Any) -> NDArray[np.float32]:
         """Move the wanted flow by an action, shape (1,), and return the absolute action."""
-        if self._flow is None:
-            raise ResetNeeded("call reset before step")
         move = one_action(action)
         if not math.isfinite(move):
             reject_action(action)
         actuator = self._actuator
-        flow = self._flow + actuator.move * max(-1.0, min(1.0, move))
+        flow = self._flow + actuator.move * max(-1.0, min(1.0, move))  # faster than `moved`
         self._flow = max(actuator.u_min, min(actuator.u_max, flow))
         return np.array([actuator.action(self._flow)], np.float32)
 
@@ -140,22 +130,15 @@ class Actuator:
     ) -> None:
         if not is_number(max_move) or not 0.0 < max_move <= 2.0:
             reject("max_move", max_move, "a number above 0, up to 2")
-        if not isinstance(compensate_dead_zone, bool) and not (
-            is_number(compensate_dead_zone) and compensate_dead_zone >= 0.0
-        ):
-            reject(
-                "compensate_dead_zone",
-                compensate_dead_zone,
-                "True, False or a number from 0 to 1e9",
-            )
         own, self.u_min, self.u_max = (numbers[name] for name in NUMBERS)
-        half_range = (self.u_max - self.u_min) / 2.0
-        self.move = max_move * half_range  # change of the wanted flow by an action of 1, t/h
+        self.move = max_move * ((self.u_max - self.u_min) / 2.0)  # by an action of 1, t/h
         self._compensates = compensate_dead_zone is not False
-        self._zone = z = own if compensate_dead_zone is True else compensate_dead_zone
+        self._zone = zone = own if compensate_dead_zone is True else compensate_dead_zone
+        if not isinstance(compensate_dead_zone, bool) and not (is_number(zone) and zone >= 0.0):
+            reject("compensate_dead_zone", zone, "True, False or a number from 0 to 1e9")
         # A limit inside the dead zone is reached by commanding the edge, which (29) limits.
         self._above, self._below = (
-            np.maximum(limit - z, 0.0) / np.where(limit > 0.0, limit, 1.0)
+            np.maximum(limit - zone, 0.0) / np.where(limit > 0.0, limit, 1.0)
             for limit in (self.u_max, -self.u_min)
         )
 
@@ -168,8 +151,6 @@ class Actuator:
         """Return the environment's action for a wanted flow in t/h, a float or an array."""
         if not self._compensates:
             return action_from_command(flow, self.u_min, self.u_max)
-        above, below = flow > 0.0, flow < 0.0
-        flow = above * (self._zone + self._above * flow) - below * (
-            self._zone - self._below * flow
-        )
-        return float32_action(flow, self.u_min, self.u_max, self._zone)
+        above = (flow > 0.0) * (self._zone + self._above * flow)
+        below = (flow < 0.0) * (self._zone - self._below * flow)
+        return float32_action(above - below, self.u_min, self.u_max, self._zone)

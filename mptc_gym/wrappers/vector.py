@@ -7,7 +7,6 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -62,7 +61,7 @@ class IncrementalAction(VectorActionWrapper):
         }
         self._actuator = Actuator(self._numbers, *self._arguments)
         self._mode = AutoresetMode(env.metadata["autoreset_mode"])
-        self._flows: NDArray[np.float64] | None = None
+        self._flows = np.zeros(self.num_envs)  # wanted, t/h
         self._ended = np.zeros(self.num_envs, np.bool_)  # to be reset by the next step
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
@@ -70,13 +69,11 @@ class IncrementalAction(VectorActionWrapper):
         # Read first, as Gymnasium's own environments remove it from the options.
         mask = options.get("reset_mask") if isinstance(options, Mapping) else None
         observations, infos = self.env.reset(seed=seed, options=options)
-        self._restart(np.ones(self.num_envs, np.bool_) if mask is None else mask, infos)
+        self._begin(np.ones(self.num_envs, np.bool_) if mask is None else mask, infos)
         return observations, infos
 
     def step(self, actions: Any) -> Any:
         """Move the wanted flows by actions, shape (num_envs, 1), and step the environments."""
-        if self._flows is None:
-            raise ResetNeeded("call reset before step")
         moves = many_actions(actions, self.num_envs, self._ended)
         flows = self._actuator.moved(self._flows, moves)
         returned = self.env.step(self._actuator.action(flows).astype(np.float32)[:, np.newaxis])
@@ -85,30 +82,28 @@ class IncrementalAction(VectorActionWrapper):
         ended = terminations | truncations
         begun = ended if self._mode is AutoresetMode.SAME_STEP else self._ended.copy()
         if begun.any():
-            self._restart(begun, infos)
+            self._begin(begun, infos)
         if self._mode is AutoresetMode.NEXT_STEP:
             self._ended = ended
         return returned
 
-    def _restart(self, begun: NDArray[np.bool_], infos: dict[str, Any]) -> None:
+    def _begin(self, begun: NDArray[np.bool_], infos: dict[str, Any]) -> None:
         """Set the wanted flow to 0 where an episode has begun, and store what was drawn."""
-        for name in NUMBERS:
-            if name in infos:
-                self._numbers[name][begun] = infos[name][begun]
+        for name in {*NUMBERS} & {*infos}:
+            self._numbers[name][begun] = infos[name][begun]
         self._actuator = Actuator(self._numbers, *self._arguments)
-        self._flows = np.zeros(self.num_envs) if self._flows is None else self._flows
         self._flows[begun] = 0.0
         self._ended = self._ended & ~begun
 
 
 def _parameters(env: VectorEnv[Any, Any, Any]) -> list[Parameters]:
     """Return the arguments of each environment."""
-    inner = env.unwrapped
+    inner: Any = env.unwrapped
     if isinstance(inner, MiddlePointVectorEnv):
         return [inner.parameters] * env.num_envs
     plants: list[Any] = []
     with suppress(AttributeError):  # from environments that are not plants
-        plants = list(inner.get_attr("parameters"))  # type: ignore[attr-defined]
+        plants = list(inner.get_attr("parameters"))
     if not plants or not all(isinstance(plant, Parameters) for plant in plants):
         reject("env", env, "a vector environment of MiddlePointEnv in NumPy")
     return plants
