@@ -19,7 +19,7 @@ from mptc_gym.checks import one_action, one_of, plain, reject_action
 from mptc_gym.parameters import Parameters, insert_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
-from mptc_gym.record import Record
+from mptc_gym.rendering import Record
 from mptc_gym.signals import ONE, Signals, Streams
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys, see `reset`
@@ -187,10 +187,10 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     | "rgb_array" | returns a picture, shape (540, 960, 3), uint8 |
     | "human" | shows it in a window, as do `reset` and `step`, at most `metadata["render_fps"]` times a second |
 
-    Both show a strip chart of the last 200 samples, or of more if the delay is long: set point
-    and true temperature; commanded and applied flow, with the dead zone, the limits and the
-    part of the applied flow that is still in transit to the middle point. Both need pygame:
-    `pip install "mptc_gym[render]"`.
+    Both show the last 200 samples, or more if the delay is long: set point and true
+    temperature; commanded and applied flow, with the dead zone, the limits and the time in
+    which the flow is still in transit to the middle point. Both need pygame:
+    `pip install "mptc_gym[render]"`. Gymnasium's `RecordVideo` also needs moviepy.
 
     ## Errors
 
@@ -373,7 +373,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         DependencyNotInstalled
             If pygame is not installed.
         """
-        return rendering.render(self.render_mode, self._record, self.metadata["render_fps"])
+        records = [] if self._record is None else [self._record]
+        frames = rendering.render(self.render_mode, records, self.metadata["render_fps"])
+        return None if frames is None else frames[0]
 
     def close(self) -> None:
         """Close the window, if there is one."""

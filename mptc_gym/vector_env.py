@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, cast
 
 import numpy as np
-from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
@@ -19,7 +18,7 @@ from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
-from mptc_gym.record import Record
+from mptc_gym.rendering import Record
 from mptc_gym.signals import BLOCK, Indices, Signals, Streams, Values
 
 Observations = NDArray[np.float32]  # shape (num_envs, observation_size)
@@ -139,12 +138,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         DependencyNotInstalled
             If pygame is not installed.
         """
-        if self.render_mode is None:
-            rendering.warn_no_mode()
-            return None
-        if not self._records:
-            raise ResetNeeded("call reset before render")
-        return tuple(rendering.frame(self._records[i]) for i in range(self.num_envs))
+        return rendering.render(self.render_mode, [*self._records.values()])
 
     def _advance(self, a: Values) -> tuple[Observations, Values, Mask, Mask, Infos]:
         # This is the hot path: for few plants, the number of calls determines its speed.

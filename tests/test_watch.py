@@ -52,7 +52,7 @@ def test_a_gif_shows_the_run(tmp_path, capsys):
         if k % 5 == 0:
             half, i = divmod(k, SAMPLES // 2)
             top = watch.CAPTION + half * (height + watch.CAPTION)
-            picture = Image.fromarray(env.render()[watch.HEADER :]).resize((width, height))
+            picture = Image.fromarray(env.render()).resize((width, height))
             assert np.abs(shown[i // 5][top : top + height] - picture).mean() < 3
         observation, _, _, _, info = env.step(controller.act(observation))
         errors.append(abs(info["error"]))

@@ -30,8 +30,7 @@ from mptc_gym.drawing import SIZE
 LINES = (drawing.SETPOINT, drawing.TEMPERATURE, drawing.APPLIED, drawing.COMMAND)
 COLOURS = 20  # of a GIF: lines, areas and the shades between them
 FASTEST = 10  # pictures a second of a GIF
-HEADER = 67  # rows of a picture that hold the readings, which a film leaves out
-SHOWN = 560, 7 * (SIZE[1] - HEADER) // 12  # size of one half of the run
+SHOWN = 560, 7 * SIZE[1] // 12  # size of one half of the run
 CAPTION = 28  # height of its caption
 OUT = Path("results/watch")
 
@@ -102,7 +101,7 @@ def write_film(
 
     def keep(k: int) -> None:
         if k % half % every == 0:
-            picture = Image.fromarray(np.asarray(plant.render())[HEADER:])
+            picture = Image.fromarray(np.asarray(plant.render()))
             small = picture.resize(SHOWN, Image.Resampling.LANCZOS)
             frames[k // half].append(zlib.compress(small.tobytes(), 1))
 
