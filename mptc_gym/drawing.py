@@ -11,7 +11,7 @@ import numpy as np
 import pygame
 from numpy.typing import NDArray
 
-from mptc_gym.rendering import Record
+from mptc_gym.record import Record
 
 Colour = tuple[int, int, int]
 Place = tuple[int, int, int, int]  # pixels from the left edge, from the top, width and height

@@ -19,7 +19,7 @@ from mptc_gym.checks import one_action, one_of, plain, reject_action
 from mptc_gym.parameters import Parameters, insert_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
-from mptc_gym.rendering import Record
+from mptc_gym.record import Record
 from mptc_gym.signals import ONE, Signals, Streams
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys, see `reset`

@@ -18,7 +18,7 @@ from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.ranges import Ranges, numbers_of_plant
-from mptc_gym.rendering import Record
+from mptc_gym.record import Record
 from mptc_gym.signals import BLOCK, Indices, Signals, Streams, Values
 
 Observations = NDArray[np.float32]  # shape (num_envs, observation_size)

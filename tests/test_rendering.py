@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, drawing
 from mptc_gym.parameters import Parameters
 from mptc_gym.ranges import Ranges
-from mptc_gym.rendering import Record
+from mptc_gym.record import Record
 from tests.arguments import MODES, NOISY
 from tests.conftest import native_and_sync, run
 
