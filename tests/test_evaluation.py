@@ -14,8 +14,8 @@ from gymnasium.spaces import Box
 from agents import DirectNNController, PIController, PolicyNetwork
 from agents.networks import PRETRAINED
 from benchmarks.bounds import least_possible
+from benchmarks.bounds.__main__ import PACKAGED as CASES
 from benchmarks.bounds.__main__ import main as bounds_command
-from benchmarks.bounds.command import PACKAGED as CASES
 from mptc_gym import IDS, PRESETS, MiddlePointEnv, Parameters, evaluate
 from mptc_gym.evaluation import SEED, least_errors
 from mptc_gym.wrappers import IncrementalAction
