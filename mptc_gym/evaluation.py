@@ -1,36 +1,38 @@
-"""Score any policy on fixed episodes."""
+"""Score any policy on fixed episodes, in the environments that it is to act in."""
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
 import shlex
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
-from typing import Any, Final, cast
+from typing import Any, Final, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import SyncVectorEnv, VectorEnv
+from gymnasium.vector import VectorEnv
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from numpy.typing import NDArray
 
-from mptc_gym.checks import MOST_PLANTS, count, reject, shorten
+from mptc_gym import environments
+from mptc_gym.checks import MOST_PLANTS, count, reject
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
-from mptc_gym.policies import Step, check_fit, rollout, start, training_of
+from mptc_gym.policies import is_model, owner_of, rollout, start
 from mptc_gym.presets import IDS, PRESETS
-from mptc_gym.training import WINDOWS, entry_point, make_one, wrappers_of
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
-Values = NDArray[np.float64]  # one per episode, shape (episodes,)
 Env = gymnasium.Env[Any, Any]
+Values = NDArray[np.float64]  # one per episode, shape (episodes,)
 Batch = Callable[..., VectorEnv[Any, Any, Any]]  # makes n environments
 
 SEED: Final = 7_000_000
@@ -40,6 +42,7 @@ EPISODES: Final = 100
 SAMPLES: Final = 1200
 """Length of an episode if its environment has no time limit, samples."""
 
+WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
 # Arguments that change observations or rewards, but not the least possible error.
 _NO_MATTER: Final = *WINDOWS, "reward", "error_scale", "move_weight"
 _RESAMPLES: Final = 2000  # bootstrap resamples
@@ -49,37 +52,52 @@ _RESAMPLES: Final = 2000  # bootstrap resamples
 class Evaluation:
     """Result of `evaluate`; `str` gives a one-line summary.
 
-    Fields that depend on the least possible error are None where the package has no bound, as
-    for arguments of no preset. Arrays have one element per episode.
+    Attributes
+    ----------
+    env : str
+        The environment's id, or the name of its class.
+    mean_error : float
+        Mean of |e(k)| over k = 1 to N and over all episodes, degC.
+    travel : float
+        Mean distance that the valve moves in an episode, t/h.
+    errors : ndarray, shape (episodes,)
+        Mean of |e(k)| over k = 1 to N of each episode, degC.
+    travels : ndarray, shape (episodes,)
+        Distance that the valve moves in each episode, t/h.
+    seeds : range
+        Seeds of the episodes.
+    least_possible : float or None
+        Least possible mean error of these episodes, degC: see `benchmarks/bounds`. This and all
+        that follows from it are None where the package has no bound, as for arguments of no
+        preset.
+    multiple : float or None
+        `mean_error / least_possible`.
+    score : float or None
+        0 for a valve that is left alone, 1 for the least possible error.
+    interval : (float, float) or None
+        95 % bootstrap interval of the score, from resampled episodes.
+    least : ndarray or None, shape (episodes,)
+        Least possible error of each episode, degC. Where only noise and load are drawn, all
+        elements equal its expectation over these.
+    scores : ndarray or None, shape (episodes,)
+        Score of each episode against its own bound.
+    missing : str
+        How to compute the bound if there is none; otherwise empty.
     """
 
     env: str
-    """The environment's id."""
     mean_error: float
-    """Mean of |e(k)| over k = 1 to N and over all episodes, degC."""
     travel: float
-    """Mean distance that the valve moves in an episode, t/h."""
     errors: Values
-    """Mean of |e(k)| over k = 1 to N, degC."""
     travels: Values
-    """Distance that the valve moves, t/h."""
     seeds: range
-    """Seeds of the episodes."""
     least_possible: float | None = None
-    """Least possible mean error of these episodes, degC: see `benchmarks/bounds`."""
     multiple: float | None = None
-    """`mean_error / least_possible`."""
     score: float | None = None
-    """0 for a valve that is left alone, 1 for the least possible error."""
     interval: tuple[float, float] | None = None
-    """95 % bootstrap interval of the score, from resampled episodes."""
     least: Values | None = None
-    """Least possible error, degC. Where only noise and load are drawn, all elements equal its
-    expectation over these."""
     scores: Values | None = None
-    """Score of each episode against its own bound."""
     missing: str = ""
-    """How to compute the bound if there is none; otherwise empty."""
 
     def __str__(self) -> str:
         parts = [f"{self.env}: mean error {self.mean_error:.3f} degC"]
@@ -99,7 +117,7 @@ class Evaluation:
 
 def evaluate(
     policy: Any,
-    env: str | EnvSpec | Callable[[], Env] | None = None,
+    env: Any = IDS["paper"],
     *,
     episodes: int = EPISODES,
     seed: int = SEED,
@@ -107,33 +125,25 @@ def evaluate(
 ) -> Evaluation:
     """Run a policy on fixed episodes and score it.
 
+    As with `evaluate_policy` of Stable-Baselines3, the policy acts in exactly the environments
+    that it is given: their windows, wrappers and statistics must be those of its training.
+
     Parameters
     ----------
     policy
-        One of the following. It receives float32 observations of shape (episodes, size), one
-        row per episode, and returns actions of shape (episodes, 1). All episodes run side by
-        side, however many there are. If it has a method `reset`, that is called first, without
-        arguments; what a policy without one remembers is not forgotten.
-
-        - a model of Stable-Baselines3, which acts without exploration. Its observations are
-          normalised and stacked as in its training, and `env` must have the windows and
-          wrappers of its training. It must still have its training environments, or come from
-          `mptc_gym.sb3.load`.
-        - another object with `predict(observations)`. If that takes them by name or by
-          `**kwargs`, it is also given `state`, `episode_start` and `deterministic=True`. It
-          returns actions, or actions and state.
-        - another object with `act(observations)`, such as the controllers in `agents`.
-        - a `torch.nn.Module`, which is called with tensors. With or without `predict` or
-          `act`, it is in evaluation mode and computes no gradients.
-        - a function of the observations. For what it reads and does, the caller vouches.
-
-        `act`, a module's `forward` and a function are given `deterministic=True`, too, if they
-        take it by name.
+        A function of observations of shape (n, size), n plants side by side, that returns
+        actions of shape (n, 1); a `torch.nn.Module`, called with tensors, in evaluation mode
+        and without gradients; or an object with `predict`, such as a model of
+        Stable-Baselines3, or with `act`, such as the controllers in `agents`. `predict` is
+        given `state`, `episode_start` and `deterministic=True` as far as it takes them, others
+        `deterministic=True` where they name it. A method `reset` is called before the episodes;
+        what was learnt carries over from round to round.
     env
-        An id, such as one of `IDS`; an `EnvSpec`, which may include wrappers, such as that of
-        `mptc_gym.sb3.spec_of`; or a function that makes a new environment at each call, which
-        must run the episodes of its seeds. By default `MiddlePoint-v0`, for a model with the
-        windows and wrappers of its training.
+        An id, such as one of `IDS`, or an `EnvSpec`; a function that makes one environment; or
+        environments: one, a vector environment of Gymnasium, or a `VecEnv` of
+        Stable-Baselines3, such as `model.get_env()`. What normalises is frozen meanwhile.
+        Environments that are given are not closed, and begin a new episode afterwards. If they
+        are fewer than `episodes`, they run several rounds.
     episodes
         Number of episodes, at least 2.
     seed
@@ -143,12 +153,18 @@ def evaluate(
         Further arguments for the id or the `EnvSpec`, as in `gymnasium.make`: those of the
         environment and `max_episode_steps`.
 
+    Returns
+    -------
+    Evaluation
+        Mean error, score with its interval, and valve travel; arrays of shape (episodes,) hold
+        those of each episode.
+
     Raises
     ------
     ValueError
         If the environment does not exist, is not one of this package or runs other episodes
-        than those of its seeds; if the policy does not fit it, or is a model that does not say
-        how it was trained; or if the policy's actions have the wrong shape or are not finite.
+        than those of its seeds; if the policy does not fit it; or if actions have the wrong
+        shape or are not finite.
     TypeError
         If an argument of the environment is unknown.
 
@@ -158,36 +174,31 @@ def evaluate(
     >>> print(mptc_gym.evaluate(lambda observations: np.zeros((len(observations), 1))))
     MiddlePoint-v0: mean error 5.000 degC, 5.49 times the least possible; score 0.000; \
 valve travel 0 t/h; 100 episodes, all alike
+
+    A model of Stable-Baselines3 acts in its own environments, or in others like them:
+
+    >>> from stable_baselines3 import PPO
+    >>> plants = mptc_gym.sb3.make_vec_env("MiddlePointNoisy-v0", 10, action_window=20)
+    >>> model = PPO("MlpPolicy", plants).learn(20_000)
+    >>> mptc_gym.evaluate(model, model.get_env())
+    >>> mptc_gym.evaluate(model, mptc_gym.sb3.spec_of(model, "MiddlePointHard-v0"))
     """
     episodes = count("episodes", episodes, 2, MOST_PLANTS)
     first = count("seed", seed, 0, 2**63)
     seeds = range(first, first + episodes)
-    make = _maker(policy, env, arguments)
-    single = make()
-    parameters = _parameters(single)
-    with ExitStack() as made:
-        made.enter_context(closing(single))
-        # Of an id or a spec, all are alike.
-        if callable(env) and _parameters(made.enter_context(closing(make()))) != parameters:
-            raise ValueError("env must be a function that makes the same plant at each call")
-        check_fit(policy, single, parameters, episodes)
-        spec = single.spec
-        name = spec.id if spec else type(single.unwrapped).__name__
-        samples = (spec and spec.max_episode_steps) or SAMPLES
-        native: Batch = partial(MiddlePointVectorEnv, **dataclasses.asdict(parameters))
-        batch = native_batch(single)
-    if batch is not None:
-        errors, travels = _run(batch, policy, seeds, samples)
-    else:
-        errors, travels = _run(_one_by_one(make), policy, seeds, samples, native)
+    with _stage(policy, env, episodes, arguments) as stage:
+        errors, travels, samples = _run(policy, stage, seeds)
+    parameters = stage.parameters
     found = Evaluation(
-        name, float(errors.mean()), float(travels.mean()), errors, travels, seeds
+        stage.name, float(errors.mean()), float(travels.mean()), errors, travels, seeds
     )
     least = least_errors(parameters, samples, seeds)
     if least is None:
         return dataclasses.replace(found, missing=_missing(parameters, samples, seeds))
     rest = action_from_command(0.0, parameters.u_min, parameters.u_max)
-    idle, _ = _run(native, lambda seen: np.full((len(seen), 1), rest), seeds, samples)
+    with closing(MiddlePointVectorEnv(episodes, **dataclasses.asdict(parameters))) as plants:
+        alone = Stage(plants, parameters, samples, True)
+        idle, *_ = _run(lambda seen: np.full((len(seen), 1), rest), alone, seeds)
     gained, possible = idle - errors, idle - least
     return dataclasses.replace(
         found,
@@ -200,13 +211,120 @@ valve travel 0 t/h; 100 episodes, all alike
     )
 
 
+class Stage(NamedTuple):
+    """Where a policy acts."""
+
+    plants: Any
+    """A batch that is reset and stepped at once."""
+    parameters: Parameters
+    """The arguments of all plants, but for what does not affect bounds."""
+    most: int
+    """Length of an episode that does not end before, samples."""
+    native: bool
+    """Whether these are the package's own plants, whose episodes need no check."""
+    name: str = ""
+    """The environment's id, or the name of its class."""
+
+
+@contextmanager
+def _stage(policy: Any, env: Any, n: int, arguments: dict[str, Any]) -> Iterator[Stage]:
+    """Yield environments for n episodes, if a policy fits them, and clean up afterwards."""
+    most, name, batch = SAMPLES, "", None
+    if isinstance(env, str | EnvSpec):
+        env = partial(make_one, env, arguments)
+        with closing(env()) as single:
+            spec, batch = single.spec, native_batch(single)
+        if spec is not None:
+            most, name = spec.max_episode_steps or SAMPLES, spec.id
+    elif arguments:
+        raise ValueError(f"{', '.join(arguments)} must be given where env is made")
+    given: Any = closing(batch(n)) if batch else environments.opened(env, n, policy)
+    with given as plants:
+        inner = [plants.unwrapped] if batch else plants.inner
+        parameters = inner[0].parameters
+        if any(case_of(each.parameters) != case_of(parameters) for each in inner):
+            raise ValueError("env must have the same plants, but for windows and rewards")
+        owner = owner_of(policy)
+        if hasattr(owner, "check_environment") and not isinstance(owner, type):
+            owner.check_environment(parameters, environments.acting(plants), plants.num_envs)
+        if is_model(policy):
+            environments.check_model(policy, plants, env)
+        name = name or (inner[0].spec.id if inner[0].spec else type(inner[0]).__name__)
+        yield Stage(plants, parameters, most, batch is not None, name)
+
+
+def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
+    """Make an environment from an id or a spec; ValueError if it cannot be found."""
+    try:
+        return gymnasium.make(env, disable_env_checker=True, **arguments)
+    except (gymnasium.error.Error, ImportError):
+        known = list(IDS.values())
+        close = difflib.get_close_matches(str(env), known, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"such as one of {', '.join(known)}"
+        reject("env", env, f"the id of an environment ({hint})")
+
+
+def native_batch(single: Env) -> Batch | None:
+    """Return a function that makes many of an environment, to be stepped at once.
+
+    It takes their number and, optionally, an `autoreset_mode` and a `render_mode`. Return None
+    if there is no such batch: for another class, or wrappers other than `IncrementalAction`.
+    """
+    inner, moves = single, []
+    while isinstance(inner, gymnasium.Wrapper):
+        if type(inner) is IncrementalAction:
+            moves.append(inner._saved_kwargs)
+        elif type(inner) not in (OrderEnforcing, PassiveEnvChecker, TimeLimit):
+            return None
+        inner = inner.env
+    spec = single.spec
+    if type(inner) is not MiddlePointEnv or spec is None or len(moves) > 1:
+        return None
+    limit = spec.max_episode_steps
+    plants: Batch = partial(
+        MiddlePointVectorEnv, max_episode_steps=limit, **dataclasses.asdict(inner.parameters)
+    )
+    if not moves:
+        return plants
+    return lambda n, **modes: VectorIncrementalAction(plants(n, **modes), **moves[0])
+
+
+def _run(policy: Any, stage: Stage, seeds: range) -> tuple[Values, Values, int]:
+    """Run one episode per seed, in rounds of as many as there are plants.
+
+    Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each episode;
+    and N.
+    """
+    errors, travels, lengths = [], [], set()
+    n = stage.plants.num_envs
+    for first in range(seeds.start, seeds.stop, n):
+        own = [*range(first, first + n)]
+        steps = rollout(stage.plants, start(policy, n), stage.most, own)
+        if not stage.native:
+            native = MiddlePointVectorEnv(n, **dataclasses.asdict(case_of(stage.parameters)))
+            steps = environments.replayed(steps, native, own)
+        error, travel = np.zeros(n), np.zeros(n)
+        for k, (before, after, ended) in enumerate(steps, 1):  # noqa: B007 (used below)
+            error += np.abs(after["error"])
+            travel += np.abs(after["applied"] - before["applied"])
+            if ended.any():
+                break
+        lengths.add(k)
+        if len(lengths) > 1 or ended.any() != ended.all():
+            raise ValueError(f"env must end all episodes at once, got an end after {k} samples")
+        errors.append(error / k)
+        travels.append(travel)
+    count = len(seeds)
+    return np.concatenate(errors)[:count], np.concatenate(travels)[:count], k
+
+
 def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values | None:
     """Return the least possible mean error of each episode, degC, from the package's bounds.
 
     Return None if there is no bound for N = `samples` and these seeds. Where only noise and
     load are drawn, one bound holds for all episodes and any seeds.
     """
-    least = _kept().get(_case(parameters))
+    least = _kept().get(case_of(parameters))
     if least is None or samples != SAMPLES:
         return None
     if len(least) == 1:
@@ -220,10 +338,10 @@ def _kept() -> dict[Parameters, Values]:
     """Return the bounds written by `python -m benchmarks.bounds --package`, by case."""
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
     cases = json.loads(text)["cases"].values()
-    return {_case(Parameters(**case["arguments"])): np.array(case["least"]) for case in cases}
+    return {case_of(Parameters(**case["arguments"])): np.array(case["least"]) for case in cases}
 
 
-def _case(parameters: Parameters) -> Parameters:
+def case_of(parameters: Parameters) -> Parameters:
     """Return the arguments, with those that do not affect the bound at their defaults."""
     defaults = {name: ARGUMENTS[name].default for name in _NO_MATTER}
     return dataclasses.replace(parameters, **defaults)
@@ -231,9 +349,9 @@ def _case(parameters: Parameters) -> Parameters:
 
 def _missing(parameters: Parameters, samples: int, seeds: range) -> str:
     """Return a message with the command that computes a missing bound."""
-    case, options = _case(parameters), []
+    case, options = case_of(parameters), []
     for name, given in PRESETS.items():
-        if case == _case(Parameters(**given)):
+        if case == case_of(Parameters(**given)):
             options = ["--preset", name]
     if not options:
         for name, value in dataclasses.asdict(case).items():
@@ -256,123 +374,3 @@ def _interval(gained: Values, possible: Values) -> tuple[float, float]:
     quotients = [gained[which].mean() / possible[which].mean() for which in drawn]
     low, high = np.quantile(quotients, (0.025, 0.975))
     return float(low), float(high)
-
-
-def _maker(policy: Any, env: Any, arguments: dict[str, Any]) -> Callable[[], Env]:
-    """Return a function that makes one environment."""
-    if env is None:
-        training = training_of(policy)
-        if training is not None:
-            return partial(make_one, training.spec(IDS["paper"], arguments), {})
-        env = IDS["paper"]
-    if isinstance(env, str | EnvSpec):
-        return partial(make_one, env, arguments)
-    if not callable(env):
-        reject("env", env, "an id, an EnvSpec or a function that makes an environment")
-    if arguments:
-        raise ValueError(f"{', '.join(arguments)} must be given in the function that is env")
-    return cast("Callable[[], Env]", env)
-
-
-def _parameters(single: Env) -> Parameters:
-    """Return the arguments of an environment of this package.
-
-    An environment that would scale observations differently than in training is refused.
-    """
-    inner = getattr(single, "unwrapped", None)
-    if not isinstance(inner, MiddlePointEnv):
-        reject("env", single, "a MiddlePointEnv, in wrappers or not")
-    if single.has_wrapper_attr("obs_rms"):
-        raise ValueError(
-            "env must not be in NormalizeObservation, whose statistics would begin anew: "
-            "train in VecNormalize and save by mptc_gym.sb3.save, or scale by fixed numbers"
-        )
-    return inner.parameters
-
-
-def native_batch(single: Env) -> Batch | None:
-    """Return a function that makes many of an environment, to be stepped at once.
-
-    It takes their number and, optionally, an `autoreset_mode` and a `render_mode`. Return None
-    if there is no such batch: for another environment, one without a spec, or one in wrappers
-    other than `IncrementalAction`.
-    """
-    inner, spec = single.unwrapped, single.spec
-    if type(inner) is not MiddlePointEnv or spec is None:
-        return None
-    arguments = dataclasses.asdict(inner.parameters)
-    plants: Batch = partial(
-        MiddlePointVectorEnv, max_episode_steps=spec.max_episode_steps, **arguments
-    )
-    match wrappers_of(single):
-        case ():
-            return plants
-        case (only,) if only.entry_point == entry_point(IncrementalAction):
-            moves = only.kwargs or {}
-            return lambda n, **modes: VectorIncrementalAction(plants(n, **modes), **moves)
-    return None
-
-
-def _one_by_one(make: Callable[[], Env]) -> Batch:
-    """Return a function that makes n environments, to be stepped one after the other."""
-
-    def batch(n: int) -> VectorEnv[Any, Any, Any]:
-        plants = SyncVectorEnv([make] * n)
-        if len({id(each.unwrapped) for each in plants.envs}) < n:
-            raise ValueError("env must be a function that makes a new environment at each call")
-        return plants
-
-    return batch
-
-
-def _run(
-    batch: Batch, policy: Any, seeds: range, samples: int, native: Batch | None = None
-) -> tuple[Values, Values]:
-    """Run one episode of N = `samples` per seed; `batch(n)` makes n environments.
-
-    With `native`, which makes the package's own plants, other episodes than theirs are refused.
-    Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each episode.
-    """
-    n = len(seeds)
-    error, travel = np.zeros(n), np.zeros(n)
-    with ExitStack() as stack:
-        plants = stack.enter_context(closing(batch(n)))
-        steps = rollout(plants, start(policy, n), samples, seeds[0])
-        if native:
-            steps = _same_episodes(steps, stack.enter_context(closing(native(n))), seeds[0])
-        for k, (before, after, ended) in enumerate(steps, 1):
-            error += np.abs(after["error"])
-            travel += np.abs(after["applied"] - before["applied"])
-            if k < samples and ended.any():
-                raise ValueError(f"env must run episodes of {samples} samples, got {k}")
-    return error / samples, travel
-
-
-def _same_episodes(steps: Iterable[Step], plants: Any, seed: int) -> Iterator[Step]:
-    """Yield steps, as long as `plants`, given the same commands, show the same."""
-    expected = plants.reset(seed=seed)[1]
-    limits = [
-        expected.get(each, getattr(plants.parameters, each)) for each in ("u_min", "u_max")
-    ]
-    for k, step in enumerate(steps):
-        if k == 0:
-            _check_infos(step.before, expected, k)
-        flows = step.after.get("command", np.zeros(plants.num_envs))
-        expected = plants.step(action_from_command(flows, *limits)[:, np.newaxis])[-1]
-        _check_infos(step.after, expected, k + 1)
-        yield step
-
-
-def _check_infos(infos: dict[str, Any], expected: dict[str, Any], k: int) -> None:
-    """Refuse infos at sample k that are not those expected, but for rounding."""
-    names = [name for name in expected if not name.startswith("_")]
-    values = np.array([expected[name] for name in names])
-    found = np.array([infos.get(name, np.full_like(values[0], np.nan)) for name in names])
-    right = np.isclose(found, values, 1e-6, 1e-6, equal_nan=True).all(axis=1)
-    follow = "output", "error", "command", "applied"  # from the others, which tell more
-    for name in sorted(np.array(names)[~right], key=lambda name: name in follow):
-        raise ValueError(
-            f"env must run the episodes of its seeds, whose {name} by sample {k} is "
-            f"{shorten(expected[name])}, got {shorten(infos.get(name))}: it must not reset "
-            "with another seed, skip or repeat samples, or change the plant or info"
-        )

@@ -1,4 +1,4 @@
-"""Run any policy: find out whether it fits an environment and how it acts, and let it act."""
+"""Let any policy act: find out how it is called, and step a batch of plants with it."""
 
 from __future__ import annotations
 
@@ -9,248 +9,53 @@ from functools import partial
 from inspect import Parameter
 from typing import Any, NamedTuple, cast
 
-import gymnasium
 import numpy as np
-from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from mptc_gym.checks import reject, shorten
-from mptc_gym.parameters import Parameters
-from mptc_gym.training import Training, wrappers_of
 
-Act = Callable[[NDArray[np.float32]], Any]  # observations, shape (n, size), to actions
-
-
-def is_model(policy: Any) -> bool:
-    """Whether a policy is a model of Stable-Baselines3, or the policy inside one."""
-    return _is_instance(policy, "stable_baselines3.common.base_class", "BaseAlgorithm") or (
-        _is_instance(policy, "stable_baselines3.common.policies", "BaseModel")
-    )
-
-
-def _is_instance(policy: Any, module: str, name: str) -> bool:
-    """Whether an object is of a class of a package that is only imported where it is used."""
-    return module in sys.modules and isinstance(policy, getattr(sys.modules[module], name))
-
-
-def training_of(policy: Any) -> Training | None:
-    """Return how a model of Stable-Baselines3 was trained; None for any other policy.
-
-    A model that does not say it is refused with a ValueError.
-    """
-    if not is_model(policy):
-        return None
-    from mptc_gym import sb3_training  # here: it needs Stable-Baselines3
-
-    return sb3_training.training_of(policy)
-
-
-def start(policy: Any, n: int) -> Act:
-    """Reset a policy for a batch of n episodes, and return its function of observations."""
-    predicts, acts = (callable(getattr(policy, name, None)) for name in ("predict", "act"))
-    if isinstance(policy, type) or not (predicts or acts or callable(policy)):
-        reject(
-            "policy",
-            policy,
-            "a function, or an object with predict, such as mptc_gym.sb3.load(path), or with "
-            "act, not a class",
-        )
-    owner = _owner(policy)
-    reset = getattr(owner, "reset", None)
-    if callable(reset) and not isinstance(owner, type):
-        _check_call(reset, "policy.reset", "no argument")
-        reset()
-    act = _predicting(policy, n) if predicts else _deterministic(policy.act if acts else policy)
-    if _is_instance(owner, "torch.nn", "Module"):
-        return _evaluating(owner, act, tensors=not (predicts or acts or owner is not policy))
-    return act
-
-
-def _owner(policy: Any) -> Any:
-    """Return a policy; of a method, such as `controller.act`, its object."""
-    while isinstance(policy, partial):
-        policy = policy.func
-    return getattr(policy, "__self__", policy)
-
-
-def _deterministic(act: Any) -> Act:
-    """Return a function that explores only on request as one that does not explore."""
-    explores = "deterministic" in _keywords(getattr(act, "forward", act))
-    return partial(act, deterministic=True) if explores else cast("Act", act)
-
-
-def _predicting(policy: Any, n: int) -> Act:
-    """Return the function of observations of a policy in the form of Stable-Baselines3."""
-    offered: dict[str, Any] = {"state": None, "episode_start": None, "deterministic": True}
-    keywords = _keywords(policy.predict)
-    if "*" in keywords and "**" not in keywords:
-        raise ValueError(
-            "policy.predict must name its arguments, such as state, episode_start and "
-            f"deterministic, or take **kwargs, got {inspect.signature(policy.predict)}"
-        )
-    accepted = [name for name in offered if name in keywords or "**" in keywords]
-    _check_call(
-        policy.predict, "policy.predict", "the observations", 0, **dict.fromkeys(accepted)
-    )
-    prepare: Act = lambda seen: seen  # noqa: E731
-    if is_model(policy):
-        from mptc_gym import sb3_training
-
-        prepare = sb3_training.preparation(policy, n)
-    offered["episode_start"] = np.ones(n, np.bool_)
-
-    def act(observations: NDArray[np.float32]) -> Any:
-        given = {name: offered[name] for name in accepted}
-        actions = policy.predict(prepare(observations), **given)
-        offered["episode_start"] = np.zeros(n, np.bool_)
-        if isinstance(actions, tuple):
-            actions, offered["state"] = actions
-        if offered["state"] is not None and "state" not in accepted:
-            raise ValueError("policy.predict must take the state that it returns: state=None")
-        return actions
-
-    return act
-
-
-def _keywords(function: Any) -> set[str]:
-    """Return the names of a function's arguments, as far as they can be known.
-
-    "*" stands for arguments that have no names, and "**" for any further names.
-    """
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return set()
-    marks: dict[Any, str] = {Parameter.VAR_POSITIONAL: "*", Parameter.VAR_KEYWORD: "**"}
-    return {marks.get(each.kind, each.name) for each in parameters}
-
-
-def _check_call(
-    method: Callable[..., Any], name: str, what: str, *given: Any, **named: Any
-) -> None:
-    """Refuse a method that needs more arguments than it gets."""
-    try:
-        inspect.signature(method).bind(*given, **named)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a method that needs {what} alone: {error}") from error
-
-
-def _evaluating(module: Any, act: Act, tensors: bool) -> Act:
-    """Return the function of a `torch.nn.Module`, in evaluation mode and without gradients."""
-    torch: Any = sys.modules["torch"]
-    numbers = (*module.parameters(), *module.buffers())
-    like = next(filter(torch.is_floating_point, numbers), torch.empty(0))
-
-    def evaluating(observations: NDArray[np.float32]) -> Any:
-        in_training = [part for part in module.modules() if part.training]
-        module.eval()
-        try:
-            with torch.no_grad():
-                actions = act(torch.tensor(observations).to(like) if tensors else observations)
-        finally:
-            for part in in_training:
-                part.training = True
-        return np.array(actions.tolist()) if isinstance(actions, torch.Tensor) else actions
-
-    return evaluating
-
-
-def check_fit(
-    policy: Any, env: gymnasium.Env[Any, Any], parameters: Parameters, episodes: int
-) -> None:
-    """Refuse an environment that a policy was not trained or set up for.
-
-    Raises
-    ------
-    ValueError
-        If they differ, or if a model does not say how it was trained.
-    """
-    predict = getattr(policy, "predict", None)
-    if env.has_wrapper_attr("action_masks") and "action_masks" in _keywords(predict):
-        raise ValueError(
-            "policy.predict takes the action_masks of env, which are not handed to it: give a "
-            "function that finds the masks from the observations"
-        )
-    training = training_of(policy)
-    if training is not None:
-        training.check(env)
-        return
-    owner = _owner(policy)
-    seen = getattr(getattr(owner, "observation_space", None), "shape", None)
-    if seen not in (None, env.observation_space.shape):
-        raise ValueError(
-            f"env must have observations of shape {seen}, as policy reads them, got "
-            f"{env.observation_space.shape}: give it the windows of the training"
-        )
-    place, wanted = getattr(owner, "error_index", None), getattr(owner, "observation", {})
-    if place is not None and (place != parameters.heads[0] or not parameters.error_window):
-        raise ValueError(
-            f"env must show its newest error as element {place} of the observation, where "
-            f"policy reads it, got windows {parameters.windows}"
-        )
-    if isinstance(wanted, Mapping) and any(
-        getattr(parameters, name) != value for name, value in wanted.items()
-    ):
-        asked = ", ".join(f"{name}={value}" for name, value in wanted.items())
-        raise ValueError(
-            f"env must have the windows that policy wants, {asked}, got {parameters.windows}"
-        )
-    loops = getattr(owner, "num_envs", episodes)
-    if loops != episodes:
-        raise ValueError(
-            f"policy must be made with num_envs={episodes}, one loop per episode, got "
-            f"{loops or 1}"
-        )
-    limits = getattr(owner, "u_min", None), getattr(owner, "u_max", None)
-    actuator = parameters.range_of("u_min")[0], parameters.range_of("u_max")[1]
-    if None not in limits and limits != actuator:
-        raise ValueError(
-            f"policy must be made with the limits of env, u_min={actuator[0]}, "
-            f"u_max={actuator[1]}, got {limits[0]}, {limits[1]}"
-        )
-    if None not in limits and wrappers_of(env):
-        raise ValueError(
-            "env must not be wrapped, as policy commands the flow of the plant itself, got "
-            f"{', '.join(each.name for each in wrappers_of(env))}"
-        )
+Act = Callable[[Any], Any]  # observations, one row a plant, to actions
 
 
 class Step(NamedTuple):
     """What a step of a batch showed; the arrays have one element per plant."""
 
-    before: dict[str, Any]
+    before: Mapping[str, Any]
     """The infos at sample k."""
-    after: dict[str, Any]
-    """The infos at sample k + 1."""
+    after: Mapping[str, Any]
+    """The infos at sample k + 1, also where that ends an episode."""
     ended: NDArray[np.bool_]
     """Whether the episodes have ended."""
 
 
-def rollout(
-    plants: VectorEnv[Any, Any, Any],
-    act: Callable[[Any], Any],
-    samples: int,
-    seed: int | list[int],
-) -> Iterator[Step]:
-    """Reset a batch with seeds from `seed` on, and step it through samples k = 0, 1, ...
+def rollout(plants: Any, act: Act, samples: int, seed: int | list[int]) -> Iterator[Step]:
+    """Reset a batch of plants, and step it through samples k = 0, 1, ...
 
-    In place of a first seed, a list has that of each plant. This is the one loop, for scores,
-    benchmarks and tests.
+    This is the one loop, for scores, benchmarks and tests.
 
-    `act` is called with the observations, shape (n, size), and returns the actions.
+    Parameters
+    ----------
+    plants
+        A vector environment of Gymnasium.
+    act
+        A function of the observations that returns the actions.
+    samples
+        Number of steps.
+    seed
+        The seed of the first plant, or a list of all seeds.
 
     Raises
     ------
     ValueError
         If actions have the wrong shape or are not finite.
     """
-    # It takes a list as well, despite its annotation.
-    observations, infos = plants.reset(seed=cast("int", seed))
+    observations, infos = plants.reset(seed=seed)
     for k in range(samples):
         actions = _checked(act(observations), plants.action_space.shape, k)
         before = infos
         observations, _, terminated, truncated, infos = plants.step(actions)
-        yield Step(before, infos, terminated | truncated)
+        # Where the same step resets a plant, the last sample's infos are apart.
+        yield Step(before, infos.get("final_info", infos), terminated | truncated)
 
 
 def _checked(actions: Any, shape: Any, k: int) -> NDArray[Any]:
@@ -269,3 +74,131 @@ def _checked(actions: Any, shape: Any, k: int) -> NDArray[Any]:
         wrong = checked[~finite][0]
         raise ValueError(f"policy must return finite actions, got {wrong} at sample {k}")
     return checked
+
+
+def start(policy: Any, n: int) -> Act:
+    """Reset a policy for n episodes, and return its function of observations."""
+    predicts, acts = (callable(getattr(policy, name, None)) for name in ("predict", "act"))
+    if isinstance(policy, type) or not (predicts or acts or callable(policy)):
+        reject("policy", policy, "a function, or an object with predict or act, not a class")
+    owner = owner_of(policy)
+    reset = getattr(owner, "reset", None)
+    if callable(reset) and not isinstance(owner, type):
+        _check_call(reset, "policy.reset", "no argument")
+        reset()
+    act = _predicting(policy, n) if predicts else _deterministic(policy.act if acts else policy)
+    if isinstance(owner, loaded("torch.nn", "Module")):
+        function = _unbound(policy)
+        forward = function is owner or getattr(function, "__name__", "") == "forward"
+        return _evaluating(owner, act, tensors=forward and not (predicts or acts))
+    return act
+
+
+def loaded(module: str, name: str) -> Any:
+    """Return a class of a package that is imported only where it is used.
+
+    Before that it is the empty tuple, of which nothing is an instance.
+    """
+    return getattr(sys.modules.get(module), name, ())
+
+
+def is_model(policy: Any) -> bool:
+    """Whether a policy is a model of Stable-Baselines3, or the policy inside one."""
+    model = loaded("stable_baselines3.common.base_class", "BaseAlgorithm")
+    return isinstance(policy, (model, loaded("stable_baselines3.common.policies", "BaseModel")))
+
+
+def owner_of(policy: Any) -> Any:
+    """Return a policy; of a method, such as `controller.act`, its object."""
+    function = _unbound(policy)
+    return getattr(function, "__self__", function)
+
+
+def _unbound(function: Any) -> Any:
+    while isinstance(function, partial):
+        function = function.func
+    return function
+
+
+def _deterministic(act: Any) -> Act:
+    """Return a function that explores only on request as one that does not explore."""
+    function, chosen = act, False
+    while isinstance(function, partial):
+        chosen |= "deterministic" in function.keywords  # by the caller
+        function = function.func
+    explores = "deterministic" in _keywords(getattr(function, "forward", function))
+    return partial(act, deterministic=True) if explores and not chosen else cast("Act", act)
+
+
+def _predicting(policy: Any, n: int) -> Act:
+    """Return the function of observations of a policy in the form of Stable-Baselines3."""
+    offered: dict[str, Any] = {"state": None, "episode_start": None, "deterministic": True}
+    keywords = _keywords(policy.predict)
+    if "*" in keywords and "**" not in keywords:
+        raise ValueError(
+            "policy.predict must name its arguments, such as state, episode_start and "
+            f"deterministic, or take **kwargs, got {inspect.signature(policy.predict)}"
+        )
+    if "action_masks" in keywords:
+        raise ValueError(
+            "policy.predict takes action_masks, which are not handed to it: give a function "
+            "that finds them from the observations"
+        )
+    accepted = [name for name in offered if name in keywords or "**" in keywords]
+    named = dict.fromkeys(accepted)
+    _check_call(policy.predict, "policy.predict", "the observations", 0, **named)
+    offered["episode_start"] = np.ones(n, np.bool_)
+
+    def act(observations: Any) -> Any:
+        actions = policy.predict(observations, **{name: offered[name] for name in accepted})
+        offered["episode_start"] = np.zeros(n, np.bool_)
+        if isinstance(actions, tuple):
+            actions, offered["state"] = actions
+        if offered["state"] is not None and "state" not in accepted:
+            raise ValueError("policy.predict must take the state that it returns: state=None")
+        return actions
+
+    return act
+
+
+def _keywords(function: Any) -> set[str]:
+    """Return the names of a function's arguments, with their stars if they are many."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # of a function that is not written in Python
+        return set()
+    stars: dict[Any, str] = {Parameter.VAR_POSITIONAL: "*", Parameter.VAR_KEYWORD: "**"}
+    return {stars.get(each.kind, each.name) for each in parameters}
+
+
+def _check_call(method: Any, name: str, what: str, *given: Any, **named: Any) -> None:
+    """Refuse a method that needs more arguments than it gets."""
+    try:
+        inspect.signature(method).bind(*given, **named)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a method that needs {what} alone: {error}") from error
+
+
+def _evaluating(module: Any, act: Act, tensors: bool) -> Act:
+    """Return the function of a `torch.nn.Module`, in evaluation mode and without gradients."""
+    torch: Any = sys.modules["torch"]
+    numbers = (*module.parameters(), *module.buffers())
+    like = next(filter(torch.is_floating_point, numbers), torch.empty(0))
+
+    def tensor(seen: Any) -> Any:
+        if isinstance(seen, Mapping):
+            return {name: tensor(each) for name, each in seen.items()}
+        return torch.tensor(seen).to(like)
+
+    def evaluating(observations: Any) -> Any:
+        in_training = [part for part in module.modules() if part.training]
+        module.eval()
+        try:
+            with torch.no_grad():
+                actions = act(tensor(observations) if tensors else observations)
+        finally:
+            for part in in_training:
+                part.training = True
+        return np.array(actions.tolist()) if isinstance(actions, torch.Tensor) else actions
+
+    return evaluating

@@ -125,19 +125,20 @@ def test_its_cost_is_known(factory):
     assert factory.cost.prior_knowledge
 
 
+@pytest.fixture
+def written(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def write(code):
+        name = f"own_{abs(hash(code))}"
+        (tmp_path / f"{name}.py").write_text(code)
+        return f"{name}:Mine"
+
+    return write
+
+
 class TestOwnControllers:
     """What is no controller is named before anything runs."""
-
-    @pytest.fixture
-    def written(self, tmp_path, monkeypatch):
-        monkeypatch.syspath_prepend(tmp_path)
-
-        def write(code):
-            name = f"own_{abs(hash(code))}"
-            (tmp_path / f"{name}.py").write_text(code)
-            return f"{name}:Mine"
-
-        return write
 
     def test_a_factory_gets_what_it_asks_for(self, written):
         code = (
@@ -177,7 +178,7 @@ class TestOwnControllers:
     @pytest.mark.parametrize(
         ("body", "complaint"),
         [
-            ("act = lambda self, o: [[0.0]] * len(o)", "reset"),
+            ("pass", "policy must be a function, or an object with predict or act"),
             ("observation = 3", "observation of .* must be a dict"),
             ("observation = ['error_window']", "observation of .* must be a dict"),
             ("observation = {'dead_zone': 0.0}", "out of .* got {'dead_zone': 0.0}"),
@@ -202,6 +203,7 @@ def zips(tmp_path_factory):
         save(model, folder / f"velocity-{seed}.zip")
     bare = PPO("MlpPolicy", gymnasium.make("MiddlePoint-v0"), device="cpu")
     bare.save(folder / "bare.zip")
+    model.save(folder / "wide.zip")  # of other windows, which it does not say
     delayed = DelayObservation(gymnasium.make("MiddlePoint-v0"), 2)
     save(PPO("MlpPolicy", delayed, device="cpu"), folder / "delayed.zip")
     with torch.no_grad():
@@ -223,13 +225,39 @@ class TestSavedPolicies:
         controller = factory(PRESETS[preset], 3, SEED)
         found = errors(factory, 3, 1200, **PRESETS[preset])
         model = load(file, device="cpu")
-        expected = evaluate(model, spec_of(file, IDS[preset]), episodes=3)
+        expected = evaluate(model, spec_of(model, IDS[preset]), episodes=3)
         np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-12)
         # What it remembers, the flow, is forgotten at the beginning of an episode.
         first, again = (
             factory.run(PRESETS[preset], 50, 3, SEED, controller).applied for _ in range(2)
         )
         np.testing.assert_array_equal(first, again)
+
+    def test_a_zip_of_any_other_kind_acts_in_the_plain_environment(self, zips):
+        (factory,) = chosen([], [f"mine=PPO:{zips / 'bare.zip'}"])["mine"].members()
+        model = PPO.load(zips / "bare.zip", device="cpu")
+        expected = evaluate(model, IDS["noisy"], episodes=3)
+        found = errors(factory, 3, 1200, **PRESETS["noisy"])
+        np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-12)
+
+    def test_a_function_gives_the_policy_and_where_it_acts(self, zips, written):
+        factory = own_factory(
+            written(
+                "import dataclasses, gymnasium\n"
+                "from gymnasium.wrappers import DelayObservation\n"
+                "from mptc_gym import MiddlePointEnv\n"
+                "from stable_baselines3 import PPO\n"
+                f"model = PPO.load({str(zips / 'delayed.zip')!r}, device='cpu')\n"
+                "def Mine(parameters):\n"
+                "    given = dataclasses.asdict(parameters)\n"
+                "    return model, lambda: DelayObservation(MiddlePointEnv(**given), 2)\n"
+            )
+        )
+        found = errors(factory, 3, 600, **PRESETS["noisy"])
+        model = load(zips / "delayed.zip", device="cpu")
+        spec = spec_of(model, IDS["noisy"], max_episode_steps=600)
+        expected = evaluate(model, spec, episodes=3)
+        np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-9)
 
     def test_several_trainings_are_members_of_one(self, zips):
         both = [f"mine=PPO:{zips / 'velocity-0.zip'}", f"mine=PPO:{zips / 'velocity-1.zip'}"]
@@ -243,15 +271,13 @@ class TestSavedPolicies:
     @pytest.mark.parametrize(
         ("location", "complaint"),
         [
-            ("PPO:{}/bare.zip", "bare.zip does not say how its policy was trained: save it by"),
-            (
-                "PPO:{}/delayed.zip",
-                "trained in DelayObservation, and only IncrementalAction is",
-            ),
+            ("PPO:{}/wide.zip", "not act in the plain environment: write a function that ret"),
+            ("PPO:{}/delayed.zip", "acts in DelayObservation, not in IncrementalAction alone"),
+            ("No:{}/bare.zip", "No must be an algorithm of Stable-Baselines3, such as PPO"),
             ("PPO:{}/nan.zip", "trying it raised ValueError: Expected parameter loc"),
             ("{}/velocity-0.zip", "must be ALGORITHM:FILE.zip, such as PPO:.*velocity-0.zip"),
             ("PPO:{}/none.zip", "there is no file .*none.zip"),
-            ("SAC:{}/velocity-0.zip", "holds a model of stable_baselines3.*PPO, not of SAC"),
+            ("SAC:{}/velocity-0.zip", "holds a model of PPO, not of SAC"),
         ],
     )
     def test_what_is_refused(self, location, complaint, zips):

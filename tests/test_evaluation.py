@@ -1,22 +1,20 @@
 """Tests of `mptc_gym.evaluate`, of the bounds that come with it, and of the presets' ids."""
 
+import dataclasses
 import json
 import shlex
 from functools import partial
-from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.spaces import Box
 
-from agents import DirectNNController, PIController, PolicyNetwork
-from agents.networks import PRETRAINED
+from agents import PIController
 from benchmarks.bounds import least_possible
-from benchmarks.bounds.__main__ import PACKAGED as CASES
 from benchmarks.bounds.__main__ import main as bounds_command
-from mptc_gym import IDS, PRESETS, MiddlePointEnv, Parameters, evaluate
+from benchmarks.bounds.command import PACKAGED as CASES
+from mptc_gym import IDS, PRESETS, Evaluation, MiddlePointEnv, Parameters, evaluate
 from mptc_gym.evaluation import SEED, least_errors
 from mptc_gym.wrappers import IncrementalAction
 from tests.conftest import ROOT, run_closed
@@ -89,11 +87,6 @@ class TestEvaluate:
         alike = evaluate(PIController(1.0, 0.05), episodes=10)
         assert np.ptp(alike.interval) == pytest.approx(0.0, abs=1e-12)
 
-    def test_reset_keeps_what_a_controller_has_learnt(self):
-        learning = DirectNNController(num_envs=3, seed=0)
-        first, again = (evaluate(learning, episodes=3) for _ in range(2))
-        assert again.mean_error < first.mean_error
-
     def test_wrappers_are_those_of_the_spec(self):
         by_spec = evaluate(proportional, wrapped().spec, episodes=2)
         by_function = evaluate(proportional, wrapped, episodes=2)
@@ -126,6 +119,10 @@ class TestEvaluate:
         np.testing.assert_array_equal(some.errors, whole.errors[100:])
         np.testing.assert_array_equal(some.scores, whole.scores[100:])
         assert evaluate(PIController(), HARD, episodes=121).score is None
+
+    @pytest.mark.parametrize("field", dataclasses.fields(Evaluation), ids=lambda f: f.name)
+    def test_help_explains_each_field(self, field):
+        assert f"\n    {field.name} : " in Evaluation.__doc__
 
     def test_its_text_is_one_line(self):
         found = evaluate(PIController(), HARD, episodes=4)
@@ -160,58 +157,6 @@ class TestEvaluate:
         least = least_possible(kind="preview", folder=None, **case)
         assert bounds_command([*shlex.split(command)[3:], f"--cache={tmp_path}"]) == 0
         assert f"{least:.4f}" in capsys.readouterr().out
-
-
-def normalised():
-    return gymnasium.wrappers.NormalizeObservation(gymnasium.make("MiddlePoint-v0"))
-
-
-class TestRefusals:
-    @pytest.mark.parametrize(
-        ("policy", "message"),
-        [
-            (lambda seen: np.zeros(len(seen)), r"policy must return actions of shape \(4, 1\)"),
-            (lambda seen: np.zeros((1, 1)), r"policy must return actions of shape \(4, 1\)"),
-            (lambda seen: np.full((len(seen), 1), np.nan), "policy must return finite actions"),
-            (lambda seen: [["open"]] * len(seen), "policy must return an array of numb"),
-            (lambda seen: [[0.0], 0.0], "policy must return an array of numbers, got "),
-            (3, "policy must be a function, or an object .* with act, not a class, got 3"),
-            (PIController, "policy must be a function, or an object .* with act, not a class"),
-        ],
-    )
-    def test_policies(self, policy, message):
-        with pytest.raises(ValueError, match=message):
-            evaluate(policy, episodes=4)
-
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            ({"env": "MiddlePointEasy-v0"}, "env must be the id of an env.*MiddlePointHard-v0"),
-            ({"env": "no_such_module:Plant-v0"}, "env must be the id of an environment"),
-            ({"env": "CartPole-v1"}, "env must be a MiddlePointEnv, in wrappers or not, got <"),
-            ({"env": 7}, "env must be an id, an EnvSpec or a function that makes an env.* 7"),
-            ({"env": lambda: None}, "env must be a MiddlePointEnv, in wrappers or not, got No"),
-            ({"env": normalised}, "env must not be in NormalizeObservation, whose statistics"),
-            ({"env": MiddlePointEnv, "delay": 3}, "delay must be given in the function that"),
-            ({"delay": -1}, "delay must be"),
-            *(({"episodes": n}, "episodes must be an integer from") for n in (1, 2.5, "many")),
-        ],
-    )  # fmt: skip
-    def test_arguments(self, arguments, message):
-        with pytest.raises(ValueError, match=message):
-            evaluate(idle, **arguments)
-
-    def test_observations_that_do_not_fit(self):
-        trained = SimpleNamespace(observation_space=Box(-1.0, 1.0, (26,)), predict=idle)
-        with pytest.raises(ValueError, match=r"shape \(26,\), as policy reads them, got \(6"):
-            evaluate(trained)
-        evaluate(trained, action_window=20, episodes=2)
-        network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
-        with pytest.raises(ValueError, match=r"the windows that policy wants, .*=\d+, got"):
-            evaluate(network)
-        for windows in ({"setpoint_window": 7}, {"error_window": 0, "output_window": 3}):
-            with pytest.raises(ValueError, match="newest error as element 3"):
-                evaluate(PIController(), **windows)
 
 
 class TestBounds:

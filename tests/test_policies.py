@@ -1,8 +1,6 @@
-"""Tests that `evaluate` runs each kind of policy as it was meant, or refuses it."""
+"""Policies and environments of many kinds: scored as in a plain loop, or refused by a rule."""
 
 import copy
-import json
-import zipfile
 from contextlib import closing
 from functools import partial
 from types import SimpleNamespace
@@ -11,67 +9,89 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils import RecordConstructorArgs
+from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.wrappers import (
     FrameStackObservation,
+    NormalizeObservation,
+    NormalizeReward,
     RescaleAction,
-    ReshapeObservation,
     TimeLimit,
-    TransformObservation,
-)
-from sb3_contrib import MaskablePPO
+    vector,
+)  # fmt: skip
+from sb3_contrib import TQC, MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
     VecEnvWrapper,
     VecFrameStack,
+    VecMonitor,
     VecNormalize,
-)
+)  # fmt: skip
 
 from agents import DirectNNController, PIController
-from mptc_gym import MiddlePointEnv, evaluate, training
+from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, evaluate
 from mptc_gym.evaluation import SEED
-from mptc_gym.sb3 import GymnasiumVecEnv, ScoreCallback, load, make_vec_env, save, spec_of
-from mptc_gym.training import MEMBER
+from mptc_gym.sb3 import load, make_vec_env, save, spec_of
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as IncrementalBatch
 
 NOISY = "MiddlePointNoisy-v0"
-LIMITS = np.float32([-2.0, 2.0])
+LENGTH, EPISODES, N = 40, 3, 2  # so that N environments run two rounds
 # Without a dead zone, every action matters.
-SHORT = {"max_episode_steps": 50, "dead_zone": 0.0}
+PLANT = {"dead_zone": 0.0}
+SHORT = {**PLANT, "max_episode_steps": LENGTH}
 VELOCITY = {"max_move": 0.3, "compensate_dead_zone": 4.0}
+BARE = {"noise_variance": 0.5, **PLANT}
 
 
 def made(**arguments):
-    return gymnasium.make(NOISY, **SHORT, **arguments)
+    return gymnasium.make(NOISY, **{**SHORT, **arguments})
 
 
-def errors_of(new_act, make=made, episodes=3):
+def many(**arguments):
+    return gymnasium.make_vec(NOISY, N, **{**SHORT, **arguments})
+
+
+def moved(env):
+    return IncrementalAction(env, **VELOCITY)
+
+
+def normal(wrapper):
+    """Return environments that normalise, with statistics as if of a training."""
+    size = wrapper.obs_rms.mean.shape[-1]
+    wrapper.obs_rms.mean = np.linspace(-1.0, 2.0, size)
+    wrapper.obs_rms.var = np.linspace(1.0, 4.0, size)
+    wrapper.obs_rms.count = 1000
+    return wrapper
+
+
+def errors_of(new_act, make=made, episodes=EPISODES):
     """Return the mean errors of a plain loop; `new_act()` gives a function for an episode."""
     errors = []
     for seed in range(SEED, SEED + episodes):
         with closing(make()) as env:
-            act, total, ended = new_act(), [], False
+            act, total = new_act(), []
             observation, _ = env.reset(seed=seed)
-            while not ended:
-                observation, _, _, ended, info = env.step(act(observation))
+            for _ in range(LENGTH):
+                observation, *_, info = env.step(act(observation))
                 total.append(abs(info["error"]))
         errors.append(np.mean(total))
     return errors
 
 
-def acting(model, prepare=lambda seen: seen):
+def predicting(model, prepare=lambda: lambda seen: seen):
     """Return how a model of Stable-Baselines3 acts in one episode."""
 
     def new_act():
-        memory = {"state": None, "episode_start": np.ones(1)}
+        memory, see = {"state": None, "episode_start": np.ones(1)}, prepare()
 
         def act(observation):
-            actions, state = model.predict(
-                prepare(observation[None]), deterministic=True, **memory
-            )
+            seen = see(batched(observation))
+            actions, state = model.predict(seen, deterministic=True, **memory)
             memory.update(state=state, episode_start=np.zeros(1))
             return actions[0]
 
@@ -80,42 +100,57 @@ def acting(model, prepare=lambda seen: seen):
     return new_act
 
 
-def stacked(n=3):
+def batched(observation):
+    if isinstance(observation, dict):
+        return {name: each[None] for name, each in observation.items()}
+    return np.asarray(observation)[None]
+
+
+def frames(n=3):
     """Return the n latest observations of one episode, zeros before its first."""
     seen = []
 
-    def prepare(observation):
+    def see(observation):
         seen.append(observation)
         zeros = [np.zeros_like(observation)] * (n - len(seen))
         return np.concatenate([*zeros, *seen[-n:]], axis=1)
 
-    return prepare
+    return see
 
 
-def trained(algorithm, plants, steps=64):
-    short = {"n_steps": 32} | ({"batch_size": 32} if algorithm is PPO else {})
-    if algorithm not in (PPO, A2C):
+def frozen(statistics):
+    """Return a function that normalises like a wrapper with these statistics."""
+    kept = copy.deepcopy(statistics)
+    return lambda: lambda seen: ((seen - kept.mean) / np.sqrt(kept.var + 1e-8)).astype("f4")
+
+
+def model_of(algorithm, env, policy="MlpPolicy", **more):
+    """Return an untrained model whose actions are large and differ."""
+    short = {"n_steps": 32} if algorithm in (PPO, A2C, RecurrentPPO) else {}
+    if algorithm in (PPO, RecurrentPPO):
+        short["batch_size"] = 32
+    if algorithm in (SAC, TD3, TQC, DQN):
         small = {"net_arch": [16]}
-        short = {"learning_starts": 8, "buffer_size": 500, "policy_kwargs": small}
-    return algorithm("MlpPolicy", plants, seed=0, device="cpu", **short).learn(steps)
+        short = {"learning_starts": 8, "buffer_size": 200, "policy_kwargs": small}
+    model = algorithm(policy, env, seed=0, device="cpu", **{**short, **more})
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for weight in model.policy.parameters():
+            weight.add_(0.2 * torch.randn(weight.shape, generator=generator))
+    return model
 
 
-def plants(n=4, **arguments):
-    return make_vec_env(NOISY, n, seed=1, **arguments)
-
-
-@pytest.fixture(scope="module")
-def ppo():
-    return trained(PPO, plants())
-
-
-@pytest.fixture(scope="module")
-def velocity():
-    return trained(PPO, plants(wrapper=VELOCITY, action_window=5))
+def law(observations):
+    return np.clip(-0.3 * observations[..., 3:4], -1.0, 1.0)
 
 
 class Integrator:
+    """A policy that remembers, with a method that forgets."""
+
     def __init__(self):
+        self.reset()
+
+    def reset(self):
         self.sum = 0.0
 
     def __call__(self, observations):
@@ -125,484 +160,316 @@ class Integrator:
     act = __call__
 
 
-class Resettable(Integrator):
-    def reset(self):
-        self.sum = 0.0
+class Recurrent:
+    """A policy with a state, in the form of Stable-Baselines3."""
+
+    def predict(self, observations, state=None, episode_start=None, **_):
+        assert (np.asarray(episode_start) == (state is None)).all()
+        state = (0.0 if state is None else state) + observations[..., 3:4]
+        return -0.05 * observations[..., 3:4] - 0.002 * state, state
 
 
-class Levels(gymnasium.ActionWrapper, RecordConstructorArgs):
+class Exploring:
+    def act(self, observations, deterministic=False):
+        return law(observations) + (0.0 if deterministic else 0.5)
+
+
+class Network(torch.nn.Module):
+    num_envs = 64  # of its training
+    u_min, u_max, observation_space = -1, 1, "a stranger's attribute"
+
+    def __init__(self, dtype=torch.float32):
+        super().__init__()
+        torch.manual_seed(0)
+        layers = torch.nn.Linear(6, 9), torch.nn.Dropout(), torch.nn.Linear(9, 1)
+        self.layers = torch.nn.Sequential(*layers).to(dtype)
+
+    def forward(self, seen, scale=1.0):
+        return torch.tanh(scale * self.layers(seen))
+
+
+class Acting(Network):
+    def act(self, observations):
+        assert isinstance(observations, np.ndarray)
+        return self(torch.as_tensor(observations))
+
+
+def network_act(network):
+    evaluating = copy.deepcopy(network).eval()
+    dtype = next(network.parameters()).dtype
+    return lambda seen: evaluating(torch.tensor(seen, dtype=dtype)).detach().numpy()
+
+
+class Levels(gymnasium.ActionWrapper):
     """Choose among a few flows."""
 
-    def __init__(self, env, levels):
-        RecordConstructorArgs.__init__(self, levels=levels)
-        gymnasium.ActionWrapper.__init__(self, env)
-        self.levels, self.action_space = levels, gymnasium.spaces.Discrete(levels)
+    def __init__(self, env, levels=5):
+        super().__init__(env)
+        self.levels, self.action_space = levels, Discrete(levels)
 
     def action(self, action):
         return np.array([2.0 * action / (self.levels - 1) - 1.0], np.float32)
 
 
-class Gains(gymnasium.ActionWrapper, RecordConstructorArgs):
-    def __init__(self, env, about):
-        RecordConstructorArgs.__init__(self, about=about)
-        gymnasium.ActionWrapper.__init__(self, env)
-        self.gain = about["gains"][1].max()
-
-    def action(self, action):
-        return self.gain * action
-
-
-class Masked(Levels):
-    def action_masks(self):
-        return np.array([False, True, False])
-
-
-class Moves(IncrementalAction):
-    def __init__(self, env, share=1.0, **arguments):
-        super().__init__(env, **arguments)
-        self.share = share
-
-    def action(self, action):
-        return super().action(self.share * action)
-
-
-class Blocks(gymnasium.ObservationWrapper, RecordConstructorArgs):
+class Blocks(gymnasium.ObservationWrapper):
     """Show set points and errors by name."""
 
     def __init__(self, env):
-        RecordConstructorArgs.__init__(self)
-        gymnasium.ObservationWrapper.__init__(self, env)
-        box = env.observation_space
-        self.observation_space = gymnasium.spaces.Dict(
-            {
-                "setpoints": gymnasium.spaces.Box(box.low[:3], box.high[:3]),
-                "errors": gymnasium.spaces.Box(box.low[3:], box.high[3:]),
-            }
-        )
+        super().__init__(env)
+        low, high = env.observation_space.low, env.observation_space.high
+        parts = {"setpoints": Box(low[:3], high[:3]), "errors": Box(low[3:], high[3:])}
+        self.observation_space = Dict(parts)
 
     def observation(self, observation):
         return {"setpoints": observation[:3], "errors": observation[3:]}
 
 
-class Network(torch.nn.Module):
-    def __init__(self):
-        super().__init__()
-        torch.manual_seed(0)
-        layers = torch.nn.Linear(6, 9), torch.nn.Dropout(), torch.nn.Linear(9, 1)
-        self.layers = torch.nn.Sequential(*layers)
-
-    def forward(self, seen):
-        return torch.tanh(self.layers(seen))
-
-
-class Acting(torch.nn.Module):
-    def __init__(self, module):
-        super().__init__()
-        self.module = module
-
-    def act(self, observations):
-        dtype = next(self.parameters()).dtype
-        return self.module(torch.as_tensor(observations, dtype=dtype))
-
-
-class Constant(torch.nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.register_buffer("gain", torch.tensor([0, 0, 0, -0.3, 0, 0], dtype=torch.float64))
-
-    def forward(self, seen):
-        return seen @ self.gain[:, None]
-
-
 class Scaled(gymnasium.ObservationWrapper):
     def observation(self, observation):
-        return observation * np.float32(0.01)
+        return observation * np.float32(0.1)
 
 
 class OwnPlant(MiddlePointEnv):
     pass
 
 
+class OwnBatch(MiddlePointVectorEnv):
+    pass
+
+
 class Times(VecEnvWrapper):
     def reset(self):
-        return 0.01 * self.venv.reset()
+        return 0.1 * self.venv.reset()
 
     def step_wait(self):
         observations, *others = self.venv.step_wait()
-        return 0.01 * observations, *others
+        return 0.1 * observations, *others
 
 
-class TestPoliciesWithoutARecord:
-    @pytest.mark.parametrize("episodes", [3, 130])
-    @pytest.mark.parametrize("form", ["call", "act", "method", "partial", "predict"])
-    def test_memory_is_forgotten_before_the_episodes(self, form, episodes):
-        policy = Resettable()
-        if form == "method":
-            policy = policy.act
-        elif form == "partial":
-            policy = partial(policy.act)
-        elif form == "predict":
-            policy = SimpleNamespace(predict=policy.act, reset=policy.reset)
-        short = {**SHORT, "max_episode_steps": 30}
-        given = {"episodes": episodes, **short}
-        found = [evaluate(policy, NOISY, **given) for _ in range(2)]
-        expected = errors_of(Integrator, partial(gymnasium.make, NOISY, **short), episodes)
-        for each in found:
-            np.testing.assert_allclose(each.errors, expected, atol=1e-9)
+class NoResetInfos(DummyVecEnv):
+    """A vector environment of somebody's, from before `reset_infos`."""
 
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-    def test_modules_run_in_evaluation_mode(self, dtype):
-        module = Network().to(dtype)
-        frozen = module.layers[0].eval()
-        evaluating = copy.deepcopy(module).eval()
-
-        def act(observation):
-            seen = torch.as_tensor(observation, dtype=dtype)
-            return evaluating(seen).detach().float().numpy()
-
-        expected = errors_of(lambda: act)
-        for policy in (module, Acting(module), Acting(module).act):
-            found = evaluate(policy, NOISY, episodes=3, **SHORT)
-            assert found.errors == pytest.approx(expected, abs=1e-6)
-        assert module.training
-        assert not frozen.training
-
-    def test_constants_of_a_module_set_its_dtype(self):
-        found = evaluate(Constant(), NOISY, episodes=3, **SHORT)
-        expected = errors_of(lambda: lambda seen: -0.3 * seen[3:4].astype(float))
-        assert found.errors == pytest.approx(expected, abs=1e-6)
-
-    @pytest.mark.parametrize("form", ["call", "act", "forward"])
-    def test_what_explores_on_request_does_not(self, form):
-        def act(observations, deterministic=False):
-            return -0.3 * observations[..., 3:4] + (0.0 if deterministic else 0.5)
-
-        policy = act if form == "call" else SimpleNamespace(act=act)
-        if form == "forward":
-            policy = torch.nn.Module()
-            policy.forward = act
-        found = evaluate(policy, NOISY, episodes=3, **SHORT)
-        expected = errors_of(lambda: lambda seen: act(seen, True))
-        assert found.errors == pytest.approx(expected, abs=1e-6)
-
-    def test_keywords_pass_a_thin_wrapper(self, ppo):
-        def named(observations, **keywords):
-            return ppo.predict(observations, **keywords)
-
-        def forwarded(*arguments, **keywords):
-            return ppo.predict(*arguments, **keywords)
-
-        expected = errors_of(acting(ppo))
-        for predict in (named, forwarded):
-            found = evaluate(SimpleNamespace(predict=predict), NOISY, episodes=3, **SHORT)
-            assert found.errors == pytest.approx(expected, abs=1e-6)
-
-    def test_a_state_is_handed_back(self):
-        begun = []
-
-        def predict(observations, state=None, episode_start=None, **_):
-            assert (episode_start == (state is None)).all()
-            if state is None:
-                begun.append(len(observations))
-            return 0.0 * observations[:, :1], (state or 0) + 1
-
-        evaluate(SimpleNamespace(predict=predict), episodes=130, max_episode_steps=4)
-        assert begun == [130]
-
-    @pytest.mark.parametrize(
-        ("policy", "message"),
-        [
-            (SimpleNamespace(predict=lambda *seen: 0), r"name its arguments.*got \(\*seen\)"),
-            (SimpleNamespace(predict=lambda seen, deep: 0), "needs the observations alone"),
-            (SimpleNamespace(predict=lambda seen: (0 * seen[:, :1], 1)),
-             "must take the state that it returns"),
-            (SimpleNamespace(act=Integrator(), reset=lambda seed: None),
-             "policy.reset must be a method that needs no argument alone: missing"),
-            (lambda seen: (0 * seen[:, :1], None), r"(?s)array of numbers.*its first element"),
-            (lambda seen: torch.zeros(len(seen), 1, requires_grad=True),
-             r"array of numbers, got tensor.*tensor\.detach\(\)"),
-            (DirectNNController(), "made with num_envs=3, one loop per episode, got 1"),
-            (DirectNNController(num_envs=2), "with num_envs=3, one loop per episode, got 2"),
-        ],
-    )  # fmt: skip
-    def test_what_is_refused(self, policy, message):
-        with pytest.raises(ValueError, match=message):
-            evaluate(policy, NOISY, episodes=3, **SHORT)
-
-    def test_a_controller_for_another_actuator_or_in_a_wrapper_is_refused(self):
-        with pytest.raises(ValueError, match=r"limits of env, u_min=-10.0, u_max=6.0, got -10"):
-            evaluate(PIController(), NOISY, u_max=6.0)
-        with pytest.raises(ValueError, match=r"env must not be wrapped.*IncrementalAction"):
-            evaluate(PIController(), lambda: IncrementalAction(made()))
+    def reset(self):
+        observations = super().reset()
+        self.reset_infos = [{} for _ in self.envs]
+        return observations
 
 
-class TestModels:
-    @pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3])
-    def test_algorithms(self, algorithm, tmp_path):
-        model = trained(algorithm, plants(1))
-        expected = errors_of(acting(model))
-        save(model, tmp_path / "model.zip")
-        for each in (model, load(tmp_path / "model.zip", device="cpu")):
-            assert type(each) is algorithm
-            found = evaluate(each, NOISY, episodes=3, **SHORT)
-            assert found.errors == pytest.approx(expected, abs=1e-6)
-
-    @pytest.mark.parametrize("kind", ["normalise", "stack", "both", "rewards alone"])
-    @pytest.mark.parametrize("base", [plants, lambda: DummyVecEnv([made] * 2)])
-    def test_vec_wrappers_are_those_of_the_training(self, kind, base, tmp_path):
-        envs = base()
-        if kind in ("stack", "both"):
-            envs = VecFrameStack(envs, 3)
-        if kind != "stack":
-            seen = kind != "rewards alone"
-            envs = VecNormalize(envs, norm_obs=seen, clip_obs=1.5, epsilon=0.1)
-        model = trained(PPO, envs, 256)
-        normalise = envs.normalize_obs if kind != "stack" else (lambda seen: seen)
-
-        def new_act():
-            stack = stacked() if kind in ("stack", "both") else (lambda seen: seen)
-            return acting(model, lambda seen: normalise(stack(seen)))()
-
-        expected = errors_of(new_act)
-        save(model, tmp_path / "model.zip")
-        for each in (model, load(tmp_path / "model.zip", device="cpu")):
-            found = evaluate(each, NOISY, episodes=3, **SHORT)
-            assert found.errors == pytest.approx(expected, abs=1e-6)
-        if kind == "normalise":
-            assert normalise(np.full((1, 6), 1e9)).max() == 1.5  # it was clipped, too
-
-    def test_training_goes_on_where_it_stopped(self, tmp_path):
-        model = trained(PPO, VecNormalize(plants()), 256)
-        save(model, tmp_path / "model.zip")
-        loaded = load(tmp_path / "model.zip", device="cpu")
-        count = loaded.get_env().obs_rms.count
-        assert count == model.get_env().obs_rms.count
-        assert loaded.get_env().num_envs == 4
-        loaded.learn(128, reset_num_timesteps=False)
-        assert loaded.num_timesteps == 384
-        assert loaded.get_env().obs_rms.count >= count + 128
-
-    def test_environments_in_other_processes(self, tmp_path):
-        envs = SubprocVecEnv([made] * 2, start_method="fork")
-        try:
-            model = trained(PPO, envs)
-            save(model, tmp_path / "model.zip")
-        finally:
-            envs.close()
-        found = evaluate(load(tmp_path / "model.zip", device="cpu"), NOISY, episodes=3, **SHORT)
-        assert found.errors == pytest.approx(errors_of(acting(model)), abs=1e-6)
-        for attempt in (evaluate, partial(save, path=tmp_path / "closed.zip")):
-            with pytest.raises(ValueError, match="of policy's training are closed"):
-                attempt(model)
-
-    def test_the_default_environment_is_that_of_the_training(self, velocity):
-        found = evaluate(velocity, episodes=3, **SHORT)
-        wrapped = partial(gymnasium.make, "MiddlePoint-v0", action_window=5, **SHORT)
-        expected = errors_of(acting(velocity), lambda: IncrementalAction(wrapped(), **VELOCITY))
-        assert found.errors == pytest.approx(expected, abs=1e-6)
-        with pytest.raises(ValueError, match="action_window must be that of policy's training"):
-            evaluate(velocity, action_window=6)
-
-    @pytest.mark.parametrize(
-        ("algorithm", "wrap"),
-        [
-            (PPO, lambda env: FrameStackObservation(Scaled(env), 2)),
-            (PPO, lambda env: RescaleAction(env, LIMITS[:1], LIMITS[1:])),
-            (PPO, lambda env: ReshapeObservation(env, (2, 3))),
-            (PPO, lambda env: Gains(env, {"gains": [0.1, np.float32([-0.2, 0.2])]})),
-            (DQN, lambda env: Levels(env, 5)),
-        ],
-    )
-    def test_wrappers_and_their_arguments_are_part_of_it(self, algorithm, wrap, tmp_path):
-        model = trained(algorithm, wrap(made()))
-        expected = errors_of(acting(model), lambda: wrap(made()))
-        save(model, tmp_path / "model")
-        for each in (model, load(tmp_path / "model.zip", device="cpu")):
-            for env in (lambda: wrap(made()), spec_of(each, NOISY, **SHORT)):
-                found = evaluate(each, env, episodes=3)
-                assert found.errors == pytest.approx(expected, abs=1e-6)
-
-    @pytest.mark.parametrize("order", ["first", "last"])
-    def test_frames_are_stacked_along_the_axis_of_the_training(self, order, tmp_path):
-        twice = lambda: FrameStackObservation(made(), 2)  # noqa: E731
-        model = trained(PPO, VecFrameStack(DummyVecEnv([twice]), 3, channels_order=order))
-
-        def new_act():
-            frames = [np.zeros((2, 6), np.float32)] * 3
-
-            def act(observation):
-                frames[:] = [*frames[1:], observation]
-                seen = np.concatenate(frames, axis=0 if order == "first" else 1)
-                return model.predict(seen, deterministic=True)[0]
-
-            return act
-
-        expected = errors_of(new_act, twice)
-        save(model, tmp_path / "model.zip")
-        for each in (model, load(tmp_path / "model.zip", device="cpu")):
-            found = evaluate(each, spec_of(each, NOISY, **SHORT), episodes=3)
-            assert found.errors == pytest.approx(expected, abs=1e-6)
-
-    def test_masked_actions_are_refused(self):
-        model = MaskablePPO("MlpPolicy", Masked(made(), 3), device="cpu")
-        with pytest.raises(ValueError, match="takes the action_masks of env, which are not"):
-            evaluate(model, spec_of(model, NOISY, **SHORT), episodes=3)
-
-    @pytest.mark.parametrize(
-        ("policy", "env", "message"),
-        [
-            ("ppo", partial(made, action_window=3), "windows.* action_window=0, got action_w"),
-            ("ppo", partial(made, error_window=0, output_window=3), "windows.*got error_win"),
-            ("ppo", lambda: IncrementalAction(made()), "wrappers .*, none, got 1. mptc_gym"),
-            ("ppo", lambda: RescaleAction(made(), *LIMITS), "wrappers .*, none, got 1. gym"),
-            ("ppo", lambda: OwnPlant(noise_variance=0.5), "class of policy's training"),
-            ("velocity", partial(made, action_window=5), r"wrappers .*max_move.*, got none: "),
-            ("velocity", lambda: IncrementalAction(made(action_window=5), max_move=0.4),
-             r"wrappers .*'max_move': 0.3.*'max_move': 0.4.*spec_of\(policy, 'MiddlePointN"),
-            ("velocity", lambda: IncrementalAction(
-                IncrementalAction(made(action_window=5), **VELOCITY), **VELOCITY
-            ), "wrappers .*, none, got 2. mptc_gym"),
-        ],
-    )  # fmt: skip
-    def test_another_environment_is_refused(self, policy, env, message, request):
-        model = request.getfixturevalue(policy)
-        with pytest.raises(ValueError, match=message):
-            evaluate(model, env, episodes=3)
-
-    def test_spec_of_replaces_windows_and_wrappers(self, ppo, velocity):
-        other = IncrementalAction(made(output_window=2, action_window=9), max_move=1.0).spec
-        for model, wrappers in ((ppo, 0), (velocity, 1)):
-            spec = spec_of(model, other)
-            assert len(spec.additional_wrappers) == wrappers
-            assert evaluate(model, spec, episodes=2).mean_error > 0.0
-
-    @pytest.mark.parametrize(
-        ("make", "message"),
-        [
-            (lambda: Times(plants()), "trained in Times, and what that does is not known"),
-            (lambda: GymnasiumVecEnv(
-                IncrementalBatch(gymnasium.make_vec(NOISY, 2, autoreset_mode="SameStep"))
-            ), "trained on a batch whose wrappers are not known"),
-            (lambda: Levels(MiddlePointEnv(), 3), "Levels does not record its arguments"),
-            (lambda: Moves(made(), 0.3), "Moves does not record its arguments"),
-            (lambda: type("Local", (Scaled,), {})(made()), "Local must be at the top level"),
-            (lambda: VecNormalize(DummyVecEnv([lambda: Blocks(made())])),
-             "trained in VecNormalize on observations that are not a Box"),
-            (lambda: VecFrameStack(DummyVecEnv([lambda: Blocks(made())]), 2),
-             "trained in VecFrameStack on observations that are not a Box"),
-            (lambda: "CartPole-v1", "policy must be trained on environments of this package"),
-            (lambda: DummyVecEnv([made, partial(made, error_window=2, output_window=1)]),
-             "plants of different windows or wrappers"),
-        ],
-    )  # fmt: skip
-    def test_training_that_cannot_be_recorded(self, make, message, tmp_path):
-        envs = make()
-        discrete = isinstance(envs, Levels | str)
-        named = not discrete and isinstance(envs.observation_space, gymnasium.spaces.Dict)
-        policy = "MultiInputPolicy" if named else "MlpPolicy"
-        model = (DQN if discrete else PPO)(policy, envs, device="cpu")
-        for attempt in (evaluate, spec_of, partial(save, path=tmp_path / "x.zip")):
-            with pytest.raises(ValueError, match=message):
-                attempt(model)
-        assert not [*tmp_path.iterdir()]
-
-    def test_without_a_record_the_ways_out_are_told_and_work(self, ppo, tmp_path):
-        ppo.save(tmp_path / "plain.zip")
-        bare = PPO.load(tmp_path / "plain.zip", device="cpu")
-        for each in (evaluate, spec_of):
-            with pytest.raises(ValueError, match=r"save it by .*PPO\.load\(path, env=.*lambda"):
-                each(bare)
-        with pytest.raises(ValueError, match="does not say how it was trained"):
-            evaluate(ppo.policy)
-        with pytest.raises(ValueError, match=r"plain\.zip does not say how its policy was"):
-            load(tmp_path / "plain.zip")
-        with_env = PPO.load(tmp_path / "plain.zip", env=made(), device="cpu")
-        save(with_env, tmp_path / "anew.zip")
-        expected = errors_of(acting(ppo))
-        for policy in (
-            load(tmp_path / "anew.zip", device="cpu"),
-            lambda observations: bare.predict(observations, deterministic=True)[0],
-        ):
-            found = evaluate(policy, NOISY, episodes=3, **SHORT)
-            assert found.errors == pytest.approx(expected, abs=1e-6)
-
-    def test_statistics_of_another_run_are_refused(self, tmp_path):
-        envs = VecNormalize(plants())
-        model = trained(PPO, envs, 256)
-        expected = errors_of(acting(model, envs.normalize_obs))
-        model.save(tmp_path / "plain.zip")
-        envs.save(str(tmp_path / "statistics.pkl"))
-        fresh = PPO.load(tmp_path / "plain.zip", env=VecNormalize(plants()), device="cpu")
-        for attempt in (evaluate, partial(save, path=tmp_path / "fresh.zip")):
-            with pytest.raises(ValueError, match=r"learnt from 256 samples.* has seen 0, so"):
-                attempt(fresh)
-        without = PPO.load(tmp_path / "plain.zip", env=plants(), device="cpu")
-        fresh.set_env(plants())
-        for each in (without, fresh):
-            with pytest.raises(
-                ValueError, match=r"trained in VecNormalize, and its env.* lack"
-            ):
-                evaluate(each, NOISY, **SHORT)
-        kept = VecNormalize.load(str(tmp_path / "statistics.pkl"), plants())
-        loaded = PPO.load(tmp_path / "plain.zip", env=kept, device="cpu")
-        found = evaluate(loaded, NOISY, episodes=3, **SHORT)
-        assert found.errors == pytest.approx(expected, abs=1e-6)
+def halfway(env):
+    env.reset(seed=1)
+    for _ in range(7):
+        env.step(env.action_space.sample())
+    return env
 
 
-class TestRecords:
-    def test_files_that_are_no_models_or_cannot_be_written(self, ppo, tmp_path):
-        save(ppo, tmp_path / "model.zip")
-        assert [each.name for each in tmp_path.iterdir()] == ["model.zip"]
-        with pytest.raises(ValueError, match=r"model\.zip/model\.zip cannot be written: Not a"):
-            save(ppo, tmp_path / "model.zip/model.zip")
-        (tmp_path / "text.zip").write_text("no zip")
-        with pytest.raises(ValueError, match=r"text\.zip must be a zip that Stable-Baselines3"):
-            load(tmp_path / "text.zip")
-        with pytest.raises(ValueError, match=r"none\.zip cannot be read: No such file"):
-            spec_of(tmp_path / "none.zip")
+def dummy(make=made, n=N):
+    return DummyVecEnv([make] * n)
 
-    @pytest.mark.parametrize(
-        ("edit", "message"),
-        [
-            (lambda record: "[" * 100_000, "damaged record"),
-            (lambda record: '{"env": "MiddlePoint-v0"}', "damaged record"),
-            (lambda record: record["arguments"].pop("error_window"), "damaged.*error_window"),
-            (lambda record: record.update(later=1), "damaged .* or that of another version"),
-            (lambda record: record.update(env="None-v0"), "cannot be loaded as .*None-v0"),
-            (lambda record: record.update(
-                wrappers=[{"name": "X", "entry_point": "none:X", "kwargs": {}}]
-            ), "wrappers of env must be importable: No module named 'none'"),
-            (lambda record: record.update(vec_wrappers=[{"name": "VecTimes"}]),
-             "cannot be loaded as .*VecTimes is not known here"),
-        ],
-    )  # fmt: skip
-    def test_an_edited_record_is_refused(self, edit, message, ppo, tmp_path):
-        save(ppo, tmp_path / "model.zip")
-        with zipfile.ZipFile(tmp_path / "model.zip") as archive:
-            record = json.loads(archive.read(MEMBER))
-        text = edit(record)
-        ppo.save(tmp_path / "model.zip")
-        with zipfile.ZipFile(tmp_path / "model.zip", "a") as archive:
-            archive.writestr(MEMBER, text if isinstance(text, str) else json.dumps(record))
-        with pytest.raises(ValueError, match=message):
-            load(tmp_path / "model.zip")
 
-    def test_an_argument_that_is_no_value_cannot_be_saved(self, tmp_path):
-        model = PPO("MlpPolicy", TransformObservation(made(), lambda seen: seen, None))
-        for attempt in (partial(save, model), partial(model.learn, 8)):
-            given = {"path": tmp_path / "model.zip"}
-            if attempt.func != save:
-                given = {"callback": ScoreCallback(**given)}
-            with pytest.raises(ValueError, match="argument of a wrapper cannot be recorded"):
-                attempt(**given)
-        assert model.num_timesteps == 0
+def both():
+    envs = normal(VecNormalize(VecFrameStack(dummy(), 3)))
+    model = model_of(PPO, envs)
+    return model, envs, predicting(model, _stacked_then(envs))
 
-    def test_members_of_absurd_size_are_not_read(self, ppo, tmp_path, monkeypatch):
-        assert training.LARGEST_MEMBER <= 2**30
-        monkeypatch.setattr(training, "LARGEST_MEMBER", 1_000)
-        save(ppo, tmp_path / "large.zip")
-        with pytest.raises(ValueError, match=r"data in it has [\d,]+ bytes, and 1,000 are all"):
-            load(tmp_path / "large.zip")
+
+def _stacked_then(envs):
+    normalise = frozen(envs.obs_rms)
+
+    def prepare():
+        see = frames()
+        return lambda seen: normalise()(see(seen))
+
+    return prepare
+
+
+def with_statistics(kind, envs):
+    """Return a policy in environments that normalise, and the plain loop."""
+    envs = normal(kind(envs))
+    model = model_of(PPO, dummy())
+    see = frozen(envs.obs_rms)
+    expected = predicting(model, see)
+    return lambda seen: model.predict(seen, deterministic=True)[0], envs, expected
+
+
+def rl_zoo(folder):
+    """Return a model and the statistics that RL Zoo keeps beside it."""
+    envs = normal(VecNormalize(dummy()))
+    model = model_of(PPO, envs)
+    model.save(folder / "model.zip")
+    envs.save(str(folder / "vec_normalize.pkl"))
+    kept = VecNormalize.load(str(folder / "vec_normalize.pkl"), dummy())
+    loaded = PPO.load(folder / "model.zip", device="cpu")
+    return loaded, kept, predicting(model, frozen(envs.obs_rms))
+
+
+def best_of_callback(folder):
+    model = model_of(PPO, dummy())
+    callback = EvalCallback(dummy(lambda: Monitor(made()), 1), eval_freq=16,
+        n_eval_episodes=1, verbose=0,
+                            best_model_save_path=str(folder))  # fmt: skip
+    model.learn(32, callback=callback)
+    best = PPO.load(folder / "best_model.zip", device="cpu")
+    return best, NOISY, predicting(best)
+
+
+def bare_zip(folder, algorithm=PPO):
+    model = model_of(algorithm, made())
+    model.save(folder / "bare.zip")
+    return algorithm.load(folder / "bare.zip", device="cpu"), NOISY, predicting(model)
+
+
+def closed_processes(folder):
+    envs = SubprocVecEnv([made] * N, start_method="fork")
+    model = model_of(PPO, envs)
+    envs.close()
+    return model, NOISY, predicting(model)
+
+
+def own_processes(folder):
+    model = model_of(PPO, SubprocVecEnv([made] * N, start_method="fork"))
+    return model, model.get_env(), predicting(model)
+
+
+def saved(folder, wrap=moved, plants=None, **windows):
+    """Return a model from the zip of `save`, on the spec of its environments."""
+    plants = plants or make_vec_env(NOISY, N, wrapper=VELOCITY, **windows, **SHORT)
+    save(model_of(PPO, plants), folder / "model.zip")
+    model = load(folder / "model.zip", device="cpu")
+    make = lambda: wrap(made(**windows))  # noqa: E731
+    return model, spec_of(model, NOISY, **SHORT), predicting(model), make
+
+
+def live(algorithm, env, make=made, policy="MlpPolicy"):
+    model = model_of(algorithm, env, policy)
+    return model, model.get_env(), predicting(model), make
+
+
+def memory(env, make=made):
+    return Integrator(), env, Integrator, make
+
+
+def plain(policy, env=NOISY, make=made):
+    return policy, env, lambda: policy, make
+
+
+def network(policy, original=None):
+    return policy, NOISY, lambda: network_act(original or policy)
+
+
+MADE_WITHOUT_SPEC = partial(TimeLimit, MiddlePointEnv(**BARE), LENGTH)
+# Each gives a policy, where it acts, how it acts in a plain loop, and the environment there.
+RIGHT = {
+    "function": lambda _: plain(law),
+    "object with act and reset": lambda _: memory(NOISY),
+    "its bound method": lambda _: (Integrator().act, NOISY, Integrator),
+    "a partial of it": lambda _: (partial(Integrator().act), NOISY, Integrator),
+    "predict of one's own": lambda _: (
+        SimpleNamespace(predict=(i := Integrator()).act, reset=i.reset), NOISY, Integrator),
+    "predict with a state": lambda _: (
+        Recurrent(), NOISY, lambda: Integrator()),
+    "predict behind **keywords": lambda _: (
+        SimpleNamespace(predict=lambda seen, **k: Exploring().act(seen, k["deterministic"])),
+        NOISY, lambda: law),
+    "function that remembers": lambda _: (Integrator().__call__, NOISY, Integrator),
+    "act that explores on request": lambda _: (Exploring(), NOISY, lambda: law),
+    "partial that wants to explore": lambda _: (
+        partial(Exploring().act, deterministic=False), NOISY, lambda: lambda s: law(s) + 0.5),
+    "PI controller": lambda _: (PIController(), NOISY, lambda: PIController().act),
+    "network that learns": lambda _: (
+        DirectNNController(num_envs=EPISODES, learning=False), NOISY, None),
+    "module": lambda _: network(Network()),
+    "module in float64": lambda _: network(Network(torch.float64)),
+    "its forward": lambda _: network((m := Network()).forward, m),
+    "a partial of a module": lambda _: network(partial(m := Network(), scale=1.0), m),
+    "module with act": lambda _: network(Acting()),
+    "spec with wrappers": lambda _: plain(law, moved(made()).spec, lambda: moved(made())),
+    "function that makes one": lambda _: memory(made),
+    "the same, in a wrapper": lambda _: memory(lambda: Scaled(made()), lambda: Scaled(made())),
+    "the same, without a spec": lambda _: memory(
+        lambda: TimeLimit(MiddlePointEnv(**BARE), LENGTH)),
+    "subclass of the plant": lambda _: memory(lambda: TimeLimit(OwnPlant(**BARE), LENGTH)),
+    "one environment": lambda _: memory(made()),
+    "one in mid-episode": lambda _: memory(halfway(made())),
+    "one with Monitor": lambda _: memory(Monitor(made())),
+    "native batch": lambda _: memory(many()),
+    "native batch, SameStep": lambda _: memory(many(autoreset_mode="SameStep")),
+    "native batch, Disabled": lambda _: memory(many(autoreset_mode="Disabled")),
+    "native batch in mid-episode": lambda _: memory(halfway(many())),
+    "subclass of the batch": lambda _: memory(OwnBatch(N, max_episode_steps=LENGTH, **BARE)),
+    "SyncVectorEnv": lambda _: memory(SyncVectorEnv([made] * N)),
+    "SyncVectorEnv, SameStep": lambda _: memory(
+        SyncVectorEnv([made] * N, autoreset_mode="SameStep")),
+    "AsyncVectorEnv": lambda _: memory(AsyncVectorEnv([made] * N, context="fork")),
+    "vector IncrementalAction": lambda _: memory(
+        IncrementalBatch(many(), **VELOCITY), lambda: moved(made())),
+    "vector wrapper that watches": lambda _: memory(vector.RecordEpisodeStatistics(many())),
+    "infos as lists": lambda _: memory(vector.DictInfoToList(many())),
+    "DummyVecEnv": lambda _: memory(dummy()),
+    "DummyVecEnv in mid-episode": lambda _: memory(dummy(lambda: halfway(made()))),
+    "SubprocVecEnv": lambda _: memory(SubprocVecEnv([made] * N, start_method="fork")),
+    "plants in groups": lambda _: memory(make_vec_env(NOISY, N, group=N, **SHORT)),
+    "VecMonitor": lambda _: memory(VecMonitor(make_vec_env(NOISY, N, **SHORT))),
+    "VecEnv without reset_infos": lambda _: memory(NoResetInfos([made] * N)),
+    "VecEnvWrapper of one's own": lambda _: memory(Times(dummy()), lambda: Scaled(made())),
+    "plants that differ in rewards": lambda _: memory(
+        DummyVecEnv([made, partial(made, reward="absolute")])),
+    "VecNormalize": lambda _: with_statistics(VecNormalize, dummy()),
+    "VecNormalize on a batch": lambda _: with_statistics(
+        VecNormalize, make_vec_env(NOISY, N, **SHORT)),
+    "NormalizeObservation": lambda _: with_statistics(NormalizeObservation, made()),
+    "vector NormalizeObservation": lambda _: with_statistics(
+        vector.NormalizeObservation, many()),
+    "VecFrameStack": lambda _: (
+        m := model_of(PPO, VecFrameStack(dummy(), 3)), m.get_env(), predicting(m, frames)),
+    "VecFrameStack in VecNormalize": lambda _: both(),
+    "FrameStackObservation": lambda _: live(
+        PPO, FrameStackObservation(made(), 2), lambda: FrameStackObservation(made(), 2)),
+    "dict observations": lambda _: live(
+        PPO, dummy(lambda: Blocks(made())), lambda: Blocks(made()), "MultiInputPolicy"),
+    "rescaled actions": lambda _: live(
+        PPO, dummy(rescaled := lambda: RescaleAction(made(), np.float32([-2]),
+        np.float32([2]))),
+        rescaled),
+    "PPO": lambda _: live(PPO, dummy()),
+    "PPO on a batch": lambda _: live(PPO, make_vec_env(NOISY, N, **SHORT)),
+    "PPO in IncrementalAction": lambda _: live(
+        PPO, make_vec_env(NOISY, N, wrapper=VELOCITY, **SHORT), lambda: moved(made())),
+    "A2C": lambda _: live(A2C, dummy()),
+    "SAC": lambda _: live(SAC, made()),
+    "TD3": lambda _: live(TD3, made()),
+    "TQC": lambda _: live(TQC, made()),
+    "DQN": lambda _: live(DQN, Levels(made()), lambda: Levels(made())),
+    "RecurrentPPO": lambda _: live(RecurrentPPO, dummy(), policy="MlpLstmPolicy"),
+    "model of another id": lambda _: (
+        m := model_of(PPO, gymnasium.make("MiddlePoint-v0")), NOISY, predicting(m)),
+    "policy of a model": lambda _: ((m := model_of(PPO, made())).policy, NOISY, predicting(m)),
+    "model without environments": bare_zip,
+    "SAC without environments": partial(bare_zip, algorithm=SAC),
+    "best_model.zip": best_of_callback,
+    "vec_normalize.pkl": rl_zoo,
+    "model in processes": own_processes,
+    "model of closed processes": closed_processes,
+    "zip of save": partial(saved, action_window=3),
+    "zip of save, own wrapper": lambda folder: saved(
+        folder, wrap=(w := partial(FrameStackObservation, stack_size=2)), plants=w(made())),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_it_is_the_plain_loop(name, tmp_path, table):
+    policy, env, new_act, *make = RIGHT[name](tmp_path)
+    given = SHORT if env == NOISY else {}
+    found = evaluate(policy, env, episodes=EPISODES, **given)
+    if new_act is None:  # each loop has a network of its own
+        seeds = iter(range(EPISODES))
+        new_act = lambda: DirectNNController(seed=next(seeds), learning=False).act  # noqa: E731
+    expected = errors_of(new_act, *make)
+    table(name, np.abs(found.errors - expected).max())
+    np.testing.assert_allclose(found.errors, expected, rtol=0, atol=1e-6)
+    assert np.ptp(found.errors) > 1e-3
+    assert found.travels.min() > 1.0
+    if hasattr(env, "close"):
+        env.close()
 
 
 class Reseeded(gymnasium.Wrapper):
@@ -612,45 +479,20 @@ class Reseeded(gymnasium.Wrapper):
 
 class Skipping(gymnasium.Wrapper):
     def step(self, action):
-        for _ in range(3):
-            self.env.step(action)
+        self.env.step(action)
         return self.env.step(action)
 
 
-class TestEpisodes:
-    @pytest.mark.parametrize(
-        ("make", "message"),
-        [
-            (lambda: Reseeded(made()), "episodes of its seeds, whose noise by sample 1"),
-            (lambda: Reseeded(made(noise_variance=0.0, delay=[3, 9])), "whose delay by"),
-            (lambda: Skipping(made()), "whose noise by sample 1 is"),
-            (lambda: TimeLimit(
-                Skipping(gymnasium.make("MiddlePoint-v0", max_episode_steps=4800)), 1200
-            ), "whose output by sample 29 is"),
-            (lambda: Flatters(made()), "whose error by sample 1 is"),
-            (lambda: Faster(noise_variance=0.5), "whose output by sample 2"),
-            (lambda: made(delay=int(np.random.default_rng().integers(2, 1000))),
-             "makes the same plant at each call"),
-            (lambda: Ends(gymnasium.make("MiddlePoint-v0", max_episode_steps=60)),
-             "env must run episodes of 60 samples, got 41"),
-        ],
-    )  # fmt: skip
-    def test_other_episodes_are_refused(self, make, message):
-        with pytest.raises(ValueError, match=message):
-            evaluate(Integrator(), make, episodes=3)
+class Telling(gymnasium.Wrapper):
+    """Tell other infos than those of the plant."""
 
-    def test_one_environment_for_all_episodes_is_refused(self):
-        one = gymnasium.make("MiddlePoint-v0", setpoint=5.0)
-        scaled = Scaled(one)
-        for make in (lambda: scaled, lambda: Scaled(one)):
-            with pytest.raises(ValueError, match="makes a new environment at each call"):
-                evaluate(Integrator(), make, episodes=3)
+    def __init__(self, env, tell):
+        super().__init__(env)
+        self.tell = tell
 
-
-class Flatters(gymnasium.Wrapper):
     def step(self, action):
         *others, info = self.env.step(action)
-        return *others, info | {"error": 0.1 * info["error"]}
+        return *others, self.tell(info)
 
 
 class Faster(MiddlePointEnv):
@@ -664,13 +506,248 @@ class Faster(MiddlePointEnv):
         return returned
 
 
-class Ends(gymnasium.Wrapper):
-    def reset(self, **given):
-        self.left = 41
-        return self.env.reset(**given)
-
+class Dying(gymnasium.Wrapper):
     def step(self, action):
-        self.left -= 1
-        *others, info = self.env.step(action)
-        others[2] = self.left == 0
-        return *others, info
+        raise OSError("broken")
+
+
+def told(tell):
+    return lambda: Telling(made(), tell)
+
+
+def unlike(first, second):
+    return SyncVectorEnv([lambda: made(**first), lambda: made(**second)])
+
+
+def returned(**more):
+    return law, NOISY, more
+
+
+REFUSED = {
+    "actions of another shape": (lambda seen: np.zeros(len(seen)), NOISY, r"of shape \(3, 1\)"),
+    "actions of one plant": (lambda seen: np.zeros((1, 1)), NOISY, r"actions of shape \(3, 1"),
+    "actions that are not finite": (
+        lambda seen: np.full((len(seen), 1), np.nan), NOISY, "return finite actions, got nan"),
+    "actions that are text": (lambda seen: [["open"]] * len(seen), NOISY, "array of numbers"),
+    "ragged actions": (lambda seen: [[0.0], 0.0], NOISY, "policy must return an array of numb"),
+    "actions and state": (lambda seen: (law(seen), None), NOISY, r"(?s)numbers.*first element"),
+    "tensors with gradients": (
+        lambda seen: torch.zeros(len(seen), 1, requires_grad=True), NOISY, r"tensor\.detach\("),
+    "no policy": (3, NOISY, "policy must be a function, or an object with predict or act"),
+    "a class": (PIController, NOISY, "predict or act, not a class"),
+    "predict without names": (
+        SimpleNamespace(predict=lambda *seen: 0), NOISY, r"name its arguments.*got \(\*seen\)"),
+    "predict that keeps its state": (
+        SimpleNamespace(predict=lambda seen: (law(seen), 1)), NOISY, "take the state that it"),
+    "masked actions": (
+        lambda: MaskablePPO("MlpPolicy", Levels(made())), lambda: Levels(made()),
+        "action_masks, which are not"),
+    "controller of another actuator": (
+        PIController(u_max=6.0), NOISY, "limits of env, u_min=-10.0, u_max=10.0"),
+    "controller in a wrapper": (PIController(), lambda: moved(made()),
+        "not be wrapped.*Increm"),
+    "controller of other windows": (
+        PIController(), partial(made, setpoint_window=7), "newest error as element 3"),
+    "controller of too few loops": (DirectNNController(num_envs=2), NOISY, "num_envs=3"),
+    "unknown id": (law, "MiddlePointNosy-v0",
+        r"id of an env.*did you mean MiddlePointNoisy-v0"),
+    "no id": (law, "", "env must be the id of an environment .such as one of MiddlePoint-v0"),
+    "blank id": (law, " ", "env must be the id of an environment"),
+    "id with a zero": (law, "a\0b", "env must be the id of an environment"),
+    "id with a line break": (law, "MiddlePoint-v0\n", r"id of an.*did you mean MiddlePoint-v0"),
+    "id of no module": (law, "no_such_module:Plant-v0", "env must be the id of an environment"),
+    "another environment": (law, "CartPole-v1", "environment of MiddlePointEnv in NumPy"),
+    "others in a VecEnv": (
+        law, lambda: dummy(lambda: gymnasium.make("CartPole-v1")),
+        "of MiddlePointEnv in NumPy"),
+    "no environment": (law, 7, "env must be an id, an EnvSpec, environments, or a function"),
+    "function that makes none": (law, lambda: int, "open environment of MiddlePointEnv",
+        "as is"),
+    "function that makes a batch": (law, many, "not many: call it", "as is"),
+    "function that makes a VecEnv": (law, dummy, "not many: call it", "as is"),
+    "function that makes the same": (
+        law, lambda e=made(): e, "new environment at each call", "as is"),  # noqa: B008
+    "another seed": (law, lambda: Reseeded(made()), "of its seeds, whose noise by sample",
+        "as is"),
+    "skipped samples": (law, lambda: Skipping(made()), "whose noise by sample 1 is", "as is"),
+    "flattering errors": (
+        law, told(lambda info: info | {"error": 0.1}), "whose error by sample 1 is", "as is"),
+    "no errors": (
+        law, told(lambda info: {k: info[k] for k in info if k != "error"}),
+        "whose error by sample 1 is.* got None", "as is"),
+    "another plant": (
+        law, lambda: TimeLimit(Faster(**BARE), 40), "whose output by sample 2", "as is"),
+    "plants that differ": (law, lambda: unlike({}, {"delay": 3}), "must have the same plants"),
+    "episodes that differ": (
+        law, lambda: unlike({}, {"max_episode_steps": 9}),
+        "all episodes at once, got an .* 9 s"),
+    "VecNormalize without statistics": (
+        law, lambda: VecNormalize(dummy()), "in its VecNormalize, which has seen nothing"),
+    "new NormalizeObservation": (
+        law, lambda: NormalizeObservation(made()), "NormalizeObservation, which has seen noth"),
+    "the same, made by a function": (
+        law, lambda: NormalizeObservation(made()), "has seen nothing", "as is"),
+    "normalised in processes": (
+        law, lambda: SubprocVecEnv([lambda: NormalizeObservation(made())], "fork"),
+        "not normalise in other processes"),
+    "the same, of Gymnasium": (
+        law, lambda: AsyncVectorEnv([lambda: NormalizeObservation(made())], context="fork"),
+        "not normalise in other processes"),
+    "closed processes": (
+        law, lambda: closed(SubprocVecEnv([made], start_method="fork")), "an open environment"),
+    "Monitor in mid-episode": (
+        law, lambda: halfway(Monitor(made(), allow_early_resets=False)),
+        "allow_early_resets=T"),
+    "model of other windows": (
+        lambda: model_of(PPO, made(action_window=3)), NOISY,
+        r"observation space of policy's training, .*model\.get_env\(\)\), or .*spec_of\(model"),
+    "model of windows as large": (
+        lambda: model_of(PPO, made(setpoint=49.0)), partial(made, error_window=0,
+        output_window=3),
+        "observation space of policy's training"),
+    "model of windows with these bounds": (
+        lambda: model_of(PPO, made(error_window=0, output_window=3)),
+        partial(made, setpoint_window=6, error_window=0), "windows of policy's training"),
+    "model without environments, other bounds": (
+        lambda: model_of(PPO, made(temperature_span=9.0)).policy, NOISY,
+        "observation space of"),
+    "model whose IncrementalAction is forgotten": (
+        lambda: model_of(PPO, make_vec_env(NOISY, N, wrapper=VELOCITY)), NOISY,
+        "IncrementalAction of policy's training, .*, got none"),
+    "model in another IncrementalAction": (
+        lambda: model_of(PPO, moved(made())), lambda: IncrementalAction(made()),
+        "IncrementalAction of policy's training", "as is"),
+    "the same, in processes": (
+        lambda: model_of(PPO, SubprocVecEnv([lambda: moved(made())], "fork")), NOISY,
+        "IncrementalAction of policy's training"),
+    "model whose VecNormalize is forgotten": (
+        lambda: model_of(PPO, normal(VecNormalize(dummy()))), NOISY,
+        "wrappers of policy's training, {'VecNormalize'}, got none"),
+    "model whose VecFrameStack is forgotten": (
+        lambda: model_of(PPO, VecFrameStack(dummy(), 3)), NOISY, "observation space of policy"),
+}  # fmt: skip
+
+
+def closed(env):
+    env.close()
+    return env
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_it_is_refused_by_a_rule(name, table):
+    policy, env, message, *is_function = REFUSED[name]
+    if getattr(policy, "__name__", "") == "<lambda>" and not _takes_one(policy):
+        policy = policy()
+    if callable(env) and not is_function:
+        env = env()
+    given = SHORT if env == NOISY else {}
+    with pytest.raises(ValueError, match=message) as refusal:
+        evaluate(policy, env, episodes=EPISODES, **given)
+    table(name, f"refused: {str(refusal.value)[:100]}")
+
+
+def _takes_one(function):
+    return function.__code__.co_argcount == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"env": made, "delay": 3}, "delay must be given where env is made"),
+        ({"delay": -1}, "delay must be"),
+        ({"seed": -1}, "seed must be an integer from 0"),
+        *(({"episodes": n}, "episodes must be an integer from 2") for n in (1, 2.5, "many")),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate(law, **arguments)
+
+
+class TestEnvironmentsAreLeftAsTheyWere:
+    @pytest.mark.parametrize("fails", [False, True])
+    def test_flags_and_modes_are_put_back_and_new_seeds_drawn(self, fails):
+        envs = normal(VecNormalize(dummy(lambda: NormalizeReward(made()))))
+        inner, before = envs.venv.envs[0], copy.deepcopy(vars(envs.obs_rms))
+        network = Network()
+        network.layers[0].eval()
+
+        def act(seen):
+            assert not any((envs.training, inner.update_running_mean, network.training))
+            return np.full((N, 1), np.nan) if fails else network.layers(seen)
+
+        network.forward = act
+        with pytest.raises(ValueError, match="finite") if fails else closing(envs):
+            evaluate(network, envs, episodes=EPISODES)
+        assert envs.training
+        assert inner.update_running_mean
+        assert network.training
+        assert not network.layers[0].training
+        for name, value in vars(envs.obs_rms).items():
+            np.testing.assert_array_equal(value, before[name])
+        assert inner.return_rms.count < 1
+        seeds = [each.unwrapped.np_random_seed for each in envs.venv.envs]
+        assert not set(seeds) & {*range(SEED, SEED + 9)}
+
+    @pytest.mark.parametrize("make", [made, many, dummy, lambda: make_vec_env(NOISY, **SHORT)])
+    def test_they_are_not_closed_and_may_be_scored_again(self, make):
+        env = make()
+        env.close = lambda: pytest.fail("closed")
+        first, again = (evaluate(Integrator(), env, episodes=EPISODES) for _ in range(2))
+        np.testing.assert_array_equal(first.errors, again.errors)
+
+    def test_an_error_of_their_own_is_not_hidden(self):
+        with pytest.raises(OSError, match="broken"):
+            evaluate(law, Dying(made()), episodes=EPISODES)
+
+    @pytest.mark.parametrize("algorithm", [PPO, SAC, RecurrentPPO])
+    def test_training_goes_on_after_a_score_in_its_own_environments(self, algorithm):
+        policy = "MlpLstmPolicy" if algorithm is RecurrentPPO else "MlpPolicy"
+        model = model_of(algorithm, VecNormalize(dummy(n=1)), policy).learn(64)
+        evaluate(model, model.get_env(), episodes=EPISODES)
+        assert model._last_obs is None
+        count = model.get_env().obs_rms.count
+        model.learn(64, reset_num_timesteps=False)
+        assert model.num_timesteps == 128
+        assert model.get_env().obs_rms.count == count + 65  # with that of a reset
+        kept = model._last_obs
+        evaluate(model.policy, dummy(), episodes=EPISODES)
+        assert model._last_obs is kept  # of others it forgets nothing
+
+
+class TestRounds:
+    def test_each_begins_anew_and_has_the_next_seeds(self):
+        begun = []
+
+        class Noting(Integrator):
+            def reset(self):
+                begun.append("reset")
+                super().reset()
+
+            def __call__(self, observations):
+                assert observations.shape == (N, 6)
+                return super().__call__(observations)
+
+        policy = Noting()
+        begun.clear()
+        few = evaluate(policy, many(), episodes=5)
+        assert begun == ["reset"] * 3
+        whole = evaluate(Integrator(), NOISY, episodes=5, **SHORT)
+        np.testing.assert_allclose(few.errors, whole.errors, atol=1e-12)
+        np.testing.assert_allclose(few.travels, whole.travels, atol=1e-9)
+
+    def test_what_is_learnt_carries_over(self):
+        for learns in (True, False):
+            network = DirectNNController(num_envs=N, learning=learns)
+            errors = evaluate(
+                network, gymnasium.make_vec("MiddlePoint-v0", N), episodes=4
+            ).errors
+            assert np.array_equal(errors[:N], errors[N:]) is not learns
+
+    @pytest.mark.parametrize("limit", [None, 2000])
+    def test_without_an_end_of_its_own_it_has_1200_samples(self, limit):
+        plants = MiddlePointVectorEnv(N, max_episode_steps=limit)
+        assert evaluate(law, plants, episodes=2).score is not None
+        # Its spec says 1200.
+        short = gymnasium.make_vec("MiddlePoint-v0", N, max_episode_steps=50)
+        assert "--samples 50" in evaluate(law, short, episodes=2).missing

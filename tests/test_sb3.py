@@ -1,21 +1,32 @@
 """Tests of `mptc_gym.sb3`: the batch against DummyVecEnv, and the callback."""
 
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import SyncVectorEnv
-from gymnasium.wrappers import DelayObservation
+from gymnasium.wrappers import DelayObservation, TransformObservation
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from mptc_gym import MiddlePointEnv, evaluate
 from mptc_gym.evaluation import SEED
-from mptc_gym.sb3 import GymnasiumVecEnv, ScoreCallback, load, make_vec_env, spec_of
+from mptc_gym.sb3 import (
+    MEMBER,
+    GymnasiumVecEnv,
+    ScoreCallback,
+    load,
+    make_vec_env,
+    save,
+    spec_of,
+)  # fmt: skip
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
@@ -88,15 +99,14 @@ def test_trajectories_equal_those_of_dummy_vec_env(kind, rng):
                 np.testing.assert_array_equal(array, other)
                 assert array.dtype == other.dtype
             for info, other, done in zip(infos, expected_infos, arrays[2], strict=True):
-                assert info.get("TimeLimit.truncated", False) is other["TimeLimit.truncated"]
-                assert ("terminal_observation" in info) == ("episode" in info) == done
+                assert bool(info) == done
                 if done:
-                    last = info["terminal_observation"]
-                    np.testing.assert_array_equal(last, other["terminal_observation"])
-                    truncated.append(info["TimeLimit.truncated"])
-                    own, its = info["episode"], other["episode"]
+                    own, its = info.pop("episode"), other.pop("episode")
                     assert own["r"] == pytest.approx(its["r"], abs=2e-6)
                     assert own["l"] == its["l"]
+                    truncated.append(info["TimeLimit.truncated"])
+                    assert data_equivalence(info, other, exact=True)
+            assert ours.reset_infos == theirs.reset_infos
     assert set(truncated) == ({True, False} if kind == "terminate" else {True})
 
 
@@ -167,13 +177,126 @@ class TestMakeVecEnv:
             ({"wrapper": 3}, "wrapper must be the arguments of IncrementalAction"),
             ({"wrapper": partial(DelayObservation, delay=2)}, "wrapper must be IncrementalAct"),
             ({"wrapper": {"max_move": 7}}, "max_move must be"),
-            ({"env": "MiddlePointEasy-v0"}, "env must be the id of an environment"),
+            *(
+                ({"env": env}, "env must be the id of an environment")
+                for env in ("", "Point-v0")
+            ),
             ({"delay": -2}, "delay must be"),
         ],
     )
     def test_what_is_refused(self, arguments, message):
         with pytest.raises(ValueError, match=message):
             make_vec_env(**arguments)
+
+
+class TestSave:
+    def test_a_model_comes_back_with_environments_like_its_own(self, tmp_path):
+        plants = make_vec_env(HARD, 3, wrapper=VELOCITY, action_window=4, max_episode_steps=9)
+        model = model_of(plants)
+        save(model, tmp_path / "model")
+        assert [each.name for each in tmp_path.iterdir()] == ["model.zip"]
+        loaded = load(tmp_path / "model", device="cpu")
+        assert type(loaded) is PPO
+        assert loaded.get_env().num_envs == 3
+        assert spec_of(loaded, HARD) == spec_of(model, HARD)
+        assert loaded.get_env().get_attr("spec")[0].max_episode_steps == 9
+        # It is a zip of Stable-Baselines3 all the same.
+        bare = PPO.load(tmp_path / "model.zip", device="cpu")
+        seen = np.ones((1, 10), np.float32)
+        for each in (loaded, bare):
+            assert each.predict(seen, deterministic=True)[0] == pytest.approx(
+                model.predict(seen, deterministic=True)[0]
+            )
+        loaded.learn(64)
+
+    def test_long_names_threads_and_steps_in_a_name(self, tmp_path):
+        model, long = model_of(make_vec_env()), "m" * 250 + ".zip"
+        names = [long] * 4 + [f"model.step{i}" for i in range(4)]
+        with ThreadPoolExecutor(8) as threads:
+            saved = [threads.submit(save, model, tmp_path / name) for name in names * 3]
+        assert [each.result() for each in saved] == [None] * len(saved)
+        assert {each.name for each in tmp_path.iterdir()} == set(names)
+        assert load(tmp_path / long, device="cpu").num_timesteps == 0
+        mode = (tmp_path / long).stat().st_mode
+        (tmp_path / "other").touch()
+        assert mode == (tmp_path / "other").stat().st_mode
+        with pytest.raises(ValueError, match="cannot be written: File name too long"):
+            save(model, tmp_path / ("m" * 300))
+
+    @pytest.mark.parametrize(
+        ("make", "message"),
+        [
+            (
+                lambda: VecNormalize(make_vec_env()),
+                "in VecNormalize to be saved here: .*env",
+            ),
+            (lambda: VecFrameStack(make_vec_env(), 2), "in VecFrameStack to be saved here"),
+            (MiddlePointEnv, "must come from gymnasium.make or make_vec_env, .* got None"),
+            (two_batches, "must come from gymnasium.make or make_vec_env"),
+            (
+                lambda: TransformObservation(gymnasium.make(HARD), abs, None),
+                "that can be impor",
+            ),
+            (
+                lambda: type("Local", (DelayObservation,), {})(gymnasium.make(HARD), 2),
+                "that can",
+            ),
+        ],
+    )
+    def test_what_cannot_be_saved_is_said_also_before_training(self, make, message, tmp_path):
+        model = model_of(make())
+        with pytest.raises(ValueError, match=message):
+            save(model, tmp_path / "model.zip")
+        with pytest.raises(ValueError, match=message):
+            model.learn(64, ScoreCallback(law_env, path=tmp_path / "best.zip"))
+        assert model.num_timesteps == 0
+        assert not [*tmp_path.iterdir()]
+
+    @pytest.mark.parametrize(
+        ("edit", "message"),
+        [
+            (lambda record: "[" * 100_000, "RecursionError"),
+            (lambda record: "{}", "KeyError"),
+            (lambda record: record.replace("PPO", "PPOO"), "AttributeError"),
+            (lambda record: record.replace("wrappers:Incr", "wrappers:In"), "cannot be loaded"),
+            (None, "was not saved by mptc_gym.sb3.save: load it by its algorithm"),
+        ],
+    )
+    def test_damaged_and_other_zips_are_refused(self, edit, message, tmp_path):
+        model, file = model_of(make_vec_env(wrapper=VELOCITY)), tmp_path / "model.zip"
+        save(model, file)
+        with zipfile.ZipFile(file) as archive:
+            record = archive.read(MEMBER).decode()
+        model.save(file)
+        if edit:
+            with zipfile.ZipFile(file, "a") as archive:
+                archive.writestr(MEMBER, edit(record))
+        with pytest.raises(ValueError, match=message):
+            load(file)
+        file.write_bytes(file.read_bytes()[:500])
+        for path in (file, tmp_path / "none.zip"):
+            with pytest.raises(ValueError, match="cannot be loaded"):
+                load(path)
+
+
+def law_env():
+    return gymnasium.make("MiddlePoint-v0")
+
+
+class TestSpecOf:
+    def test_windows_and_wrappers_are_those_of_the_model(self):
+        model = model_of(make_vec_env("MiddlePoint-v0", 2, wrapper=VELOCITY, **TRAINING))
+        other = DelayObservation(gymnasium.make(HARD, output_window=2), 3).spec
+        for env in (HARD, other):
+            env = gymnasium.make(spec_of(model, env, delay=3))
+            assert isinstance(env, IncrementalAction)
+            parameters = env.unwrapped.parameters
+            assert (parameters.action_window, parameters.output_window) == (20, 0)
+            assert (parameters.delay, parameters.setpoint) == (3, "random")
+        with pytest.raises(ValueError, match=r"action_window must be that of policy's tr.* 20"):
+            spec_of(model, HARD, action_window=3)
+        with pytest.raises(ValueError, match="must be a model with its env"):
+            spec_of(model.policy)
 
 
 class TestScoreCallback:
@@ -189,8 +312,8 @@ class TestScoreCallback:
         assert [samples for samples, _ in callback.scores] == [128, 192]
         errors = [found.mean_error for _, found in callback.scores]
         assert callback.best.mean_error == min(errors)
-        spec = spec_of(tmp_path / "best.zip", "MiddlePointNoisy-v0")
         kept = load(tmp_path / "best.zip", device="cpu")
+        spec = spec_of(kept, "MiddlePointNoisy-v0")
         found = evaluate(kept, spec, episodes=3, seed=SEED + 100)
         assert found.mean_error == min(errors)
         shown = capsys.readouterr().out.splitlines()
@@ -213,11 +336,29 @@ class TestScoreCallback:
         model.learn(128, callback=callback)
         assert [samples for samples, _ in callback.scores[4:]] == [64, 128]
 
+    def test_statistics_of_the_training_are_handed_over(self):
+        model = model_of(VecNormalize(make_vec_env(HARD, 2, seed=0)))
+        own = VecNormalize(make_vec_env(HARD, 2), training=False)
+        callback = ScoreCallback(own, every=64, episodes=2, verbose=0)
+        model.learn(64, callback)
+        assert own.obs_rms.count == model.get_env().obs_rms.count
+        found = evaluate(model, own, episodes=2, seed=SEED + 100)
+        assert found.mean_error == callback.best.mean_error
+
     def test_it_refuses_what_it_cannot_judge(self, tmp_path):
         with pytest.raises(ValueError, match="every must be an integer from 1"):
             ScoreCallback(every=0)
-        with pytest.raises(ValueError, match="path must be the name of a zip"):
-            ScoreCallback(path=tmp_path)
-        env = DelayObservation(MiddlePointEnv(), 2)  # made without a spec
-        with pytest.raises(ValueError, match="DelayObservation does not record its arguments"):
-            model_of(env).learn(32, callback=ScoreCallback())
+        for path in (tmp_path, tmp_path / "none" / "best.zip"):
+            with pytest.raises(ValueError, match="path must be the name of a zip"):
+                ScoreCallback(path=path)
+        model = model_of(VecNormalize(make_vec_env()))
+        for env, message in (
+            (model.get_env(), "must not be the environments of the training"),
+            (model.get_env().venv, "must not be the environments of the training"),
+            (make_vec_env(), "must be wrapped like the environments of the training"),
+            ("MiddlePoint-v0", "wrappers of policy's training, {'VecNormalize'}"),
+            (law_env, "wrappers of policy's training, {'VecNormalize'}"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                model.learn(64, ScoreCallback(env, every=1))
+        assert model.num_timesteps <= 1

@@ -13,10 +13,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 from cyclopts import Parameter
 
+from agents.controller import PAPER_WINDOWS
 from agents.policy_network import WINDOWS
 from benchmarks.controllers.engineered import limits
 from benchmarks.controllers.records import Cost, Factory, RosterEntry
@@ -25,6 +26,7 @@ from benchmarks.lib.command import Names, Repeated, UsageError, blame, options
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.loop.rollout import Agent
 from mptc_gym import Parameters
+from mptc_gym.policies import start
 
 AgentNames = Annotated[Names, Parameter(help="Controllers to run.", choices=ROSTER)]
 
@@ -36,7 +38,7 @@ class ControllerOptions:
 
     agent: Repeated = ()
     """A controller of your own in addition to those of --agents, NAME=MODULE:FACTORY or
-    NAME=PPO:FILE.zip, of mptc_gym.sb3.save; loading a zip runs the code in it. The same name
+    NAME=PPO:FILE.zip, of Stable-Baselines3; loading a zip runs the code in it. The same name
     again adds another training of it (repeatable)."""
     fan_out: FanOut = field(default_factory=FanOut)
 
@@ -95,7 +97,7 @@ def own_factory(location: str) -> Factory:
         raise ValueError(f"{location!r} cannot be imported: {text}") from error
     if not callable(found):
         raise ValueError(f"{location!r} must be MODULE:FACTORY, got {found!r}")
-    observation = getattr(found, "observation", {})
+    observation = getattr(found, "observation", PAPER_WINDOWS)
     if not (isinstance(observation, Mapping) and set(observation) <= set(WINDOWS)):
         raise ValueError(
             f"observation of {found!r} must be a dict with names out of {', '.join(WINDOWS)}, "
@@ -114,9 +116,10 @@ def _try_out(factory: Factory, location: str) -> None:
         factory.run({}, samples=2, runs=2, seed=0)
     except (Exception, SystemExit) as error:
         raise ValueError(
-            f"{location!r} must give an object with reset() and act(observations), and act "
-            f"take observations of shape (2, {size}), one row a plant, and return actions of "
-            f"shape (2, 1); trying it raised {type(error).__name__}: {error}"
+            f"{location!r} must give an object with reset() and act(observations), or another "
+            "policy that mptc_gym.evaluate takes, with or without its own environment; "
+            f"it must take observations of shape (2, {size}), one row a plant, and return "
+            f"actions of shape (2, 1); trying it raised {type(error).__name__}: {error}"
         ) from error
 
 
@@ -125,6 +128,25 @@ def _made(location: str, plant: Parameters, runs: int, seed: int) -> Agent:
     made_by: Callable[..., Agent] = pkgutil.resolve_name(location)
     offered = {"parameters": plant, "num_envs": runs, "seed": seed, **limits(plant)}
     accepted = inspect.signature(made_by).parameters
-    if any(each.kind is each.VAR_KEYWORD for each in accepted.values()):
-        return made_by(**offered)
-    return made_by(**{name: offered[name] for name in offered if name in accepted})
+    if not any(each.kind is each.VAR_KEYWORD for each in accepted.values()):
+        offered = {name: offered[name] for name in offered if name in accepted}
+    made: Any = made_by(**offered)
+    policy, env = made if isinstance(made, tuple) else (made, None)
+    if env is None and hasattr(policy, "reset") and hasattr(policy, "act"):
+        return cast("Agent", policy)
+    return OwnPolicy(policy, env, runs)
+
+
+class OwnPolicy:
+    """A policy in any form that `mptc_gym.evaluate` takes, and the environment it acts in."""
+
+    def __init__(self, policy: Any, env: Any, runs: int) -> None:
+        self.policy, self.env, self._runs = policy, env, runs
+
+    def reset(self) -> None:
+        """Start an episode."""
+        self._act = start(self.policy, self._runs)
+
+    def act(self, observation: Any) -> Any:
+        """Return actions, shape (runs, 1)."""
+        return self._act(observation)

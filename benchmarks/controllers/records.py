@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any
 
 from agents.controller import PAPER_WINDOWS
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from mptc_gym import Parameters
+from mptc_gym.environments import opened
+from mptc_gym.evaluation import case_of
 
 LEARNING = 1200  # samples of the square wave on which a network is commissioned
 COMMISSIONING_SEED = 3_000_000  # of plants and noise during commissioning
@@ -62,10 +65,16 @@ class Factory:
         controller: Agent | None = None,
     ) -> Trajectory:
         """Run the given controller, by default a new one for this plant; see `rollout`."""
-        plants = make_plants(runs, samples, **self.arguments(plant))
-        trajectory = rollout(plants, controller or self(plant, runs, seed), samples, seed)
-        plants.close()
-        return trajectory
+        agent = controller or self(plant, runs, seed)
+        env = getattr(agent, "env", None)  # of a user's policy that acts in one of its own
+        if env is None:
+            with closing(make_plants(runs, samples, **self.arguments(plant))) as plants:
+                return rollout(plants, agent, samples, seed)
+        with opened(env, runs) as plants:
+            there = [case_of(each.parameters) for each in plants.inner]
+            if set(there) != {case_of(Parameters(**self.arguments(plant)))}:
+                raise ValueError("the environment must have the parameters that it is made for")
+            return rollout(plants, agent, samples, seed)
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
         """Return a controller that is ready for plants it was not made for.

@@ -1,10 +1,12 @@
-"""Make controllers from policies saved by `mptc_gym.sb3`: `--agent mine=PPO:model.zip`."""
+"""Make controllers from policies of Stable-Baselines3: `--agent mine=PPO:model.zip`."""
 
 from __future__ import annotations
 
 import glob
 import hashlib
-from dataclasses import asdict
+import importlib
+import zipfile
+from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -14,19 +16,24 @@ from numpy.typing import NDArray
 
 from benchmarks.controllers.records import Cost, Factory
 from benchmarks.loop.rollout import drawn_numbers
-from mptc_gym import Parameters
+from mptc_gym import MiddlePointEnv, Parameters
+from mptc_gym.evaluation import WINDOWS
 from mptc_gym.policies import start
-from mptc_gym.sb3 import load
-from mptc_gym.training import Training, entry_point
-from mptc_gym.wrappers import NUMBERS, Actuator, IncrementalAction
+from mptc_gym.sb3 import MEMBER, load, spec_of
+from mptc_gym.wrappers import NUMBERS, Actuator
+
+_ADVICE = (
+    "write a function that returns the policy, or the policy and the environment that it acts "
+    "in, and give --agent NAME=MODULE:FUNCTION"
+)
 
 
 def policies(location: str) -> list[Factory]:
     """Return a factory for each saved policy at a location, such as `PPO:model.zip`.
 
     The file may be a pattern, such as `runs/*.zip`. Loading a zip runs the code in it. A
-    ValueError says if there is no such file, if it does not say how its policy was trained, or
-    if that was with another algorithm or with wrappers that a comparison cannot give.
+    ValueError says if there is no such file, if it is of another algorithm, or if its policy
+    acts in an environment that a comparison cannot give.
     """
     algorithm, _, pattern = location.partition(":")
     if not pattern:
@@ -39,33 +46,19 @@ def policies(location: str) -> list[Factory]:
 
 
 def _policy(algorithm: str, file: Path) -> Factory:
-    training = Training.read(file)
-    if training.algorithm.rpartition(":")[2] != algorithm:
-        raise ValueError(f"{file} holds a model of {training.algorithm}, not of {algorithm}")
-    increments = None
-    match training.wrappers:
-        case ():
-            pass
-        case (only,) if only.entry_point == entry_point(IncrementalAction):
-            increments = dict(only.kwargs or {})
-        case several:
-            raise ValueError(
-                f"{file} was trained in {', '.join(each.name for each in several)}, and only "
-                "IncrementalAction is known here: mptc_gym.evaluate scores it"
-            )
-    model = _loaded(str(file))
+    model, windows, increments = _loaded(algorithm, str(file))
     weights = sum(weight.numel() for weight in model.policy.parameters())
     return Factory(
-        partial(SavedPolicy, str(file), increments),
+        partial(SavedPolicy, algorithm, str(file)),
         Cost(
             parameters=f"{weights:,} weights a policy",
             samples=f"{model.num_timesteps / 1e6:.3g} M a policy",
         ),
-        training.windows,
+        windows,
         provenance={
             "file": file.name,
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "training": asdict(training),
+            "increments": increments,
         },
     )
 
@@ -73,19 +66,13 @@ def _policy(algorithm: str, file: Path) -> Factory:
 class SavedPolicy:
     """A deterministic controller from a policy in a zip file.
 
-    `increments` are the arguments of `IncrementalAction` if the policy moves the flow: an
-    actuator then turns the resulting flows into actions.
+    If the policy moves the flow, an actuator turns the resulting flows into actions.
     """
 
     def __init__(
-        self,
-        file: str,
-        increments: dict[str, Any] | None,
-        plant: Parameters,
-        runs: int,
-        seed: int,
+        self, algorithm: str, file: str, plant: Parameters, runs: int, seed: int
     ) -> None:
-        self._model = _loaded(file)
+        self._model, _, increments = _loaded(algorithm, file)
         self._actuator = None
         if increments is not None:
             numbers = drawn_numbers(plant, runs, seed).chosen(NUMBERS)
@@ -109,5 +96,44 @@ class SavedPolicy:
 
 
 @cache
-def _loaded(file: str) -> Any:
-    return load(file, device="cpu")
+def _loaded(algorithm: str, file: str) -> tuple[Any, dict[str, int], dict[str, Any] | None]:
+    """Return a model, its windows and, if it has any, the arguments of `IncrementalAction`."""
+    kept = False
+    with suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
+        kept = MEMBER in archive.namelist()
+    if not kept:
+        return _plain(algorithm, file), _windows(Parameters()), None
+    model = load(file, device="cpu")
+    if type(model).__name__ != algorithm:
+        raise ValueError(f"{file} holds a model of {type(model).__name__}, not of {algorithm}")
+    spec = spec_of(model)
+    match spec.additional_wrappers:
+        case ():
+            increments = None
+        case (only,) if only.name == "IncrementalAction":
+            increments = dict(only.kwargs or {})
+        case several:
+            names = ", ".join(each.name for each in several)
+            raise ValueError(
+                f"{file} acts in {names}, not in IncrementalAction alone: {_ADVICE}"
+            )
+    return model, _windows(Parameters.of_environment(spec.kwargs)), increments
+
+
+def _plain(algorithm: str, file: str) -> Any:
+    """Return a model that does not say where it acts, if the plain environment fits it."""
+    for package in ("stable_baselines3", "sb3_contrib"):
+        with suppress(ImportError):
+            if kind := getattr(importlib.import_module(package), algorithm, None):
+                model = kind.load(file, device="cpu")
+                plain = MiddlePointEnv()
+                spaces = plain.observation_space, plain.action_space
+                if (model.observation_space, model.action_space) != spaces:
+                    raise ValueError(f"{file} does not act in the plain environment: {_ADVICE}")
+                return model
+    raise ValueError(f"{algorithm} must be an algorithm of Stable-Baselines3, such as PPO")
+
+
+def _windows(parameters: Parameters) -> dict[str, int]:
+    """Return the windows by their names."""
+    return {name: getattr(parameters, name) for name in WINDOWS}

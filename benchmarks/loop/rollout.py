@@ -90,7 +90,7 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
 
 
 def rollout(
-    plants: gymnasium.vector.VectorEnv,
+    plants: Any,
     agent: Agent,
     samples: int,
     seed: int,
@@ -98,7 +98,8 @@ def rollout(
 ) -> Trajectory:
     """Run a controller on a batch of plants for k = 0 to samples - 1. Both are reset first.
 
-    Run i has the noise and the set point of seed `seed + i`. `before` is called with k before
+    Plants are a vector environment, or given ones as `mptc_gym.environments` opens them. Run i
+    has the noise and the set point of seed `seed + i`. `before` is called with k before
     the controller acts at sample k, to observe or to damage it.
     """
     shape = samples, plants.num_envs
@@ -111,7 +112,9 @@ def rollout(
             before(next(clock))
         return agent.act(observations)
 
-    for k, (at, after, _) in enumerate(run_batch(plants, act, samples, seed)):
+    for k, (at, after, _) in enumerate(
+        run_batch(plants, act, samples, [*range(seed, seed + shape[1])])
+    ):
         trajectory.setpoint[k] = at["setpoint"]
         trajectory.output[k] = at["output"]
         trajectory.noise[k] = at["noise"]
