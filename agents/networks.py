@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.controller import check_numbers
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 # Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
 Layers = Sequence[tuple[Array, Array]]
 
@@ -27,17 +27,23 @@ ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
 }
 
 
-def forward(layers: Layers, activation: str, x: Array) -> Array:
-    """Return outputs, shape (..., outputs), for inputs; the last layer has no activation."""
+def forward(layers: Layers, activation: str, inputs: ArrayLike) -> NDArray[np.float64]:
+    """Return outputs, shape (..., outputs), for inputs; the last layer has no activation.
+
+    It is computed in float32, in which the networks were trained. BLAS rounds sums of a batch
+    in another order than those of a single row, so that they can differ by some 1e-6.
+    """
+    x = np.asarray(inputs, np.float32)
     *hidden, (last_W, last_b) = layers
     for W, b in hidden:
         x = ACTIVATIONS[activation](x @ W.T + b)
-    return x @ last_W.T + last_b
+    return (x @ last_W.T + last_b).astype(np.float64)
 
 
 def check_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return a copy in float64 if the shape fits and all is finite; otherwise a ValueError."""
-    array = np.array(check_numbers(name, value))
+    """Return a copy in float32 if the shape fits and all is finite; otherwise a ValueError."""
+    with np.errstate(over="ignore"):  # too large for float32 is infinite there, and refused
+        array = np.array(check_numbers(name, value), np.float32)
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():
@@ -46,7 +52,7 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def check_layers(layers: Layers, inputs: int, outputs: int) -> list[tuple[Array, Array]]:
-    """Return the layers in float64 if each fits the one before it; otherwise a ValueError."""
+    """Return the layers in float32 if each fits the one before it; otherwise a ValueError."""
     if not layers:
         raise ValueError("layers must hold at least one layer, got none")
     checked = []

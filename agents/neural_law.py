@@ -249,7 +249,7 @@ class Law:
 
 @dataclass(frozen=True)
 class LawNetwork:
-    """The two networks of the law, in NumPy."""
+    """The two networks of the law, in NumPy and float32."""
 
     choosing: Layers
     """The network of the outputs."""

@@ -43,7 +43,8 @@ class PolicyNetwork(Controller):
 
     The observation is multiplied by `input_scale` and passed through the layers. The activation
     follows every layer but the last, whose single output is clipped to [-1, 1]. This output is
-    the action or, with `increments`, moves the wanted flow. All arithmetic is in float64.
+    the action or, with `increments`, moves the wanted flow. The layers are run in float32, so a
+    loop in a batch can differ from a single one by rounding; see `agents.networks.forward`.
 
     `u_min` and `u_max` are those of `Controller`.
 
@@ -67,7 +68,7 @@ class PolicyNetwork(Controller):
 
     layers: Layers = field(repr=False, kw_only=False)
     observation: Mapping[str, int]
-    input_scale: Array = field(repr=False)
+    input_scale: NDArray[np.floating[Any]] = field(repr=False)
     activation: str = "elu"
     increments: Increments | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict, repr=False)

@@ -8,13 +8,15 @@ import pytest
 from scipy import linalg, optimize, signal, stats
 
 from agents import PIController
-from benchmarks.bounds import command, least, linear_program
+from benchmarks.bounds import __main__ as command
+from benchmarks.bounds import least, linear_program
 from benchmarks.bounds.__main__ import main
 from benchmarks.bounds.causal import SetPointLaw
-from benchmarks.bounds.least import frontier, least_possible
+from benchmarks.bounds.least import least_possible
 from benchmarks.bounds.linear_program import plan, reference
 from benchmarks.bounds.unknown import noise_variance, unknown
 from benchmarks.controllers.mpc import PredictiveController
+from benchmarks.lib import storage
 from benchmarks.loop.linear import time_varying_model
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import make_plants, rollout
@@ -359,15 +361,16 @@ class TestLeastPossible:
             hopeless.score(1.0)
 
     def test_it_is_kept_by_all_that_shapes_it(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(storage, "commit", lambda: 40 * "a")  # a clean checkout
         ask = {"samples": 60, "kind": "preview", "folder": tmp_path, "setpoint": 5.0}
         first = least_possible(**ask)
-        (file,) = tmp_path.iterdir()
+        (file,) = tmp_path.rglob("*.pkl")
         with monkeypatch.context() as patch:
-            patch.setattr(least, "_draw", None)  # nothing is computed now
+            patch.setattr(least, "_least", None)  # nothing is computed now
             assert least_possible(**ask) == first
         for other in ({"samples": 61}, {"delay": 3}, {"kind": "reference"}, {"seed": 1}):
             least_possible(**{**ask, **other})
-        assert len(list(tmp_path.iterdir())) == 5
+        assert len(list(tmp_path.rglob("*.pkl"))) == 5
         file.write_text("{")  # damaged
         assert least_possible(**ask) == first
 
@@ -384,31 +387,6 @@ class TestLeastPossible:
     def test_bad_arguments(self, arguments, message):
         with pytest.raises(ValueError, match=message):
             least_possible(**arguments)
-
-
-class TestFrontier:
-    def test_less_travel_costs_error_and_no_controller_lies_below(self):
-        points = np.array(frontier(samples=600, setpoint=5.0))
-        assert np.all(np.diff(points[:, 0]) <= 1e-9)
-        assert np.all(np.diff(points[:, 1]) >= -1e-9)
-        least = least_possible(samples=600, folder=None, setpoint=5.0)
-        assert points[0, 1] == pytest.approx(least.value, rel=0.02)
-        assert points[-1].tolist() == [0.0, 5.0]
-        for agent in (PIController(), PIController(1.0, 0.02), PIController(0.5, 0.01)):
-            runs = rollout(make_plants(1, 600, setpoint=5.0), agent, 600, seed=0)
-            travel = np.abs(np.diff(runs.applied[:, 0], prepend=0.0)).sum() / 600
-            lowest = np.interp(travel, *points[::-1].T)
-            assert mean_error(runs)[0] > lowest * (1 - 1e-6)
-
-    def test_a_valve_that_must_not_overshoot_by_hand(self):
-        # The least travel that holds 5 degC is one move to 7.33 t/h: what is dear enough.
-        steady = 5.0 * 0.07273 / 0.04964
-        travel, error = frontier(samples=600, setpoint=5.0, prices=[25.0])[0]
-        assert travel * 600 == pytest.approx(steady, rel=0.02)
-        plants = make_plants(1, 600, setpoint=5.0)
-        moved = rollout(plants, Plan(np.full(600, -steady)), 600, seed=0)
-        worth = mean_error(moved)[0] + 25.0 * steady / 600
-        assert 0.98 * worth < error + 25.0 * travel <= worth * (1 + 1e-6)
 
 
 class TestPredictiveController:

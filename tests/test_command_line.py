@@ -12,15 +12,13 @@ import pytest
 
 pytest.importorskip("cyclopts", reason="the commands need the extra compare")
 
+from benchmarks.__main__ import commands
 from benchmarks.__main__ import main as show_map
 from benchmarks.compare.__main__ import Options
 from benchmarks.lib.command import read
 from tests.conftest import ROOT, python
 
-COMMANDS = sorted(
-    ".".join(path.parent.relative_to(ROOT).parts[1:])
-    for path in (ROOT / "benchmarks").glob("*/**/__main__.py")
-)
+COMMANDS = commands()
 HEAVY = {
     "joblib", "matplotlib", "optuna", "pandas", "pygame", "ray", "scipy", "stable_baselines3",
     "torch",
@@ -28,14 +26,14 @@ HEAVY = {
 
 
 def main_of(name):
-    return importlib.import_module(f"benchmarks.{name}.__main__").main
+    return importlib.import_module(COMMANDS[name]).main
 
 
 def test_help_imports_nothing_heavy():
     program = (
         "import importlib, sys\n"
-        f"for name in {COMMANDS}:\n"
-        "    importlib.import_module(f'benchmarks.{name}.__main__').main(['--help'])\n"
+        f"for module in {[*COMMANDS.values()]}:\n"
+        "    importlib.import_module(module).main(['--help'])\n"
         "print(*{name.partition('.')[0] for name in sys.modules}, file=sys.stderr)"
     )
     done = python("-c", program, check=True)
@@ -145,7 +143,7 @@ def test_a_missing_package_is_named_with_its_extra(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, package, None)
     for name in [*sys.modules]:  # those that import it are imported anew
-        if re.fullmatch(r"benchmarks\.(train|tune|watch)\.(?!__main__).*", name):
+        if re.fullmatch(r"benchmarks\.train\.(?!__main__).*", name):
             monkeypatch.delitem(sys.modules, name)
     name, *options = given.split()
     said = refused(main_of(name), options)
@@ -179,7 +177,7 @@ def test_a_command_on_a_page_can_be_typed_as_it_stands(page):
     text = page.read_text("utf-8").replace("\\\n", "")
     for name, options in re.findall(r"python -m benchmarks\.([\w.]+)([^`|#\n]*)", text):
         if name in COMMANDS:  # an example takes no options
-            declared = importlib.import_module(f"benchmarks.{name}.__main__").Options
+            declared = importlib.import_module(COMMANDS[name]).Options
             assert read(declared, name, shlex.split(options)), name
 
 

@@ -12,8 +12,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from agents import PIController
 from benchmarks.bounds import least_possible
+from benchmarks.bounds.__main__ import PACKAGED as CASES
 from benchmarks.bounds.__main__ import main as bounds_command
-from benchmarks.bounds.command import PACKAGED as CASES
 from mptc_gym import IDS, PRESETS, Evaluation, MiddlePointEnv, Parameters, evaluate
 from mptc_gym.evaluation import SEED, least_errors
 from mptc_gym.wrappers import IncrementalAction

@@ -18,7 +18,7 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import mptc_gym.sb3
-from benchmarks.datasets.command import arguments_of, record
+from benchmarks.datasets import arguments_of, record
 from benchmarks.examples import offline, sb3
 from mptc_gym import evaluate
 from mptc_gym.sb3 import load, spec_of
@@ -108,10 +108,8 @@ class TestOffline:
 
     @pytest.fixture
     def data(self):
-        logged = record("paper", "smith", 2)
         return offline.transitions_of(
-            SimpleNamespace(observations=o, actions=a, rewards=r)
-            for o, a, r in zip(logged.observations, logged.actions, logged.rewards, strict=True)
+            SimpleNamespace(**episode) for episode in record("paper", "smith", 2)
         )
 
     def test_transitions_follow_one_another_within_an_episode(self, data):

@@ -141,7 +141,7 @@ def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, caps
         pytest.importorskip(name, reason=f"the example needs {name}, of an extra")
     monkeypatch.chdir(tmp_path)
     if "minari" in names:
-        from benchmarks.datasets.__main__ import main  # as it needs Minari
+        from benchmarks.datasets import main  # as it needs Minari
 
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
         assert main([*re.findall(r"middlepoint/[\w/-]+", example), "--episodes", "2"]) == 0

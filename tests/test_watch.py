@@ -9,83 +9,116 @@ import pytest
 from PIL import Image
 
 from agents import PIController
-from benchmarks.watch import command as watch
-from benchmarks.watch.__main__ import main
-from mptc_gym import MiddlePointEnv, drawing
+from benchmarks import watch
+from benchmarks.watch import equal_steps, main
+from mptc_gym import MiddlePointEnv
+from tests.conftest import run_closed
 
 SAMPLES = 40
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch, tmp_path):
-    """Make the scenarios short, and keep what is written out of the checkout."""
+    """Make the cases short, and keep what is written out of the checkout."""
     made = {name: replace(each, samples=SAMPLES) for name, each in watch.SCENARIOS.items()}
     monkeypatch.setattr(watch, "SCENARIOS", made)
+    monkeypatch.setattr(watch, "PICTURES", 4)
     monkeypatch.chdir(tmp_path)
 
 
-def pictures(path):
-    with Image.open(path) as film:
-        for i in range(film.n_frames):
-            film.seek(i)
-            yield np.array(film.convert("RGB")).astype(int)
+def test_equal_steps_by_hand():
+    levels = [0.0, 5.0, -5.0, 5.0, -5.0, 5.0, 5.0, -5.0]
+    found = equal_steps(np.repeat(levels, [4, 6, 6, 6, 6, 3, 3, 5]))
+    assert found == [(10, 16), (22, 28)]  # from 5 to -5 for 6 samples; the last is shorter
+    assert equal_steps(np.repeat([5.0], 7)) == [(0, 7)]
 
 
-def test_a_gif_shows_the_run(tmp_path, capsys):
-    path = tmp_path / "new" / "film.gif"
-    arguments = ["--agent", "pi", "--scenario", "square-noise", "--seed", "7", "--speed", "50"]
-    assert main([*arguments, "--video", str(path)]) == 0
-    assert [each.name for each in path.parent.iterdir()] == ["film.gif"]
-    assert path.stat().st_size < 200_000
-    with Image.open(path) as film:
-        assert film.info["duration"] == 100  # ms; 10 pictures a second, of each fifth sample
-        assert film.info["loop"] == 0
-    shown = list(pictures(path))
-    assert len(shown) == SAMPLES / 2 / 5
+@pytest.mark.parametrize(
+    ("given", "panels"),
+    [
+        (["--set", "setpoint_period=20", "--scenario", "run"], 2),
+        (["--scenario", "constant"], 1),
+    ],
+)
+def test_a_film_shows_steps_side_by_side(given, panels, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(
+        watch,
+        "scenarios_of",
+        lambda *_: {"run": replace(case, arguments={"setpoint_period": 20})},
+    ) if panels == 2 else None
+    case = watch.SCENARIOS["square"]
+    assert main(["--agent", "pi", *given, "--video", "new/film.gif"]) == 0
+    (film,) = (tmp_path / "new").iterdir()
+    with Image.open(film) as pictures:
+        assert pictures.n_frames == 1 + 4
+        assert pictures.info["loop"] == 0
+        inked = []
+        for i in range(pictures.n_frames):
+            pictures.seek(i)
+            blue = np.abs(np.array(pictures.convert("RGB")) - [0, 114, 178.0]).max(axis=2) < 40
+            inked.append(blue[100:430].sum(axis=0))
+    total = [each.sum() for each in inked]
+    # The first picture is the whole, as is the last; those between grow, and none is blank.
+    assert total[0] == pytest.approx(total[-1], rel=0.02)
+    assert 0 < total[1] < total[2] < total[3] < total[0]
+    halves = inked[0][:375].sum(), inked[0][375:].sum()
+    assert min(halves) > 0.3 * max(halves)
+    arguments = {"setpoint": 5.0} if panels == 1 else {"setpoint_period": 20}
+    errors = np.abs(run_closed(MiddlePointEnv(**arguments), PIController(), SAMPLES)["error"])
+    assert f"mean absolute error {errors[1:].mean():.3f} °C" in capsys.readouterr().out
 
-    env = MiddlePointEnv(noise_variance=0.5, render_mode="rgb_array")
-    controller = PIController()
-    observation, info = env.reset(seed=7)
-    errors = []
-    width, height = watch.SHOWN
-    for k in range(SAMPLES):
-        if k % 5 == 0:
-            half, i = divmod(k, SAMPLES // 2)
-            top = watch.CAPTION + half * (height + watch.CAPTION)
-            picture = Image.fromarray(env.render()).resize((width, height))
-            assert np.abs(shown[i // 5][top : top + height] - picture).mean() < 3
-        observation, _, _, _, info = env.step(controller.act(observation))
-        errors.append(abs(info["error"]))
-    assert f"mean absolute error {np.mean(errors):.3f} °C" in capsys.readouterr().out
+
+def test_multiples_are_of_the_reference_on_the_same_step(tmp_path, monkeypatch):
+    # Of a run that has twice, then three times the reference's error.
+    titles = []
+    setpoint = np.tile(np.repeat([5.0, -5.0], 10), 2)[:, np.newaxis]
+    error = np.ones((40, 1))
+    runs = [
+        Mock(setpoint=setpoint, error=error * np.repeat(factors, 10)[:, np.newaxis],
+             output=setpoint, applied=setpoint)
+        for factors in ([9.0, 2.0, 9.0, 3.0], [1.0, 1.0, 1.0, 1.0])
+    ]  # fmt: skip
+    from matplotlib.figure import Figure
+
+    kept = Figure.suptitle
+    monkeypatch.setattr(
+        Figure, "suptitle", lambda self, text, **k: titles.append(text) or kept(self, text, **k)
+    )
+    watch.write_film(tmp_path / "film.gif", "mine", 8.0, *runs)
+    assert titles[0].replace("\n", " ").startswith("mine: error 2.00 and 3.00 times that of")
 
 
-def test_where_there_is_no_screen_it_says_so_and_writes_a_film(tmp_path, capsys):
+def test_what_cannot_be_written_is_said_before_anything_is_run(refused, monkeypatch):
+    monkeypatch.setattr(watch.Factory, "run", None)
+    assert "--video: " in refused(main, ["--video", "/proc/x.gif"])
+    assert "--video: must end in .gif" in refused(main, ["--video", "film.avi"])
+
+
+def test_where_there_is_no_screen_it_says_so_and_writes_a_film(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(watch, "write_film", lambda path, *_: path.write_text("a film"))
     assert main(["--agent", "smith", "--scenario", "constant"]) == 0  # of the driver "dummy"
     assert (tmp_path / "results" / "watch" / "smith-constant.gif").is_file()
     assert "There is no screen" in capsys.readouterr().out
 
 
-def test_interrupted(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("closed_after", [None, 4])
+def test_a_window_shows_the_run_until_it_is_closed(closed_after, monkeypatch, capsys):
+    monkeypatch.setattr(watch, "_has_screen", lambda: True)
+    waits = []
+    monkeypatch.setattr(
+        pygame.event, "get", lambda kind: waits.append(kind) or len(waits) == closed_after
+    )
+    assert main(["--agent", "pi", "--scenario", "constant", "--speed", "1000"]) == 0
+    samples = closed_after or SAMPLES
+    errors = np.abs(run_closed(MiddlePointEnv(setpoint=5.0), PIController(), samples)["error"])
+    said = f"mean absolute error {errors[1:].mean():.3f} °C in {samples} samples"
+    assert said in capsys.readouterr().out
+    assert not pygame.display.get_init()
+
+
+def test_an_interrupted_film_leaves_the_one_before(tmp_path, monkeypatch, capsys):
     (tmp_path / "film.gif").write_bytes(b"earlier")
-    monkeypatch.setattr(watch, "rollout", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(Image.Image, "save", Mock(side_effect=KeyboardInterrupt))
     assert main(["--video", "film.gif"]) == 130
     assert "Interrupted" in capsys.readouterr().out
     assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"earlier"]
-
-
-@pytest.mark.parametrize("closed_at", [4, None])
-def test_a_window_shows_the_run_until_it_is_closed(monkeypatch, capsys, closed_at):
-    monkeypatch.setattr(watch, "_has_screen", lambda: True)
-    drawn, show = [], drawing.show
-
-    def shown(record, fps):
-        show(record, fps)
-        drawn.append(fps)
-        if len(drawn) - 1 == closed_at:
-            pygame.event.post(pygame.event.Event(pygame.QUIT))
-
-    monkeypatch.setattr(drawing, "show", shown)
-    assert main(["--speed", "1000"]) == 0
-    assert not pygame.display.get_init()
-    assert ("The window was closed." in capsys.readouterr().out) == (closed_at is not None)
-    assert drawn[1:] == [1000] * (SAMPLES if closed_at is None else closed_at)

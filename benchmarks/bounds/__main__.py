@@ -2,13 +2,37 @@
 
 from __future__ import annotations
 
+import shutil
+import textwrap
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from benchmarks.lib.command import Count, Runs, Seed, command, options
 from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.storage import ROOT, commit, out_folder, versions, write_json
 from benchmarks.loop.plants import PlantOptions
-from mptc_gym.evaluation import EPISODES, SEED
+from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
+from mptc_gym import PRESETS
+from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
+
+HEADINGS = {"preview": "with preview", "causal": "without preview", "reference": "reference"}
+NOTE = (
+    "With preview: no controller does better on average, even one that knows the set point "
+    "beforehand. Without: none that learns of a change of the set point when it happens; for "
+    "random set points alone, which have a law. Reference: the same, if each change finds the "
+    "plant settled; a controller that counts samples can come below it. Where a set point "
+    "never changes, the three are the same. 95 % intervals over drawn episodes."
+)
+PACKAGE = ROOT / "mptc_gym" / "bounds.json"
+MORE = 20  # episodes of the package beyond those of a score, for choosing policies
+PACKAGED = PRESETS | {
+    f"{name}, random set points": {**PRESETS[name], "setpoint": "random"}
+    for name in ("paper", "disturbed", "fouling")  # for the data sets
+}
 
 
 @options
@@ -35,7 +59,83 @@ class Options:
     """Folder in which computed bounds are kept (default: results/bounds)."""
 
 
-main = command(Options, "benchmarks.bounds.command", width=150)
+def work(options: Options) -> str:
+    """Print the bounds of the cases and of the presets, or of another plant."""
+    from benchmarks.bounds.least import CACHE
+
+    plant, one = options.plant.chosen(), options.plant != PlantOptions()
+    folder = out_folder(options.cache or CACHE, "--cache")
+    if options.package:
+        return write_package(folder, options.fan_out)
+    cases = {**SCENARIOS, **PRESET_SCENARIOS}
+    if one:
+        cases = scenarios_of(plant.name, plant.arguments)
+    drawn = {"episodes": options.episodes, "seed": options.seed, "folder": folder}
+    tasks = {
+        name: partial(row, case, options.samples or case.samples, drawn, options.mpc)
+        for name, case in cases.items()
+    }
+    print(f"Mean |e| in °C, {plant.name}:" if one else "Mean |e| in °C:")
+    _show("", ["no control", *HEADINGS.values(), *["MPC"] * bool(options.mpc)])
+    for name, cells in options.fan_out.stream(tasks):
+        _show(name, cells)
+    return "\n" + textwrap.fill(NOTE, shutil.get_terminal_size((150, 24)).columns)
+
+
+def _show(name: str, cells: list[str]) -> None:
+    print((f"{name:20}" + "".join(f"{cell:>26}" for cell in cells)).rstrip(), flush=True)
+
+
+def row(case: Scenario, samples: int, drawn: Mapping[str, Any], mpc: int | None) -> list[str]:
+    """Return the bounds of a case, and the error of `mpc` runs of MPC, if any.
+
+    `drawn` holds the number and first seed of the episodes, and the folder of kept bounds.
+    """
+    from benchmarks.bounds.least import least_possible
+    from benchmarks.controllers.roster import ROSTER
+    from benchmarks.lib.statistics import Estimate, bootstrap
+    from benchmarks.loop.metrics import mean_error
+
+    ask = {"samples": samples, **drawn, **case.arguments}
+    of = least_possible(kind="preview", **ask)
+    cells = [f"{Estimate(of.idle, of.idle_low, of.idle_high, of.runs):.4f}"]
+    for kind in HEADINGS:
+        cells.append("")
+        # "causal" needs random set points, "reference" those that are held long enough.
+        with suppress(ValueError):
+            cells[-1] = f"{least_possible(kind=kind, **ask):.4f}"
+    if mpc:
+        (predictive,) = ROSTER["mpc"].members()
+        runs = predictive.run(case.arguments, samples, mpc, drawn["seed"])
+        cells.append(f"{bootstrap(mean_error(runs), seed=0):.4f}")
+    return cells
+
+
+def write_package(folder: Path, fan_out: FanOut) -> str:
+    """Write the least possible error of each case, for every episode where they differ."""
+    from benchmarks.bounds.least import least_possible
+
+    case: dict[str, Any] = {"samples": SAMPLES, "seed": SEED, "episodes": EPISODES + MORE}
+    tasks = {
+        name: partial(least_possible, folder=folder, **{**case, **arguments})
+        for name, arguments in PACKAGED.items()
+    }
+    found = fan_out.run(tasks, "bounds")
+    cases = {
+        name: {"arguments": arguments, "kind": found[name].kind, "least": found[name].episodes}
+        for name, arguments in PACKAGED.items()
+    }
+    about = {
+        "command": "python -m benchmarks.bounds --package",
+        "commit": commit(),
+        "versions": versions(),
+        "unit": "degC, mean of |e(k)| over k = 1 to samples",
+    }
+    write_json(PACKAGE, {**about, **case, "cases": cases})
+    return f"Written to {PACKAGE}"
+
+
+main = command("bounds", Options, work)
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

@@ -49,11 +49,6 @@ class Plan:
         """The value over k = 1 to N, as no flow changes e(0)."""
         return self.value - float(self.error[0])
 
-    @property
-    def travel(self) -> float:
-        """The sum of |u_a(k) - u_a(k-1)| of the mean flow, t/h, which is 0 before k = 0."""
-        return float(np.abs(np.diff(self.flow, prepend=0.0)).sum())
-
 
 def plan(
     model: TimeVaryingModel,
@@ -62,9 +57,8 @@ def plan(
     *,
     before: Plan | None = None,
     start: int = 0,
-    price: float = 0.0,
+    quiet: bool = False,
     penalty: Array | None = None,
-    least_slope: float = 0.0,
 ) -> Plan:
     """Minimise the sum of the bounds of E|e(k)| over the mean flow.
 
@@ -73,8 +67,7 @@ def plan(
     as u_a(k) always lies within [low, high], so does its mean; and as E|m - n| is convex in m,
     its mean over everything that may be known is at least its value at the mean of m, which is
     y_d - y (Jensen). So the controller's error is at least the minimum over all mean flows
-    within the limits: a linear program, as each bound of E|m - n| is a maximum of lines. The
-    mean travel of a flow is at least the travel of the mean flow, again by Jensen.
+    within the limits: a linear program, as each bound of E|m - n| is a maximum of lines.
 
     The bound is loose where the required flow lies within the dead zone, or alternates between
     the two sides of a limit: the mean of 0 and 5 t/h is 2.5 t/h, and the mean of what the noise
@@ -82,11 +75,10 @@ def plan(
 
     The model covers at least the samples of `setpoint`, y_d(k) in degC. Outputs up to sample
     `start`, and flows before it, are those of the plan `before`; without one, the plant has
-    been at rest. The value counts the samples from `start` on, with a `price` of valve travel,
-    degC times samples for each t/h, and a `penalty` for each t/h of u_a(k), shape (samples,).
-    The bounds of E|m - n| are level near 0: while planning, a `least_slope` above 0 selects, of
-    equally good plans, one that comes to the set point. `NotSolvedError` is raised if all
-    attempts fail or take too long.
+    been at rest. The value counts the samples from `start` on, with a `penalty` in degC for
+    each t/h of u_a(k), shape (samples,). A `quiet` plan is, of equally good ones, the one that
+    comes to the set point with the least travel. `NotSolvedError` is raised if all attempts
+    fail or take too long.
     """
     samples = len(setpoint)
     penalty = np.zeros(samples) if penalty is None else penalty
@@ -97,14 +89,13 @@ def plan(
     of_now = unknown.of(start, samples)
     if n:
         output[start + 1 :], flow[start:-1] = _solve(
-            model, of_now, setpoint, output, flow, start, price, penalty, least_slope
+            model, of_now, setpoint, output, flow, start, quiet, penalty
         )
     # The last flow affects no output; if it does not move, it costs nothing either.
     flow[-1] = flow[-2] if samples > 1 else 0.0
     error = np.zeros(samples)
     error[start:] = of_now.mean_error(setpoint[start:] - output[start:])
-    moves = np.abs(np.diff(flow, prepend=0.0))[start:]
-    value = error[start:].sum() + price * moves.sum() + penalty[start:] @ flow[start:]
+    value = error[start:].sum() + penalty[start:] @ flow[start:]
     return Plan(error, output, flow, float(value))
 
 
@@ -115,9 +106,8 @@ def _solve(
     output: Array,
     flow: Array,
     start: int,
-    price: float,
+    quiet: bool,
     penalty: Array,
-    least_slope: float,
 ) -> tuple[Array, Array]:
     """Return outputs after `start`, and flows from it on."""
     samples = len(setpoint)
@@ -130,26 +120,26 @@ def _solve(
     A, B = A[:, start + 1 :], B[:, start:-1]
 
     # The unknowns are y, u, the pieces of E|m - n| for m above and below 0, and the moves up
-    # and down, if they have a price.
-    eye, slopes = scipy.sparse.eye_array(n), unknown.slopes
+    # and down of a quiet plan.
+    # The bound of E|m - n| may be level near 0, where a quiet plan needs a slope.
+    slopes = np.maximum(unknown.slopes, LEVEL if quiet else 0.0)
+    eye = scipy.sparse.eye_array(n)
     pieces = scipy.sparse.hstack([eye, -eye] * len(slopes))
     lengths = np.repeat(unknown.lengths[1:], 2, axis=1).T.ravel()
     columns = [
         _unknowns(n, 0.0, -np.inf, np.inf),
         _unknowns(n, penalty[start:-1], model.low, model.high),
-        _unknowns(
-            len(lengths), np.repeat(np.maximum(slopes, least_slope), 2 * n), 0.0, lengths
-        ),
+        _unknowns(len(lengths), np.repeat(slopes, 2 * n), 0.0, lengths),
     ]
     rows: list[list[Any]] = [[A, -B, None], [eye, None, pieces]]
     right = [past, setpoint[start + 1 :]]
-    if price:
+    if quiet:
         moves = eye - scipy.sparse.eye_array(n, k=-1)
         rows = [[*row, None] for row in rows]
         rows.append([None, moves, None, scipy.sparse.hstack([-eye, eye])])
         right.append(np.zeros(n))
         right[-1][0] = flow[start - 1] if start else 0.0
-        columns.append(_unknowns(2 * n, price, 0.0, np.inf))
+        columns.append(_unknowns(2 * n, SMOOTH, 0.0, np.inf))
 
     # With outputs among the unknowns the program is sparse, and fast where A is slow. But if
     # a zero of B lies outside the unit circle, the flow that gives an output grows without
@@ -199,9 +189,7 @@ def _lagged(coefficients: Array, samples: int, lag: int) -> scipy.sparse.sparray
     return scipy.sparse.diags_array(diagonals, offsets=offsets, shape=(samples, samples))
 
 
-def reference(
-    model: TimeVaryingModel, unknown: Unknown, setpoint: Array, *, price: float = SMOOTH
-) -> Plan:
+def reference(model: TimeVaryingModel, unknown: Unknown, setpoint: Array) -> Plan:
     """Return the best mean flow of a controller that never expects another change.
 
     Where set points have no law (a square wave, a list), the only bound is that with preview:
@@ -220,9 +208,7 @@ def reference(
         last = stop == len(setpoint)
         beyond = np.full(0 if last else model.lag + TAIL, setpoint[start])
         ahead = np.concatenate([setpoint[:stop], beyond])
-        found = plan(
-            model, unknown, ahead, before=found, start=start, price=price, least_slope=LEVEL
-        )
+        found = plan(model, unknown, ahead, before=found, start=start, quiet=True)
         error[start:stop] = found.error[start:stop]
         moving = found.flow[max(stop - model.lag - 1, start - 1, 0) : stop]
         if not last and (stop - start < model.lag or np.ptp(moving) > settled):
@@ -231,4 +217,5 @@ def reference(
                 f"got a hold of {stop - start} samples"
             )
     assert found is not None
-    return replace(found, error=error, value=float(error.sum() + price * found.travel))
+    travel = np.abs(np.diff(found.flow, prepend=0.0)).sum()
+    return replace(found, error=error, value=float(error.sum() + SMOOTH * travel))

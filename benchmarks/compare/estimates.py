@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.bounds.least import LeastPossible, frontier, is_random, least_possible
+from benchmarks.bounds.least import LeastPossible, is_random, least_possible
 from benchmarks.lib.statistics import Estimate, bootstrap, improvement
 from benchmarks.lib.tables import groups
 from benchmarks.loop.scenarios import Scenario
@@ -34,19 +34,16 @@ class Scale:
     """The least possible error of any controller, even with preview."""
     drawn: bool
     """Whether anything is random, so that runs differ."""
-    frontier: tuple[tuple[float, float], ...] = ()
-    """Points of valve travel, t/h, and least error for it, degC, if known; see `bounds`."""
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> Scale:
         """Return a scale from the values that `asdict` gives, in JSON or not."""
         least, preview = (LeastPossible(**values[name]) for name in ("least", "preview"))
-        frontier = tuple((travel, error) for travel, error in values["frontier"])
-        return cls(**{**values, "least": least, "preview": preview, "frontier": frontier})
+        return cls(**{**values, "least": least, "preview": preview})
 
 
 def scale_of(scenario: Scenario, runs: int) -> Scale:
-    """Return the bounds on the errors of a scenario, without the frontier.
+    """Return the bounds on the errors of a scenario.
 
     Bounds of drawn plants and set points are means over the episodes that are run.
     """
@@ -60,22 +57,8 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
 
 
 def bounds(scenario: Scenario, runs: int) -> dict[str, Any]:
-    """Return the bounds on the errors of a scenario, with the frontier; see `Scale.of`.
-
-    The frontier is sorted by descending travel; between two of its points the bound is the
-    straight line. Drawn plants and set points have no frontier: it would take linear programs
-    for every episode, more than a picture is worth.
-    """
-    scale, parameters = scale_of(scenario, runs), scenario.parameters
-    if parameters.ranges or parameters.setpoint == "random":
-        return asdict(scale)
-    case: dict[str, Any] = {"samples": scenario.samples, **scenario.arguments}
-    try:
-        points = frontier(kind="reference", **case)
-    except ValueError:  # the plant does not settle between changes
-        points = frontier(**case)
-    travels = tuple((travel * scenario.samples, error) for travel, error in points)
-    return asdict(replace(scale, frontier=travels))
+    """Return the bounds on the errors of a scenario as values to be kept; see `Scale.of`."""
+    return asdict(scale_of(scenario, runs))
 
 
 def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:

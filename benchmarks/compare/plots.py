@@ -145,7 +145,6 @@ def plot_travel(
             f"Of those within 0.02 of the best score, {label(least)} moves the valve least: "
             f"{travels[least]:,.0f} t/h a run"
         )
-    line: dict[str, Any] = {"color": "0.4", "linewidth": 1}
     with panels(path, [*cases], 2.4, 2, title) as (figure, found, free):
         entries: dict[str, Any] = {}
         for axes, (scenario, rows) in zip(found, cases.items(), strict=True):
@@ -158,10 +157,6 @@ def plot_travel(
                 colour, marker = style[agent]
                 (entries[label(agent)],) = axes.plot(x, y, marker, color=colour)
             across = np.geomspace(0.7 * travel.min(), 1.4 * travel.max(), 200)
-            if scale.frontier:
-                least_error = np.interp(across, *np.transpose(scale.frontier[::-1]))
-                excess = (least_error / scale.least.value - 1.0).clip(1e-9)
-                (entries["least for this travel"],) = axes.plot(across, excess, **line)
             scale_by_excess(axes, "y", errors.min(), errors.max())
             axes.set_xscale("log")
             axes.set_xlim(across[0], across[-1])

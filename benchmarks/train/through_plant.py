@@ -102,7 +102,7 @@ class Net(nn.Module):
         """Return the networks in NumPy."""
         parts = [
             [
-                (layer.weight.detach().double().numpy(), layer.bias.detach().double().numpy())
+                (layer.weight.detach().numpy(), layer.bias.detach().numpy())
                 for layer in part
                 if isinstance(layer, nn.Linear)
             ]

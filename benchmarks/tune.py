@@ -1,0 +1,221 @@
+"""Search for a controller's gains with Optuna: `python -m benchmarks.tune --help`."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from cyclopts import Parameter
+
+from benchmarks.controllers.records import Tuning
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.command import Count, Folder, Runs, command, options
+from benchmarks.lib.fan_out import FanOut, progress_bar
+from benchmarks.lib.storage import (
+    UnfinishedError,
+    UsageError,
+    commit,
+    out_folder,
+    write_csv,
+    write_text,
+)
+from benchmarks.loop.metrics import mean_error, settled, split
+from benchmarks.loop.plants import PlantOptions
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SEED = 1  # of the search
+FIRST_RUN = 3_000_000  # first seed of the runs; no comparison uses these seeds
+FINAL_RUNS, FINAL_FIRST_RUN = 1000, 4_000_000  # for judging the best again
+TUNED: dict[str, Tuning] = {name: each.tuning for name, each in ROSTER.items() if each.tuning}
+_TRIALS = ", ".join(f"{tuning.trials} for {name}" for name, tuning in TUNED.items())
+
+PAGE = """\
+# Gains: {label}
+
+By `python -m benchmarks.tune {name} --trials {trials} --runs {runs}`. For each case, the median
+over runs of the mean absolute error, °C. The objective is their mean, plus {penalty:g} °C times
+the share of runs at the constant set point that do not settle.
+
+The best gains of the {trials} trials, on {final} new runs:
+
+{table}
+"""
+
+Row = dict[str, float]  # gains, and their result from `score`
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Tune a controller's gains with Optuna.
+
+    All trials use the same set points and seeds, which no comparison uses. The search is saved
+    after every trial; the same command resumes it and gives the same result.
+    """
+
+    controller: Annotated[str, Parameter(choices=TUNED)] = field(kw_only=False)
+    """Whose gains to search."""
+    trials: Annotated[
+        Count | None, Parameter(help=f"How many sets of gains to try (default: {_TRIALS}).")
+    ] = None
+    runs: Runs = 100
+    """Runs of each case in a trial."""
+    plant: PlantOptions = field(default_factory=PlantOptions)
+    out: Folder = Path("results/tune")
+    fan_out: FanOut = field(default_factory=FanOut)
+
+
+# Neighbours of the paper's cases: samples, the first of them that counts, and arguments. Three
+# count from an untrained controller on, and two count only what follows learning.
+CASES: dict[str, tuple[int, int, dict[str, float]]] = {
+    "constant": (600, 0, {"setpoint": 4.8}),
+    "dead zone": (
+        1280, 0, {"setpoint_amplitude": 5.1, "setpoint_period": 640, "dead_zone": 6.5}
+    ),
+    "noise": (
+        1040, 0, {"setpoint_amplitude": 4.9, "setpoint_period": 520, "noise_variance": 0.4}
+    ),
+    "learnt": (2240, 1120, {"setpoint_amplitude": 5.2, "setpoint_period": 560}),
+    "learnt, slow": (1920, 1280, {"setpoint_amplitude": 5.4, "setpoint_period": 640}),
+}  # fmt: skip
+
+
+def work(options: Options) -> str:
+    """Run the search, and write and print its results."""
+    import pandas as pd
+
+    from benchmarks.lib.report import on_screen
+
+    name, plant, out = options.controller, options.plant.chosen().arguments, options.out
+    tuning, judge = TUNED[name], partial(score, name, plant)
+    study = f"{name}, {options.runs} runs, {json.dumps(plant)}, {commit()}"
+    trials = search(
+        study,
+        tuning,
+        partial(judge, options.runs, FIRST_RUN),
+        options.trials or tuning.trials,
+        out_folder(out) / f"{name}.csv",
+    )
+    # The best gains of a search owe some of their result to luck; new runs show how much.
+    best = trials.nsmallest(tuning.finalists, "objective")
+    rounded = best[[*tuning.space]].map(lambda gain: float(f"{gain:.3g}"))
+    tasks = {
+        f"trial {i}": partial(judge, FINAL_RUNS, FINAL_FIRST_RUN, gains)
+        for i, gains in rounded.to_dict("index").items()
+    }
+    table = pd.DataFrame(options.fan_out.run(tasks, "new runs for the best").values())
+    table = table.assign(**{"in the search": best["objective"].to_numpy()})
+    table = table.sort_values("objective", ignore_index=True)
+    page = PAGE.format(
+        name=name, label=ROSTER[name].label, penalty=tuning.penalty, trials=len(trials),
+        runs=options.runs, final=FINAL_RUNS,
+        table=table.to_markdown(index=False, floatfmt=".4g"),
+    )  # fmt: skip
+    write_text(out / f"{name}.md", page)
+    shown = table[[*tuning.space, "objective"]].head(5).map("{:.4g}".format)
+    print(f"The best, on {FINAL_RUNS} new runs\n{on_screen(shown)}")
+    return f"All trials are in {out / name}.csv, the best in {out / name}.md"
+
+
+def search(
+    name: str, tuning: Tuning, judge: Callable[[Row], Row], count: int, path: Path
+) -> pd.DataFrame:
+    """Try gains until there are `count` trials, and return and write one row for each.
+
+    Each trial has a sampler of its own, seeded with the search's seed and the number of trials
+    before, so that an interrupted search, found by its name, goes on as it would have.
+    """
+    import optuna
+    import pandas as pd
+
+    optuna.logging.set_verbosity(optuna.logging.CRITICAL)
+    with _storage(path.with_name("trials.log")) as storage:
+        study = optuna.create_study(study_name=name, storage=storage, load_if_exists=True)
+        state = optuna.trial.TrialState
+        for trial in study.get_trials(states=[state.RUNNING]):  # it was interrupted
+            study.tell(trial.number, state=state.FAIL)
+        done = study.get_trials(states=[state.COMPLETE])
+        rows: list[Row] = [trial.user_attrs["row"] for trial in done[:count]]
+        try:
+            with progress_bar(path.stem, count - len(rows)) as advance:
+                while len(rows) < count:
+                    study.sampler = optuna.samplers.TPESampler(
+                        seed=SEED * 1_000_000 + len(rows),
+                        n_startup_trials=tuning.startup,
+                        multivariate=True,
+                    )
+                    new, spans = study.ask(), tuning.space.items()
+                    rows.append(
+                        judge({k: new.suggest_float(k, *v, log=True) for k, v in spans})
+                    )
+                    new.set_user_attr("row", rows[-1])
+                    study.tell(new, rows[-1]["objective"])
+                    advance()
+        finally:
+            write_csv(path, pd.DataFrame(rows))
+    return pd.DataFrame(rows)
+
+
+@contextmanager
+def _storage(log: Path) -> Iterator[Any]:
+    """Yield Optuna's storage in a file; a second search at the same time is refused."""
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+
+    # Released when the process ends, even if it is killed, which Optuna's own lock is not.
+    guard = sqlite3.connect(log.with_suffix(".lock"), timeout=0.0)
+    no_lock: Any = SimpleNamespace(acquire=lambda: True, release=lambda: None)
+    try:
+        guard.execute("BEGIN EXCLUSIVE")
+        with log.open("a+b") as file:
+            file.seek(0)
+            # Optuna cannot read an unfinished line, which a process that is killed leaves.
+            file.truncate(file.read().rfind(b"\n") + 1)
+        try:
+            storage = JournalStorage(JournalFileBackend(str(log), no_lock))
+        except (LookupError, TypeError, ValueError) as error:
+            raise UnfinishedError(f"{log} is damaged; delete it: {error}") from error
+        yield storage
+    except sqlite3.OperationalError as error:
+        raise UsageError(f"--out: another search is under way in {log.parent}") from error
+    except OSError as error:
+        raise UnfinishedError(f"{log} could not be written: {error.strerror}") from error
+    finally:
+        guard.close()
+
+
+def score(name: str, plant: Mapping[str, Any], runs: int, first_run: int, gains: Row) -> Row:
+    """Judge a controller with these gains on the cases of the search.
+
+    Each case has seeds of its own, beginning with `first_run`. Returned are the gains; for
+    each case the median over runs of the mean |e|, degC; `not converged`, the share of runs
+    at the constant set point that fail to settle; and `objective`, the mean of the medians plus
+    the penalty times that share.
+    """
+    (factory,) = ROSTER[name].members()
+    factory = replace(factory, make=partial(factory.make, **gains))
+    medians: Row = {}
+    for i, (case, (samples, first, arguments)) in enumerate(CASES.items()):
+        trajectory = factory.run({**plant, **arguments}, samples, runs, first_run + i * 100_000)
+        _, counted = split(trajectory, first)
+        medians[case] = float(np.median(mean_error(counted)))
+        if case == "constant":
+            failed = 1.0 - float(settled(trajectory).mean())
+    objective = float(np.mean(list(medians.values()))) + TUNED[name].penalty * failed
+    return {**gains, **medians, "not converged": failed, "objective": objective}
+
+
+main = command("tune", Options, work)
+
+if __name__ == "__main__":
+    raise SystemExit(main(None))
