@@ -6,7 +6,8 @@ PyTorch tensors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -27,8 +28,11 @@ Mask = NDArray[np.bool_]  # of plants, shape (num_envs,)
 FACTORS = ("gain_factor", "time_constant_factor")
 
 
-class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array]):
+class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
     """n plants that advance together, without what depends on the array library."""
+
+    _where: Any  # numpy.where or torch.where
+    _zeros: Array  # one per plant, read-only
 
     def __init__(
         self,
@@ -46,9 +50,9 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array]):
         self.single_observation_space = observation_space(self.parameters)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._factors = FACTORS if self.parameters.drifts else ()
+        self._factor_names = FACTORS if self.parameters.drifts else ()
         load = ("disturbance",) if self.parameters.is_disturbed else ()
-        self._names = (*INFO, *load, *self._factors)  # keys of the infos
+        self._names = (*INFO, *load, *self._factor_names)  # keys of the infos
         self._masks = tuple(f"_{name}" for name in self._names)
         # Each plant's k is the clock minus its start.
         self._clock = 0
@@ -189,28 +193,37 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array]):
             reject("options['reset_mask']", given, allowed)
         return mask.copy()
 
-    # To be defined by each environment.
-
-    _where: Any  # numpy.where or torch.where
-    _zeros: Array  # one per plant, read-only
-    # A mask as a new array of the environment's library.
-    _flags: Callable[[Mask], Array]
-    # Check the other arguments of `reset`, seed and options, then apply them.
-    _prepare: Callable[[Mask, Any, Mapping[str, Any]], None]
-    # The actions, shape (num_envs,); 0 where they are ignored.
-    _checked_actions: Callable[[Any], Array]
-    # Begin an episode of some plants; return their infos at k = 0 that are not 0.
-    _begin: Callable[[Mask], dict[str, Array]]
-    # Move all plants by one sample, and return what `step` returns if no episode ends.
-    _advance: Callable[[Array], tuple[Array, Array, Array, Array, Infos]]
-    # The current observations, which the caller may overwrite.
-    _observations: Callable[[], Array]
-    # `final_obs`, given the plants whose episode has ended, and the observations.
-    _final: Callable[[Mask, Array], Array]
-
     def _on_host(self, mask: Any) -> Any:
         """Return a mask as a NumPy array if it is an array of the environment's library."""
         return mask
+
+    @abstractmethod
+    def _flags(self, mask: Mask) -> Array:
+        """Return a mask as a new array of the environment's library."""
+
+    @abstractmethod
+    def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
+        """Check the other arguments of `reset`, then apply them."""
+
+    @abstractmethod
+    def _begin(self, mask: Mask) -> dict[str, Array]:
+        """Begin an episode of some plants; return their infos at k = 0 that are not 0."""
+
+    @abstractmethod
+    def _checked_actions(self, actions: Any) -> Array:
+        """Return the actions, shape (num_envs,); 0 where they are ignored."""
+
+    @abstractmethod
+    def _advance(self, a: Array) -> tuple[Array, Array, Array, Array, Infos]:
+        """Move all plants by one sample; return what `step` returns if no episode ends."""
+
+    @abstractmethod
+    def _observations(self) -> Array:
+        """Return the current observations, which the caller may overwrite."""
+
+    @abstractmethod
+    def _final(self, ended: Mask, observations: Array) -> Array:
+        """Return `final_obs`, given the plants whose episode has ended."""
 
 
 def _checked_count(num_envs: int, parameters: Parameters) -> int:
@@ -234,7 +247,7 @@ def _checked_limit(max_episode_steps: int | None) -> int:
 
 
 def _checked_mode(autoreset_mode: str | AutoresetMode) -> AutoresetMode:
-    """Return an autoreset mode, given as itself or by its value."""
+    """Return an autoreset mode, given as such or by its value."""
     try:
         return AutoresetMode(autoreset_mode)
     except ValueError:

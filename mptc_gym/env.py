@@ -316,7 +316,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             a = one_action(action)
         shown = a if -1.0 <= a <= 1.0 else _beyond_the_box(a)
         if not self._ahead:
-            self._look_ahead()
+            if self._streams is None:
+                raise ResetNeeded("call reset before step")
+            self._ahead = self._signals.ahead()[::-1]
         setpoint, noise, load, transmitter_noise = self._ahead.pop()
         error_scale, quadratic, move_weight = self._reward_terms
         span, error_head, output_head, action_head, size = self._layout
@@ -386,11 +388,6 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     def _show(self) -> None:
         if self.render_mode == "human":
             self.render()
-
-    def _look_ahead(self) -> None:
-        if self._streams is None:
-            raise ResetNeeded("call reset before step")
-        self._ahead = self._signals.ahead()[::-1]
 
     def _add_more_info(self, info: dict[str, float], load: float) -> None:
         """Add the info that belongs to arguments that are off by default."""

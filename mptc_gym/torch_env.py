@@ -222,11 +222,11 @@ class MiddlePointTorchEnv(BatchEnv):
         if load is not None:
             infos["disturbance"] = load
         rows = [each.unbind() for each in infos.values()]
-        if self._factors:
+        if self._factor_names:
             rows += zip(*factors, strict=True)
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         masks = dict.fromkeys(self._masks, everyone)
-        names = (*infos, *self._factors)
+        names = (*infos, *self._factor_names)
         flags = self._zeros.new_zeros(2 * samples, self.num_envs, dtype=torch.bool).unbind()
         self._ahead = [
             (reward, *both, {**dict(zip(names, values, strict=True)), **masks})
@@ -258,7 +258,7 @@ class MiddlePointTorchEnv(BatchEnv):
         self._action = select(which, rest_action, self._action)
         self._shown.reset(which, unused, setpoint, rest_action)
         first |= {"setpoint": setpoint, "error": setpoint}
-        return first | {name: self._zeros + numbers[name] for name in self._factors}
+        return first | {name: self._zeros + numbers[name] for name in self._factor_names}
 
     def _observations(self) -> Tensor:
         return self._shown.present()

@@ -176,26 +176,19 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             for i, numbers in enumerate(zip(*columns, strict=True)):
                 self._records[i].add(*numbers)
 
-        everyone = self._everyone.copy()
         infos = {
             "output": output.copy(),
-            "_output": everyone,
             "setpoint": setpoint.copy(),
-            "_setpoint": everyone,
             "error": error,
-            "_error": everyone,
             "command": command,
-            "_command": everyone,
             "applied": applied,
-            "_applied": everyone,
             "noise": noise.copy(),
-            "_noise": everyone,
         }
         if load is not None:
-            infos["disturbance"], infos["_disturbance"] = load.copy(), everyone
-        if self._factors:
-            for name, factors in zip(self._factors, self._plants.factors, strict=True):
-                infos[name], infos[f"_{name}"] = factors.copy(), everyone
+            infos["disturbance"] = load.copy()
+        for name, factors in zip(self._factor_names, self._plants.factors, strict=False):
+            infos[name] = factors.copy()
+        infos |= dict.fromkeys(self._masks, self._everyone.copy())
         return observations, rewards, self._nobody.copy(), self._nobody.copy(), infos
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
@@ -214,7 +207,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
         first = {"setpoint": setpoint, "error": setpoint}
         first |= numbers.chosen(self._ranges.names)
-        for name, factors in zip(self._factors, self._plants.factors, strict=False):
+        for name, factors in zip(self._factor_names, self._plants.factors, strict=False):
             first[name] = factors[which]
         of_all = {name: np.zeros(self.num_envs, each.dtype) for name, each in first.items()}
         for name, values in first.items():
