@@ -10,6 +10,7 @@ call is much faster than drawing them one by one, and gives the same numbers.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
@@ -153,20 +154,14 @@ class Noise:
             for i, row in zip(plants.tolist(), draws[:, order:], strict=True):
                 self._generators[i].standard_normal(out=row)
             self._past[plants] = draws[:, samples:]
+            colour = self._colour if self._alike else self._colour[:, plants]
+            noise = colour[0] * draws[:, order:]
+            for lag, coefficient in enumerate(colour[1:], start=1):
+                noise += coefficient * draws[:, order - lag : -lag]
             # If there are no gaps, a slice is much faster.
             gaps = plants[-1] - plants[0] >= len(plants)
             columns = plants if gaps else slice(plants[0], plants[-1] + 1)
-            colour = self._colour if self._alike else self._colour[:, plants]
-            self._block[first_row:, columns] = _coloured(colour, draws).T
-
-
-def _coloured(colour: Sequence[float] | Values, draws: Values) -> Values:
-    """Filter draws along the last axis; the first len(colour) - 1 are past draws."""
-    order = len(colour) - 1
-    noise: Values = colour[0] * draws[..., order:]
-    for lag, coefficient in enumerate(colour[1:], start=1):
-        noise += coefficient * draws[..., order - lag : -lag]
-    return noise
+            self._block[first_row:, columns] = noise.T
 
 
 class Levels:
@@ -197,7 +192,7 @@ class Levels:
         return level, int(generator.integers(self.shortest, self.longest, endpoint=True))
 
 
-class _Held:
+class _Held(ABC):
     """Values of many plants, each held until it changes."""
 
     def __init__(self, num_envs: int) -> None:
@@ -220,9 +215,9 @@ class _Held:
             self._change(self._changes <= self._clock)
             self._next_change = int(self._changes.min())
 
+    @abstractmethod
     def _change(self, due: NDArray[np.bool_]) -> None:
         """Change the values that are due, and set when they change next."""
-        raise NotImplementedError
 
 
 class SetPoint(_Held):
@@ -285,6 +280,7 @@ class Disturbance(_Held):
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs)
         self._generators: dict[int, np.random.Generator] = {}
+        # Amplitude, probability of a jump, and half width of the walk's steps.
         self._shapes = np.zeros((num_envs, 3))
         self._last = np.zeros((num_envs, 2))
         self._levels = np.zeros((num_envs, LEVELS_AT_A_TIME))  # those ahead
@@ -298,8 +294,12 @@ class Disturbance(_Held):
         """Begin an episode of some plants, with the streams of each."""
         for i, own in zip(which.tolist(), streams, strict=True):
             self._generators[i] = own.plant.generator
-        for column, values in enumerate(_shape(numbers)):
-            self._shapes[which, column] = values
+        shape = self._shapes[which].T
+        shape[0] = numbers.disturbance_amplitude
+        shape[1] = LOAD_INTERVAL / numbers.disturbance_interval
+        # Uniform within +-h, a step of the walk has the variance h^2 / 3.
+        shape[2] = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
+        self._shapes[which] = shape.T
         self._last[which] = self._now[which] = 0.0
         self._places[which] = self._ends[which]
         self._changes[which] = self._clock + LOAD_INTERVAL
@@ -327,35 +327,21 @@ class Disturbance(_Held):
             draws = np.empty((len(plants), LEVELS_AT_A_TIME, 3))
             for i, row in zip(plants.tolist(), draws, strict=True):
                 self._generators[i].random(out=row)
-            self._levels[plants], self._last[plants] = _disturbance(
-                draws, self._shapes[plants], self._last[plants]
-            )
+            self._levels[plants] = self._sum(plants, draws)
         self._places[which] = self._ends[which] - LEVELS_AT_A_TIME
 
-
-def _shape(numbers: PlantNumbers[Any]) -> tuple[Any, Any, Any]:
-    """Return amplitude, probability of a jump, and half width of the walk's steps."""
-    return (
-        numbers.disturbance_amplitude,
-        LOAD_INTERVAL / numbers.disturbance_interval,
-        # Uniform within +-h, a step has the variance h^2 / 3.
-        np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance),
-    )
-
-
-def _disturbance(draws: Values, shapes: Values, last: Values) -> tuple[Values, Values]:
-    """Return disturbances w, (plants, changes), from uniform draws, (plants, changes, 3).
-
-    `shapes`, shape (plants, 3), come from `_shape`. `last`, shape (plants, 2), are the previous
-    levels of the steps and of the walk; the new ones are returned, too.
-    """
-    amplitude, probability, width = (shapes[:, [i]] for i in range(3))
-    walk = np.hstack((last[:, 1:], (2.0 * draws[..., 0] - 1.0) * width)).cumsum(axis=1)[:, 1:]
-    jumps = draws[..., 1] < probability
-    levels = np.hstack((last[:, :1], (2.0 * draws[..., 2] - 1.0) * amplitude))
-    latest = np.maximum.accumulate(np.where(jumps, np.arange(1, jumps.shape[1] + 1), 0), axis=1)
-    steps = np.take_along_axis(levels, latest, axis=1)
-    return steps + walk, np.stack((steps[:, -1], walk[:, -1]), axis=1)
+    def _sum(self, plants: Indices, draws: Values) -> Values:
+        """Return levels w, (plants, levels), from uniform draws, (plants, levels, 3)."""
+        amplitude, probability, width = self._shapes[plants, :, np.newaxis].swapaxes(0, 1)
+        step, walk = self._last[plants, :, np.newaxis].swapaxes(0, 1)  # the previous ones
+        walk = np.hstack((walk, (2.0 * draws[..., 0] - 1.0) * width)).cumsum(axis=1)[:, 1:]
+        jumps = draws[..., 1] < probability
+        steps = np.hstack((step, (2.0 * draws[..., 2] - 1.0) * amplitude))
+        latest = np.where(jumps, np.arange(1, jumps.shape[1] + 1), 0)
+        steps = np.take_along_axis(steps, np.maximum.accumulate(latest, axis=1), axis=1)
+        self._last[plants] = np.stack((steps[:, -1], walk[:, -1]), axis=1)
+        levels: Values = steps + walk
+        return levels
 
 
 class Signals(NamedTuple):

@@ -167,7 +167,7 @@ class MiddlePointTorchEnv(BatchEnv):
         self._block = min(self._plants.most_samples, LONGEST, in_cache, held)
         # Precomputed returns of the steps ahead, the next one last.
         self._ahead: list[tuple[Any, ...]] = []
-        self._shown = _Window(self.parameters.windows, self._zeros, differentiable)
+        self._shown = _Window(self.parameters.windows, self._episodes, differentiable)
 
     __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
 
@@ -192,7 +192,7 @@ class MiddlePointTorchEnv(BatchEnv):
     def _advance(self, a: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
         command, applied = self._plants.apply(a)
         if not self._ahead:
-            self._look_ahead()
+            self._compute_block()
         rewards, terminations, truncations, infos = self._ahead.pop()
         observations = self._shown.next(a)
         if self._move_weight:
@@ -201,43 +201,41 @@ class MiddlePointTorchEnv(BatchEnv):
         infos["command"], infos["applied"] = command, applied
         return observations, rewards, terminations, truncations, infos
 
-    def _look_ahead(self) -> None:
-        """Compute what the next steps return, except what depends on their actions."""
+    def _compute_block(self) -> None:
+        """Compute what the next steps return, except what depends on their actions.
+
+        As actions show after the delay, the outputs of a block follow from the actions so far.
+        """
         samples = max(1, min(self._block, self._first_end - self._clock + 1))
-        made = {name: each.next(self._clock, samples) for name, each in self._signals.items()}
-        setpoint, noise, load = made["setpoint"], made.get("noise"), made.get("disturbance")
-        output, factors = self._plants.outputs(self._clock, samples, noise, load)
+        self._episodes.clock = self._clock
+        signals = {name: each.next(samples) for name, each in self._signals.items()}
+        setpoint, noise = signals["setpoint"], signals.get("noise")
+        load = signals.get("disturbance")
+        output, factors = self._plants.outputs(samples, noise, load)
         error = setpoint - output
-        measured = output + made["measurement_noise"] if "measurement_noise" in made else output
+        measured = output
+        if "measurement_noise" in signals:
+            measured = output + signals["measurement_noise"]
         span = self.parameters.temperature_span
         measured = measured.clamp(-span, span)
         self._shown.add(setpoint, setpoint - measured, measured)
 
         infos = {
-            "output": output,
-            "setpoint": setpoint.clone(memory_format=torch.contiguous_format),
-            "error": error,
-            "noise": torch.zeros_like(error) if noise is None else noise,
+            "output": output.unbind(),
+            "setpoint": setpoint.clone(memory_format=torch.contiguous_format).unbind(),
+            "error": error.unbind(),
+            "noise": (torch.zeros_like(error) if noise is None else noise).unbind(),
         }
         if load is not None:
-            infos["disturbance"] = load
-        rows = [each.unbind() for each in infos.values()]
-        if self._factor_names:
-            rows += zip(*factors, strict=True)
+            infos["disturbance"] = load.unbind()
+        infos |= zip(self._factor_names, zip(*factors, strict=True), strict=False)
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         masks = dict.fromkeys(self._masks, everyone)
-        names = (*infos, *self._factor_names)
+        rewards = self._rewards(error).unbind()
         flags = self._zeros.new_zeros(2 * samples, self.num_envs, dtype=torch.bool).unbind()
-        self._ahead = [
-            (reward, *both, {**dict(zip(names, values, strict=True)), **masks})
-            for reward, *both, values in zip(
-                self._rewards(error).unbind(),
-                flags[:samples],
-                flags[samples:],
-                zip(*rows, strict=True),
-                strict=True,
-            )
-        ][::-1]
+        for k in reversed(range(samples)):
+            own = {name: rows[k] for name, rows in infos.items()}
+            self._ahead.append((rewards[k], flags[k], flags[samples + k], own | masks))
 
     def _rewards(self, error: Tensor) -> Tensor:
         """Return the rewards of errors, without the cost of moves."""
@@ -249,14 +247,15 @@ class MiddlePointTorchEnv(BatchEnv):
 
     def _begin(self, mask: Mask) -> dict[str, Tensor]:
         which = None if mask.all() else self._flags(mask)
-        unused, self._ahead = len(self._ahead), []  # samples computed, but not returned
-        first = self._episodes.reset(which, self._starts, self._clock, self._given)
-        self._plants.reset(which, unused)
-        at_rest = {name: each.reset(which, unused) for name, each in self._signals.items()}
+        self._episodes.clock, self._episodes.unused = self._clock, len(self._ahead)
+        self._ahead = []
+        first = self._episodes.reset(which, self._starts, self._given)
+        self._plants.reset(which)
+        at_rest = {name: each.reset(which) for name, each in self._signals.items()}
         numbers, setpoint = self._episodes.numbers, at_rest["setpoint"]
         rest_action = self._zeros + action_from_command(0.0, numbers["u_min"], numbers["u_max"])
         self._action = select(which, rest_action, self._action)
-        self._shown.reset(which, unused, setpoint, rest_action)
+        self._shown.reset(which, setpoint, rest_action)
         first |= {"setpoint": setpoint, "error": setpoint}
         return first | {name: self._zeros + numbers[name] for name in self._factor_names}
 
@@ -320,9 +319,12 @@ class MiddlePointTorchEnv(BatchEnv):
 class _Window:
     """The observations of all plants, with or without gradients for past actions."""
 
-    def __init__(self, windows: Sequence[int], zeros: Tensor, differentiable: bool) -> None:
+    def __init__(
+        self, windows: Sequence[int], episodes: Episodes, differentiable: bool
+    ) -> None:
         *self._windows, self._past_actions = windows
-        self._zeros, self._differentiable = zeros, differentiable
+        self._episodes, self._differentiable = episodes, differentiable
+        self._zeros = zeros = episodes.zeros
         self._actions: list[Tensor] = []  # those shown, newest first
         # Set points, errors and outputs, oldest first: those of one observation, then those of
         # the latest block.
@@ -332,15 +334,13 @@ class _Window:
         numbers = max(1, sum(self._windows) * len(zeros))
         self._at_once = max(1, _IN_CACHE // numbers) if zeros.is_cpu else LONGEST
 
-    def reset(
-        self, which: Tensor | None, unused: int, setpoint: Tensor, rest_action: Tensor
-    ) -> None:
-        """Begin an episode of some plants at rest; drop the last samples of the block."""
+    def reset(self, which: Tensor | None, setpoint: Tensor, rest_action: Tensor) -> None:
+        """Begin an episode of some plants at rest."""
         for rows, w, newest in zip(
             self._rows, self._windows, (setpoint, setpoint, self._zeros), strict=True
         ):
             at_rest = [*[self._zeros] * (w - 1), newest.clone()][:w]
-            end = len(rows) - unused
+            end = len(rows) - self._episodes.unused
             past = rows[end - w : end] or at_rest
             rows[:] = [select(which, *each) for each in zip(at_rest, past, strict=True)]
         if self._past_actions:

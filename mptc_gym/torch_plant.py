@@ -69,11 +69,8 @@ class TorchPlants:
         self.most_samples = shortest + 1
         self._order = len(parameters.a) - 1  # of A
 
-    def reset(self, mask: Tensor | None, unused: int) -> None:
-        """Bring some plants, or all, to rest, with the numbers of the current episodes.
-
-        The last `unused` outputs are dropped before.
-        """
+    def reset(self, mask: Tensor | None) -> None:
+        """Bring some plants, or all, to rest, with the numbers of the current episodes."""
         numbers, zeros = self._episodes.numbers, self._zeros
         self._now: tuple[Any, Any] | None = None  # factors and coefficients of (28)
         plants = PlantNumbers(**numbers)
@@ -92,8 +89,8 @@ class TorchPlants:
             self._flows = deque([zeros] * flows, flows)
             self._outputs = [zeros] * self._order
         else:
-            past = self._outputs[: len(self._outputs) - unused]
-            self._outputs = [each.masked_fill(mask, 0.0) for each in past]
+            used = self._outputs[: len(self._outputs) - self._episodes.unused]
+            self._outputs = [each.masked_fill(mask, 0.0) for each in used]
             self._flows.extend(torch.stack([*self._flows]).masked_fill_(mask, 0.0).unbind())
         self._limits = u_min, u_max = numbers["u_min"], numbers["u_max"]
         self._middle = zeros.new_zeros(()) + (u_min + u_max) / 2.0
@@ -120,19 +117,18 @@ class TorchPlants:
         return command, applied
 
     def outputs(
-        self, clock: int, samples: int, noise: Tensor | None, load: Tensor | None
+        self, samples: int, noise: Tensor | None, load: Tensor | None
     ) -> tuple[Tensor, list[tuple[Number, Number]]]:
         """Compute the outputs of the next samples, after the action before them was applied.
 
-        The first of them is at that time of the clock. n and w, if any, and y have the shape
-        (samples, n), degC. Also return gain and time constant at each sample, as multiples of
-        those of A and B.
+        n and w, if any, and y have the shape (samples, n), degC. Also return gain and time
+        constant at each sample, as multiples of those of A and B.
         """
         rows, all_factors = self._outputs[len(self._outputs) - self._order :], []
         response = self._response(samples)
-        begins = [k for k in range(samples) if k == 0 or self._changes_at(clock + k)]
+        begins = [k for k in range(samples) if k == 0 or self._changes_at(k)]
         for first, last in pairwise([*begins, samples]):
-            factors, (alpha, scale, load_gain) = self._dynamics_at(clock + first)
+            factors, (alpha, scale, load_gain) = self._dynamics_at(first)
             forced = response[first:last]
             if noise is not None:
                 forced = _plus(noise[first:last], scale, forced)
@@ -165,22 +161,21 @@ class TorchPlants:
             response = response.add_(earlier, alpha=coefficient)
         return response
 
-    def _changes_at(self, clock: int) -> bool:
-        """Whether the drifting dynamics of any plant change at a sample."""
-        return self._drifts and self._episodes.any_due(clock)
+    def _changes_at(self, row: int) -> bool:
+        """Whether the drifting dynamics of any plant change at a row of the block."""
+        return self._drifts and self._episodes.any_due(row)
 
-    def _dynamics_at(self, clock: int) -> tuple[Any, Any]:
-        """Return gain and time constant at a sample, and the coefficients of (28) for them."""
-        if self._now is None or self._changes_at(clock):
+    def _dynamics_at(self, row: int) -> tuple[Any, Any]:
+        """Return gain and time constant at a row, and the coefficients of (28) for them."""
+        if self._now is None or self._changes_at(row):
             factors: tuple[Any, ...] = self._factors
             if self._drifts:
-                age = self._episodes.age(clock)
+                age = self._episodes.age(row)
                 if isinstance(age, Tensor):
                     age = age.to(self._zeros.dtype)
                 share = self._dynamics.share(age - age % DRIFT_INTERVAL)
                 factors = tuple(_plus(first, share, more) for first, more in self._drift)
-            gain, time_constant = factors
-            self._now = factors, self._dynamics.coefficients(gain, time_constant)
+            self._now = factors, self._dynamics.coefficients(*factors)
         return self._now
 
 

@@ -1,10 +1,9 @@
 """Generate external signals in PyTorch, drawn from one generator, or pass on given ones.
 
 The signals have two methods, for many plants and a block of samples at a time, without a loop
-over plants. `reset(mask, unused)` begins an episode of some plants, or of all if `mask` is
-None, after the last `unused` samples of the latest block have been dropped, and returns the
-signal at k = 0, shape (n,). `next(clock, samples)` returns the samples that follow, the first
-of them at that time of the environment's clock, degC, shape (samples, n).
+over plants. `reset(mask)` begins an episode of some plants, or of all if `mask` is None, and
+returns the signal at k = 0, shape (n,). `next(samples)` returns a block of the samples that
+follow, degC, shape (samples, n). All share the clock of `Episodes`.
 """
 
 from __future__ import annotations
@@ -43,14 +42,17 @@ def as_tensor(values: Any, like: Tensor) -> Tensor | None:
 
 
 class Episodes:
-    """The current episodes: plant numbers and starts, shared by signals and plants.
+    """The current episodes: clock, starts and plant numbers, shared by signals and plants.
 
     `zeros`, shape (n,), have the device and type to use, and `generator` is the one source of
-    all draws.
+    all draws. Before each block of samples, `clock` is set to the time of the first of them,
+    and before a reset to the time at which episodes begin. `unused` samples of the latest block
+    then lie ahead of it, and are dropped.
     """
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
         self.zeros, self.generator = zeros, torch.Generator(zeros.device)
+        self.clock = self.unused = 0
         self._ranges = {name: parameters.range_of(name) for name in parameters.ranges}
         # If one limit is drawn, both are tensors: PyTorch clamps either between two numbers or
         # between two tensors.
@@ -68,11 +70,7 @@ class Episodes:
         self._rows = torch.arange(LONGEST, device=zeros.device)[:, None]
 
     def reset(
-        self,
-        mask: Tensor | None,
-        starts: NDArray[np.int64],
-        clock: int,
-        given: Mapping[str, Given],
+        self, mask: Tensor | None, starts: NDArray[np.int64], given: Mapping[str, Given]
     ) -> dict[str, Tensor]:
         """Begin an episode of some plants, and return the numbers that are drawn or given.
 
@@ -84,26 +82,26 @@ class Episodes:
             values = given[name].reset(mask) if name in given else self.draw(low, high, whole)
             self.numbers[name] = select(mask, values, self.zeros + self.numbers[name])
             first[name] = values.to(torch.int64) if whole else values
-        if (starts == clock).all():
-            self._starts = clock
+        if (starts == self.clock).all():
+            self._starts = self.clock
         else:
             before = torch.zeros_like(self.zeros, dtype=torch.int64) + self._starts
-            self._starts = select(mask, torch.full_like(before, clock), before)
+            self._starts = select(mask, torch.full_like(before, self.clock), before)
         if self._changes:
             self._due = {*np.unique(starts % DRIFT_INTERVAL).tolist()}
         return first
 
-    def age(self, clock: int) -> Tensor | int:
-        """Return k at a time of the clock, shape (n,), or one number for all plants."""
-        return clock - self._starts
+    def age(self, row: int) -> Tensor | int:
+        """Return k at a row of the block, shape (n,), or one number for all plants."""
+        return self.clock + row - self._starts
 
-    def ages(self, clock: int, samples: int) -> Tensor:
-        """Return k at each sample of a block, shape (samples, n), or (samples, 1)."""
-        return self._rows[:samples] + self.age(clock)
+    def ages(self, samples: int) -> Tensor:
+        """Return k at each sample of the block, shape (samples, n), or (samples, 1)."""
+        return self._rows[:samples] + self.age(0)
 
-    def any_due(self, clock: int) -> bool:
-        """Whether the age of any plant is a multiple of `DRIFT_INTERVAL`."""
-        return clock % DRIFT_INTERVAL in self._due
+    def any_due(self, row: int) -> bool:
+        """Whether a plant's age is a multiple of `DRIFT_INTERVAL` at a row of the block."""
+        return (self.clock + row) % DRIFT_INTERVAL in self._due
 
     def draw_within_one(self, rows: int) -> Tensor:
         """Draw numbers from -1 to 1, 1 excluded, shape (rows, n)."""
@@ -125,17 +123,18 @@ class Noise:
         self._order = len(self._c) - 1
         self._episodes = episodes
 
-    def reset(self, mask: Tensor | None, unused: int) -> Tensor:
+    def reset(self, mask: Tensor | None) -> Tensor:
         """Begin an episode of some plants."""
         zeros = self._episodes.zeros
         self._deviation = self._episodes.numbers[self._variance] ** 0.5
         if mask is None:
             self._xi = zeros.expand(self._order, -1)  # those of the latest block last
         else:
-            self._xi = self._xi[: len(self._xi) - unused].masked_fill(mask, 0.0)
+            used = len(self._xi) - self._episodes.unused
+            self._xi = self._xi[:used].masked_fill(mask, 0.0)
         return zeros
 
-    def next(self, clock: int, samples: int) -> Tensor:
+    def next(self, samples: int) -> Tensor:
         """Draw the next samples."""
         order, generator = self._order, self._episodes.generator
         past = self._xi[len(self._xi) - order :]
@@ -161,30 +160,30 @@ class RandomSetPoint:
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
         self._distribution, self._episodes = levels, episodes
         zeros = episodes.zeros
-        # Samples are counted from the latest draw, in floats, which are fastest.
-        self._rows = torch.arange(1, LONGEST + 1, dtype=zeros.dtype).to(zeros.device)[:, None]
-        self._returned = self._known = 0
+        # Ends of levels are counted from the clock at the latest draw, as floats are fastest.
+        self._rows = torch.arange(LONGEST, dtype=zeros.dtype).to(zeros.device)[:, None]
+        self._drawn_at = 0
         # The level of then and where it ends, and the same of the level that follows.
         self._level = self._end = self._next_level = self._next_end = zeros
 
-    def reset(self, mask: Tensor | None, unused: int) -> Tensor:
+    def reset(self, mask: Tensor | None) -> Tensor:
         """Begin an episode of some plants."""
-        self._returned -= unused
-        self._count_from_here()
+        self._count_from(self._episodes.clock)
         level, hold = self._draw()
         self._level = select(mask, level, self._level)
         self._end = select(mask, hold, self._end)
+        self._known_until = self._drawn_at
         return self._level
 
-    def next(self, clock: int, samples: int) -> Tensor:
+    def next(self, samples: int) -> Tensor:
         """Return the next samples."""
-        if self._returned + samples > self._known:
-            self._count_from_here()
-            self._known = self._distribution.shortest
+        clock = self._episodes.clock
+        if clock + samples - 1 > self._known_until:
+            self._count_from(clock - 1)
+            self._known_until = self._drawn_at + self._distribution.shortest
             self._next_level, hold = self._draw()
             self._next_end = self._end + hold
-        reached = _is_past(self._rows[:samples] + self._returned, self._end)
-        self._returned += samples
+        reached = _is_past(self._rows[:samples] + (clock - self._drawn_at), self._end)
         return torch.lerp(self._level.expand(samples, -1), self._next_level, reached)
 
     def _draw(self) -> tuple[Tensor, Tensor]:
@@ -193,12 +192,13 @@ class RandomSetPoint:
         level = self._episodes.draw_within_one(1)[0] * law.amplitude
         return level, self._episodes.draw(law.shortest, law.longest, whole=True)
 
-    def _count_from_here(self) -> None:
-        """Count from the sample returned last, and forget what was before."""
-        reached = _is_past(self._end.new_full((), self._returned), self._end)
+    def _count_from(self, clock: int) -> None:
+        """Count from a time of the clock, and forget what was before."""
+        passed = clock - self._drawn_at
+        reached = _is_past(self._end.new_full((), passed), self._end)
         self._level = torch.lerp(self._level, self._next_level, reached)
-        self._end = torch.lerp(self._end, self._next_end, reached) - self._returned
-        self._returned = self._known = 0
+        self._end = torch.lerp(self._end, self._next_end, reached) - passed
+        self._drawn_at = clock
 
 
 class RepeatedSetPoint:
@@ -210,16 +210,16 @@ class RepeatedSetPoint:
         self._ends = torch.tensor(levels.lengths, device=self._values.device).cumsum(0)
         self._period = sum(levels.lengths)
 
-    def reset(self, mask: Tensor | None, unused: int) -> Tensor:
+    def reset(self, mask: Tensor | None) -> Tensor:
         """Begin an episode of some plants."""
         return self._values[0].expand(len(self._episodes.zeros))
 
-    def next(self, clock: int, samples: int) -> Tensor:
+    def next(self, samples: int) -> Tensor:
         """Return the next samples."""
         n = len(self._episodes.zeros)
         if len(self._values) == 1:
             return self._values.expand(samples, n)
-        ages = self._episodes.ages(clock, samples)
+        ages = self._episodes.ages(samples)
         places = torch.bucketize(ages % self._period, self._ends, right=True)
         return self._values[places].expand(samples, n)
 
@@ -230,30 +230,30 @@ class Disturbance:
     def __init__(self, episodes: Episodes) -> None:
         self._episodes = episodes
 
-    def reset(self, mask: Tensor | None, unused: int) -> Tensor:
+    def reset(self, mask: Tensor | None) -> Tensor:
         """Begin an episode of some plants."""
         zeros = self._episodes.zeros
         # Steps and walk at the sample before the latest block, and at those of the block.
         if mask is None:
             self._parts = [(zeros, zeros)]
         else:
-            step, walk = self._parts[-1 - unused]
+            step, walk = self._parts[-1 - self._episodes.unused]
             self._parts = [(step.masked_fill(mask, 0.0), walk.masked_fill(mask, 0.0))]
         return zeros
 
-    def next(self, clock: int, samples: int) -> Tensor:
+    def next(self, samples: int) -> Tensor:
         """Draw the next samples."""
         parts = self._parts[-1]
         self._parts, total, rows = [parts], torch.add(*parts), []
-        for now in range(clock, clock + samples):
-            if self._episodes.any_due(now):
-                parts = self._change(*parts, now)
+        for row in range(samples):
+            if self._episodes.any_due(row):
+                parts = self._change(*parts, row)
                 total = torch.add(*parts)
             self._parts.append(parts)
             rows.append(total)
         return torch.stack(rows)
 
-    def _change(self, step: Tensor, walk: Tensor, clock: int) -> tuple[Tensor, Tensor]:
+    def _change(self, step: Tensor, walk: Tensor, row: int) -> tuple[Tensor, Tensor]:
         """Return steps and walk after the plants that are due have changed."""
         numbers, drawn = self._episodes.numbers, self._episodes.draw_within_one(2)
         interval = numbers["disturbance_interval"]
@@ -267,7 +267,7 @@ class Disturbance:
         level = place * numbers["disturbance_amplitude"]
         # Uniform within +-h, a step of the walk has the variance h^2 / 3.
         width = (3.0 * LOAD_INTERVAL * numbers["disturbance_walk_variance"]) ** 0.5
-        moved, age = walk + drawn[1] * width, self._episodes.age(clock)
+        moved, age = walk + drawn[1] * width, self._episodes.age(row)
         if isinstance(age, Tensor):
             due = (age % LOAD_INTERVAL == 0).to(place.dtype)
             moved, jumps = torch.lerp(walk, moved, due), jumps.mul_(due)
@@ -292,14 +292,14 @@ class Given:
         self._values, self._episodes = values, episodes
         self._episode = torch.full_like(episodes.zeros, -1, dtype=torch.int64)  # of each plant
 
-    def reset(self, mask: Tensor | None, unused: int = 0) -> Tensor:
+    def reset(self, mask: Tensor | None) -> Tensor:
         """Begin the next episode of some plants."""
         self._episode = self._episode + (1 if mask is None else mask)
         return self._at(torch.zeros_like(self._episode)[None])[0]
 
-    def next(self, clock: int, samples: int) -> Tensor:
+    def next(self, samples: int) -> Tensor:
         """Return the next samples."""
-        return self._at(self._episodes.ages(clock, samples))
+        return self._at(self._episodes.ages(samples))
 
     def _at(self, ages: Tensor) -> Tensor:
         count, length, _ = self._values.shape
