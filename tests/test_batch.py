@@ -16,8 +16,6 @@ from mptc_gym.batch import FACTORS, INFO
 from tests.arguments import MODES, NOISY
 from tests.conftest import assert_the_seed_is_all_that_differs
 
-SHELL = {"num_envs", "max_episode_steps", "autoreset_mode"}
-
 
 @pytest.fixture(params=["NumPy", "PyTorch"])
 def library(request):
@@ -62,7 +60,7 @@ def assert_equal(ours, theirs):
     assert data_equivalence(plain(ours), plain(theirs), exact=True)
 
 
-def test_spaces_are_those_of_gymnasium(library):
+def test_spaces_modes_and_arguments_are_those_of_gymnasium_s_environments(library):
     arguments = {"setpoint": 70.0, "output_window": 2}
     ours = library.make(3, **arguments)
     theirs = gymnasium.make_vec("MiddlePoint-v0", 3, vectorization_mode="sync", **arguments)
@@ -71,86 +69,61 @@ def test_spaces_are_those_of_gymnasium(library):
         assert getattr(ours, f"single_{name}") == getattr(theirs, f"single_{name}")
     assert ours.num_envs == 3
     assert set(ours.metadata) >= {"autoreset_mode", "render_modes"}
-
-
-def test_autoreset_mode_is_an_attribute_as_in_gymnasium_s_own_and_in_the_metadata(library):
-    assert library.make().autoreset_mode is AutoresetMode.NEXT_STEP
+    assert ours.autoreset_mode is AutoresetMode.NEXT_STEP
     for mode in [*MODES, *AutoresetMode]:
         envs = library.make(autoreset_mode=mode)
         assert envs.metadata["autoreset_mode"] is envs.autoreset_mode is AutoresetMode(mode)
-
-
-def test_help_shows_every_argument(library):
+    shell = {"num_envs", "max_episode_steps", "autoreset_mode"}
     names = set(inspect.signature(library.cls).parameters)
-    assert names == SHELL | library.own | set(inspect.signature(Parameters).parameters)
+    assert names == shell | library.own | set(inspect.signature(Parameters).parameters)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
+SEEDS = [
+    -1, 1.5, True, "12", b"12", np.array(3.0), np.array(3), [1], [1, 2, 3], [1, -2], [1, 1.5],
+    [1, "2"],
+]  # fmt: skip
+MASKS = [[True, False], np.array([[True, False]]), np.array([1, 0]), np.array([True]),
+         np.array([False, False]), None]  # fmt: skip
+ACTIONS = [
+    np.zeros(2), np.zeros((1, 1)), np.zeros((2, 2)), np.array([[np.nan], [0.0]]),
+    np.array([[0.0], [np.inf]]), [[10**400], [0]], [["up"], ["down"]], [[0.0], [None]], None,
+    [["0.3"], ["0.3"]], np.array([["0.3"], ["0.3"]]), [[b"0.3"], [b"0.3"]], [["0.3"], [0.3]],
+    [[0.3], [0.3j]],
+]  # fmt: skip
+REFUSED = [
+    *(("make", {name: value}, f"^{name} must be") for name, value in [
         ("num_envs", 0), ("num_envs", 2.0), ("num_envs", True), ("num_envs", 10**9),
         ("max_episode_steps", 0), ("max_episode_steps", 1.5), ("max_episode_steps", -2),
         ("max_episode_steps", np.ones(2)), ("autoreset_mode", "Never"), ("dead_zone", -1.0),
         ("delay", 1.5), ("render_mode", np.ones(2)), ("render_mode", "human"),
-    ],
-)  # fmt: skip
-def test_bad_argument_is_named(library, name, value):
-    with pytest.raises(ValueError, match=f"^{name} must be"):
-        library.make(**{name: value})
-
-
-def test_unknown_arguments_and_more_plants_than_a_memory_holds_are_refused(library):
-    with pytest.raises(TypeError, match="deadzone"):
-        library.make(deadzone=5.0)
-    with pytest.raises(ValueError, match=r"^num_envs must be at most 33,\d+ with this delay"):
-        library.make(1_000_000, delay=[0, 10_000])
-
-
-BAD_SEEDS = [
-    -1, 1.5, True, "12", b"12", np.array(3.0), np.array(3), [1], [1, 2, 3], [1, -2], [1, 1.5],
-    [1, "2"],
+    ]),
+    *(("reset", {"seed": seed}, "seed must be") for seed in SEEDS),
+    *(("reset", {"options": {"reset_mask": mask}}, "reset_mask") for mask in MASKS),
+    *(("reset", {"options": each}, "^options must be a dict or None")
+      for each in ("reset_mask", 5, [True, False])),
+    *(("step", actions, "actions must be") for actions in ACTIONS),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", BAD_SEEDS, ids=repr)
-def test_bad_seed_changes_nothing(library, seed):
-    envs, twin = library.make(**NOISY), library.make(**NOISY)
+@pytest.mark.parametrize(("way", "given", "named"), REFUSED, ids=range(len(REFUSED)))
+def test_what_is_refused_is_named_and_changes_nothing(library, way, given, named):
+    if way == "make":
+        with pytest.raises(ValueError, match=named):
+            library.make(**given)
+        return
+    mask = given["options"]["reset_mask"] if named == "reset_mask" else None
+    if isinstance(mask, np.ndarray):
+        given = {"options": {"reset_mask": library.array(mask)}}
+    if isinstance(given, np.ndarray) and given.dtype == float:
+        given = library.array(given)
+    envs, twin = (library.make(delay=0, **NOISY) for _ in range(2))
     envs.reset(seed=0), twin.reset(seed=0)
-    with pytest.raises(ValueError, match="seed must be"):
-        envs.reset(seed=seed)
-    actions = library.array([[1.0], [0.0]])
+    good = library.array(np.array([[1.0], [-0.8]]))
     for _ in range(3):
-        assert_equal(envs.step(actions), twin.step(actions))
+        with pytest.raises(ValueError, match=named):
+            envs.step(given) if way == "step" else envs.reset(**given)
+        assert_equal(envs.step(good), twin.step(good))
     assert_equal(envs.reset(), twin.reset())
-
-
-@pytest.mark.parametrize("mask", [[True, False], [1, 0], [True], [False, False], None])
-@pytest.mark.parametrize("of_library", [False, True])
-def test_bad_reset_mask_is_refused(library, mask, of_library):
-    envs = library.make()
-    envs.reset(seed=0)
-    if of_library and mask is not None:
-        mask = library.array(mask) if mask != [True, False] else library.array(mask)[None]
-    with pytest.raises(ValueError, match="reset_mask"):
-        envs.reset(options={"reset_mask": mask})
-
-
-def test_masks_may_be_views_that_cannot_be_written(library):
-    envs, twin = library.make(**NOISY), library.make(**NOISY)
-    envs.reset(seed=0), twin.reset(seed=0)
-    mask = np.array([True, False])[::-1]
-    mask.flags.writeable = False
-    options = {"reset_mask": mask}
-    assert_equal(
-        envs.reset(options=options), twin.reset(options={"reset_mask": np.array([False, True])})
-    )
-    assert list(options) == ["reset_mask"]
-
-
-@pytest.mark.parametrize("options", ["reset_mask", 5, [True, False]])
-def test_options_that_are_no_dict_are_refused(library, options):
-    with pytest.raises(ValueError, match=r"^options must be a dict or None"):
-        library.make().reset(options=options)
 
 
 def test_an_error_shows_the_beginning_of_a_large_array_and_its_shape(library):
@@ -160,44 +133,52 @@ def test_an_error_shows_the_beginning_of_a_large_array_and_its_shape(library):
         envs.step(library.array(np.zeros((300, 3))))
     assert len(str(error.value)) < 200
     assert "\n" not in str(error.value)
+    with pytest.raises(TypeError, match="deadzone"):
+        library.make(deadzone=5.0)
 
 
-BAD_ACTIONS = [
-    np.zeros(2), np.zeros((1, 1)), np.zeros((2, 2)), np.array([[np.nan], [0.0]]),
-    np.array([[0.0], [np.inf]]), [[10**400], [0]], [["up"], ["down"]], [[0.0], [None]], None,
-    [["0.3"], ["0.3"]], np.array([["0.3"], ["0.3"]]), [[b"0.3"], [b"0.3"]], [["0.3"], [0.3]],
-    [[0.3], [0.3j]],
-]  # fmt: skip
+def test_more_plants_than_a_memory_holds_are_refused(library, monkeypatch):
+    with pytest.raises(ValueError, match=r"^num_envs must be at most 33,\d+ with this delay"):
+        library.make(1_000_000, delay=[0, 10_000])
+    # A plant keeps 3 (d + 2) + 6 numbers, so 10 plants keep 660.
+    monkeypatch.setattr("mptc_gym.batch.MOST_NUMBERS", 660)
+    assert library.make(10).num_envs == 10
+    with pytest.raises(ValueError, match=r"^num_envs must be at most 10 with"):
+        library.make(11)
 
 
-@pytest.mark.parametrize("actions", BAD_ACTIONS, ids=range(len(BAD_ACTIONS)))
-def test_bad_actions_leave_the_plants_untouched(library, actions):
-    if isinstance(actions, np.ndarray) and actions.dtype == float:
-        actions = library.array(actions)
+def test_masks_may_be_views_that_cannot_be_written(library):
     envs, twin = library.make(**NOISY), library.make(**NOISY)
     envs.reset(seed=0), twin.reset(seed=0)
-    good = library.array(np.ones((2, 1)))
-    for _ in range(25):
-        with pytest.raises(ValueError, match="actions"):
-            envs.step(actions)
-        assert_equal(envs.step(good), twin.step(good))
+    mask = np.array([True, False])[::-1]
+    mask.flags.writeable = False
+    options = {"reset_mask": mask}
+    other = {"reset_mask": np.array([False, True])}
+    assert_equal(envs.reset(options=options), twin.reset(options=other))
+    assert list(options) == ["reset_mask"]
 
 
 @pytest.mark.parametrize(
     "actions",
-    [[[1], [0]], [[True], [False]], np.array([[1], [0]]), np.array([[1.0], [0.0]], np.float32)],
-)
+    [
+        [[1], [-0.8]], [[1], [-1]], [[True], [False]], np.array([[1], [0]]),
+        np.array([[1.0], [-0.5]], np.float32), np.array([[1e200], [-1e200]]),
+    ],
+)  # fmt: skip
 def test_any_numbers_are_actions(library, actions):
-    envs, twin = library.make(), library.make()
-    envs.reset(seed=0), twin.reset(seed=0)
-    assert_equal(envs.step(actions), twin.step(library.array([[1.0], [0.0]])))
-
-
-def test_huge_actions_are_taken(library):
     envs = library.make()
     envs.reset(seed=0)
-    infos = envs.step(library.array(np.array([[1e200], [-1e200]])))[4]
-    assert infos["applied"].tolist() == [10.0, -10.0]
+    infos = plain(envs.step(actions)[-1])
+    wanted = 10.0 * np.ravel(actions).astype(float)
+    np.testing.assert_allclose(infos["command"], wanted, rtol=1e-15)
+    np.testing.assert_allclose(infos["applied"], wanted.clip(-10, 10), rtol=1e-15)
+
+
+def test_objects_that_are_numbers_are_actions_in_numpy():
+    envs = MiddlePointVectorEnv(2)
+    envs.reset(seed=0)
+    infos = envs.step(np.array([[0.75], [-1]], object))[-1]
+    assert infos["command"].tolist() == [7.5, -10.0]
 
 
 def test_the_action_of_a_plant_that_is_reset_is_ignored(library):
@@ -231,15 +212,22 @@ def test_reset_is_asked_for(library):
     envs.step(actions)
 
 
-def test_time_limit(library):
-    def truncations(limit):
-        envs = library.make(max_episode_steps=limit)
-        envs.reset(seed=0)
-        return [bool(envs.step(np.zeros((2, 1)))[3].all()) for _ in range(20)]
+def truncations(envs, steps):
+    envs.reset(seed=0)
+    return [bool(envs.step(np.zeros((2, 1)))[3].all()) for _ in range(steps)]
 
-    assert np.flatnonzero(truncations(7)).tolist() == [6, 14]  # a reset lies between
-    assert not any(truncations(None))
-    assert not any(truncations(-1))
+
+def test_time_limit(library):
+    limited = library.make(max_episode_steps=7)
+    assert np.flatnonzero(truncations(limited, 20)).tolist() == [6, 14]  # a reset lies between
+    for unlimited in (None, -1):
+        assert not any(truncations(library.make(max_episode_steps=unlimited), 20))
+
+
+def test_gymnasium_s_time_limit_is_that_of_the_registration_unless_another_is_given():
+    made = partial(gymnasium.make_vec, "MiddlePoint-v0", 2)
+    assert np.flatnonzero(truncations(made(), 1210)) == 1199
+    assert not any(truncations(made(max_episode_steps=None), 1210))
 
 
 def overwrite(returned, value, shared):
@@ -274,23 +262,10 @@ def test_what_is_returned_can_be_overwritten(library, plant, window, rng):
             assert mask.tolist() == [True, False, False, True]
 
 
-def test_gymnasium_s_time_limit_is_that_of_the_registration_unless_another_is_given():
-    def truncations(**limit):
-        envs = gymnasium.make_vec("MiddlePoint-v0", 2, **limit)
-        envs.reset(seed=0)
-        return [bool(envs.step(np.zeros((2, 1)))[3].all()) for _ in range(1210)]
-
-    assert np.flatnonzero(truncations()) == 1199
-    assert not any(truncations(max_episode_steps=None))
-
-
 def collected(env, steps, name):
     """Return an info of all samples from k = 1 on, shape (steps, n), with no flow."""
     actions = np.zeros((env.num_envs, 1))
     return np.stack([plain(env.step(actions)[-1][name]) for _ in range(steps)])
-
-
-SIGNALS = "setpoint", "noise", "disturbance"
 
 
 def assert_mean(values, expected):
@@ -317,15 +292,12 @@ class TestDraws:
         assert_mean(np.abs(normal) < 0.6745, 0.5)  # the quartiles of a normal distribution
 
     def test_readings_are_off_by_white_noise(self, library):
-        n = 200
-        env = library.make(
-            n, measurement_noise_variance=0.3, output_window=1, setpoint=0.0,
-            setpoint_window=0, error_window=1,
-        )  # fmt: skip
+        windows = {"output_window": 1, "setpoint_window": 0, "error_window": 1}
+        env = library.make(200, measurement_noise_variance=0.3, setpoint=0.0, **windows)
         env.reset(seed=0)
         readings = []
         for _ in range(100):
-            observation, _, _, _, infos = env.step(np.zeros((n, 1)))
+            observation, _, _, _, infos = env.step(np.zeros((200, 1)))
             error, reading = plain(observation).T
             np.testing.assert_array_equal(error, -reading)
             assert not infos["output"].any()
@@ -336,13 +308,12 @@ class TestDraws:
 
     @pytest.mark.parametrize("period", [600, 7, 1])
     def test_set_points_have_their_levels_and_lengths(self, library, period):
-        n, steps, amplitude = 300, 40 * max(period // 6, 3), 4.0
-        env = library.make(
-            n, setpoint="random", setpoint_period=period, setpoint_amplitude=amplitude, delay=25
-        )
+        n, steps, size = 300, 40 * max(period // 6, 3), 4.0
+        arguments = {"setpoint_period": period, "setpoint_amplitude": size, "delay": 25}
+        env = library.make(n, setpoint="random", **arguments)
         _, infos = env.reset(seed=1)
         levels = np.vstack([plain(infos["setpoint"]), collected(env, steps, "setpoint")])
-        assert np.abs(levels).max() <= amplitude
+        assert np.abs(levels).max() <= size
         shortest, longest = max(1, -(-period // 6)), max(1, -(-period // 6), period // 2)
         first, starts = [], []
         for column in levels.T:
@@ -355,9 +326,9 @@ class TestDraws:
         if longest < 100:
             assert (np.min(first), np.max(first)) == (shortest, longest)
         assert_mean(np.ravel(starts), 0.0)
-        assert_mean(np.ravel(starts) ** 2, amplitude**2 / 3)
+        assert_mean(np.ravel(starts) ** 2, size**2 / 3)
         ends = np.min(starts), np.max(starts)
-        assert ends == pytest.approx((-amplitude, amplitude), abs=0.03 * amplitude)
+        assert ends == pytest.approx((-size, size), abs=0.03 * size)
 
     @pytest.mark.parametrize("interval", [50.0, 2.0])
     def test_load_steps_have_their_times_and_levels(self, library, interval):
@@ -375,11 +346,10 @@ class TestDraws:
         assert_mean(levels**2, 1 / 3)
 
     def test_a_walk_gains_its_variance_per_sample(self, library):
-        n, steps, variance = 2000, 400, 0.02
-        env = library.make(n, disturbance_walk_variance=variance)
+        env = library.make(2000, disturbance_walk_variance=0.02)
         env.reset(seed=4)
-        moves = np.diff(collected(env, steps, "disturbance")[9::10], axis=0)
-        assert_mean(moves**2, 10 * variance)
+        moves = np.diff(collected(env, 400, "disturbance")[9::10], axis=0)
+        assert_mean(moves**2, 10 * 0.02)
         assert_mean(moves[1:] * moves[:-1], 0.0)
 
     def test_ranges_have_both_ends(self, library):
@@ -399,23 +369,24 @@ class TestDraws:
             assert_mean((delays - 18) * (gains - 1.125), 0.0)
 
     def test_resets_leave_the_distributions_as_they_are(self, library):
-        n, steps, variance, walk, jump = 800, 250, 2.0, 0.01, 0.3
+        n, variance, walk, jump = 800, 2.0, 0.01, 0.3
         env = library.make(
             n, noise_variance=variance, c=[1.0, 3.0], disturbance_walk_variance=walk,
             disturbance_amplitude=jump, disturbance_interval=10, setpoint="random",
             setpoint_period=60, max_episode_steps=100,
         )  # fmt: skip
+        names = "setpoint", "noise", "disturbance"
         _, infos = env.reset(seed=6)
         rng, age, ended = np.random.default_rng(0), np.zeros(n, int), np.zeros(n, bool)
-        rows = [(age.copy(), *(plain(infos[name]) for name in SIGNALS))]
-        for _ in range(steps):
+        rows = [(age.copy(), *(plain(infos[name]) for name in names))]
+        for _ in range(250):
             _, _, _, truncated, infos = plain(env.step(np.zeros((n, 1))))
             age = np.where(ended, 0, age + 1)
             mask = rng.random(n) < 0.02
             _, first = plain(env.reset(options={"reset_mask": mask}))
             age[mask] = 0
             ended = truncated & ~mask
-            found = (np.where(mask, first[name], infos[name]) for name in SIGNALS)
+            found = (np.where(mask, first[name], infos[name]) for name in names)
             rows.append((age.copy(), *found))
         ages, setpoint, noise, load = np.swapaxes(rows, 0, 1)
         assert_mean(noise[ages == 1] ** 2, variance)

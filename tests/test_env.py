@@ -12,8 +12,8 @@ from gymnasium.envs.registration import EnvSpec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import mptc_gym
 from mptc_gym import MiddlePointEnv, Parameters
+from mptc_gym.parameters import argument_table
 from tests.arguments import WINDOWS, valid_arguments
 from tests.conftest import run
 
@@ -182,26 +182,23 @@ def test_info_is_made_of_floats_and_counts_of_ints():
     assert type(reward) is float
 
 
-BAD = [
-    ("delay", 1.5), ("delay", -1), ("delay", "18"), ("delay", True),
-    ("dead_zone", -0.1), ("dead_zone", 10.1), ("dead_zone", float("nan")), ("dead_zone", "5"),
-    ("u_min", 10.0), ("u_min", 11.0), ("u_min", float("-inf")), ("u_max", float("inf")),
-    ("noise_variance", -0.5), ("noise_variance", float("inf")), ("noise_variance", None),
-    ("a", [2.0, 0.5]), ("a", []), ("a", [1.0, float("nan")]), ("a", 1.0), ("a", "1"),
-    ("b", []), ("b", [float("inf")]), ("b", [None]), ("c", [0.9]), ("c", {}),
-    ("sampling_interval", 0.0), ("sampling_interval", -8.0),
-    ("setpoint", "triangle"), ("setpoint", []), ("setpoint", [1.0, float("nan")]),
-    ("setpoint", float("nan")), ("setpoint", None), ("setpoint", 10**400), ("setpoint", 1e300),
-    ("setpoint_amplitude", -1.0), ("setpoint_period", 0), ("setpoint_period", 2.5),
-    ("setpoint_window", -1), ("error_window", 1.0), ("output_window", "2"),
-    ("action_window", -3), ("temperature_span", 0.0), ("temperature_span", float("inf")),
-    ("reward", "cubic"), ("reward", 2), ("error_scale", 0.0), ("error_scale", -5.0),
-    ("move_weight", -1.0), ("move_weight", float("nan")),
-    # These would fill the memory, or take hours.
-    ("delay", 10**12), ("action_window", 10**9), ("error_window", 10_001), ("delay", 100_000),
-    ("setpoint_period", 10**400), ("drift_samples", 10**10),
-    ("a", [1.0] + [0.1] * 1000), ("b", [0.1] * 1001), ("c", [1.0] + [0.1] * 1000),
-]  # fmt: skip
+NAN, INF = float("nan"), float("inf")
+BAD = {
+    # Some of these would fill the memory, or take hours.
+    "delay": [1.5, -1, "18", True, 10**12, 100_000, 10_001],
+    "dead_zone": [-0.1, 10.1, NAN, "5"],
+    "u_min": [10.0, 11.0, -INF], "u_max": [INF], "noise_variance": [-0.5, INF, None],
+    "disturbance_interval": [0.9], "gain_factor": [0.0],
+    "a": [[2.0, 0.5], [], [1.0, NAN], 1.0, "1", [1.0] + [0.1] * 1000],
+    "b": [[], [INF], [None], [0.1] * 1001], "c": [[0.9], {}, [1.0] + [0.1] * 1000],
+    "drift_samples": [10**10, 0], "sampling_interval": [0.0, -8.0],
+    "setpoint": ["triangle", [], [1.0, NAN], NAN, None, 10**400, 1e300],
+    "setpoint_amplitude": [-1.0], "setpoint_period": [0, 2.5, 10**400],
+    "setpoint_window": [-1], "error_window": [1.0, 10_001], "output_window": ["2"],
+    "action_window": [-3, 10**9], "temperature_span": [0.0, INF],
+    "reward": ["cubic", 2], "error_scale": [0.0, -5.0], "move_weight": [-1.0, NAN],
+}  # fmt: skip
+BAD = [(name, value) for name, values in BAD.items() for value in values]
 
 
 @pytest.mark.parametrize(("name", "value"), BAD, ids=[f"{n}={v!r:.20}" for n, v in BAD])
@@ -214,12 +211,10 @@ def test_bad_arguments_are_named(name, value):
 
 @pytest.mark.parametrize("made", [gymnasium.make, partial(gymnasium.make_vec, num_envs=2)])
 def test_misspelt_argument_is_refused_and_the_right_one_named(made):
-    message = r"unexpected keyword argument 'dead_zon': did you mean 'dead_zone'\?"
-    with pytest.raises(TypeError, match=message):
-        made("MiddlePoint-v0", dead_zon=5.0)
-    message = "MiddlePoint-v0 got an unexpected keyword argument 'xyz'"
-    with pytest.raises(TypeError, match=message):
-        made("MiddlePoint-v0", xyz=5.0)
+    message = "MiddlePoint-v0 got an unexpected keyword argument "
+    for name, hint in {"dead_zon": r": did you mean 'dead_zone'\?", "xyz": ""}.items():
+        with pytest.raises(TypeError, match=f"{message}'{name}'{hint}"):
+            made("MiddlePoint-v0", **{name: 5.0})
 
 
 @pytest.mark.parametrize("name", ["setpoint", "a", "b"])
@@ -229,8 +224,6 @@ def test_a_long_list_is_not_repeated_in_an_error(name):
     with pytest.raises(ValueError, match=r"10000 elements.*where element 777 is nan") as error:
         MiddlePointEnv(**{name: values})
     assert len(str(error.value)) < 300
-    with pytest.raises(ValueError, match="where element 777 is nan"):
-        MiddlePointEnv(**{name: np.array(values)})
 
 
 def test_arrays_are_taken_where_lists_are():
@@ -246,10 +239,9 @@ def test_arrays_are_taken_where_lists_are():
         assert {type(element) for element in elements} <= {int, float, str}
     scalars = MiddlePointEnv(delay=np.array(7), dead_zone=np.float32(2), setpoint=np.int64(1))
     assert scalars.parameters == MiddlePointEnv(delay=7, dead_zone=2, setpoint=1).parameters
-    with pytest.raises(ValueError, match="setpoint must be"):
-        MiddlePointEnv(setpoint=np.ones((2, 2)))
-    with pytest.raises(ValueError, match="delay must be an integer"):
-        MiddlePointEnv(delay=np.array([12.0, 24.0]))
+    for name, value in {"setpoint": np.ones((2, 2)), "delay": np.array([12.0, 24.0])}.items():
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            MiddlePointEnv(**{name: value})
 
 
 def test_the_longest_delay_and_window_are_taken():
@@ -289,11 +281,11 @@ def test_a_tensor_of_two_numbers_is_refused_as_an_array_of_two_is():
 def test_help_shows_every_argument():
     names = inspect.signature(MiddlePointEnv).parameters
     assert {"dead_zone", "delay", "noise_variance", "render_mode"} <= set(names)
-    documented = mptc_gym.MiddlePointEnv.__doc__
-    assert all(f"`{name}`" in documented for name in names)
-    lines = [line.strip() for line in documented.splitlines()]
-    assert all(row in lines for row in mptc_gym.parameters.argument_table().splitlines())
-    assert "| `delay` | 18* | samples | transport delay d of (28) |" in lines
+    assert all(f"`{name}`" in MiddlePointEnv.__doc__ for name in names)
+    for documented in (MiddlePointEnv, Parameters):
+        lines = [line.strip() for line in documented.__doc__.splitlines()]
+        assert all(row in lines for row in argument_table().splitlines())
+        assert "| `delay` | 18* | samples | transport delay d of (28) |" in lines
 
 
 @pytest.mark.parametrize(

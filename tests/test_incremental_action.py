@@ -23,6 +23,7 @@ RANGES = {
     "move_weight": 0.1,
 }  # fmt: skip
 PLANTS, LIMIT = 3, 7
+MANY_MODES = "sync", "vector_entry_point"
 
 
 def make(arguments=None, **wrapper):
@@ -84,22 +85,24 @@ def test_drawn_numbers_are_those_of_the_episode():
     assert len(drawn) == 5
 
 
+def made_many(**wrapper):
+    envs = gymnasium.make_vec("MiddlePoint-v0", 2, max_episode_steps=LIMIT, **RANGES)
+    return many.IncrementalAction(envs, **wrapper)
+
+
 @pytest.mark.parametrize(
-    ("plants", "bad"),
+    ("made", "bad"),
     [
-        *((1, bad) for bad in (np.array([np.nan]), np.array([np.inf]), np.zeros(2), "0.5")),
-        *((2, bad) for bad in (np.zeros(2), np.zeros((3, 1)), np.full((2, 1), np.nan))),
-        (2, [["0.5"], ["1"]]),
+        *((make, bad) for bad in (np.array([np.nan]), np.array([np.inf]), np.zeros(2), "0.5")),
+        *((made_many, bad) for bad in (np.zeros(2), np.zeros((3, 1)), np.full((2, 1), np.nan))),
+        (made_many, [["0.5"], ["1"]]),
     ],
 )
-def test_a_bad_action_changes_nothing(plants, bad):
-    def made():
-        if plants == 1:
-            return make(RANGES)
-        return many.IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", plants, **RANGES))
-
+def test_a_reset_comes_first_and_a_bad_action_changes_nothing(made, bad):
     env, other = made(), made()
     good = np.full(env.action_space.shape, 0.5, np.float32)
+    with pytest.raises(ResetNeeded):
+        env.step(good)
     for each in (env, other):
         each.reset(seed=0)
         each.step(good)
@@ -108,37 +111,32 @@ def test_a_bad_action_changes_nothing(plants, bad):
     assert data_equivalence(env.step(-good), other.step(-good), exact=True)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("max_move", 0.0), ("max_move", 2.1), ("max_move", float("nan")), ("max_move", "x"),
-        ("max_move", True), ("compensate_dead_zone", -1.0), ("compensate_dead_zone", np.inf),
-        ("compensate_dead_zone", "yes"), ("compensate_dead_zone", None),
-        ("compensate_dead_zone", 10**400),
-    ],
-)  # fmt: skip
-def test_bad_arguments_are_named(name, value):
-    with pytest.raises(ValueError, match=name):
-        make(**{name: value})
-    with pytest.raises(ValueError, match=name):
-        many.IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2), **{name: value})
+@pytest.mark.parametrize("made", [make, made_many])
+def test_bad_arguments_are_named(made):
+    for name, values in {
+        "max_move": (0.0, 2.1, float("nan"), "x", True),
+        "compensate_dead_zone": (-1.0, np.inf, "yes", None, 10**400),
+    }.items():
+        for value in values:
+            with pytest.raises(ValueError, match=f"^{name} must be"):
+                made(**{name: value})
+    made(compensate_dead_zone=0.0, max_move=2.0)
 
 
 def test_other_environments_are_refused():
-    with pytest.raises(ValueError, match="env must be a MiddlePointEnv"):
-        IncrementalAction(gymnasium.make("CartPole-v1"))
-    with pytest.raises(ValueError, match=r"mptc_gym\.wrappers\.vector\.IncrementalAction"):
-        IncrementalAction(gymnasium.make_vec("MiddlePoint-v0", 2))
-    with pytest.raises(ValueError, match=r"mptc_gym\.wrappers\.IncrementalAction"):
-        many.IncrementalAction(gymnasium.make("MiddlePoint-v0"))
-    others = [
-        gymnasium.make_vec("CartPole-v1", 2, vectorization_mode=mode)
-        for mode in ("sync", "vector_entry_point")
-    ]
+    wrap, wrap_many = IncrementalAction, many.IncrementalAction
+    carts = [gymnasium.make_vec("CartPole-v1", 2, vectorization_mode=m) for m in MANY_MODES]
+    for wrapped, env, allowed in [
+        (wrap, gymnasium.make("CartPole-v1"), "a MiddlePointEnv"),
+        (wrap, MiddlePointVectorEnv(2), "one environment; mptc_gym.wrappers.vector"),
+        (wrap_many, MiddlePointEnv(), "a vector environment; mptc_gym.wrappers.Incr"),
+        *((wrap_many, cart, "a vector environment of MiddlePointEnv") for cart in carts),
+    ]:
+        with pytest.raises(ValueError, match=f"^env must be {allowed}"):
+            wrapped(env)
     torch_env = pytest.importorskip("mptc_gym.torch_env", reason="it is refused")
-    for env in (*others, torch_env.MiddlePointTorchEnv(2)):
-        with pytest.raises(ValueError, match="of MiddlePointEnv in NumPy"):
-            many.IncrementalAction(env)
+    with pytest.raises(ValueError, match="of MiddlePointEnv in NumPy"):
+        many.IncrementalAction(torch_env.MiddlePointTorchEnv(2))
 
 
 def test_tensors_are_actions_but_those_with_a_graph_are_refused_for_many():
@@ -153,16 +151,12 @@ def test_tensors_are_actions_but_those_with_a_graph_are_refused_for_many():
             each.step(torch.ones(2, 1, requires_grad=True))
 
 
-def test_the_spec_makes_it_again():
+def test_the_spec_makes_it_again_and_both_checkers_have_no_complaint():
     env = make({"action_window": 20}, max_move=0.3, compensate_dead_zone=True)
-    spec = EnvSpec.from_json(env.spec.to_json())
-    again = gymnasium.make(spec)
+    again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
     assert isinstance(again, IncrementalAction)
     for _ in range(2):
         assert infos_of(env, [0.4, -1.0, 0.2]) == infos_of(again, [0.4, -1.0, 0.2])
-
-
-def test_both_checkers_have_no_complaint():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # That it is a wrapper is all that Gymnasium's has to say.
@@ -171,12 +165,6 @@ def test_both_checkers_have_no_complaint():
         check_env(env, skip_render_check=True)
         checker = pytest.importorskip("stable_baselines3.common.env_checker")
         checker.check_env(env)
-
-
-@pytest.mark.parametrize("env", [make(), many.IncrementalAction(MiddlePointVectorEnv(2))])
-def test_reset_comes_first(env):
-    with pytest.raises(ResetNeeded):
-        env.step(np.zeros(env.action_space.shape, np.float32))
 
 
 def batches(mode, *, compensate):

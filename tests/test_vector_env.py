@@ -115,6 +115,12 @@ def test_a_plant_beyond_all_floats_equals_the_one_alone(a, reward):
     assert not np.isfinite(ours[4]["output"]).any()
 
 
+def used(made):
+    """Return what was made, and the memory that it takes."""
+    tracemalloc.start()
+    return made(), tracemalloc.get_traced_memory()[0], tracemalloc.stop()
+
+
 def test_many_plants_share_a_bounded_memory_for_noise(rng):
     def made(num_bytes):
         with patch.multiple("mptc_gym.vector_env", NOISE_BYTES=num_bytes):
@@ -122,26 +128,44 @@ def test_many_plants_share_a_bounded_memory_for_noise(rng):
                 50, noise_variance=1.0, measurement_noise_variance=1.0, max_episode_steps=900
             )
 
-    tracemalloc.start()
-    long, large = made(1 << 27), tracemalloc.get_traced_memory()[0]
-    short, small = made(8 * 50 * 10), tracemalloc.get_traced_memory()[0] - large
-    tracemalloc.stop()
+    (long, large, _), (short, small, _) = (
+        used(partial(made, 1 << 27)),
+        used(partial(made, 4000)),
+    )
     assert large - small > 2 * 8 * 50 * 400  # two signals, 450 samples or 10 at a time
     assert_equal(long.reset(seed=3), short.reset(seed=3))
     compare(long, short, steps=30, rng=rng, partial_resets=0.05)
 
 
+@pytest.mark.parametrize("limit", [1200, 10**6, None])
+def test_a_plant_costs_a_few_kib_and_nothing_grows_in_the_long_run(limit):
+    def made(plants):
+        envs = MiddlePointVectorEnv(
+            plants,
+            max_episode_steps=limit,
+            action_window=20,
+            autoreset_mode="SameStep",
+            **NOISY,
+        )
+        envs.reset(seed=0)
+        envs.step(np.zeros((plants, 1)))
+        return envs
+
+    assert used(partial(made, 500))[1] / 500 < 12 * 1024
+    envs, sizes = made(2), []
+    for _ in range(2):
+        for _ in range(2_500):
+            envs.step(np.full((2, 1), 0.6, np.float32))
+        sizes.append(len(pickle.dumps(envs)))
+    assert sizes[1] <= sizes[0] + 100  # the counters become longer numbers, no more
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-@pytest.mark.parametrize(
-    "made",
-    [
-        partial(gymnasium.make, "MiddlePoint-v0"),
-        partial(MiddlePointVectorEnv, 3, max_episode_steps=100, autoreset_mode="NextStep"),
-        partial(MiddlePointVectorEnv, 3, max_episode_steps=100, autoreset_mode="SameStep"),
-    ],
-)
-def test_copies_in_the_middle_of_an_episode_go_on_alike(copied, made, rng):
-    env = made(**NOISY)
+@pytest.mark.parametrize("mode", [None, "NextStep", "SameStep"])
+def test_copies_in_the_middle_of_an_episode_go_on_alike(copied, mode, rng):
+    env = gymnasium.make("MiddlePoint-v0", **NOISY)
+    if mode:
+        env = MiddlePointVectorEnv(3, max_episode_steps=100, autoreset_mode=mode, **NOISY)
     env.reset(seed=0)
     for _ in range(130):
         env.step(rng.uniform(-1, 1, env.action_space.shape))
@@ -164,31 +188,6 @@ def test_seeds_are_told():
     assert envs.np_random_seed == (3, 4, 5)
     envs.reset(seed=[7, None, 9])
     assert envs.np_random_seed == (7, 4, 9)
-
-
-def test_nothing_grows_in_the_long_run():
-    envs = MiddlePointVectorEnv(2, autoreset_mode="SameStep", max_episode_steps=100, **NOISY)
-    actions = np.full((2, 1), 0.6, np.float32)
-    envs.reset(seed=0)
-    sizes = []
-    for _ in range(2):
-        for _ in range(5_000):
-            envs.step(actions)
-        sizes.append(len(pickle.dumps(envs)))
-    # The counters become longer numbers, no more.
-    assert sizes[1] <= sizes[0] + 100
-
-
-@pytest.mark.parametrize("limit", [1200, 10**6, None])
-def test_a_plant_costs_a_few_kib(limit):
-    plants = 500
-    tracemalloc.start()
-    envs = MiddlePointVectorEnv(plants, max_episode_steps=limit, action_window=20, **NOISY)
-    envs.reset(seed=0)
-    envs.step(np.zeros((plants, 1)))
-    used, _ = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert used / plants < 12 * 1024
 
 
 def test_it_is_a_direct_child_of_gymnasium_s():
