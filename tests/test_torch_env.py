@@ -152,29 +152,29 @@ class TestEdgeOfTheDeadZone:
     @pytest.mark.parametrize(
         "numbers",
         [
-            {},
-            {"dead_zone": 0.0},
-            {"dead_zone": 4.0, "u_min": -12.0, "u_max": 6.0},
+            {}, {"dead_zone": 0.0}, {"dead_zone": 4.0, "u_min": -12.0, "u_max": 6.0},
             {"dead_zone": 5.0, "u_min": -3.0},  # this limit lies inside
             {"dead_zone": 2.0, "u_min": 6.0, "u_max": 8.0},
             {"dead_zone": 10.0, "u_min": -8.62},  # the way to an action and back is not exact
         ],
-    )
+    )  # fmt: skip
     def test_the_actuator_is_one_for_plants_and_controllers(self, numbers):
         sizes = np.r_[0.0, 1e-9, 1.0, 2.0, 3.0, 3.999, 4.0, 4.001, 5.0, 6.0, 10.0, 12.0, 1e3]
         commands = np.r_[-sizes, sizes]
         n, parameters = len(commands), Parameters(**numbers)
         limits = parameters.dead_zone, parameters.u_min, parameters.u_max
-        expected = applied_flow(commands, *limits)
         actions = action_from_command(commands, *limits[1:])[:, np.newaxis]
-        one, many = MiddlePointEnv(**numbers), MiddlePointVectorEnv(n, **numbers)
-        tensors = make(n, **numbers)
+        one, many, tensors = (
+            MiddlePointEnv(**numbers),
+            MiddlePointVectorEnv(n, **numbers),
+            make(n, **numbers),
+        )
         for env in (one, many, tensors):
             env.reset(seed=0)
         alone = [one.step(action)[-1]["applied"] for action in actions]
-        batch = many.step(actions)[-1]["applied"]
-        in_torch = tensors.step(torch.tensor(actions))[-1]["applied"]
-        for found in (alone, batch, in_torch):
+        batches = [env.step(torch.tensor(actions))[-1]["applied"] for env in (many, tensors)]
+        for found in (alone, *batches):
+            expected = applied_flow(commands, *limits)
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
@@ -328,21 +328,13 @@ def test_a_step_never_waits_for_the_device(mode, differentiable):
                 env.step(torch.zeros(3, 1, dtype=torch.float64))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
+@pytest.mark.parametrize(("given", "named"), [
+    *(({name: value}, f"^{name} must be") for name, value in [
         ("dtype", torch.float16), ("dtype", "float32"), ("dtype", np.ones(2)),
         ("device", "toaster"), ("device", "meta"), ("differentiable", "yes"),
-    ],
-)  # fmt: skip
-def test_bad_argument_is_named(name, value):
-    with pytest.raises(ValueError, match=name):
-        MiddlePointTorchEnv(**{"num_envs": 2, name: value})
-
-
-@pytest.mark.parametrize(
-    ("signals", "named"),
-    [
+    ]),
+    ({"seed": 1 << 63}, "^seed must be None or an integer"),
+    *(({"options": {"signals": signals}}, named) for signals, named in [
         ({}, "signals"), ({"nois": torch.zeros(5, 2)}, "signals"), (3, "signals"),
         ({"noise": torch.zeros(5, 3)}, "noise"), ({"noise": torch.zeros(2)}, "noise"),
         ({"noise": torch.full((5, 2), torch.nan)}, "noise"),
@@ -351,12 +343,17 @@ def test_bad_argument_is_named(name, value):
         ({"dead_zone": torch.zeros(2)}, "dead_zone"),
         ({"noise": "x"}, r"\['noise'\] must be numbers"), ({"noise": None}, "noise"),
         ({"noise": torch.zeros(5, 2) * 1j}, "noise"), ({"noise": [[1.0, 2.0], [3.0]]}, "noise"),
-    ],
-)  # fmt: skip
-def test_bad_signals_are_named(signals, named):
-    env = make(delay=[5, 9])
-    with pytest.raises(ValueError, match=named):
-        env.reset(options={"signals": signals})
+    ]),
+])  # fmt: skip
+def test_what_is_refused_is_named(given, named):
+    if given.keys() & {"seed", "options"}:
+        env = make(delay=[5, 9])
+        env.reset(seed=(1 << 63) - 1)  # the largest
+        with pytest.raises(ValueError, match=named):
+            env.reset(**given)
+    else:
+        with pytest.raises(ValueError, match=named):
+            MiddlePointTorchEnv(2, **given)
 
 
 def test_signals_end_with_an_error_and_with_a_reset_without():
