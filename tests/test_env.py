@@ -52,19 +52,18 @@ def test_the_spec_is_json_whatever_numpy_it_was_made_of(setpoint):
     envs = gymnasium.make_vec("MiddlePoint-v0", 2, **arguments)
     kept = EnvSpec.from_json(envs.spec.to_json()).kwargs
     assert Parameters(**{name: kept[name] for name in arguments}) == envs.unwrapped.parameters
-    assert isinstance(env.unwrapped, MiddlePointEnv)
-    assert env.action_space == gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-    assert env.observation_space.shape == (6,)
 
 
-def test_bounds_of_the_observation_are_those_of_the_span_unless_a_set_point_is_beyond():
-    windows = dict.fromkeys(WINDOWS, 1)
+def test_spaces_whose_bounds_are_those_of_the_span_unless_a_set_point_is_beyond():
     for setpoint in ("square", "random", 5.0, [1.0, -3.0]):
-        space = MiddlePointEnv(setpoint=setpoint, **windows).observation_space
-        assert list(space.high) == [50, 100, 50, 1]
-        assert list(space.low) == [-50, -100, -50, -1]
-    beyond = MiddlePointEnv(setpoint=60.0, setpoint_window=1, error_window=1)
+        env = MiddlePointEnv(setpoint=setpoint, **dict.fromkeys(WINDOWS, 1))
+        assert list(env.observation_space.high) == [50, 100, 50, 1]
+        assert list(env.observation_space.low) == [-50, -100, -50, -1]
+        assert env.action_space == gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    beyond = MiddlePointEnv(setpoint=[5.0, -60.0], setpoint_window=1, error_window=1)
     assert list(beyond.observation_space.high) == [60, 110]
+    amplitude = MiddlePointEnv(setpoint_amplitude=60.0, setpoint_window=1, error_window=1)
+    assert amplitude.observation_space == beyond.observation_space
 
 
 def test_an_unstable_plant_stays_in_its_observation_space():
@@ -80,6 +79,12 @@ def test_reset_is_at_rest():
     assert list(observation) == [5, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0]
     rest = {"output": 0.0, "command": 0.0, "applied": 0.0, "noise": 0.0}
     assert info == {"setpoint": 5.0, "error": 5.0, **rest}
+    # Of an unsymmetric actuator: u = 0 is a quarter of the way up.
+    env = MiddlePointEnv(u_min=-5.0, u_max=15.0, action_window=2, move_weight=1.0)
+    observation, _ = env.reset(seed=0)
+    assert list(observation[-2:]) == [-0.5, -0.5]
+    _, reward, *_ = env.step(np.array([-0.5], np.float32))
+    assert reward == -0.5  # no move, so only the error costs
 
 
 def test_timeline_by_hand():
@@ -98,37 +103,21 @@ def test_timeline_by_hand():
     assert list(record["error"]) == [3, 2, 3, 2, -2.5]
     # |e(k+1)| / 2 + 0.5 |a(k) - a(k-1)|: 1 + 0.25, 1.5 + 0.3125, 1 + 0.9375, 1.25 + 1
     assert list(record["reward"]) == [-1.25, -1.8125, -1.9375, -2.25]
+    square = MiddlePointEnv(setpoint_amplitude=2.0, setpoint_period=6)
+    assert list(run(square, np.zeros(8))["setpoint"]) == [2, 2, 2, -2, -2, -2, 2, 2, 2]
     # y_d newest first, e, y, and actions as the actuator limits them
     assert list(record["observation"][4]) == [1, 1, 1, -2.5, 2, 3, 3.5, -1, 0, -1]
 
 
-def test_rest_of_an_unsymmetric_actuator_is_zero_flow():
-    env = MiddlePointEnv(u_min=-5.0, u_max=15.0, action_window=2, move_weight=1.0)
-    observation, _ = env.reset(seed=0)
-    assert list(observation[-2:]) == [-0.5, -0.5]  # u = 0 is a quarter of the way up
-    _, reward, *_ = env.step(np.array([-0.5], np.float32))
-    assert reward == -0.5  # no move, so only the error costs
-
-
-@pytest.mark.parametrize(
-    ("windows", "expected"),
-    [
-        ({"setpoint_window": 0}, [4, 3, 2]),
-        ({"error_window": 0}, [5, 5, 5]),
-        ({"setpoint_window": 1, "error_window": 2}, [5, 4, 3]),
-        ({"setpoint_window": 0, "error_window": 0, "output_window": 4}, [1, 2, 3, 0]),
-        ({"setpoint_window": 0, "error_window": 0, "action_window": 2}, [0.25, 0.5]),
-        ({"setpoint_window": 0, "output_window": 1, "error_window": 1}, [4, 1]),
-    ],
-)
+@pytest.mark.parametrize(("windows", "expected"), [
+    ((0, 3, 0, 0), [4, 3, 2]), ((3, 0, 0, 0), [5, 5, 5]), ((1, 2, 0, 0), [5, 4, 3]),
+    ((0, 0, 4, 0), [1, 2, 3, 0]), ((0, 0, 0, 2), [0.25, 0.5]), ((0, 1, 1, 0), [4, 1]),
+])  # fmt: skip
 def test_windows(windows, expected):
-    env = MiddlePointEnv(
-        a=[1.0], b=[1.0], delay=0, dead_zone=0.0, u_min=-4.0, u_max=4.0, setpoint=5.0, **windows
-    )
-    env.reset(seed=0)
-    for action in (0.75, 0.5, 0.25):  # y = 3, 2, 1
-        observation, *_ = env.step(np.array([action], np.float32))
-    assert list(observation) == expected
+    plant = {"a": [1.0], "b": [1.0], "delay": 0, "dead_zone": 0.0, "u_min": -4.0, "u_max": 4.0}
+    env = MiddlePointEnv(setpoint=5.0, **plant, **dict(zip(WINDOWS, windows, strict=True)))
+    record = run(env, [0.75, 0.5, 0.25])  # y = 3, 2, 1
+    assert list(record["observation"][-1]) == expected
 
 
 def test_measurement_saturates_and_truth_does_not():
@@ -138,11 +127,6 @@ def test_measurement_saturates_and_truth_does_not():
     assert record["error"][-1] == 5.0 - record["output"][-1]
     assert record["reward"][-1] == pytest.approx(-((record["error"][-1] / 5.0) ** 2) / 2)
     assert list(record["observation"][-1]) == [5, 5, 5, 3, 3, 3, 2]
-
-
-def test_square_wave_by_hand():
-    env = MiddlePointEnv(setpoint_amplitude=2.0, setpoint_period=6)
-    assert list(run(env, np.zeros(8))["setpoint"]) == [2, 2, 2, -2, -2, -2, 2, 2, 2]
 
 
 @pytest.mark.parametrize(
