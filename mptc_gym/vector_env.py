@@ -176,19 +176,26 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             for i, numbers in enumerate(zip(*columns, strict=True)):
                 self._records[i].add(*numbers)
 
-        infos = {
+        everyone = self._everyone.copy()
+        infos = {  # written out, which is fastest
             "output": output.copy(),
+            "_output": everyone,
             "setpoint": setpoint.copy(),
+            "_setpoint": everyone,
             "error": error,
+            "_error": everyone,
             "command": command,
+            "_command": everyone,
             "applied": applied,
+            "_applied": everyone,
             "noise": noise.copy(),
+            "_noise": everyone,
         }
         if load is not None:
-            infos["disturbance"] = load.copy()
-        for name, factors in zip(self._factor_names, self._plants.factors, strict=False):
-            infos[name] = factors.copy()
-        infos |= dict.fromkeys(self._masks, self._everyone.copy())
+            infos["disturbance"], infos["_disturbance"] = load.copy(), everyone
+        if self._factor_names:
+            for name, factors in zip(self._factor_names, self._plants.factors, strict=True):
+                infos[name], infos[f"_{name}"] = factors.copy(), everyone
         return observations, rewards, self._nobody.copy(), self._nobody.copy(), infos
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
