@@ -103,6 +103,8 @@ REFUSED = {
     "sweep": [
         (["--agents", "nobody"], '"nobody" for --agents. Choose from: "nothing", "nn"'),
         (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),
+        (["--plants", "10"], "--plants and --design-seed are for --design random"),
+        (["--design-seed", "3"], "--plants and --design-seed are for --design random"),
     ],
     "train": [([], "NETWORK is missing: name what to train, one of nn-smith, ppo, ppo-hard")],
     "watch": [

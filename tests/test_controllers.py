@@ -17,7 +17,7 @@ from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import UsageError
 from benchmarks.loop.rollout import IdleValve
 from benchmarks.loop.scenarios import Scenario
-from benchmarks.sweep.command import agent_task
+from benchmarks.sweep import SETPOINT, run_agent
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from mptc_gym.sb3 import load, make_vec_env, save, spec_of
@@ -47,7 +47,7 @@ def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, mo
     scenario = Scenario("other", "", 900, plant)
     ways = {
         "compare": run_case(scenario, entry.name, [factory], 2)["runs"]["mae"],
-        "sweep": agent_task(factory, plant, plant, 900, 2)["mae"],
+        "sweep": run_agent(factory, plant, {**plant, **SETPOINT}, 900, 2)["mae"],
     }
     for way, found in ways.items():
         if entry.name == "nothing":

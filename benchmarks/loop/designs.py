@@ -22,14 +22,6 @@ SPANS = {
     "gain_factor": (0.75, 1.6),
     "time_constant_factor": (0.5, 2.0),
 }
-# About 95 % of these plants lie outside `SPANS`, the ranges covered by the self-tuning bank.
-WIDE = {
-    "delay": (0, 60),
-    "dead_zone": (0.0, 10.0),
-    "noise_variance": (0.0, 1.0),
-    "gain_factor": (0.5, 3.0),
-    "time_constant_factor": (0.25, 4.0),
-}
 GRID = {"delay": range(2, 42, 2), "gain_factor": np.linspace(0.75, 1.65, 10)}
 
 
