@@ -2,11 +2,37 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from benchmarks.lib.command import Folder, Names, Runs, command, options
+from benchmarks.lib.command import Folder, Names, Runs, command, known, options
 from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.storage import origin, out_folder, write_csv
+from mptc_gym import Parameters
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+    from benchmarks.claims.runs import Claim
+    from benchmarks.lib.report import Section
+
+
+NOTE = (
+    "Every number rests on independent draws of initial weights and noise. What a claim asks "
+    "of a number counts as shown if the whole 95 % interval keeps it. A claim holds if all "
+    "that it asks is shown, and in part if some is."
+)
+PICTURE = {"figures.png": "The cases of the paper's figures: a typical run, and all runs"}
+SIGNALS = {
+    "output": ("temperature y (°C)", "#0072B2"),
+    "command": ("command u (t/h)", "#009E73"),
+    "noise": ("noise n (°C)", "#CC79A7"),
+}
 
 
 @options
@@ -14,7 +40,7 @@ from benchmarks.lib.fan_out import FanOut
 class Options:
     """Test the paper's claims, each on a thousand runs.
 
-    The verdicts go to claims.md, all numbers to claims.csv, plots and their data beside them.
+    The verdicts go to report.md, all numbers to claims.csv.
     """
 
     claims: Names = field(default=(), kw_only=False)
@@ -25,7 +51,134 @@ class Options:
     out: Folder = Path("results/claims")
 
 
-main = command(Options, "benchmarks.claims.command")
+def work(options: Options) -> str:
+    """Examine the claims and write the verdicts, also where some examinations have failed."""
+    from benchmarks.claims.claims import CLAIMS
+    from benchmarks.claims.runs import Batch
+    from benchmarks.lib.report import provenance_line, show, write_report
+
+    chosen = known("CLAIM", options.claims or list(CLAIMS), list(CLAIMS))
+    made, out = provenance_line("claims", origin()), out_folder(options.out)
+    # The last claims take longest, and start first.
+    tasks = {
+        name: partial(CLAIMS[name].examined, Batch(options.runs)) for name in reversed(chosen)
+    }
+    done: dict[str, Claim] = {}
+    try:
+        done.update(options.fan_out.stream(tasks, "claims"))
+    finally:
+        claims = [done[each] for each in chosen if each in done]
+        if claims:
+            write_csv(out / "claims.csv", table(claims))
+            if curves := [each.curves for each in claims if each.curves is not None]:
+                write_csv(out / "figures.csv", curves[0])
+                plot_figures(curves[0], out / "figures.png")
+            found = sections(claims, pictures=bool(curves))
+            write_report(out, "The paper's claims", found, made)
+            show(found[:1])
+    return f"All numbers are in {out}/report.md and claims.csv"
+
+
+def table(claims: Sequence[Claim]) -> pd.DataFrame:
+    """Return one row for each finding, and one for each claim without findings."""
+    import pandas as pd
+
+    rows: list[dict[str, Any]] = []
+    for claim in claims:
+        about = {name: getattr(claim, name) for name in ("section", "statement", "verdict")}
+        about = {"claim": claim.name, **about}
+        rows += [{**about, **finding} for finding in claim.findings] or [about]
+    frame = pd.DataFrame(rows)
+    # Nullable integers, as a claim without findings has no runs.
+    return frame.astype({"runs": "Int64"}) if "runs" in frame else frame
+
+
+def sections(claims: Sequence[Claim], *, pictures: bool = False) -> list[Section]:
+    """Return the sections of the report: the verdicts, then the numbers of each claim."""
+    import pandas as pd
+
+    from benchmarks.lib.report import Section
+
+    verdicts = [{"claim": each.statement, "verdict": each.verdict} for each in claims]
+    found = [Section("", [NOTE], pd.DataFrame(verdicts), PICTURE if pictures else {})]
+    for claim in claims:
+        rows = pd.DataFrame([_row(**finding) for finding in claim.findings])
+        title, text = f"{claim.statement}: {claim.verdict}", f"{claim.section}. {claim.method}"
+        found.append(Section(title, [text], rows if len(rows) else None))
+    return found
+
+
+def _row(
+    quantity: str, unit: str, runs: int, criterion: str, shown: str, **numbers: float
+) -> dict[str, str]:
+    from benchmarks.lib.report import Best
+
+    value, low, high = (_three_digits(numbers[name]) for name in ("value", "low", "high"))
+    return {
+        "measured": quantity + (f" ({unit})" if unit else ""),
+        "value": value,
+        "95 % interval": "exact" if runs == 1 else f"{low} to {high}",
+        "asked": criterion,
+        "shown": Best(shown) if shown == "no" else shown,
+    }
+
+
+def _three_digits(value: float) -> str:
+    if math.isinf(value):
+        return "never" if value > 0 else "?"
+    digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 3
+    return f"{value:,.{digits}f}"
+
+
+def plot_figures(curves: pd.DataFrame, path: Path) -> None:
+    """Draw counterparts of Figs 5 to 12: a typical run, and the spread of all runs."""
+    from benchmarks.claims.runs import FIGURES
+    from benchmarks.lib.drawing import draw_legend, panels
+
+    signals = [
+        (f"Fig. {number}: {case.title}", signal, case)
+        for case in FIGURES
+        for number, signals in case.figures.items()
+        for signal in signals
+    ]
+    with panels(path, [each[0] for each in signals], 1.7, 2, *PICTURE.values()) as (
+        sheet,
+        found,
+        free,
+    ):
+        entries: dict[str, Any] = {}
+        for axes, (_, signal, case) in zip(found, signals, strict=True):
+            of_case = curves[curves["case"] == case.title]
+            _draw_signal(axes, signal, of_case, Parameters(**case.arguments))
+            handles, names = axes.get_legend_handles_labels()
+            entries = dict(zip(names, handles, strict=True)) | entries
+        for axes in found[-2:]:  # the lowest of each column
+            axes.set_xlabel("time (min)")
+        draw_legend(sheet, free, entries)
+
+
+def _draw_signal(axes: Axes, signal: str, curves: pd.DataFrame, plant: Parameters) -> None:
+    from benchmarks.lib.drawing import draw_actuator
+
+    minutes = curves["time_s"] / 60
+    name, colour = SIGNALS[signal]
+    axes.fill_between(
+        minutes, curves[f"{signal}_p10"], curves[f"{signal}_p90"], color=colour, alpha=0.25,
+        linewidth=0, label="10th to 90th percentile",
+    )  # fmt: skip
+    typical = curves[f"{signal}_typical"]
+    axes.plot(minutes, typical, color=colour, linewidth=1, label="a typical run")
+    if signal == "output":
+        axes.step(
+            minutes, curves["setpoint"], "k--", linewidth=1, where="post", label="set point"
+        )
+    if signal == "command":
+        draw_actuator(axes, plant)
+    axes.set_xlim(0, minutes.max())
+    axes.set_ylabel(name)
+
+
+main = command("claims", Options, work)
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

@@ -25,7 +25,6 @@ from benchmarks.claims.runs import (
     typical,
 )
 from benchmarks.lib.statistics import Estimate, exact, median
-from benchmarks.lib.tables import groups
 from benchmarks.loop.linear import nominal
 from benchmarks.loop.margins import Loop
 from benchmarks.loop.metrics import mean_error, settled, split
@@ -48,7 +47,7 @@ LEARNING = 600  # samples after which a network counts as trained
 GAINS = {False: "the same gains", True: "gains in proportion"}  # of networks of other shapes
 
 CLAIMS: dict[str, Claim] = {}
-Examination: TypeAlias = Callable[[Batch, Claim], None]
+Examination: TypeAlias = Callable[[Batch, Claim], pd.DataFrame | None]
 
 
 def claimed(section: str, statement: str, method: str) -> Callable[[Examination], Examination]:
@@ -75,19 +74,17 @@ def ratio(errors: Array, reference: Array) -> Estimate:
     "at the start, for the last 100 samples at the least.",
 )
 def convergence(batch: Batch, claim: Claim) -> None:
-    times = {}
     for name, arguments, samples in SETPOINTS:
         network = batch.networks()
         weights: list[Array] = []
         watch = lambda _: weights.append(flat(network.weights))  # noqa: B023, E731
         batch.run(network, samples, watch, **arguments)
-        times[name] = converged_at(np.array(weights))
-        soon = times[name] <= SOON
+        times = converged_at(np.array(weights))
+        soon = times <= SOON
         claim.ask_share(f"weights converged within {SOON} samples, {name}", soon, often=True)
-        claim.ask_time(f"time until the weights have converged, {name}", times[name])
-        never = np.isinf(times[name])
+        claim.ask_time(f"time until the weights have converged, {name}", times)
+        never = np.isinf(times)
         claim.ask_share(f"weights not converged when the run ends, {name}", never)
-    claim.tables["convergence"] = pd.DataFrame(times)
 
 
 @claimed(
@@ -150,16 +147,11 @@ def pi_gains(batch: Batch, claim: Claim) -> None:
         np.ptp(paper.output[-300:]), "°C", at_least=2 * 0.05 * 5.0,
     )  # fmt: skip
     gains = np.linspace(0.1, KP, 22)  # the last is the paper's
-    rows = []
     for name, arguments in (
         ("constant set point", CONSTANT), ("square wave", SQUARE), (NOISY_SQUARE, NOISY),
     ):  # fmt: skip
         errors = [mean_error(batch.run_pi(kp, KI, samples, **arguments)) for kp in gains]
         medians = [float(np.median(error)) for error in errors]
-        rows += [
-            {"setpoint": name, "kp": kp, "mean_error": middle}
-            for kp, middle in zip(gains, medians, strict=True)
-        ]
         best = int(np.argmin(medians[:-1]))
         claim.ask(
             f"mean error with the best lower Kp ({gains[best]:.1f}) as a multiple of that with "
@@ -175,7 +167,6 @@ def pi_gains(batch: Batch, claim: Claim) -> None:
     claim.ask("the same, Kp = 2.2", largest_pole(KP, KI))
     smallest = min(largest_pole(gain, KI) for gain in gains)
     claim.ask("the same, the best Kp of 0.1 to 2.2", smallest)
-    claim.tables["pi_gains"] = pd.DataFrame(rows)
 
 
 def largest_pole(kp: float, ki: float) -> float:
@@ -355,39 +346,40 @@ def direction_only(batch: Batch, claim: Claim) -> None:
         "set point 5 °C": (0.75, 1.0, 1.25, 1.4),
         "set point 5 °C times the gain": (0.7, 1.0, 1.25, 1.5),
     }
-    rows, draws = [], []
+    settles: dict[tuple[str, float, float, int], Any] = {}
     for family, gains in families.items():
-        for time_constant, gain, delay in itertools.product(
-            (0.5, 1.0, 2.0), gains, (9, 18, 27, 36)
-        ):
+        for case in itertools.product((0.5, 1.0, 2.0), gains, (9, 18, 27, 36)):
+            constant, gain, delay = case
             setpoint = 5.0 * gain if "times" in family else 5.0
-            plant = {"gain_factor": gain, "time_constant_factor": time_constant}
+            plant = {"gain_factor": gain, "time_constant_factor": constant}
             runs = batch.run_nn(1200, setpoint=setpoint, delay=delay, **plant)
-            draws.append(settled(runs))
-            about = {"delay": delay, "gain": gain, "time_constant": time_constant}
-            found = {"settled": draws[-1].mean(), "mean_error": np.median(mean_error(runs))}
-            rows.append({"setpoint": family, **about, **found})
-    cells = claim.tables["other_plants"] = pd.DataFrame(rows)
-    paper = pd.Series({"delay": 18, "gain": 1.0, "time_constant": 1.0})
+            settles[family, constant, gain, delay] = settled(runs)
 
-    def ask(text: str, of: pd.DataFrame) -> None:
-        i = min(of.index, key=lambda i: rows[i]["settled"])
-        where = ", ".join(f"{name.replace('_', ' ')} {rows[i][name]:g}" for name in paper.index)
+    def ask(text: str, of: list[tuple[str, float, float, int]]) -> None:
+        worst = min(of, key=lambda case: settles[case].mean())
+        _, constant, gain, delay = worst
+        where = f"delay {delay:g}, gain {gain:g}, time constant {constant:g}"
         quantity = f"settled within 1,200 samples, the worst of {text} ({where})"
-        claim.ask_share(quantity, draws[i], often=True)
+        claim.ask_share(quantity, settles[worst], often=True)
 
-    for name, text, family in (
-        ("delay", "delays from 9 to 36", "set point 5 °C"),
-        ("time_constant", "time constants from 0.5 to 2 times the paper's", "set point 5 °C"),
-        *(("gain", "gains from 0.7 to 1.5 times the paper's", family) for family in families),
+    paper = (1.0, 1.0, 18)  # time constant, gain, delay
+    for place, text, family in (
+        (2, "delays from 9 to 36", "set point 5 °C"),
+        (0, "time constants from 0.5 to 2 times the paper's", "set point 5 °C"),
+        *((1, "gains from 0.7 to 1.5 times the paper's", family) for family in families),
     ):
-        others = paper.drop(name)
-        alone = (cells["setpoint"] == family) & (cells[others.index] == others).all(axis=1)
-        ask(f"{text}, {family}", cells[alone])
-    for family, those in groups(cells, "setpoint"):
+        differ = {*range(3)} - {place}
+        alone = [
+            each for each in settles
+            if each[0] == family and all(each[1:][i] == paper[i] for i in differ)
+        ]  # fmt: skip
+        ask(f"{text}, {family}", alone)
+    for family in families:
+        those = [each for each in settles if each[0] == family]
         ask(f"all {len(those)} combinations, {family}", those)
         quantity = f"combinations in which at least {OFTEN:.0%} of runs settle, {family}"
-        claim.ask(quantity, 100 * (those["settled"] >= OFTEN).mean(), "%")
+        often = np.mean([settles[each].mean() >= OFTEN for each in those])
+        claim.ask(quantity, 100 * often, "%")
 
 
 @claimed(
@@ -396,9 +388,9 @@ def direction_only(batch: Batch, claim: Claim) -> None:
     "The text gives neither their set points nor the gains, initial weights and noise behind "
     "them. `python -m benchmarks.claims figures` draws counterparts.",
 )
-def figures(batch: Batch, claim: Claim) -> None:
+def figures(batch: Batch, claim: Claim) -> pd.DataFrame:
     curves = []
     for case in FIGURES:
         agent = PIController() if case.nodes is None else batch.networks(nodes=case.nodes)
         curves.append(typical(batch.run(agent, 1200, **case.arguments)).assign(case=case.title))
-    claim.tables["figures"] = pd.concat(curves, ignore_index=True)
+    return pd.concat(curves, ignore_index=True)

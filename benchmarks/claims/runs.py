@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents import DirectNNController, PIController
 from agents.direct_nn import Weights
-from benchmarks.lib.statistics import Estimate, exact, median, quantile, share
-from benchmarks.lib.tables import percentiles
+from benchmarks.lib.statistics import Estimate, exact, median, percentiles, quantile, share
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from mptc_gym import PRESETS, Parameters
@@ -119,18 +118,17 @@ class Claim:
     statement: str
     method: str
     """Description of the test."""
-    examine: Callable[[Batch, Claim], None]
-    """Performs the runs, and records the findings with `ask`."""
+    examine: Callable[[Batch, Claim], pd.DataFrame | None]
+    """Performs the runs, records the findings with `ask`, and returns `curves`, if any."""
     findings: list[dict[str, Any]] = field(default_factory=list)
     """Rows of the table of numbers."""
-    tables: dict[str, pd.DataFrame] = field(default_factory=dict)
-    """Tables to draw, by name."""
+    curves: pd.DataFrame | None = None
+    """What is drawn: signals, a row for each sample."""
 
     def examined(self, batch: Batch) -> Claim:
         """Return the claim with its findings."""
-        claim = replace(self, findings=[], tables={})
-        self.examine(batch, claim)
-        return claim
+        claim = replace(self, findings=[])
+        return replace(claim, curves=self.examine(batch, claim))
 
     @property
     def verdict(self) -> str:
@@ -160,11 +158,10 @@ class Claim:
             found = median(found) if np.ndim(found) else exact(float(np.asarray(found)))
         bounds = {"at least": at_least, "at most": at_most}
         asked = [f"{name} {bound:g}" for name, bound in bounds.items() if math.isfinite(bound)]
-        if not asked:
-            shown = ""
-        elif at_least <= found.low and found.high <= at_most:
+        shown = ""
+        if asked and at_least <= found.low and found.high <= at_most:
             shown = "yes"
-        else:
+        elif asked:
             out = found.high < at_least or found.low > at_most
             shown = "no" if out else "undecided"
         criterion = {"criterion": " and ".join(asked), "shown": shown}
