@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
-from benchmarks.controllers.records import Tuning
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Count, Folder, Runs, command, options
 from benchmarks.lib.fan_out import FanOut, progress_bar
@@ -36,8 +35,10 @@ if TYPE_CHECKING:
 SEED = 1  # of the search
 FIRST_RUN = 3_000_000  # first seed of the runs; no comparison uses these seeds
 FINAL_RUNS, FINAL_FIRST_RUN = 1000, 4_000_000  # for judging the best again
-TUNED: dict[str, Tuning] = {name: each.tuning for name, each in ROSTER.items() if each.tuning}
-_TRIALS = ", ".join(f"{tuning.trials} for {name}" for name, tuning in TUNED.items())
+TRIALS, STARTUP = 800, 200  # of the search, and those at random before the sampler learns
+FINALISTS = 10  # of the best trials, which are evaluated again
+PENALTY = 5.0  # degC, for failing to settle: the cost of doing nothing about an error of 5 degC
+TUNED = {name: each.gains for name, each in ROSTER.items() if each.gains}
 
 PAGE = """\
 # Gains: {label}
@@ -65,9 +66,8 @@ class Options:
 
     controller: Annotated[str, Parameter(choices=TUNED)] = field(kw_only=False)
     """Whose gains to search."""
-    trials: Annotated[
-        Count | None, Parameter(help=f"How many sets of gains to try (default: {_TRIALS}).")
-    ] = None
+    trials: Count = TRIALS
+    """How many sets of gains to try."""
     runs: Runs = 100
     """Runs of each case in a trial."""
     plant: PlantOptions = field(default_factory=PlantOptions)
@@ -97,38 +97,42 @@ def work(options: Options) -> str:
     from benchmarks.lib.report import on_screen
 
     name, plant, out = options.controller, options.plant.chosen().arguments, options.out
-    tuning, judge = TUNED[name], partial(score, name, plant)
+    gains, judge = TUNED[name], partial(score, name, plant)
     study = f"{name}, {options.runs} runs, {json.dumps(plant)}, {commit()}"
     trials = search(
         study,
-        tuning,
+        gains,
         partial(judge, options.runs, FIRST_RUN),
-        options.trials or tuning.trials,
+        options.trials,
         out_folder(out) / f"{name}.csv",
     )
     # The best gains of a search owe some of their result to luck; new runs show how much.
-    best = trials.nsmallest(tuning.finalists, "objective")
-    rounded = best[[*tuning.space]].map(lambda gain: float(f"{gain:.3g}"))
+    best = trials.nsmallest(FINALISTS, "objective")
+    rounded = best[[*gains]].map(lambda gain: float(f"{gain:.3g}"))
     tasks = {
-        f"trial {i}": partial(judge, FINAL_RUNS, FINAL_FIRST_RUN, gains)
-        for i, gains in rounded.to_dict("index").items()
+        f"trial {i}": partial(judge, FINAL_RUNS, FINAL_FIRST_RUN, best_gains)
+        for i, best_gains in rounded.to_dict("index").items()
     }
     table = pd.DataFrame(options.fan_out.run(tasks, "new runs for the best").values())
     table = table.assign(**{"in the search": best["objective"].to_numpy()})
     table = table.sort_values("objective", ignore_index=True)
     page = PAGE.format(
-        name=name, label=ROSTER[name].label, penalty=tuning.penalty, trials=len(trials),
+        name=name, label=ROSTER[name].label, penalty=PENALTY, trials=len(trials),
         runs=options.runs, final=FINAL_RUNS,
         table=table.to_markdown(index=False, floatfmt=".4g"),
     )  # fmt: skip
     write_text(out / f"{name}.md", page)
-    shown = table[[*tuning.space, "objective"]].head(5).map("{:.4g}".format)
+    shown = table[[*gains, "objective"]].head(5).map("{:.4g}".format)
     print(f"The best, on {FINAL_RUNS} new runs\n{on_screen(shown)}")
     return f"All trials are in {out / name}.csv, the best in {out / name}.md"
 
 
 def search(
-    name: str, tuning: Tuning, judge: Callable[[Row], Row], count: int, path: Path
+    name: str,
+    gains: Mapping[str, tuple[float, float]],
+    judge: Callable[[Row], Row],
+    count: int,
+    path: Path,
 ) -> pd.DataFrame:
     """Try gains until there are `count` trials, and return and write one row for each.
 
@@ -151,10 +155,10 @@ def search(
                 while len(rows) < count:
                     study.sampler = optuna.samplers.TPESampler(
                         seed=SEED * 1_000_000 + len(rows),
-                        n_startup_trials=tuning.startup,
+                        n_startup_trials=STARTUP,
                         multivariate=True,
                     )
-                    new, spans = study.ask(), tuning.space.items()
+                    new, spans = study.ask(), gains.items()
                     rows.append(
                         judge({k: new.suggest_float(k, *v, log=True) for k, v in spans})
                     )
@@ -211,7 +215,7 @@ def score(name: str, plant: Mapping[str, Any], runs: int, first_run: int, gains:
         medians[case] = float(np.median(mean_error(counted)))
         if case == "constant":
             failed = 1.0 - float(settled(trajectory).mean())
-    objective = float(np.mean(list(medians.values()))) + TUNED[name].penalty * failed
+    objective = float(np.mean(list(medians.values()))) + PENALTY * failed
     return {**gains, **medians, "not converged": failed, "objective": objective}
 
 

@@ -11,8 +11,7 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 
-from benchmarks.controllers.records import Factory, RosterEntry
-from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.roster import ROSTER, Controller
 from benchmarks.lib.command import Count, Seed, command, options
 from benchmarks.lib.storage import UsageError, out_folder, replacing
 from benchmarks.loop.metrics import held
@@ -69,11 +68,11 @@ def work(options: Options) -> str:
         for each in (factory, ROSTER["nn-smith"].members()[0])
     )
     write_film(path, controller.label, case.parameters.sampling_interval, run, reference)
-    error = f"mean absolute error {np.abs(run.error).mean():.3f} °C"
+    error = f"mean absolute error {np.abs(run.next_error).mean():.3f} °C"
     return f"{controller.label} on {case.title}: {error}\nThe film is {path}"
 
 
-def show(factory: Factory, case: Scenario, seed: int, speed: int) -> str:
+def show(factory: Controller, case: Scenario, seed: int, speed: int) -> str:
     """Run a controller in a window, and return its mean error in words."""
     import pygame
 
@@ -127,7 +126,8 @@ def write_film(
         panels = figure.subplots(2, len(steps), sharex=True, sharey="row", squeeze=False)
         for column, (start, stop) in zip(panels.T, steps, strict=True):
             ours, theirs, setpoint = (
-                values[start:stop, 0] for values in (run.error, reference.error, run.setpoint)
+                values[start:stop, 0]
+                for values in (run.next_error, reference.next_error, run.setpoint)
             )
             multiples.append(np.abs(ours).mean() / np.abs(theirs).mean())
             column[0].set_title(f"from {start * interval / 60:.0f} min on: {multiples[-1]:.2f}")
@@ -177,7 +177,7 @@ def _case(options: Options) -> Scenario:
     return cases[options.scenario]
 
 
-def _controller(agent: str) -> RosterEntry:
+def _controller(agent: str) -> Controller:
     """Return the controller of a name or a location; `UsageError` if there is none."""
     from benchmarks.controllers.options import own_entry
 

@@ -1,46 +1,36 @@
-"""Scenarios, measures, tables and the comparison, on small budgets."""
+"""The comparison: measures by hand, numbers, report and pictures, and how it ends."""
 
-import _pyio
 import errno
-import io
-import itertools
 import json
 import math
 import os
 import re
-import signal
-import subprocess
-import sys
-import tempfile
-import time
+from functools import partial
 from pathlib import Path
-from unittest.mock import DEFAULT, Mock
+from unittest.mock import Mock
 
 import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
-from joblib.externals.loky import get_reusable_executor
 
 from agents import PIController
 from benchmarks.bounds.least import least_possible
-from benchmarks.compare import plots, report
+from benchmarks.compare import comparison, plots, report
 from benchmarks.compare.__main__ import main
-from benchmarks.compare.estimates import estimate, ranked, scale_of
-from benchmarks.controllers import records
+from benchmarks.compare.comparison import estimate, ranked, scale_of
 from benchmarks.controllers.roster import ROSTER, looks
-from benchmarks.lib import storage, tables
+from benchmarks.lib import storage
 from benchmarks.lib.report import Best, Section, on_screen, write_report
-from benchmarks.lib.statistics import Estimate
+from benchmarks.lib.statistics import Estimate, percentiles
 from benchmarks.loop.metrics import METRICS, measure
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
-from tests.conftest import ROOT, python, trajectory
-from tests.tasks import until
+from tests.conftest import ROOT, trajectory
 
-QUICK = "--agents pi --scenarios constant --runs 1 --jobs 1"
+GOLDEN = Path(__file__).parent / "golden"  # numbers of earlier versions
 
 
 def measured(runs, **arguments):
@@ -71,7 +61,6 @@ class TestMeasures:
             ([10, 10, 10, 0, 0, 0], [0, 10, 10, 10, 10, 0], 2),
             ([10, 10, 10, 10, 0, 0], [0, 10, 10, 9, 0, 0], math.inf),
             ([10, 10, 10, 10, 0, 0], [0, 10, 10, 10, 1, 2], math.inf),
-            ([10, 10, 10, 10, 0, 0], [0, 0, 0, 0, 0, 0], math.inf),
         ],
     )
     def test_settling(self, setpoint, output, time):
@@ -85,36 +74,15 @@ class TestMeasures:
         assert values["dead_zone_share"] == pytest.approx(100 * 2 / 6)
         assert values["saturation_share"] == pytest.approx(100 * 2 / 6)
 
-
-def test_a_controller_has_one_look_wherever_it_is_listed():
-    everyone = looks([*ROSTER, "mine", "yours"])
-    assert len(set(everyone.values())) == len(everyone)
-    assert looks(["mine", "pi"]) == {"mine": everyone["mine"], "pi": everyone["pi"]}
-
-
-class TestTables:
-    def test_percentiles_where_some_do_not_settle(self):
-        found = tables.percentiles(np.array([1.0, 2.0, 3.0, np.inf]))
-        assert found == {"median": 3.0, "p10": 2.0, "p90": np.inf}
-
-    @pytest.mark.parametrize("width", [40, 80, 200])
-    def test_on_screen_nothing_is_cut(self, width, monkeypatch):
-        monkeypatch.setenv("COLUMNS", str(width))
-        cells = {f"square-dead-zone-{i}": ["1.00 (0.99 to 1.01)", "11.5"] for i in range(7)}
-        table = pd.DataFrame({"agent": ["neural self-tuning", "NN (1992)"], **cells})
-        shown = on_screen(table)
-        assert width / 2 < max(map(len, shown.splitlines())) <= width
-        assert shown.count("11.5") == shown.count("1.00 (0.99 to 1.01)") == 7
-
-    def test_of_numbers_and_estimates_in_csv(self, tmp_path):
-        columns = {
-            "a": ["x", "y"],
-            "s": [1.5, np.inf],
-            "e": [Estimate(2.0, 1.0, 3.0, 4), np.nan],
-        }
-        report.write_numbers(tmp_path / "table.csv", pd.DataFrame(columns))
-        written = (tmp_path / "table.csv").read_text()
-        assert written == "a,s,e,e_low,e_high\nx,1.5,2.0,1.0,3.0\ny,not settled,,,\n"
+    def test_samples_line_up(self):
+        runs = rollout(make_plants(1, 50, setpoint=5.0), PIController(2.2, 0.3), 50, seed=0)
+        error = runs.setpoint - runs.output
+        law = -2.2 * error - 0.3 * np.cumsum(error, axis=0)
+        # u(k) is in the row of e(k), and u(0) shows in row 19.
+        np.testing.assert_allclose(runs.command, law, rtol=1e-6)
+        assert np.all(runs.output[:19] == 0.0)
+        assert runs.output[19] == pytest.approx(0.456)
+        np.testing.assert_array_equal(runs.next_error[:-1], error[1:])
 
 
 def some_runs(**errors):
@@ -143,14 +111,6 @@ class TestEstimates:
         assert math.isnan(nn["difference"])
         assert nn["mean"].low < nn["mean"].value < nn["mean"].high
 
-    def test_one_run_of_many_has_no_interval(self):
-        scale = scale_of(SCENARIOS["constant-noise"], 1)
-        found = estimate(some_runs(a=[[0.5]], b=[[2.0]]), scale, "a")
-        assert [format(mean, ".1f") for mean in found["mean"]] == [
-            "0.5 (one run)",
-            "2.0 (one run)",
-        ]
-
     def test_a_score_by_hand_and_the_best_comes_first(self):
         scales = {name: scale_of(SCENARIOS[name], 1) for name in ("constant", "square")}
         rows = []
@@ -168,77 +128,101 @@ class TestEstimates:
         assert (best["controller"], best["travel (t/h)"], best["square"]) == ("b", "12", "0.75")
         assert (other["controller"], other["constant"]) == ("a", "0.25")
 
+    @pytest.mark.parametrize("agent", ["mpc", "self-tuning", "smith"])
+    def test_runs_that_are_alike_are_what_each_of_them_is(self, agent, monkeypatch):
+        once = comparison.run_case(SCENARIOS["constant"], ROSTER[agent], 3)
+        monkeypatch.setattr(comparison, "is_random", lambda _: True)
+        each = comparison.run_case(SCENARIOS["constant"], ROSTER[agent], 3)
+        pd.testing.assert_frame_equal(once.runs, each.runs, rtol=1e-12)
+        pd.testing.assert_frame_equal(once.responses, each.responses, rtol=1e-12)
+
 
 class TestReport:
     def test_pages(self, tmp_path):
         (tmp_path / "picture.png").write_bytes(b"\x89PNG")
         table = pd.DataFrame({"name": [Best("a < b|c")], "value": ["1.0 (0.9 to 1.1)"]})
-        sections = [
-            Section("First", ["Some text."], table, {"picture.png": "A picture"}),
-            Section("Second"),
-        ]
+        pictures = {"picture.png": "What <it> shows"}
+        sections = [Section("First", ["Some text."], table, pictures), Section("Second")]
         write_report(tmp_path, "Title", sections, "made today")
         page = (tmp_path / "report.md").read_text()
         assert page.startswith("# Title\n\n## First\n\nSome text.\n\n| name")
         assert page.endswith("\n\nmade today\n")
-        assert "![A picture](picture.png)" in page
-        html = (tmp_path / "report.html").read_text()
-        assert "<strong>a &lt; b|c</strong>" in html
+        assert "![What &lt;it> shows](picture.png)" in page
         assert r"| **a &lt; b\|c** | 1.0 (0.9 to 1.1) |" in page
-        assert 'name="viewport"' in html
-        assert "made today" in html
-        assert 'src="data:image/png;base64,iVBORw=="' in html
-        assert "1.0 <small>(0.9 to 1.1)</small></td>" in html
+        html = (tmp_path / "report.html").read_text()
+        for part in (
+            "<strong>a &lt; b|c</strong>", 'name="viewport"', "made today", ">First</h2>",
+            "color-scheme: light dark", 'src="data:image/png;base64,iVBORw=="',
+            "1.0 <small>(0.9 to 1.1)</small></td>", 'alt="What &lt;it&gt; shows"',
+        ):  # fmt: skip
+            assert part in html
         assert "http" not in html  # nothing is fetched
 
+    @pytest.mark.parametrize("width", [40, 60, 200])
+    def test_on_screen_nothing_is_cut(self, width, monkeypatch):
+        monkeypatch.setenv("COLUMNS", str(width))
+        cells = {f"square-dead-zone-{i}": ["1.00 (0.99 to 1.01)", "11.5"] for i in range(7)}
+        table = pd.DataFrame({"agent": ["neural self-tuning", "NN (1992)"], **cells})
+        shown = on_screen(table)
+        assert width / 2 < max(map(len, shown.splitlines())) <= width
+        assert shown.count("11.5") == shown.count("1.00 (0.99 to 1.01)") == 7
 
-def test_samples_line_up():
-    runs = rollout(make_plants(1, 50, setpoint=5.0), PIController(2.2, 0.3), 50, seed=0)
-    error = runs.setpoint - runs.output
-    law = -2.2 * error - 0.3 * np.cumsum(error, axis=0)
-    np.testing.assert_allclose(runs.command, law, rtol=1e-6)  # u(k) is in the row of e(k) ...
-    assert np.all(runs.output[:19] == 0.0)
-    assert runs.output[19] == pytest.approx(0.456)  # ... and u(0) shows in row 19
+    def test_numbers_and_estimates_in_csv(self, tmp_path):
+        columns = {
+            "a": ["x", "y"],
+            "s": [1.5, np.inf],
+            "e": [Estimate(2.0, 1.0, 3.0, 4), np.nan],
+        }
+        report.write_numbers(tmp_path / "table.csv", pd.DataFrame(columns))
+        written = (tmp_path / "table.csv").read_bytes()
+        assert written == b"a,s,e,e_low,e_high\nx,1.5,2.0,1.0,3.0\ny,not settled,,,\n"
+
+    def test_percentiles_where_some_do_not_settle(self):
+        found = percentiles(np.array([1.0, 2.0, 3.0, np.inf]))
+        assert found == {"median": 3.0, "p10": 2.0, "p90": np.inf}
+
+    def test_titles_say_what_the_numbers_say(self):
+        def scores(**values):
+            return {name: (Estimate(x, x, x, 1), {}) for name, x in values.items()}
+
+        found = scores(mpc=0.998, smith=0.997, pi=0.5)
+        closest = "Smith comes closest to the least possible error: 0.997"
+        assert plots._finding(found, ["mpc"]) == f"{closest} (MPC 0.998, told the plant)"
+        assert "told the plant, has a score of 0.9" in plots._finding(scores(mpc=0.9), ["mpc"])
+        travels = pd.Series({"smith": 300.0, "mpc": 100.0, "pi": 50.0})
+        assert "MPC moves the valve least: 100" in plots._calmest(travels, found)
+        alone = scores(smith=0.997, pi=0.5)
+        assert "Smith alone is near the best score: 300" in plots._calmest(
+            travels[["smith", "pi"]], alone
+        )
 
 
-class TestStorage:
-    @pytest.mark.parametrize(
-        ("error", "raised"),
-        [
-            (KeyboardInterrupt(), KeyboardInterrupt),
-            (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), storage.UnfinishedError),
-        ],
-    )
-    def test_a_failed_write_leaves_the_old_file(self, error, raised, tmp_path):
-        path = tmp_path / "file.txt"
-        storage.write_text(path, "old")
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [
+        (KeyboardInterrupt(), KeyboardInterrupt),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), storage.UnfinishedError),
+    ],
+)
+def test_a_failed_write_leaves_the_old_file(error, raised, tmp_path):
+    path = tmp_path / "file.txt"
+    storage.write_text(path, "old")
 
-        def write_half():
-            with storage.replacing(path) as partial:
-                partial.write_text("half of the n")
-                raise error
+    def write_half():
+        with storage.replacing(path) as partial:
+            partial.write_text("half of the n")
+            raise error
 
-        with pytest.raises(raised, match=r"file\.txt .* No space left|^$"):
-            write_half()
-        assert path.read_text() == "old"
-        assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(raised, match=r"file\.txt .* No space left|^$"):
+        write_half()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
 
-    def test_a_folder_that_is_a_file(self, tmp_path):
-        path = tmp_path / "file" / "table.csv"
-        path.parent.write_text("in the way")
-        with pytest.raises(storage.UnfinishedError, match=r"table\.csv could not be written"):
-            storage.write_text(path, "new")
 
-    def test_lines_end_alike_on_every_system(self, tmp_path, monkeypatch):
-        # Python's own model of its files, as it ends lines on Windows.
-        monkeypatch.setattr(io, "open", _pyio.open)
-        monkeypatch.setattr(os, "linesep", "\r\n")
-        (tmp_path / "control").write_text("a\n", encoding="utf-8")
-        assert (tmp_path / "control").read_bytes() == b"a\r\n"
-        storage.write_text(tmp_path / "page.md", "a\nb\n")
-        assert (tmp_path / "page.md").read_bytes() == b"a\nb\n"
-        tables.write_csv(tmp_path / "table.csv", pd.DataFrame({"a": [1, 2]}))
-        assert (tmp_path / "table.csv").read_bytes() == b"a\n1\n2\n"
+def test_a_controller_has_one_look_wherever_it_is_listed():
+    everyone = looks([*ROSTER, "mine", "yours"])
+    assert len(set(everyone.values())) == len(everyone)
+    assert looks(["mine", "pi"]) == {"mine": everyone["mine"], "pi": everyone["pi"]}
 
 
 @pytest.fixture
@@ -261,252 +245,96 @@ def undrawn(monkeypatch):
     monkeypatch.setattr(report, "_draw", lambda *_: "left out")
 
 
+def assert_golden(found, name):
+    """Compare a table with that of an earlier version."""
+    read = partial(pd.read_csv, na_values=["not settled"])
+    pd.testing.assert_frame_equal(read(found), read(GOLDEN / name), rtol=1e-8, atol=1e-10)
+
+
 class TestCompare:
     def test_files_and_their_contents(self, compared, capsys):
-        out = compared("--agents nn pi --scenarios constant constant-noise --runs 3")
-        runs = pd.read_csv(out / "runs.csv")
-        assert list(runs.columns) == ["scenario", "agent", "policy", "seed", *METRICS]
-        cells = [(s, a) for a in ("nn", "pi") for s in ("constant", "constant-noise")]
-        expected = [(s, a, 0, SEED + i) for s, a in cells for i in range(3)]
-        assert list(runs.iloc[:, :4].itertuples(index=False, name=None)) == expected
-        # The paper's PI is the same in every run without noise, and never settles.
-        pi = runs[(runs.agent == "pi") & (runs.scenario == "constant")]
-        assert pi["mae"].nunique() == 1
-        assert pi["mae"].iloc[0] == pytest.approx(1.6, abs=0.05)
-        assert set(pi["settling_time"]) == {"not settled"}
-
-        summary = pd.read_csv(out / "summary.csv")
-        row = summary.query("agent == 'nn' and scenario == 'constant' and metric == 'mae'")
-        nn = runs[(runs.agent == "nn") & (runs.scenario == "constant")]["mae"]
-        assert float(row["median"].iloc[0]) == pytest.approx(nn.median())
-        assert float(row["p90"].iloc[0]) == pytest.approx(nn.quantile(0.9))
-
+        out = compared("--agents nn pi mpc --scenarios constant constant-noise --runs 3")
+        for name in ("runs", "summary", "estimates"):
+            assert_golden(out / f"{name}.csv", f"compare_{name}.csv")
         limit = least_possible(samples=600, kind="reference", setpoint=5.0).value
+        error = pd.read_csv(out / "runs.csv").query("agent == 'pi'")["mae"].iloc[0]
         page, screen = (out / "report.md").read_text(), capsys.readouterr().out
         for shown in (page, (out / "report.html").read_text(), screen):
             assert f"{limit:.3f}" in shown
-            assert f"{pi['mae'].iloc[0] / limit:.2f}" in shown
-        assert f"{nn.median():.3f}" in page
+            assert f"{error / limit:.2f}" in shown
         assert "not settled" in page
-        assert page.index("| **NN (1992)**") < page.index("| PI (1992)")  # the best comes first
-
+        # The best comes first.
+        assert page.index("| **MPC**") < page.index("| NN (1992)") < page.index("| PI (1992)")
+        assert "6 gains by 800 trials: 566 M samples" in page
         provenance = json.loads((out / "provenance.json").read_text())
         assert provenance["complete"] is True
         assert provenance["seeds"] == [SEED, SEED + 1, SEED + 2]
-        assert provenance["options"]["agents"] == ["nn", "pi"]
-        assert {"gymnasium", "numpy", "torch"} <= set(provenance["versions"])
-
-        responses = pd.read_csv(out / "constant.csv")
-        assert len(responses) == 2 * 600
-        assert (responses["output_p10"] <= responses["output_p90"]).all()
-        for name in ("constant.png", "constant-noise.png", "bounds.png", "scores.png"):
-            picture = matplotlib.image.imread(out / name)
+        assert provenance["options"]["agents"] == ["nn", "pi", "mpc"]
+        assert {"gymnasium", "numpy"} <= set(provenance["versions"])
+        assert len(pd.read_csv(out / "constant.csv")) == 2 * 600 + 600
+        for name in ("constant", "constant-noise", "bounds", "scores", "travel"):
+            picture = matplotlib.image.imread(out / f"{name}.png")
             assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
 
-    def test_the_count_of_cores_changes_no_number(self, compared, tmp_path, monkeypatch):
-        (tmp_path / "locked.py").write_text(
-            "import threading\n"
-            "from agents import PIController\n"
-            "class Factory:\n"
-            "    lock = None\n"
-            "    def __init__(self): self.lock = threading.Lock()  # which cannot be pickled\n"
-            "    def __call__(self): return PIController(kp=1.0, ki=0.02)\n"
-            "    __module__ = 'locked'\n"
-            "make = Factory()\n"
-        )
-        monkeypatch.syspath_prepend(tmp_path)
-        get_reusable_executor().shutdown()  # whose processes know another path
-        given = "--agents nn pi --agent bounds=locked:make --scenarios constant-noise constant"
+    @pytest.mark.usefixtures("undrawn")
+    def test_the_count_of_cores_changes_no_number(self, compared):
         for jobs in ("1", "2"):
-            compared(f"{given} --runs 2 --jobs {jobs}", into=jobs)
+            compared(
+                f"--agents nn ppo --scenarios constant-noise --runs 2 --jobs {jobs}", into=jobs
+            )
+        one, two = (Path(compared.__closure__[0].cell_contents) / jobs for jobs in ("1", "2"))
         for name in ("runs.csv", "summary.csv", "estimates.csv", "constant-noise.csv"):
-            one, two = ((tmp_path / jobs / name).read_bytes() for jobs in ("1", "2"))
-            assert one == two
-            assert b"bounds" in one
+            assert (one / name).read_bytes() == (two / name).read_bytes()
+        assert sorted(pd.read_csv(one / "runs.csv")["policy"].unique()) == [*range(5)]
 
     def test_a_picture_that_cannot_be_drawn_is_a_sentence(self, compared, monkeypatch):
         error = ValueError("Axis limits cannot be NaN or Inf")
         monkeypatch.setattr(plots, "plot_travel", Mock(side_effect=error))
-        page = (compared(QUICK) / "report.md").read_text()
+        out = compared("--agents nothing --scenarios constant-noise --runs 1")
+        page = (out / "report.md").read_text()
+        assert page.count("could not be drawn") == 1
         assert "travel.png could not be drawn (ValueError: Axis limits cannot be" in page
         assert "(travel.png)" not in page
-
-    @pytest.mark.parametrize("agents", ["pi pi-simc", "nothing"])
-    def test_one_run_in_noise_is_drawn(self, agents, compared):
-        out = compared(f"--agents {agents} --scenarios constant-noise --runs 1")
-        page = (out / "report.md").read_text()
-        assert "could not be drawn" not in page
         assert "(one run)" in page
 
     @pytest.mark.usefixtures("undrawn")
     def test_a_row_of_the_presets_is_what_evaluate_says(self, compared):
-        parts = {"hard": ["nn", "nn-smith", "pi-simc"], "noisy": ["mpc"]}
-        folders = [
-            compared(f"--presets --runs 2 --scenarios {preset} --agents", *agents, into=preset)
-            for preset, agents in parts.items()
-        ]
-        runs, estimates = (
-            pd.concat([pd.read_csv(folder / name) for folder in folders])
-            .set_index(["agent", "scenario"])
-            .sort_index()
-            for name in ("runs.csv", "estimates.csv")
-        )
-        assert (estimates["ratio"] > 1.0).all()
-        for agent, preset in runs.index.unique():
-            factory = ROSTER[agent].members()[0]
-            controller = factory(PRESETS[preset], 2, SEED)
-            found = evaluate(controller, IDS[preset], episodes=2, **factory.observation)
-            row = runs.loc[agent, preset]
+        out = compared("--presets --runs 2 --scenarios hard --agents nn nn-smith mpc")
+        runs = pd.read_csv(out / "runs.csv").set_index("agent")
+        estimates = pd.read_csv(out / "estimates.csv").set_index("agent")
+        for agent in estimates.index:
+            member = ROSTER[agent].members()[0]
+            controller = member(PRESETS["hard"], 2, SEED)
+            found = evaluate(controller, IDS["hard"], episodes=2, **member.observation)
+            row, against = runs.loc[agent], estimates.loc[agent]
             assert list(row["seed"]) == list(found.seeds)
             np.testing.assert_allclose(row["mae"], found.errors, rtol=0, atol=1e-12)
             np.testing.assert_allclose(row["total_variation"], found.travels, atol=1e-9)
-            against = estimates.loc[agent, preset]
             assert against["limit"] == pytest.approx(found.least_possible, abs=1e-12)
             assert against["ratio"] == pytest.approx(found.multiple, abs=1e-12)
 
-    def test_policies_are_loaded_and_none_is_trained(self, compared):
-        out = compared("--agents ppo --scenarios constant --runs 1 --jobs 1")
-        files = [f"ppo-{seed}.npz" for seed in range(10_000, 10_005)]
-        provenance = json.loads((out / "provenance.json").read_text())
-        assert [each["file"] for each in provenance["policies"]["ppo"]] == files
-        assert list(pd.read_csv(out / "runs.csv")["policy"]) == [*range(5)]
-
     @pytest.mark.usefixtures("undrawn")
-    def test_the_example_of_the_page(self, compared, tmp_path, monkeypatch):
+    def test_the_example_of_the_page_and_a_bad_one_beside_it(
+        self, compared, tmp_path, monkeypatch, capsys
+    ):
         readme = (ROOT / "benchmarks/compare/README.md").read_text(encoding="utf-8")
         (example,) = re.findall(r"```python\n(from agents import PIC.*?)```", readme, re.DOTALL)
         (option,) = re.findall(r"--agent (\w+=my_\S+)`", readme)
         (tmp_path / "my_controllers.py").write_text(example)
         monkeypatch.syspath_prepend(tmp_path)
-        out = compared(f"--agents --agent {option} --scenarios constant --runs 1")
+        bad = "--agent bad=nowhere:Mine --agent worse=my_controllers:PIController.x"
+        given = f"--agents --agent {option} {bad} --scenarios constant --runs 1"
+        out = compared(given, status=1)
         runs = pd.read_csv(out / "runs.csv")
-        assert runs["mae"].iloc[0] == pytest.approx(0.283, abs=0.001)  # that of the gains
-
-    @pytest.fixture
-    def stopped(self, compared, monkeypatch, capsys):
-        """Return a function whose runs end in an error, and which returns what is said."""
-
-        def stopped(error, after, status=130):
-            ends = itertools.chain([DEFAULT] * after, itertools.repeat(error))
-            monkeypatch.setattr(records, "rollout", Mock(wraps=rollout, side_effect=ends))
-            compared("--agents pi nn --scenarios constant square --runs 1", status=status)
-            return capsys.readouterr().out
-
-        return stopped
-
-    @staticmethod
-    def assert_the_first_are_kept(out, count):
-        kept = ["constant", "square", "square"][:count]
-        assert list(pd.read_csv(out / "runs.csv")["scenario"]) == kept
+        assert runs["mae"].tolist() == pytest.approx([0.283], abs=0.001)  # that of the gains
+        said = capsys.readouterr().out
+        assert "2 of 4 tasks failed; the others are done" in said
+        assert "bad, constant: " in said
+        assert "--agent: 'nowhere:Mine' cannot be imported: ModuleNotFoundError" in said
+        assert (out / "report.md").exists()
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
 
-    @pytest.mark.parametrize(
-        ("error", "after", "status", "said"),
-        [
-            (KeyboardInterrupt, 3, 130, ["Interrupted"]),
-            (ZeroDivisionError, 2, 1, ["nn, constant: ZeroDiv", "nn, square: ZeroDiv"]),
-        ],
-    )
-    def test_a_run_that_is_stopped_and_one_that_fails_keep_what_they_have(
-        self, error, after, status, said, stopped, tmp_path
-    ):
-        shown = stopped(error, after, status)
-        assert all(words in shown for words in said)
-        self.assert_the_first_are_kept(tmp_path / "out", after)
-        assert (tmp_path / "out/report.md").exists()
-        assert (tmp_path / "out/square.png").exists()
-
-    @pytest.mark.skipif(sys.platform == "win32", reason="no SIGTERM to another process")
-    @pytest.mark.parametrize("jobs", ["1", "2"])
-    def test_a_termination_leaves_what_has_finished(self, jobs, tmp_path):
-        (tmp_path / "endless.py").write_text(
-            "import pathlib, time\nfrom agents import PIController\n\n\n"
-            "class Endless(PIController):\n"
-            "    def act(self, seen):\n"
-            "        if len(seen) == 3:\n"
-            "            pathlib.Path(__file__).with_name('begun').touch()\n"
-            "            time.sleep(300)\n"
-            "        return super().act(seen)\n"
-        )
-        given = (
-            "benchmarks.compare --agents pi --agent own=endless:Endless --scenarios constant "
-            "--runs 3 --jobs"
-        )
-        with subprocess.Popen(
-            [sys.executable, "-m", *given.split(), jobs, "--out", tmp_path],
-            cwd=ROOT, env=os.environ | {"PYTHONPATH": str(tmp_path)}, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        ) as run:  # fmt: skip
-            until((tmp_path / "begun").exists, 60.0)
-            time.sleep(0.5)  # while the process before it is heard
-            run.send_signal(signal.SIGTERM)
-            said, _ = run.communicate(timeout=60)
-        assert run.returncode == 128 + signal.SIGTERM
-        assert "Interrupted: what has finished is written" in said
-        assert pd.read_csv(tmp_path / "runs.csv")["agent"].tolist() == ["pi"] * 3
-        assert "PI" in (tmp_path / "report.md").read_text()
-
     @pytest.mark.usefixtures("undrawn")
-    def test_a_second_interruption_while_the_report_is_written(
-        self, stopped, tmp_path, monkeypatch
-    ):
-        monkeypatch.setattr(report, "write_report", Mock(side_effect=KeyboardInterrupt))
-        assert "Interrupted" in stopped(KeyboardInterrupt, after=2)
-        self.assert_the_first_are_kept(tmp_path / "out", 2)
-
-    def test_a_folder_that_cannot_be_written_to(self, tmp_path, monkeypatch, refused):
-        (tmp_path / "file").write_text("in the way")
-        monkeypatch.setattr(records, "rollout", None)  # nothing is run before
-        for out in (tmp_path / "file", tmp_path / "file" / "below"):
-            assert f"--out: {out} cannot be written to" in refused(main, ["--out", out])
-
-        read_only = OSError(errno.EROFS, os.strerror(errno.EROFS))
-        monkeypatch.setattr(tempfile, "TemporaryFile", Mock(side_effect=read_only))
-        assert "Read-only file system" in refused(main, ["--out", tmp_path / "out"])
-
-    @pytest.mark.parametrize("name", ["runs.csv", "bounds.png"])
-    def test_a_disk_that_gets_full(self, name, compared, monkeypatch, capsys):
-        real = Path.replace
-
-        def replace(self, target):
-            if Path(target).name == name:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            return real(self, target)
-
-        monkeypatch.setattr(Path, "replace", replace)
-        out = compared(QUICK, status=1)
-        shown = capsys.readouterr().out
-        assert f"{name} could not be written: No space left on device" in shown
-        assert not list(out.glob(".*"))
-
-    def test_interrupted_before_anything_has_finished(self, stopped, tmp_path):
-        runs = tmp_path / "out" / "runs.csv"
-        runs.parent.mkdir()
-        runs.write_text("of an earlier run")
-        stopped(KeyboardInterrupt, after=0)
-        assert runs.read_text() == "of an earlier run"
-
-    def test_as_a_command(self, tmp_path):
-        command = ["-m", "benchmarks.compare", *QUICK.split(), "--out", str(tmp_path / "out")]
-        # Neither a backend that there is not nor a terminal without ° stops it.
-        odd = os.environ | {"MPLBACKEND": "nonsense", "PYTHONIOENCODING": "ascii"}
-        done = python(*command, env=odd, check=True)
-        assert "0.709" in done.stdout
-        assert "(?C)" in done.stdout
-        assert (tmp_path / "out/report.md").exists()
-
-
-@pytest.mark.usefixtures("undrawn")
-class TestOtherPlants:
-    @pytest.mark.parametrize(("preset", "drawn"), [("disturbed", False), ("hard", True)])
-    def test_what_needs_the_actuators_numbers_is_not_measured_where_they_are_drawn(
-        self, preset, drawn, compared
-    ):
-        out = compared(f"--preset {preset} --agents nothing pi --runs 2")
-        report = (out / "report.md").read_text()
-        assert "| PI" in report
-        assert ("not measured" in report) is drawn
-
     def test_controllers_are_told_about_the_plant_that_is_run(self, compared, tmp_path):
         plant = {"b": [0.04560, 0.00404], "delay": 9, "a": [1, -0.9]}
         (tmp_path / "plant.json").write_text(json.dumps(plant))
@@ -518,8 +346,12 @@ class TestOtherPlants:
         provenance = json.loads((out / "provenance.json").read_text())
         assert provenance["scenarios"]["square"]["arguments"] == plant
 
-    def test_a_part_goes_to_a_folder_of_its_own(self, tmp_path, monkeypatch):
+    @pytest.mark.usefixtures("undrawn")
+    def test_where_limits_are_drawn_shares_are_not_measured(
+        self, compared, monkeypatch, tmp_path
+    ):
         monkeypatch.chdir(tmp_path)
-        assert main([*QUICK.split(), "--set", "delay=30"]) == 0
-        (folder,) = (tmp_path / "results").iterdir()
-        assert folder.name == "compare-pi-constant-delay-30-1-runs"
+        assert main(["--preset", "hard", "--agents", "pi", "--runs", "2", "--jobs", "1"]) == 0
+        (folder,) = (tmp_path / "results").iterdir()  # of its own, as it is a part
+        assert folder.name == "compare-pi-hard-2-runs"
+        assert "not measured" in (folder / "report.md").read_text()

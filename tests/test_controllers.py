@@ -12,12 +12,12 @@ from gymnasium.wrappers import DelayObservation
 from stable_baselines3 import PPO
 
 from benchmarks.compare.comparison import run_case
-from benchmarks.controllers.options import chosen, own_factory
+from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import UsageError
+from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import IdleValve
 from benchmarks.loop.scenarios import Scenario
-from benchmarks.sweep import SETPOINT, run_agent
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from mptc_gym.sb3 import load, make_vec_env, save, spec_of
@@ -37,39 +37,34 @@ def entry(request):
 
 
 @pytest.fixture
-def factory(entry):
+def member(entry):
     return entry.members()[0]
 
 
-def test_every_command_tells_it_the_plant_that_it_is_made_for(entry, factory, monkeypatch):
+def test_it_is_told_the_plant_that_it_is_made_for(entry, member):
     plant = ACTUATOR if entry.name in UNTOLD else OTHER
-    monkeypatch.setattr(type(entry), "members", lambda *_: [factory])
-    scenario = Scenario("other", "", 900, plant)
-    ways = {
-        "compare": run_case(scenario, entry.name, [factory], 2)["runs"]["mae"],
-        "sweep": run_agent(factory, plant, {**plant, **SETPOINT}, 900, 2)["mae"],
-    }
-    for way, found in ways.items():
-        if entry.name == "nothing":
-            assert np.allclose(found, IDLE), way
-        else:
-            assert np.all(np.array(found) < 0.7 * IDLE), (way, found)
-    if factory.learns:  # in a sweep it has learnt before, on this plant
-        assert np.mean(ways["sweep"]) < 0.9 * np.mean(ways["compare"])
+    found = run_case(Scenario("other", "", 900, plant), member, 2).runs["mae"].to_numpy()
+    if entry.name == "nothing":
+        np.testing.assert_allclose(found, IDLE)
+        return
+    assert (found < 0.7 * IDLE).all()
+    if member.learns:  # in service it has learnt before, on this plant
+        learnt = member.run(plant, 900, 2, SEED, member.in_service(plant, 2, SEED))
+        assert mean_error(learnt).mean() < 0.9 * found.mean()
 
 
 @pytest.fixture
-def run(factory):
+def run(member):
     """Run plants with a limit that is nearer on one side, and set points beyond it."""
 
     def run(runs, seed, sign=1.0, again=False):
         limits = {"u_min": -6.0, "u_max": 10.0} if sign > 0 else {"u_min": -10.0, "u_max": 6.0}
         plant = {**limits, "b": [sign * b for b in Parameters().b], "noise_variance": 0.1}
-        controller = factory(plant, runs, seed)
+        controller = member(plant, runs, seed)
         plant["setpoint_amplitude"] = 6.0
         if again:
-            factory.run(plant, 700, runs, seed + 50, controller)
-        return factory.run(plant, 700, runs, seed, controller)
+            member.run(plant, 700, runs, seed + 50, controller)
+        return member.run(plant, 700, runs, seed, controller)
 
     return run
 
@@ -82,14 +77,14 @@ def test_a_batch_does_what_its_members_do_alone(entry, run):
         np.testing.assert_allclose(run(1, 5 + i).command[:, 0], batch.command[:, i], atol=1e-3)
 
 
-def test_an_episode_leaves_nothing_behind_but_what_is_learnt(entry, factory, run):
+def test_an_episode_leaves_nothing_behind_but_what_is_learnt(member, run):
     same = np.array_equal(run(2, 5).command, run(2, 5, again=True).command)
-    assert same is not factory.learns
+    assert same is not member.learns
 
 
-def test_a_mirrored_plant_gets_the_mirrored_flow(entry, factory, run):
+def test_a_mirrored_plant_gets_the_mirrored_flow(entry, run):
     # Policies trained on the paper's plant are not told another; initial weights are random.
-    if entry.name in (*UNTOLD, "nn", "nn-frozen"):
+    if entry.name in UNTOLD or entry.random:
         return
     ours, theirs = run(2, 3), run(2, 3, sign=-1.0)
     # Actions have 24 bits, which limits the agreement.
@@ -99,30 +94,27 @@ def test_a_mirrored_plant_gets_the_mirrored_flow(entry, factory, run):
         assert (ours.command > 9.99).any()  # the limits, and anti-windup, had a part
 
 
-@pytest.mark.parametrize(
-    "windows", [{"setpoint_window": 7}, {"setpoint_window": 0}, {"error_window": 0}], ids=str
-)
-def test_it_asks_for_its_own_windows(factory, windows):
-    assert errors(factory, 1, 60, **windows) == errors(factory, 1, 60)
+@pytest.mark.parametrize("windows", [{"setpoint_window": 7}, {"error_window": 0}], ids=str)
+def test_it_asks_for_its_own_windows(member, windows):
+    assert errors(member, 1, 60, **windows) == errors(member, 1, 60)
 
 
-@pytest.mark.parametrize(
-    "copied", [copy.deepcopy, lambda controller: pickle.loads(pickle.dumps(controller))]
-)
-def test_a_copy_goes_on_like_the_original_in_mid_episode(factory, copied, rng):
-    controller = factory(ACTUATOR, 2, 5)
-    size = Parameters(**factory.arguments(ACTUATOR)).observation_size
+def test_a_copy_goes_on_like_the_original_in_mid_episode(member, rng):
+    controller = member(ACTUATOR, 2, 5)
+    size = Parameters(**member.arguments(ACTUATOR)).observation_size
     before, after = np.float32(rng.uniform(-3, 3, (2, 30, 2, size)))
     for observation in before:
         controller.act(observation)
-    twin = copied(controller)
+    twins = copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))
     ours = [controller.act(observation) for observation in after]
-    np.testing.assert_array_equal([twin.act(observation) for observation in after], ours)
+    for twin in twins:
+        np.testing.assert_array_equal([twin.act(observation) for observation in after], ours)
     assert len(np.unique(ours)) > 1 or isinstance(controller, IdleValve)
 
 
-def test_its_cost_is_known(factory):
-    assert factory.cost.prior_knowledge
+def test_what_it_knows_and_what_was_searched_for_it_are_said(entry):
+    assert entry.knows
+    assert entry.searched
 
 
 @pytest.fixture
@@ -137,8 +129,12 @@ def written(tmp_path, monkeypatch):
     return write
 
 
+def members_of(*locations):
+    return chosen([], [f"mine={each}" for each in locations])["mine"].members()
+
+
 class TestOwnControllers:
-    """What is no controller is named before anything runs."""
+    """What is no controller is named by the tasks that need it."""
 
     def test_a_factory_gets_what_it_asks_for(self, written):
         code = (
@@ -148,48 +144,50 @@ class TestOwnControllers:
             "    act = lambda self, o: 0.0 * o[:, :1]\n"
         )
         named = code.format("num_envs, seed, parameters, gain=2", "locals()")
-        some = own_factory(written(named))
+        (some,) = members_of(written(named))
         given = some({"delay": 3}, 3, 7).given
         assert (given["num_envs"], given["seed"], given["gain"]) == (3, 7, 2)
         assert given["parameters"].delay == 3
-        everything = own_factory(written(code.format("**offered", "offered")))
+        (everything,) = members_of(written(code.format("**offered", "offered")))
         assert set(everything({}, 3, 7).given) == {
             "num_envs", "seed", "u_min", "u_max", "parameters",
         }  # fmt: skip
 
-    @pytest.mark.parametrize("code", ["def Mine(:", "Mine = unknown", "raise SystemExit(3)"])
-    def test_a_module_that_cannot_be_imported_is_named(self, written, code):
-        location = written(code)
-        with pytest.raises(UsageError, match=rf"--agent: '{location}' cannot be imported: \w+"):
-            chosen([], [f"mine={location}"])
-
     def test_those_of_the_project_ask_for_their_windows(self):
-        factory = own_factory("agents:PIController")
-        assert errors(factory, 1, 60, setpoint_window=7) == errors(factory, 1, 60)
+        (member,) = members_of("agents:PIController")
+        assert errors(member, 1, 60, setpoint_window=7) == errors(member, 1, 60)
 
-    @pytest.mark.parametrize(
-        "location",
-        ["agents", "agents:", "agents:No", "agents:__name__", "nowhere:x", ".:y", "..a:y"],
-    )
+    @pytest.mark.parametrize("location", ["agents", "agents:No", "nowhere:x", ".:y", "..a:y"])
     def test_bad_locations(self, location):
         with pytest.raises(UsageError, match=re.escape(f"--agent: {location!r} ")):
-            chosen([], [f"mine={location}"])
+            members_of(location)
 
     @pytest.mark.parametrize(
-        ("body", "complaint"),
+        ("code", "complaint"),
         [
-            ("pass", "policy must be a function, or an object with predict or act"),
-            ("observation = 3", "observation of .* must be a dict"),
-            ("observation = ['error_window']", "observation of .* must be a dict"),
-            ("observation = {'dead_zone': 0.0}", "out of .* got {'dead_zone': 0.0}"),
-            ("reset = dict; act = lambda self, o: 0.0", r"shape \(2, 6\).*got \(\)"),
-            ("reset = dict; act = lambda self, o: float(o)", "it raised TypeError"),
-            ("__init__ = lambda self, gain: None", "it raised TypeError.*'gain'"),
+            ("def Mine(:", "--agent: .* cannot be imported: SyntaxError"),
+            ("raise SystemExit(3)", "--agent: .* cannot be imported: SystemExit: 3"),
+            ("class Mine: pass", "policy must be a function, or an object with predict or act"),
+            ("class Mine: observation = 3", "observation of .* must be a dict"),
+            (
+                "class Mine: observation = {'dead_zone': 0.0}",
+                "out of .* got {'dead_zone': 0.0}",
+            ),
+            (
+                "class Mine: reset = dict; act = lambda self, o: 0.0",
+                r"policy must return actions of shape \(2, 1\), got \(\)",
+            ),
+            ("class Mine: __init__ = lambda self, gain: None", "argument: 'gain'"),
         ],
     )
-    def test_bad_ones(self, body, complaint, written):
-        with pytest.raises(UsageError, match=complaint):
-            chosen([], [f"mine={written('class Mine: ' + body)}"])
+    def test_bad_ones(self, code, complaint, written):
+        with pytest.raises((TypeError, ValueError), match=complaint):
+            members_of(written(code))[0].run({}, 2, 2, 0)
+
+    def test_the_same_name_again_is_another_training(self, written):
+        other = written("from agents import PIController as Mine")
+        found = members_of("agents:PIController", other)
+        assert [each.provenance["file"] for each in found] == ["agents:PIController", other]
 
 
 @pytest.fixture(scope="module")
@@ -214,34 +212,33 @@ def zips(tmp_path_factory):
 
 
 class TestSavedPolicies:
-    """Zips of Stable-Baselines3, which say how their policies were trained."""
+    """Zips of Stable-Baselines3: they act as their file says, or in the plain environment."""
 
     @pytest.mark.parametrize("preset", ["noisy", "hard"])
     def test_it_does_what_it_was_trained_to(self, preset, zips):
         file = zips / "velocity-0.zip"
-        entry = chosen([], [f"mine=PPO:{file}"])["mine"]
-        (factory,) = entry.members()
-        assert factory.cost.samples == "0 M a policy"
-        controller = factory(PRESETS[preset], 3, SEED)
-        found = errors(factory, 3, 1200, **PRESETS[preset])
+        (member,) = members_of(f"PPO:{file}")
+        assert "weights: 0 M samples a policy" in member.provenance["searched"]
+        controller = member(PRESETS[preset], 3, SEED)
+        found = errors(member, 3, 1200, **PRESETS[preset])
         model = load(file, device="cpu")
         expected = evaluate(model, spec_of(model, IDS[preset]), episodes=3)
         np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-12)
         # What it remembers, the flow, is forgotten at the beginning of an episode.
         first, again = (
-            factory.run(PRESETS[preset], 50, 3, SEED, controller).applied for _ in range(2)
+            member.run(PRESETS[preset], 50, 3, SEED, controller).applied for _ in range(2)
         )
         np.testing.assert_array_equal(first, again)
 
     def test_a_zip_of_any_other_kind_acts_in_the_plain_environment(self, zips):
-        (factory,) = chosen([], [f"mine=PPO:{zips / 'bare.zip'}"])["mine"].members()
+        (member,) = members_of(f"PPO:{zips / 'bare.zip'}")
         model = PPO.load(zips / "bare.zip", device="cpu")
         expected = evaluate(model, IDS["noisy"], episodes=3)
-        found = errors(factory, 3, 1200, **PRESETS["noisy"])
+        found = errors(member, 3, 1200, **PRESETS["noisy"])
         np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-12)
 
     def test_a_function_gives_the_policy_and_where_it_acts(self, zips, written):
-        factory = own_factory(
+        (member,) = members_of(
             written(
                 "import dataclasses, gymnasium\n"
                 "from gymnasium.wrappers import DelayObservation\n"
@@ -253,20 +250,25 @@ class TestSavedPolicies:
                 "    return model, lambda: DelayObservation(MiddlePointEnv(**given), 2)\n"
             )
         )
-        found = errors(factory, 3, 600, **PRESETS["noisy"])
+        found = errors(member, 3, 600, **PRESETS["noisy"])
         model = load(zips / "delayed.zip", device="cpu")
         spec = spec_of(model, IDS["noisy"], max_episode_steps=600)
         expected = evaluate(model, spec, episodes=3)
         np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-9)
+        (other,) = members_of(
+            written(
+                "from mptc_gym import MiddlePointEnv as E\n"
+                "def Mine(): return lambda o: 0.0 * o[:, :1], E"
+            )
+        )
+        with pytest.raises(ValueError, match="the parameters that it is made for"):
+            other.run({"delay": 3}, 2, 2, 0)
 
-    def test_several_trainings_are_members_of_one(self, zips):
-        both = [f"mine=PPO:{zips / 'velocity-0.zip'}", f"mine=PPO:{zips / 'velocity-1.zip'}"]
-        pattern = [f"mine=PPO:{zips / 'velocity-*.zip'}"]
-        for texts in (both, pattern):
-            (entry,) = chosen([], texts).values()
-            about = [member.provenance for member in entry.members()]
-            assert [each["file"] for each in about] == ["velocity-0.zip", "velocity-1.zip"]
-            assert about[0]["sha256"] != about[1]["sha256"]
+    def test_a_pattern_names_several_trainings(self, zips):
+        found = members_of(f"PPO:{zips / 'velocity-*.zip'}")
+        about = [each.provenance for each in found]
+        assert [each["file"] for each in about] == ["velocity-0.zip", "velocity-1.zip"]
+        assert about[0]["sha256"] != about[1]["sha256"]
 
     @pytest.mark.parametrize(
         ("location", "complaint"),
@@ -274,12 +276,12 @@ class TestSavedPolicies:
             ("PPO:{}/wide.zip", "not act in the plain environment: write a function that ret"),
             ("PPO:{}/delayed.zip", "acts in DelayObservation, not in IncrementalAction alone"),
             ("No:{}/bare.zip", "No must be an algorithm of Stable-Baselines3, such as PPO"),
-            ("PPO:{}/nan.zip", "trying it raised ValueError: Expected parameter loc"),
-            ("{}/velocity-0.zip", "must be ALGORITHM:FILE.zip, such as PPO:.*velocity-0.zip"),
+            ("PPO:{}/nan.zip", "Expected parameter loc"),
+            ("{}/velocity-0.zip", "must be such as PPO:.*velocity-0.zip"),
             ("PPO:{}/none.zip", "there is no file .*none.zip"),
             ("SAC:{}/velocity-0.zip", "holds a model of PPO, not of SAC"),
         ],
     )
     def test_what_is_refused(self, location, complaint, zips):
-        with pytest.raises(UsageError, match=f"^--agent: .*{complaint}"):
-            chosen([], [f"mine={location.format(zips)}"])
+        with pytest.raises(ValueError, match=complaint):
+            members_of(location.format(zips))[0].run({}, 2, 2, 0)

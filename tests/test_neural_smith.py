@@ -131,7 +131,9 @@ class TestLoop:
         ours = NeuralSmithPredictor(**shown, dead_zone=5.0, network=NETWORK)
         best = PredictiveController(Parameters(**plant), 16)
         errors = [
-            np.abs(rollout(make_plants(16, 900, **plant), each, 900, 7_000_000).error[300:])
+            np.abs(
+                rollout(make_plants(16, 900, **plant), each, 900, 7_000_000).next_error[300:]
+            )
             for each in (ours, best)
         ]
         assert errors[0].mean() < times * errors[1].mean()

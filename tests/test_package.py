@@ -127,7 +127,7 @@ EXAMPLES = [
 
 
 COMPARE = {  # the extra
-    "cyclopts", "joblib", "matplotlib", "pandas", "rich", "scipy", "tabulate", "tqdm",
+    "cyclopts", "joblib", "markdown", "matplotlib", "pandas", "rich", "scipy", "tabulate",
 }  # fmt: skip
 
 

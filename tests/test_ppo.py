@@ -3,6 +3,7 @@
 import json
 import pickle
 from dataclasses import asdict, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -12,8 +13,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 
 from agents import PolicyNetwork
 from agents.networks import PRETRAINED
-from benchmarks.controllers import engineered
-from benchmarks.controllers.records import Cost
+from benchmarks.controllers import roster
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.examples import sb3
 from benchmarks.loop.rollout import make_plants, rollout
@@ -174,7 +174,7 @@ def test_the_budget_of_the_search_is_that_of_its_log(name):
     trials = log[log.policy == name]
     samples, minutes = trials.samples.sum() / 1e6, trials.cpu_seconds.sum() / 60
     said = f"{len(trials)} trials: {samples:.0f} M samples, {minutes:.0f} min"
-    assert ROSTER[name].members()[0].cost.search == said
+    assert ROSTER[name].searched.endswith(said)
 
 
 class TestMembers:
@@ -183,18 +183,20 @@ class TestMembers:
             recipe = replace(SMALL, dead_zone=zone)
             network = ppo.export(ppo.begin(recipe, 0), recipe)
             for given, told in (*expected.items(), ((3.0, 7.0), zone)):
-                controller = engineered.trained(network, Parameters(dead_zone=given), 1, 0)
+                controller = roster.with_policy(network, Parameters(dead_zone=given), 1, 0)
                 assert controller.increments.dead_zone == told
             assert network.increments.dead_zone == zone  # is not changed by it
 
     def test_policies_of_any_learner_are_a_row_by_their_files(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(engineered, "PRETRAINED", tmp_path)
+        monkeypatch.setattr(roster, "PRETRAINED", tmp_path)
         layers = [(np.ones((1, 6)), np.zeros(1))]
         windows = {"setpoint_window": 3, "error_window": 3}
         network = PolicyNetwork(layers, observation=windows, input_scale=np.ones(6))
         for name in ("mine-1.npz", "mine-0.npz", "other.npz"):
             network.save(tmp_path / name)
-        first, second = engineered.policies("mine-*.npz", Cost("nothing"))()
+        read = partial(roster.policies, "mine-*.npz")
+        mine = replace(ROSTER["ppo"], networks=read)
+        first, second = mine.members()
         assert [each.provenance["file"] for each in (first, second)] == [
             "mine-0.npz",
             "mine-1.npz",
@@ -215,5 +217,5 @@ class TestMembers:
             network = PolicyNetwork.load(PRETRAINED / each.provenance["file"])
             assert each.provenance["recipe"] == asked
             count = sum(W.size for W, _ in network.layers)
-            assert f"{count:,} weights" in each.cost.parameters
-            assert each.cost.samples == f"{recipe.steps / 1e6:g} M a policy"
+            assert f"{count:,} weights" in each.searched
+            assert f": {recipe.steps / 1e6:g} M samples a policy" in each.searched

@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -40,7 +39,7 @@ class TestScore:
         found = tune.score("pi", {}, 1, 0, {})["learnt"]
         samples, first, arguments = tune.CASES["learnt"]
         runs = rollout(make_plants(1, samples, **arguments), PIController(), samples, 0)
-        error = np.abs(runs.error)
+        error = np.abs(runs.next_error)
         assert found == pytest.approx(error[first:].mean())
         assert found != pytest.approx(error.mean())
 
@@ -54,8 +53,8 @@ class TestScore:
 @pytest.fixture
 def short(monkeypatch):
     """Make runs and finals short, and let the sampler learn soon."""
-    for name, tuning in tune.TUNED.items():
-        monkeypatch.setitem(tune.TUNED, name, replace(tuning, finalists=2, startup=4))
+    monkeypatch.setattr(tune, "FINALISTS", 2)
+    monkeypatch.setattr(tune, "STARTUP", 4)
     monkeypatch.setattr(tune, "FINAL_RUNS", 3)
     cases = {name: (60, 0, arguments) for name, (_, _, arguments) in tune.CASES.items()}
     monkeypatch.setattr(tune, "CASES", cases)
@@ -73,7 +72,7 @@ class TestSearch:
     def test_finalists_are_judged_rounded_on_new_runs(self, tmp_path, capsys):
         trials = search(tmp_path)
         assert len(trials) == 6
-        assert trials["kp"].between(*tune.TUNED["pi"].space["kp"]).all()
+        assert trials["kp"].between(*tune.TUNED["pi"]["kp"]).all()
         assert "The best" in capsys.readouterr().out
         page = (tmp_path / "pi.md").read_text()
         rows = [[*map(float, line.split("|")[1:-1])] for line in page.splitlines()[-2:]]
@@ -176,5 +175,5 @@ def test_defaults_are_the_best_of_the_published_searches():
         text = (ROOT / f"benchmarks/published/tune_{controller}.md").read_text("utf-8")
         rows = [line.split("|") for line in text.splitlines() if line.startswith("|")]
         best = {name.strip(): value for name, value in zip(rows[0], rows[2], strict=True)}
-        for name in ROSTER[controller].tuning.space:
+        for name in ROSTER[controller].gains:
             assert getattr(default, name) == pytest.approx(float(best[name]), rel=0.005)

@@ -89,7 +89,7 @@ def test_multiples_are_of_the_reference_on_the_same_step(tmp_path, monkeypatch):
 
 
 def test_what_cannot_be_written_is_said_before_anything_is_run(refused, monkeypatch):
-    monkeypatch.setattr(watch.Factory, "run", None)
+    monkeypatch.setattr(watch.Controller, "run", None)
     assert "--video: " in refused(main, ["--video", "/proc/x.gif"])
     assert "--video: must end in .gif" in refused(main, ["--video", "film.avi"])
 

@@ -12,8 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from benchmarks.bounds.least import LeastPossible, least_possible, theorem
-from benchmarks.controllers.records import Factory
-from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.roster import ROSTER, Controller
 from benchmarks.lib.statistics import student
 from benchmarks.loop.linear import nominal
 from benchmarks.loop.metrics import mean_error
@@ -69,13 +68,13 @@ class Counting:
         return action[:, np.newaxis]
 
 
-def controllers() -> dict[str, Factory]:
+def controllers() -> dict[str, Controller]:
     """Return factories by name: the roster's that need no training, and `Counting`."""
     known = {name: entry.members()[0] for name, entry in ROSTER.items()}
-    return {**known, "counting": Factory(Counting)}
+    return {**known, "counting": Controller("counting", "counting", ("", ""), Counting)}
 
 
-def errors(factory: Factory, runs: int, samples: int, **arguments: Any) -> Array:
+def errors(factory: Controller, runs: int, samples: int, **arguments: Any) -> Array:
     """Return mean |e| of runs with seeds from `SEED` on, degC, shape (runs,)."""
     return mean_error(factory.run(arguments, samples, runs, SEED))
 

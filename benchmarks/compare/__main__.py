@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated
+import hashlib
+import itertools
+import re
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from benchmarks.controllers.options import AgentNames, ControllerOptions
+from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Folder, Names, Runs, command, options
+from benchmarks.lib.command import Folder, Names, Runs, command, known, options
+from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
 from benchmarks.loop.plants import PlantOptions
-from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS
-from mptc_gym import PRESETS
+from benchmarks.loop.scenarios import (
+    PRESET_SCENARIOS,
+    SCENARIOS,
+    SETPOINTS,
+    Scenario,
+    scenarios_of,
+)
+from mptc_gym.evaluation import SEED
+
+if TYPE_CHECKING:
+    from benchmarks.compare.comparison import Scale
 
 COMPARED = tuple(name for name, controller in ROSTER.items() if controller.compared)
 RUNS = 100
 _CASES = (
     f"Cases to run (default: all). Of the paper: {', '.join(SCENARIOS)}. With --presets: "
-    f"{', '.join(PRESETS)}. With --plant, --preset or --set: "
+    f"{', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set: "
     f"{', '.join(name for name, *_ in SETPOINTS)}."
 )
 
@@ -44,7 +59,92 @@ class Options:
     beside it that is named after them)."""
 
 
-main = command(Options, "benchmarks.compare.command", width=190)
+def work(options: Options) -> str:
+    """Run the comparison and write its results, also after an error: of what has finished."""
+    from benchmarks.compare import report
+    from benchmarks.compare.comparison import Case, run_case, scale_of
+    from benchmarks.lib.report import show
+
+    controllers = chosen(options.agents, options.controllers.agent)
+    fan_out = options.controllers.fan_out
+    scenarios = _scenarios(options)
+    out = options.out or _folder(options, [*scenarios])
+    folder, made = out_folder(out), origin()
+    # Short tasks last, so that no core waits long at the end; the bounds of drawn plants are
+    # the longest of all.
+    by_length = sorted(scenarios.values(), key=lambda each: -each.samples)
+    tasks: dict[str, Any] = {
+        f"bounds of {each.name}": partial(scale_of, each, options.runs)
+        for each in sorted(by_length, key=lambda each: not each.parameters.ranges)
+    }
+    for controller, each in itertools.product(controllers.values(), by_length):
+        tasks[f"{controller.name}, {each.name}"] = partial(
+            run_case, each, controller, options.runs
+        )
+    cases: dict[tuple[str, str], Case] = {}
+    scales: dict[str, Scale] = {}
+    complete = False
+    try:
+        for _, result in fan_out.stream(tasks, "compare"):
+            if isinstance(result, Case):
+                cases[result.agent, result.scenario] = result
+            else:
+                scales[result.scenario] = result
+        complete = True
+    finally:
+        if cases:
+            order = itertools.product(controllers, scenarios)
+            finished = [cases[each] for each in order if each in cases]
+            about = {
+                "complete": complete,
+                **made,
+                "options": {**asdict(options), "agents": [*controllers]},
+                "seeds": [*range(SEED, SEED + options.runs)],
+                "scenarios": {
+                    name: {"samples": each.samples, "arguments": each.arguments}
+                    for name, each in scenarios.items()
+                },
+                "policies": {each.agent: each.policies for each in finished if each.policies},
+            }
+            write_json(folder / "provenance.json", about)
+            jobs = fan_out.jobs if complete else 1
+            show(report.write(finished, scenarios, scales, controllers, folder, made, jobs)[:2])
+    return f"The report, tables, data and plots are in {out}/"
+
+
+def _scenarios(options: Options) -> dict[str, Scenario]:
+    """Return the cases that the options choose."""
+    plant, another = options.plant.chosen(), options.plant != PlantOptions()
+    if options.presets and another:
+        raise UsageError("--presets cannot be combined with --plant, --preset and --set")
+    there = PRESET_SCENARIOS if options.presets else SCENARIOS
+    if another:
+        there = scenarios_of(plant.name, plant.arguments)
+    given = [*there] if options.scenarios is None else options.scenarios
+    names = known("--scenarios", given, [*there])
+    if not names:
+        raise UsageError("--scenarios: none to run")
+    return {name: there[name] for name in names}
+
+
+def _folder(options: Options, names: list[str]) -> Path:
+    """Return a folder named after the differences from the default comparison."""
+    plant = options.plant
+    own = dict.fromkeys(text.partition("=")[0] for text in options.controllers.agent)
+    parts = ["compare", *(options.agents if options.agents != COMPARED else ()), *own]
+    if options.scenarios is not None:
+        parts += names
+    if plant != PlantOptions():
+        parts.append(plant.chosen().name)
+    parts += ["presets"] * options.presets
+    parts += [f"{options.runs}-runs"] * (options.runs != RUNS)
+    name = re.sub(r"[^\w.-]", "-", "-".join(parts))
+    if len(name) > 70:
+        name = f"{name[:60]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return Path("results", name)
+
+
+main = command("compare", Options, work)
 
 if __name__ == "__main__":
-    raise SystemExit(main(None))
+    raise SystemExit(main())

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
-from benchmarks.compare.estimates import Scale, Score
+from benchmarks.compare.comparison import Scale, Score
 from benchmarks.controllers.roster import label, looks
 from benchmarks.lib.drawing import (
     MULTIPLE,
@@ -24,71 +24,91 @@ from benchmarks.lib.drawing import (
     panels,
     scale_by_excess,
 )
-from benchmarks.lib.tables import groups
+from benchmarks.lib.statistics import groups, written
 from benchmarks.loop.scenarios import Scenario
 
+FARTHEST = 1.5  # distance of a score from 1 at which the axis ends
+NEAR = 0.02  # of the best score, for the least valve travel
+HELD = 15  # minutes that are shown of a held set point without load
+GREY: Any = {"color": "0.4"}
+EDGE = "at the edge or beyond"
 
-def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
-    """Draw the score of every agent, sorted, and small marks for its scenarios."""
+
+def plot_scores(scores: Mapping[str, Score], told: Sequence[str], path: Path) -> None:
+    """Draw the score of every agent, sorted, and small marks for its cases.
+
+    The title names the best of those that are not `told` the whole plant.
+    """
     style = looks([*scores])
-    with drawn(path, 0.9 + 0.3 * len(scores), _finding(scores)) as figure:
+    with drawn(path, 1.2 + 0.3 * len(scores), _finding(scores, told)) as figure:
         axes = figure.subplots()
-        for place, (agent, (overall, by_scenario)) in enumerate(scores.items()):
+        for place, (agent, (overall, by_case)) in enumerate(scores.items()):
             colour, marker = style[agent]
-            axes.plot(
-                [_away(score) for score in by_scenario.values()], [place] * len(by_scenario),
-                "|", color=colour, alpha=0.5,
-            )  # fmt: skip
-            axes.plot(_away(overall.value), place, marker, color=colour, markersize=8)
-            axes.annotate(
-                f"{overall.value:.3f}",
-                (1.01, place),
-                xycoords=("axes fraction", "data"),
-                va="center",
-            )
+            away = np.clip([1.0 - score for score in by_case.values()], NEAREST, FARTHEST)
+            axes.plot(away, [place] * len(away), "|", color=colour, alpha=0.5)
+            _mark(axes, 1.0 - overall.value, place, colour, marker, (NEAREST, FARTHEST), 8)
+            text = written(overall.value, ".3f")
+            axes.annotate(text, (1.01, place), xycoords=("axes fraction", "data"), va="center")
         _list_agents(axes, [*scores])
         axes.set_xscale("log")
-        axes.set_xlim(1.6, NEAREST / 1.3)
+        axes.set_xlim(1.1 * FARTHEST, NEAREST / 1.3)
         shown = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, NEAREST)
         axes.set_xticks(shown, [f"{1 - away:g}" for away in shown])
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_xlabel(
-            "score: 0 without control, 1 at the least possible error (log scale of 1 - score)"
+            "score: 0 without control, 1 at the least possible error (log scale of 1 - score)\n"
+            f"a tick is one case; hollow: {EDGE}"
         )
 
 
-def _away(score: float) -> float:
-    """Return the distance of a score from 1, within the axis."""
-    return min(max(1.0 - score, NEAREST), 1.5)
+def _finding(scores: Mapping[str, Score], told: Sequence[str]) -> str:
+    values = {agent: f"{overall.value:.3f}" for agent, (overall, _) in scores.items()}
+    best = next((agent for agent in values if agent not in told), "")
+    if not best:
+        first = next(iter(values))
+        return f"{label(first)}, which is told the plant, has a score of {values[first]}"
+    others = [f"{label(agent)} {values[agent]}" for agent in values if agent in told]
+    more = f" ({', '.join(others)}, told the plant)" if others else ""
+    closest = "comes closest to the least possible error" if len(values) > 1 else "has a score"
+    return f"{label(best)} {closest}: {values[best]}{more}"
 
 
-def _finding(scores: Mapping[str, Score]) -> str:
-    first, *others = ((label(agent), overall.value) for agent, (overall, _) in scores.items())
-    second = f", {others[0][0]} follows with {others[0][1]:.3f}" if others else ""
-    return f"{first[0]} comes closest to the least possible error: {first[1]:.3f}{second}"
+def _mark(
+    axes: Axes,
+    x: float,
+    y: float,
+    colour: str,
+    marker: str,
+    ends: tuple[float, float],
+    size: float,
+) -> None:
+    """Draw a marker, hollow at the end of the axis beyond which it would be."""
+    low, high = ends
+    face = colour if low < x < high else "white"
+    axes.plot(
+        min(max(x, low), high), y, marker, color=colour, markerfacecolor=face, markersize=size
+    )
 
 
 def plot_bounds(
-    estimates: pd.DataFrame, runs: pd.DataFrame, agents: Sequence[str], path: Path
+    estimates: pd.DataFrame,
+    runs: pd.DataFrame,
+    agents: Sequence[str],
+    told: Sequence[str],
+    path: Path,
 ) -> None:
     """Draw mean errors as multiples of the least possible, with intervals and worst runs."""
-    style = looks(agents)
-    worst = runs.groupby(["scenario", "agent"])["mae"].max()
-    best = estimates.assign(value=[mean.value for mean in estimates["mean"]])
-    best = best.loc[best.groupby("scenario", sort=False)["value"].idxmin(), "agent"]
-    name, count = best.mode()[0], (best == best.mode()[0]).sum()
-    title = f"{label(name)} has the least mean error in {count} of {len(best)} cases"
-    scenarios = dict(groups(estimates, "scenario"))
+    style, worst = looks(agents), runs.groupby(["scenario", "agent"])["mae"].max()
+    cases = dict(groups(estimates, "scenario"))
     height = 0.8 + 0.17 * len(agents)
-    with panels(path, [*scenarios], height, 2, title) as (figure, found, free):
-        for i, (axes, (scenario, rows)) in enumerate(
-            zip(found, scenarios.items(), strict=True)
-        ):
+    title = _least(estimates, told)
+    with panels(path, [*cases], height, 2, title) as (figure, found, free):
+        for i, (axes, (case, rows)) in enumerate(zip(found, cases.items(), strict=True)):
             ends = [NEAREST]
             for row in rows.to_dict("records"):
                 place = agents.index(row["agent"])
                 colour, marker = style[row["agent"]]
-                ratio, end = row["ratio"], worst[scenario, row["agent"]] / row["limit"]
+                ratio, end = row["ratio"], worst[case, row["agent"]] / row["limit"]
                 low, mean, high, end = (
                     max(each - 1.0, NEAREST)
                     for each in (ratio.low, ratio.value, ratio.high, end)
@@ -97,22 +117,32 @@ def plot_bounds(
                 axes.plot([mean, end], [place] * 2, color=colour, alpha=0.4, linewidth=1)
                 if math.isfinite(high):
                     axes.plot([low, high], [place] * 2, color=colour, linewidth=3)
-                axes.plot(mean, place, marker, color=colour, markersize=5)
+                _mark(axes, ratio.value - 1.0, place, colour, marker, (NEAREST, math.inf), 5)
             _list_agents(axes, agents)
             axes.tick_params(labelleft=i % 2 == 0)
             scale_by_excess(axes, "x", min(ends), max(ends))
         for axes in found[-2:]:  # the lowest of each column
             axes.set_xlabel(MULTIPLE)
-        grey: Any = {"color": "0.4"}
-        draw_legend(
-            figure,
-            free,
-            {
-                "mean error of all runs": Line2D([], [], marker="o", linestyle="", **grey),
-                "its 95 % interval": Line2D([], [], linewidth=3, **grey),
-                "to the worst run": Line2D([], [], linewidth=1, alpha=0.4, **grey),
-            },
-        )
+        entries = {
+            "mean error of all runs": Line2D([], [], marker="o", linestyle="", **GREY),
+            EDGE: Line2D([], [], marker="o", linestyle="", markerfacecolor="white", **GREY),
+            "95 % interval of the mean": Line2D([], [], linewidth=3, **GREY),
+            "to the worst run": Line2D([], [], linewidth=1, alpha=0.4, **GREY),
+        }
+        draw_legend(figure, free, entries)
+
+
+def _least(estimates: pd.DataFrame, told: Sequence[str]) -> str:
+    """Return which controller has the least error most often, of those not told the plant."""
+    means = estimates.assign(value=[mean.value for mean in estimates["mean"]])
+    others = means[~means["agent"].isin(told)]
+    among = "" if others.empty or len(others) == len(means) else ", MPC told the plant aside"
+    means = means if others.empty else others
+    best = means.loc[means.groupby("scenario", sort=False)["value"].idxmin(), "agent"]
+    name = best.mode()[0]
+    count, cases = (best == name).sum(), len(best)
+    where = "each case" if count == cases else f"{count} of {cases} cases"
+    return f"{label(name)} has the least mean error in {where}{among}"
 
 
 def _list_agents(axes: Axes, agents: Sequence[str]) -> None:
@@ -126,40 +156,30 @@ def plot_travel(
     scores: Mapping[str, Score],
     path: Path,
 ) -> None:
-    """Draw the error of every agent against its valve travel, a panel for each scenario.
+    """Draw the error of every agent against its valve travel, a panel for each case.
 
-    `summary` is what `report.summarise` returns. A valve that never moves is not drawn.
+    `summary` is what `comparison.summarise` returns. A valve that never moves is not drawn.
     """
     medians = summary.pivot_table(
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
+    medians = medians[(medians["total_variation"] > 0.0) & medians["scenario"].isin([*scales])]
     style, cases = looks([*scores]), dict(groups(medians, "scenario"))
-    medians = medians[medians["total_variation"] > 0.0]
-    travels = medians.groupby("agent")["total_variation"].mean()
-    enough = max(overall.value for overall, _ in scores.values()) - 0.02
-    calm = [agent for agent in travels.index if scores[agent][0].value >= enough]
-    title = ""
-    if calm:
-        least = str(travels[calm].idxmin())
-        title = (
-            f"Of those within 0.02 of the best score, {label(least)} moves the valve least: "
-            f"{travels[least]:,.0f} t/h a run"
-        )
+    title = _calmest(medians.groupby("agent")["total_variation"].mean(), scores)
     with panels(path, [*cases], 2.4, 2, title) as (figure, found, free):
         entries: dict[str, Any] = {}
-        for axes, (scenario, rows) in zip(found, cases.items(), strict=True):
-            rows = rows[rows["total_variation"] > 0.0]
-            if rows.empty:
-                continue
-            scale, travel = scales[scenario], rows["total_variation"]
-            errors = (rows["mae"] / scale.least.value - 1.0).clip(NEAREST)
-            for agent, x, y in zip(rows["agent"], travel, errors, strict=True):
+        for axes, (case, rows) in zip(found, cases.items(), strict=True):
+            travel = rows["total_variation"]
+            excess = rows["mae"] / scales[case].least.value - 1.0
+            for agent, x, y in zip(rows["agent"], travel, excess, strict=True):
                 colour, marker = style[agent]
-                (entries[label(agent)],) = axes.plot(x, y, marker, color=colour)
-            across = np.geomspace(0.7 * travel.min(), 1.4 * travel.max(), 200)
-            scale_by_excess(axes, "y", errors.min(), errors.max())
+                _mark_point(axes, x, y, colour, marker)
+                entries[label(agent)] = Line2D(
+                    [], [], marker=marker, linestyle="", color=colour
+                )
+            scale_by_excess(axes, "y", *excess.clip(NEAREST).agg(["min", "max"]))
             axes.set_xscale("log")
-            axes.set_xlim(across[0], across[-1])
+            axes.set_xlim(0.7 * travel.min(), 1.4 * travel.max())
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_locator(NullLocator())
@@ -170,18 +190,42 @@ def plot_travel(
         draw_legend(figure, free, entries)
 
 
+def _mark_point(axes: Axes, x: float, y: float, colour: str, marker: str) -> None:
+    face = colour if y > NEAREST else "white"
+    axes.plot(x, max(y, NEAREST), marker, color=colour, markerfacecolor=face)
+
+
+def _calmest(travels: Any, scores: Mapping[str, Score]) -> str:
+    """Return which controller near the best score moves the valve least, "" if none moves."""
+    best = max(overall.value for overall, _ in scores.values())
+    near = [agent for agent in travels.index if scores[agent][0].value >= best - NEAR]
+    if not near:
+        return ""
+    least = str(travels[near].idxmin())
+    if len(near) == 1:
+        return f"{label(least)} alone is near the best score: {travels[least]:,.0f} t/h a run"
+    return (
+        f"Of {len(near)} controllers within {NEAR} of the best score, {label(least)} moves the "
+        f"valve least: {travels[least]:,.0f} t/h a run"
+    )
+
+
 def plot_responses(
     responses: pd.DataFrame, errors: Mapping[str, float], scenario: Scenario, path: Path
 ) -> None:
     """Draw output and applied input over time, a row of panels for every agent, best first.
 
-    `responses` holds the rows of `comparison.summarise_responses` for all agents, `errors`
-    their mean errors.
+    Where the set point is held, the error is drawn in place of the output, and of a run without
+    load only the beginning. `responses` holds the rows of all agents, `errors` their mean
+    errors.
     """
-    agents = sorted(responses["agent"].unique(), key=errors.__getitem__)
-    style, best = looks(agents), agents[0]
-    title = f"{scenario.title}: {label(best)} errs least of these"
+    agents = sorted(errors, key=errors.__getitem__)
+    style, plant = looks(agents), scenario.parameters
+    held = responses["setpoint"].nunique() == 1
+    if held and not plant.is_disturbed:
+        responses = responses[responses["time_s"] <= 60 * HELD]
     height = 1.0 + 1.05 * len(agents)
+    title = f"{scenario.title[0].upper()}{scenario.title[1:]}: {label(agents[0])} errs least"
     with drawn(path, height, title) as figure:
         figure.set_layout_engine("none")  # which would take most of the time
         place = {"left": 0.09, "right": 0.98, "wspace": 0.14, "hspace": 0.5}
@@ -192,18 +236,25 @@ def plot_responses(
         for (left, right), agent in zip(rows_of, agents, strict=True):
             rows, (colour, _) = responses[responses["agent"] == agent], style[agent]
             minutes = rows["time_s"] / 60
-            left.step(minutes, rows["setpoint"], "k--", linewidth=0.8, where="post")
-            left.fill_between(
-                minutes, rows["output_p10"], rows["output_p90"], color=colour, alpha=0.3,
-                linewidth=0,
-            )  # fmt: skip
-            left.plot(minutes, rows["output_median"], color=colour, linewidth=1.2)
+            _draw_output(left, rows, colour, held=held)
             left.set_title(f"{label(agent)}: {errors[agent]:.3f} °C")
-            draw_actuator(right, scenario.parameters)
+            draw_actuator(right, plant)
             right.step(minutes, rows["applied_median"], color=colour, linewidth=1, where="post")
         left.set_xlim(0, minutes.max())
         rows_of[0, 1].set_title("applied flow (t/h); grey: dead zone")
-        figure.supylabel("temperature (°C)", fontsize="medium")
-        figure.supxlabel(
-            "time (min); lines: medians, bands: 10th to 90th percentile", fontsize="medium"
-        )
+        figure.supylabel("error (°C)" if held else "temperature (°C)", fontsize="medium")
+        what = "lines: medians, bands: 10th to 90th percentile"
+        if plant.setpoint == "random":
+            what = "the first run; the errors are means of all"
+        figure.supxlabel(f"time (min); {what}", fontsize="medium")
+
+
+def _draw_output(axes: Axes, rows: pd.DataFrame, colour: str, *, held: bool) -> None:
+    minutes, setpoint = rows["time_s"] / 60, rows["setpoint"]
+    low, middle, high = (rows[f"output_{name}"] for name in ("p10", "median", "p90"))
+    if held:
+        low, middle, high = setpoint - high, setpoint - middle, setpoint - low
+        setpoint = 0.0 * setpoint
+    axes.step(minutes, setpoint, "k--", linewidth=0.8, where="post")
+    axes.fill_between(minutes, low, high, color=colour, alpha=0.3, linewidth=0)
+    axes.plot(minutes, middle, color=colour, linewidth=1.2)

@@ -12,13 +12,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.compare.comparison import Comparison
-from benchmarks.compare.estimates import Scale, Score, estimate, ranked, scale_of
-from benchmarks.controllers.roster import ROSTER, label
+from benchmarks.compare.comparison import (
+    Case,
+    Scale,
+    Score,
+    estimate,
+    ranked,
+    summarise,
+)
+from benchmarks.controllers.roster import Controller, label
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.report import Best, Section, write_report
-from benchmarks.lib.statistics import Estimate, written
-from benchmarks.lib.tables import PERCENTILES, groups, percentiles, write_csv
+from benchmarks.lib.report import Best, Section, provenance_line, write_report
+from benchmarks.lib.statistics import PERCENTILES, Estimate, groups, written
+from benchmarks.lib.storage import write_csv
 from benchmarks.loop.metrics import METRICS
 from benchmarks.loop.scenarios import Scenario
 
@@ -28,64 +34,96 @@ STEP_METRICS = ("overshoot", "settling_time")  # meaningless in noise
 
 
 def write(
-    comparison: Comparison, folder: Path, made_by: str, jobs: int | None = 1
+    cases: Sequence[Case],
+    scenarios: Mapping[str, Scenario],
+    scales: Mapping[str, Scale],
+    controllers: Mapping[str, Controller],
+    folder: Path,
+    made: Mapping[str, Any],
+    jobs: int | None = 1,
 ) -> list[Section]:
-    """Write the report of all finished cases, with tables and pictures, and return it.
+    """Write the numbers, pictures and report of finished cases, and return the sections.
 
-    So many pictures are drawn at once.
+    So many pictures are drawn at once. A case without a scale is in the numbers only.
     """
-    from benchmarks.compare import plots  # here, so that only drawing loads Matplotlib
-
-    runs, names, agents = comparison.runs, comparison.names, comparison.agents
-    scales = {  # after an interruption, some may be missing
-        name: comparison.scales.get(name)
-        or scale_of(comparison.scenarios[name], comparison.count)
-        for name in names
-    }
+    runs = pd.concat([case.runs for case in cases], ignore_index=True)
+    summary = summarise(runs)
+    write_numbers(folder / "runs.csv", runs)
+    write_numbers(folder / "summary.csv", summary)
+    for name in scenarios:
+        responses = [case.responses for case in cases if case.scenario == name]
+        if responses:
+            write_numbers(folder / f"{name}.csv", pd.concat(responses, ignore_index=True))
+    runs = runs[runs["scenario"].isin([*scales])]
+    if runs.empty:
+        return []
+    scales = {name: scales[name] for name in scenarios if name in set(runs["scenario"])}
+    reference = str(runs["agent"].iloc[0])
     estimates = pd.concat(
-        [estimate(cases, scales[name], agents[0]) for name, cases in groups(runs, "scenario")],
+        [estimate(rows, scales[name], reference) for name, rows in groups(runs, "scenario")],
         ignore_index=True,
     )
-    summary = summarise(runs)
-    write_numbers(folder / "summary.csv", summary)
     write_numbers(folder / "estimates.csv", estimates)
-
     scores = ranked(runs, scales)
-    pictures: dict[str, Callable[[Path], None]] = {
-        "scores.png": partial(plots.plot_scores, scores),
-        "bounds.png": partial(plots.plot_bounds, estimates, runs, [*scores]),
+    sections = [
+        *_comparisons(runs, estimates, scores, scales),
+        Section(
+            "What each controller costs",
+            ["What it is told; what was searched or trained beforehand; its runs here."],
+            _costs(cases, controllers),
+        ),
+        Section(
+            f"All measures: median (10th to 90th percentile) of {runs['seed'].nunique()} runs",
+            table=metrics_table(summary, scenarios),
+        ),
+        Section(
+            "Cases",
+            table=pd.DataFrame(
+                [(name, scenarios[name].title) for name in scales],
+                columns=["case", "what it is"],
+            ),
+            pictures={f"{name}.png": f"Responses: {scenarios[name].title}" for name in scales},
+        ),
+    ]
+    tasks = _pictures(
+        cases, scenarios, scales, controllers, folder, (estimates, runs, summary, scores)
+    )
+    faults = FanOut(jobs=jobs).run(tasks, "pictures")
+    sections = [_without(faults, section) for section in sections]
+    write_report(
+        folder, "Comparison of controllers", sections, provenance_line("compare", made)
+    )
+    return sections
+
+
+def _pictures(
+    cases: Sequence[Case],
+    scenarios: Mapping[str, Scenario],
+    scales: Mapping[str, Scale],
+    controllers: Mapping[str, Controller],
+    folder: Path,
+    tables: tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, Mapping[str, Score]],
+) -> dict[str, Callable[[], str]]:
+    """Return tasks that draw, by the names of the pictures."""
+    from benchmarks.compare import plots  # here, so that only drawing loads Matplotlib
+
+    estimates, runs, summary, scores = tables
+    told = [name for name, each in controllers.items() if each.told]
+    draw: dict[str, Callable[[Path], None]] = {
+        "scores.png": partial(plots.plot_scores, scores, told),
+        "bounds.png": partial(plots.plot_bounds, estimates, runs, [*scores], told),
         "travel.png": partial(plots.plot_travel, summary, scales, scores),
     }
-    drawn = [agent for agent in agents if agent not in ROSTER or ROSTER[agent].drawn] or agents
-    for name, cases in groups(estimates, "scenario"):
-        responses = pd.concat(
-            [case.responses for case in comparison.finished if case.scenario == name],
-            ignore_index=True,
-        )
-        write_numbers(folder / f"{name}.csv", responses)
-        errors = {
-            agent: mean.value for agent, mean in zip(cases["agent"], cases["mean"], strict=True)
-        }
-        pictures[f"{name}.png"] = partial(
-            plots.plot_responses,
-            responses[responses["agent"].isin(drawn)],
-            errors,
-            comparison.scenarios[name],
-        )
-    tasks = {name: partial(_draw, draw, folder / name) for name, draw in pictures.items()}
-    faults = FanOut(jobs=jobs).run(tasks, "pictures")
-    sections = [
-        replace(
-            section,
-            text=[*section.text, *filter(None, map(faults.get, section.pictures))],
-            pictures={
-                name: shown for name, shown in section.pictures.items() if not faults[name]
-            },
-        )
-        for section in _sections(comparison, scales, summary, estimates, scores)
-    ]
-    write_report(folder, "Comparison of controllers", sections, made_by)
-    return sections
+    shown = [name for name, each in controllers.items() if each.drawn] or [*controllers]
+    for name in scales:
+        drawn = [each for each in cases if each.scenario == name and each.agent in shown]
+        if drawn:
+            errors = {each.agent: float(each.runs["mae"].mean()) for each in drawn}
+            responses = pd.concat([each.responses for each in drawn], ignore_index=True)
+            draw[f"{name}.png"] = partial(
+                plots.plot_responses, responses, errors, scenarios[name]
+            )
+    return {name: partial(_draw, draw[name], folder / name) for name in draw}
 
 
 def _draw(draw: Callable[[Path], None], path: Path) -> str:
@@ -97,27 +135,27 @@ def _draw(draw: Callable[[Path], None], path: Path) -> str:
     return ""
 
 
-def _sections(
-    comparison: Comparison,
-    scales: Mapping[str, Scale],
-    summary: pd.DataFrame,
+def _without(faults: Mapping[str, str], section: Section) -> Section:
+    """Return a section with the pictures that were drawn, and what is wrong with the others."""
+    drawn = {name: alt for name, alt in section.pictures.items() if faults.get(name) == ""}
+    said = [faults[name] for name in section.pictures if faults.get(name)]
+    return replace(section, text=[*section.text, *said], pictures=drawn)
+
+
+def _comparisons(
+    runs: pd.DataFrame,
     estimates: pd.DataFrame,
     scores: Mapping[str, Score],
+    scales: Mapping[str, Scale],
 ) -> list[Section]:
-    """Return the sections of the report, the most interesting ones first."""
-    names, (reference, *others) = comparison.names, comparison.agents
-    titles = [(name, comparison.scenarios[name].title) for name in names]
-    paired = Section(
-        f"Difference to {label(reference)} (°C), 95 % interval",
-        ["Below 0 a controller is better; in % the share of runs in which it is."],
-        paired_table(estimates) if others else None,
-    )
-    return [
+    """Return the sections that compare: scores, multiples, travel, paired differences."""
+    reference = str(runs["agent"].iloc[0])
+    sections = [
         Section(
             "Score: 0 without control, 1 at the least possible error",
             ["Mean over the cases, 95 % interval; travel of the valve in the median run."],
-            score_table(comparison.runs, scores, names),
-            pictures={"scores.png": "Scores, a tick for each case"},
+            score_table(runs, scores, [*scales]),
+            {"scores.png": "The score of each controller, and a tick for each case"},
         ),
         Section(
             "Mean error as a multiple of the least possible, with its 95 % interval",
@@ -127,65 +165,41 @@ def _sections(
                 "better, but none comes below the least with foresight."
             ],
             ratio_table(estimates, scales, [*scores]),
-            pictures={"bounds.png": "Mean errors as multiples of the least possible"},
+            {"bounds.png": "Mean error of each controller in each case"},
         ),
         Section(
             "Error against valve travel",
-            pictures={"travel.png": "Error against valve travel; down and left is better"},
-        ),
-        *([paired] if others else []),
-        Section(
-            "What each controller costs",
-            [
-                "Search: its trials, all their samples, and minutes of one core. Training: the "
-                "median policy. Runs: all cases, including measuring."
-            ],
-            _costs(comparison),
-        ),
-        Section(
-            f"All measures: median (10th to 90th percentile) of {comparison.count} runs",
-            table=metrics_table(summary, comparison.scenarios),
-        ),
-        Section(
-            "Cases",
-            table=pd.DataFrame(titles, columns=["case", "what it is"]),
-            pictures={f"{name}.png": f"Responses, {title}" for name, title in titles},
+            ["Down and left is better."],
+            pictures={"travel.png": "Mean error over valve travel, a panel for each case"},
         ),
     ]
+    if runs["agent"].nunique() > 1:
+        title = f"Difference to {label(reference)} (°C), 95 % interval"
+        text = "Below 0 a controller is better; in % the share of runs in which it is."
+        sections.append(Section(title, [text], paired_table(estimates)))
+    return sections
 
 
-def _costs(comparison: Comparison) -> pd.DataFrame:
+def _costs(cases: Sequence[Case], controllers: Mapping[str, Controller]) -> pd.DataFrame:
+    """Return what each controller is told, what it took before, and its runs."""
     rows = []
-    for name in comparison.agents:
-        members = comparison.controllers[name]
-        cost = members[0].cost
-        seconds = [member.provenance.get("cpu_seconds") for member in members]
-        training = [each for each in seconds if each is not None]
-        runs = [case.seconds for case in comparison.finished if case.agent == name]
+    for name, controller in controllers.items():
+        own = [case for case in cases if case.agent == name]
+        training = (
+            [each["cpu_seconds"] for each in own[0].policies if "cpu_seconds" in each]
+            if own
+            else []
+        )
         rows.append(
             {
                 "controller": label(name),
-                "prior knowledge": cost.prior_knowledge,
-                "parameters": cost.parameters,
-                "search for its settings": cost.search,
-                "samples before": cost.samples,
+                "prior knowledge": controller.knows,
+                "searched or trained": controller.searched,
                 "training (s)": f"{np.median(training):.0f}" if training else "",
-                "runs (s)": f"{sum(runs):.1f}",
+                "runs (s)": f"{sum(case.seconds for case in own):.1f}",
             }
         )
     return pd.DataFrame(rows)
-
-
-def summarise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return percentiles over the runs, one row for each scenario, agent and metric."""
-    return pd.DataFrame(
-        [
-            {"scenario": scenario, "agent": agent, "metric": metric, "runs": len(group)}
-            | percentiles(group[metric].to_numpy())
-            for (scenario, agent), group in runs.groupby(["scenario", "agent"], sort=False)
-            for metric in METRICS
-        ]
-    )
 
 
 def write_numbers(path: Path, table: pd.DataFrame) -> None:
@@ -202,22 +216,6 @@ def write_numbers(path: Path, table: pd.DataFrame) -> None:
                 columns[f"{name}{suffix}"] = [getattr(cell, end, math.nan) for cell in cells]
     flat = pd.DataFrame(columns)
     write_csv(path, flat.astype(object).where(flat != math.inf, NOT_SETTLED))
-
-
-def ratio_table(
-    estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
-) -> pd.DataFrame:
-    """Return the least possible and the mean errors as multiples; the least are in bold."""
-    bounds = [{"controller": "least possible (°C)"}, {"controller": "with foresight (°C)"}]
-    for name, scale in scales.items():
-        mark = "*" * (scale.least.kind == "reference")
-        bounds[0][name] = f"{scale.least.value:.3f}{mark}"
-        bounds[1][name] = f"{scale.preview.value:.3f}"
-    values = estimates["ratio"].map(lambda ratio: ratio.value)
-    least = values == values.groupby(estimates["scenario"]).transform("min")
-    cells = estimates["ratio"].map("{:.2f}".format).where(~least, lambda all_: all_.map(Best))
-    table = _by_agent(estimates, cells, agents)
-    return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
 
 
 def score_table(
@@ -237,6 +235,22 @@ def score_table(
     return pd.DataFrame(rows, columns=columns).fillna("")
 
 
+def ratio_table(
+    estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
+) -> pd.DataFrame:
+    """Return the least possible and the mean errors as multiples; the least are in bold."""
+    bounds = [{"controller": "least possible (°C)"}, {"controller": "with foresight (°C)"}]
+    for name, scale in scales.items():
+        mark = "*" * (scale.least.kind == "reference")
+        bounds[0][name] = f"{scale.least.value:.3f}{mark}"
+        bounds[1][name] = f"{scale.preview.value:.3f}"
+    values = estimates["ratio"].map(lambda ratio: ratio.value)
+    least = values == values.groupby(estimates["scenario"]).transform("min")
+    cells = estimates["ratio"].map("{:.2f}".format).where(~least, lambda all_: all_.map(Best))
+    table = _by_agent(estimates, cells, agents)
+    return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
+
+
 def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
     """Return differences from the reference, one row for each other agent."""
     others = estimates.dropna(subset=["difference"])
@@ -254,11 +268,11 @@ def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataF
 
 
 def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> pd.DataFrame:
-    """Return all metrics, one row for each scenario and agent, one column for each metric."""
+    """Return all metrics, one row for each case and agent, one column for each metric."""
     rows = []
-    for name, scenario in scenarios.items():
-        noisy = scenario.parameters.range_of("noise_variance")[1] > 0.0
-        for agent, group in groups(summary[summary["scenario"] == name], "agent"):
+    for name, of_case in groups(summary, "scenario"):
+        noisy = scenarios[name].parameters.range_of("noise_variance")[1] > 0.0
+        for agent, group in groups(of_case, "agent"):
             cells = {
                 METRICS[row["metric"]]: (
                     "" if noisy and row["metric"] in STEP_METRICS else _median(row)

@@ -1,34 +1,44 @@
 """Read the options that choose controllers: of the roster, or a user's own.
 
-A user's own is MODULE:FACTORY, or PPO:FILE.zip.
+The code of a user's own runs in the tasks that need it: what is wrong with it costs no other.
 """
 
 from __future__ import annotations
 
+import glob
 import hashlib
+import importlib
 import inspect
 import pkgutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 from agents.controller import PAPER_WINDOWS
 from agents.policy_network import WINDOWS
-from benchmarks.controllers.engineered import limits
-from benchmarks.controllers.records import Cost, Factory, RosterEntry
-from benchmarks.controllers.roster import OWN, ROSTER
-from benchmarks.lib.command import Names, Repeated, UsageError, blame, options
+from benchmarks.controllers.roster import OWN, ROSTER, Controller, limits
+from benchmarks.lib.command import Names, Repeated, blame, options
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.loop.rollout import Agent
-from mptc_gym import Parameters
+from benchmarks.lib.storage import UsageError
+from benchmarks.loop.rollout import make_plants
+from mptc_gym import MiddlePointEnv, Parameters
+from mptc_gym.environments import opened
+from mptc_gym.evaluation import case_of
 from mptc_gym.policies import start
+from mptc_gym.wrappers.vector import IncrementalAction
 
 AgentNames = Annotated[Names, Parameter(help="Controllers to run.", choices=ROSTER)]
+_ADVICE = (
+    "write a function that returns the policy, or the policy and the environment that it acts "
+    "in, and give --agent NAME=MODULE:FUNCTION"
+)
 
 
 @options
@@ -43,12 +53,8 @@ class ControllerOptions:
     fan_out: FanOut = field(default_factory=FanOut)
 
 
-def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEntry]:
-    """Return controllers of the roster by name, then a user's own, as given to `--agent`.
-
-    A `UsageError` says what is wrong with a user's own, or that there is no controller at all.
-    """
-    found = {name: ROSTER[name] for name in names}
+def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controller]:
+    """Return controllers of the roster by name, then a user's own, as given to `--agent`."""
     locations: dict[str, list[str]] = {}
     for text in own:
         name, equals, location = text.partition("=")
@@ -59,94 +65,166 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, RosterEnt
                 f"{taken}, got {text!r}"
             )
         locations.setdefault(name, []).append(location)
+    found = {name: ROSTER[name] for name in names}
     found |= {name: own_entry(name, each) for name, each in locations.items()}
     if not found:
         raise UsageError("--agents, --agent: no controller to run")
     return found
 
 
-def own_entry(name: str, locations: Sequence[str]) -> RosterEntry:
-    """Return an entry for a user's own controller, with one or more members per location.
+def own_entry(name: str, locations: Sequence[str]) -> Controller:
+    """Return the record of a user's own controller, with a member or more for each location.
 
-    A `UsageError` says what is wrong with a location.
+    Its `members` raises a `UsageError` that says what is wrong with a location.
     """
-    factories: list[Factory] = []
-    with blame("--agent"):
-        for location in locations:
+    read = partial(_read, tuple(locations))
+    return Controller(name, name, OWN[0], _make, networks=read, random=True, drawn=True)
+
+
+@dataclass(frozen=True)
+class Own:
+    """What is found at a location."""
+
+    make: Callable[..., Any]
+    """Function of the arguments that `_make` offers, as far as it takes them by name; it
+    returns a policy, or a policy and the environment that it acts in."""
+    observation: Mapping[str, int]
+    provenance: Mapping[str, Any]
+
+
+def _read(locations: Sequence[str]) -> dict[str, Own]:
+    found: dict[str, Own] = {}
+    for location in locations:
+        with blame("--agent"):
             if location.endswith(".zip"):
-                from benchmarks.controllers import saved  # here: PyTorch takes seconds to load
-
-                made = saved.policies(location)
+                algorithm, _, pattern = location.partition(":")
+                if not pattern:
+                    raise ValueError(f"{location!r} must be such as PPO:{location}")
+                files = sorted(glob.glob(pattern))  # noqa: PTH207 (patterns of absolute paths, too)
+                if not files:
+                    raise ValueError(f"{location!r}: there is no file {pattern}")
+                found |= {file: _saved(algorithm, Path(file).resolve()) for file in files}
             else:
-                made = [own_factory(location)]
-            for factory in made:
-                _try_out(factory, location)
-            factories += made
-    return RosterEntry(name, name, OWN[0], lambda: factories, drawn=True)
+                found[location] = _function(location)
+    return found
 
 
-def own_factory(location: str) -> Factory:
+def _function(location: str) -> Own:
     """Import a user's factory, `module:factory`; a ValueError says what is expected.
 
     The README of `benchmarks.compare` lists the arguments and attributes it may have.
     """
     try:
-        found: Any = pkgutil.resolve_name(location)
+        made_by: Any = pkgutil.resolve_name(location)
     except (Exception, SystemExit) as error:  # whatever the code of a user raises
         text = f"{type(error).__name__}: {error}"
         raise ValueError(f"{location!r} cannot be imported: {text}") from error
-    if not callable(found):
-        raise ValueError(f"{location!r} must be MODULE:FACTORY, got {found!r}")
-    observation = getattr(found, "observation", PAPER_WINDOWS)
+    if not callable(made_by):
+        raise ValueError(f"{location!r} must be MODULE:FACTORY, got {made_by!r}")
+    observation = getattr(made_by, "observation", PAPER_WINDOWS)
     if not (isinstance(observation, Mapping) and set(observation) <= set(WINDOWS)):
         raise ValueError(
-            f"observation of {found!r} must be a dict with names out of {', '.join(WINDOWS)}, "
-            f"got {observation!r}"
+            f"observation of {made_by!r} must be a dict with names out of "
+            f"{', '.join(WINDOWS)}, got {observation!r}"
         )
-    cost = Cost(*(str(getattr(found, each.name, "")) for each in fields(Cost)))
-    source = getattr(sys.modules[found.__module__], "__file__", None)
-    code = hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
-    return Factory(partial(_made, location), cost, dict(observation), code=code)
+    told = [getattr(made_by, name, "") for name in ("parameters", "samples", "search")]
+    about = {
+        "file": location,
+        "knows": str(getattr(made_by, "prior_knowledge", "")),
+        "searched": "; ".join(filter(None, map(str, told))),
+    }
+    source = getattr(sys.modules[made_by.__module__], "__file__", None)
+    if source:
+        about["sha256"] = hashlib.sha256(Path(source).read_bytes()).hexdigest()
+    return Own(made_by, dict(observation), about)
 
 
-def _try_out(factory: Factory, location: str) -> None:
-    """Run a controller for two samples on two plants; raise a ValueError if it fails."""
-    size = Parameters(**factory.arguments({})).observation_size
-    try:
-        factory.run({}, samples=2, runs=2, seed=0)
-    except (Exception, SystemExit) as error:
-        raise ValueError(
-            f"{location!r} must give an object with reset() and act(observations), or another "
-            "policy that mptc_gym.evaluate takes, with or without its own environment; "
-            f"it must take observations of shape (2, {size}), one row a plant, and return "
-            f"actions of shape (2, 1); trying it raised {type(error).__name__}: {error}"
-        ) from error
-
-
-def _made(location: str, plant: Parameters, runs: int, seed: int) -> Agent:
+def _make(own: Own, plant: Parameters, runs: int, seed: int) -> Any:
     """Call a user's factory with the arguments that it accepts, by name."""
-    made_by: Callable[..., Agent] = pkgutil.resolve_name(location)
     offered = {"parameters": plant, "num_envs": runs, "seed": seed, **limits(plant)}
-    accepted = inspect.signature(made_by).parameters
+    accepted = inspect.signature(own.make).parameters
     if not any(each.kind is each.VAR_KEYWORD for each in accepted.values()):
         offered = {name: offered[name] for name in offered if name in accepted}
-    made: Any = made_by(**offered)
+    made = own.make(**offered)
+    if hasattr(made, "reset") and hasattr(made, "act"):
+        return made
     policy, env = made if isinstance(made, tuple) else (made, None)
-    if env is None and hasattr(policy, "reset") and hasattr(policy, "act"):
-        return cast("Agent", policy)
-    return OwnPolicy(policy, env, runs)
+    return Policy(policy, env, plant, runs)
 
 
-class OwnPolicy:
-    """A policy in any form that `mptc_gym.evaluate` takes, and the environment it acts in."""
+@dataclass
+class Policy:
+    """A policy in any form that `mptc_gym.evaluate` takes, and what it acts in."""
 
-    def __init__(self, policy: Any, env: Any, runs: int) -> None:
-        self.policy, self.env, self._runs = policy, env, runs
+    policy: Any
+    env: Any
+    """None for the plain environment, arguments of `IncrementalAction` for it in that wrapper,
+    or an environment, or a function that makes one."""
+    plant: Parameters
+    runs: int
 
     def reset(self) -> None:
         """Start an episode."""
-        self._act = start(self.policy, self._runs)
+        self._act = start(self.policy, self.runs)
 
     def act(self, observation: Any) -> Any:
         """Return actions, shape (runs, 1)."""
         return self._act(observation)
+
+    @contextmanager
+    def opened(self, samples: int, **arguments: Any) -> Iterator[Any]:
+        """Yield the plants that it acts in, with these arguments or refused."""
+        if self.env is None or isinstance(self.env, Mapping):
+            with closing(make_plants(self.runs, samples, **arguments)) as plants:
+                yield IncrementalAction(plants, **self.env) if self.env else plants
+            return
+        with opened(self.env, self.runs) as given:
+            if {case_of(each.parameters) for each in given.inner} != {case_of(self.plant)}:
+                raise ValueError("the environment must have the parameters that it is made for")
+            yield given
+
+
+def _saved(algorithm: str, file: Path) -> Own:
+    """Return a model, which acts as its file says, or else in the plain environment."""
+    model, windows, moves = _loaded(algorithm, file)
+    weights = sum(weight.numel() for weight in model.policy.parameters())
+    samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
+    about = {
+        "file": file.name,
+        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        "searched": f"{weights:,} weights: {samples}",
+    }
+    return Own(lambda: (model, moves), windows, about)
+
+
+def _loaded(algorithm: str, file: Path) -> tuple[Any, dict[str, int], Any]:
+    """Return a model, its windows and, if it moves the flow, the arguments of that wrapper."""
+    from mptc_gym.sb3 import MEMBER, load, spec_of  # here: PyTorch takes seconds to load
+
+    with suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
+        if MEMBER not in archive.namelist():
+            return _plain(algorithm, file), dict(PAPER_WINDOWS), None
+    model = load(file, device="cpu")
+    if type(model).__name__ != algorithm:
+        raise ValueError(f"{file} holds a model of {type(model).__name__}, not of {algorithm}")
+    spec = spec_of(model)
+    names = [each.name for each in spec.additional_wrappers]
+    if names not in ([], ["IncrementalAction"]):
+        acts_in = ", ".join(names)
+        raise ValueError(f"{file} acts in {acts_in}, not in IncrementalAction alone: {_ADVICE}")
+    moves = spec.additional_wrappers[0].kwargs if names else None
+    plant = Parameters.of_environment(spec.kwargs)
+    return model, {name: getattr(plant, name) for name in WINDOWS}, moves
+
+
+def _plain(algorithm: str, file: Path) -> Any:
+    """Return a model that does not say where it acts, if it may be in the plain environment."""
+    for package in ("stable_baselines3", "sb3_contrib"):
+        with suppress(ImportError):
+            if kind := getattr(importlib.import_module(package), algorithm, None):
+                model, plain = kind.load(file, device="cpu"), MiddlePointEnv()
+                spaces = plain.observation_space, plain.action_space
+                if (model.observation_space, model.action_space) != spaces:
+                    raise ValueError(f"{file} does not act in the plain environment: {_ADVICE}")
+                return model
+    raise ValueError(f"{algorithm} must be an algorithm of Stable-Baselines3, such as PPO")

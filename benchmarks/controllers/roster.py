@@ -1,190 +1,298 @@
-"""List one entry per controller in the roster, with all that the commands need to know of it.
+"""List the controllers: one record each, with all that the commands need to know of it.
 
 A controller is added here and nowhere else: `compare`, `sweep`, `tune` and `watch` then know
-it. A user's own controllers (`--agent NAME=MODULE:FACTORY`) also become such entries.
+it. A user's own (`--agent NAME=MODULE:FACTORY`) becomes such a record, too.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from typing import Any
 
-from benchmarks.controllers import engineered
-from benchmarks.controllers.records import Cost, Factory, RosterEntry, Tuning
-
-_STEP_TEST = "gain, time constant, delay"
-_DATA_SHEET = f"{_STEP_TEST}, dead zone, limits"
-_NETWORK = "8,894 weights for all plants"
-_SEARCHED = "gains searched on the paper's plant"
-_SEARCH_OF_NN = "800 trials: 566 M samples, 6 min"
-_SEARCH_OF_NETWORK = "9 trainings of 46 M samples and 10 min; 110 settings by hand"
-
-_ENTRIES = (
-    RosterEntry(
-        "nothing",
-        "no control",
-        ("#8C8C8C", "x"),
-        Factory(engineered.nothing, Cost("nothing", "0", "none"), observation={}),
-        compared=False,
-        swept=False,
-    ),
-    RosterEntry(
-        "nn",
-        "NN (1992)",
-        ("#D55E00", "o"),
-        Factory(
-            engineered.direct_nn,
-            Cost(f"direction; {_SEARCHED}", "25 weights, 6 gains", "none", _SEARCH_OF_NN),
-            learns=True,
-        ),
-        tuning=Tuning(
-            {
-                "eta": (1e-3, 10.0),
-                "eta_1": (1e-3, 1.0),
-                "eta_theta": (1e-4, 1.0),
-                "eta_1_theta": (1e-4, 1.0),
-                "input_scale": (0.02, 1.0),
-                "weight_scale": (0.05, 2.0),
-            }
-        ),
-        drawn=True,
-    ),
-    RosterEntry(
-        "nn-frozen",
-        "NN (1992), frozen",
-        ("#7A3600", "o"),
-        Factory(
-            engineered.frozen_nn,
-            Cost(
-                f"direction; {_SEARCHED}",
-                "25 weights, 6 gains",
-                "1,200 a network",
-                _SEARCH_OF_NN,
-            ),
-        ),
-        compared=False,
-    ),
-    RosterEntry(
-        "pi",
-        "PI (1992)",
-        ("#CC79A7", "s"),
-        Factory(engineered.paper_pi, Cost("gains of the paper", "2", search="not stated")),
-        tuning=Tuning({"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}),
-        drawn=True,
-    ),
-    RosterEntry(
-        "pi-simc",
-        "PI (SIMC)",
-        ("#8E3B6B", "s"),
-        Factory(engineered.simc_pi, Cost(_STEP_TEST, "2", "one step test", "none: a rule")),
-    ),
-    RosterEntry(
-        "pi-searched",
-        "PI (searched)",
-        ("#4F1F3B", "s"),
-        Factory(
-            engineered.searched_pi,
-            Cost(_SEARCHED, "2", "none", "800 trials: 566 M samples, 3 min"),
-        ),
-        swept=False,
-    ),
-    RosterEntry(
-        "smith",
-        "Smith",
-        ("#56B4E9", "^"),
-        Factory(
-            engineered.smith,
-            Cost(_DATA_SHEET, "2 gains, 5 of the model", "one step test", "none: a rule"),
-        ),
-        drawn=True,
-    ),
-    RosterEntry(
-        "self-tuning",
-        "self-tuning",
-        ("#00B98A", "v"),
-        Factory(
-            engineered.self_tuning,
-            Cost(
-                f"{_DATA_SHEET}; delay range",
-                "a bank of models, 30 settings",
-                "one step test",
-                "by hand, not counted",
-            ),
-        ),
-    ),
-    RosterEntry(
-        "mpc",
-        "MPC",
-        ("#000000", "*"),
-        Factory(
-            engineered.mpc,
-            Cost("everything but the future", "all of the plant's", "none", "none"),
-        ),
-        swept=False,
-    ),
-    RosterEntry(
-        "ppo",
-        "PPO",
-        ("#E69F00", "D"),
-        engineered.policies(
-            "ppo-[0-9]*.npz",
-            Cost(
-                "dead zone; trained on the paper's plant",
-                "388 weights",
-                "5 M a policy",
-                "79 trials: 121 M samples, 30 min",
-            ),
-        ),
-        drawn=True,
-    ),
-    RosterEntry(
-        "ppo-hard",
-        "PPO (hard)",
-        ("#8F6200", "D"),
-        engineered.policies(
-            "ppo-hard-*.npz",
-            Cost(
-                "trained on plants that vary",
-                "12,608 weights",
-                "4 M a policy",
-                "43 trials: 36 M samples, 12 min",
-            ),
-        ),
-    ),
-    RosterEntry(
-        "nn-smith",
-        "neural Smith",
-        ("#0072B2", "^"),
-        engineered.law_network(
-            engineered.nn_smith,
-            Cost(_DATA_SHEET, _NETWORK, "one step test; 46 M, once", _SEARCH_OF_NETWORK),
-        ),
-        drawn=True,
-    ),
-    RosterEntry(
-        "nn-self-tuning",
-        "neural self-tuning",
-        ("#00664B", "v"),
-        engineered.law_network(
-            engineered.nn_self_tuning,
-            Cost(
-                f"{_DATA_SHEET}; delay range",
-                f"a bank of models, 31 settings; {_NETWORK}",
-                "one step test; 46 M, once",
-                _SEARCH_OF_NETWORK,
-            ),
-        ),
-        drawn=True,
-    ),
+from agents import (
+    DirectNNController,
+    LawNetwork,
+    NeuralSelfTuningController,
+    NeuralSmithPredictor,
+    PIController,
+    PolicyNetwork,
+    SelfTuningController,
+    SmithPredictor,
 )
-ROSTER = {entry.name: entry for entry in _ENTRIES}
+from agents.controller import PAPER_WINDOWS
+from agents.networks import PRETRAINED
+from agents.pi import SEARCHED_GAINS
+from benchmarks.controllers.mpc import PredictiveController
+from benchmarks.loop.linear import nominal, step_test
+from benchmarks.loop.rollout import Agent, IdleValve, Trajectory, make_plants, rollout
+from mptc_gym import Parameters
 
-
+LEARNING = 1200  # samples of the square wave on which a network is commissioned
+COMMISSIONING_SEED = 3_000_000  # of plants and noise during commissioning
 OWN = (("#5B3FA6", "P"), ("#A08CDB", "X"), ("#B22222", "P"), ("#F08080", "X"))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Controller:
+    """A controller, or one that was trained, as all commands know it."""
+
+    name: str = field(kw_only=False)
+    """Name in options and files."""
+    label: str = field(kw_only=False)
+    """Name in tables and pictures."""
+    look: tuple[str, str] = field(kw_only=False)
+    """Colour and marker in pictures; relatives have shades of one hue and the same marker."""
+    make: Callable[..., Agent] = field(kw_only=False)
+    """Function of the plant that it is made for (`Parameters`), the number of runs, and a seed;
+    run i uses `seed + i`. Searched gains are passed by name, a network before all others."""
+    knows: str = ""
+    """Prior knowledge: what it is told about the plant."""
+    searched: str = ""
+    """What was searched or trained, and in how many trials and samples of the plant."""
+    observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
+    """The observation windows that it expects, by the environment's arguments."""
+    networks: Callable[[], Mapping[str, Any]] | None = None
+    """Reads the networks that were trained separately, by file: each makes a member."""
+    random: bool = False
+    """Whether it draws something itself, such as its first weights."""
+    learns: bool = False
+    """Whether it keeps learning from run to run."""
+    gains: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Lowest and highest value of each of its gains in a search, by name."""
+    compared: bool = True
+    swept: bool = True
+    """Whether `compare` (`compared`) and `sweep` (`swept`) run it by default."""
+    told: bool = False
+    """Whether it is told the whole plant, as no controller of a real one is."""
+    drawn: bool = False
+    """Whether its responses are drawn in a comparison."""
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    """Origin of a trained network, JSON-serialisable; empty if nothing was trained."""
+
+    def members(self) -> list[Controller]:
+        """Return the controller, or one for each of the networks that it was trained to."""
+        if self.networks is None:
+            return [self]
+        return [
+            replace(
+                self,
+                make=partial(self.make, network),
+                observation=getattr(network, "observation", self.observation),
+                provenance={"file": file, **network.provenance},
+                networks=None,
+            )
+            for file, network in sorted(self.networks().items())
+        ]
+
+    def arguments(self, plant: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a plant's arguments of the environment, with the observation windows."""
+        return {**plant, **self.observation}
+
+    def __call__(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
+        """Return a controller for `runs` plants, made for the plant with these arguments."""
+        return self.make(Parameters(**self.arguments(plant)), runs, seed)
+
+    def run(
+        self,
+        plant: Mapping[str, Any],
+        samples: int,
+        runs: int,
+        seed: int,
+        controller: Agent | None = None,
+    ) -> Trajectory:
+        """Run the given controller, by default a new one for this plant; see `rollout`."""
+        agent, arguments = controller or self(plant, runs, seed), self.arguments(plant)
+        opened: Any = getattr(agent, "opened", None)  # of a user's, that acts in its own
+        with (
+            opened(samples, **arguments)
+            if opened
+            else closing(make_plants(runs, samples, **arguments))
+        ) as plants:
+            return rollout(plants, agent, samples, seed)
+
+    def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
+        """Return a controller that is ready for plants it was not made for.
+
+        A controller that learns has already learnt on the plant it is made for.
+        """
+        controller = self(plant, runs, seed)
+        if self.learns:
+            square = {**plant, "setpoint": "square"}
+            self.run(square, LEARNING, runs, COMMISSIONING_SEED, controller)
+        return controller
+
+
+def limits(plant: Parameters) -> dict[str, Any]:
+    """Return the limits of the flow, the widest possible if they are drawn."""
+    return {"u_min": plant.range_of("u_min")[0], "u_max": plant.range_of("u_max")[1]}
+
+
+def data_sheet(plant: Parameters) -> dict[str, Any]:
+    """Return a step test and the actuator's data sheet, the middle of a drawn dead zone."""
+    dead_zone = sum(plant.range_of("dead_zone")) / 2
+    return {**asdict(step_test(plant)), **limits(plant), "dead_zone": dead_zone}
+
+
+def with_limits(make: Callable[..., Any], plant: Parameters, *_: int, **gains: Any) -> Any:
+    """Return a controller that knows its gains and the limits of the flow, nothing else."""
+    return make(**gains, **limits(plant))
+
+
+def searched_pi(plant: Parameters, *_: int) -> PIController:
+    """Return a PI controller with the gains of a search on the paper's plant."""
+    return PIController(**{**limits(plant), **SEARCHED_GAINS})
+
+
+def with_data_sheet(make: Callable[..., Agent], plant: Parameters, *_: int) -> Agent:
+    """Return a controller that knows a step test and the actuator's data sheet."""
+    return make(**data_sheet(plant))
+
+
+def simc_pi(plant: Parameters, runs: int = 1, seed: int = 0) -> PIController:
+    """Return a PI controller tuned by the SIMC rule from a step test alone."""
+    return PIController.simc(**asdict(step_test(plant)), **limits(plant))
+
+
+def smith(plant: Parameters, runs: int = 1, seed: int = 0) -> SmithPredictor:
+    """Return a Smith predictor whose closed loop has half the plant's time constant."""
+    known = data_sheet(plant)
+    half = float(f"{known['time_constant'] / 2:.2g}")
+    return SmithPredictor(**known, closed_loop_time_constant=half)
+
+
+def direct_nn(plant: Parameters, runs: int, seed: int, **gains: Any) -> DirectNNController:
+    """Return the paper's network, which knows the direction of the plant's response."""
+    direction = 1 if nominal(plant).gain > 0.0 else -1
+    return DirectNNController(
+        num_envs=runs, seed=seed, direction=direction, **limits(plant), **gains
+    )
+
+
+def frozen_nn(plant: Parameters, runs: int, seed: int) -> Agent:
+    """Return the paper's network after it has learnt on the plant that it is made for."""
+    controller: Any = ROSTER["nn"].in_service(asdict(plant), runs, seed)
+    controller.learning = False
+    return controller  # type: ignore[no-any-return]
+
+
+def with_law(
+    make: Callable[..., Agent], network: LawNetwork, plant: Parameters, *_: int
+) -> Agent:
+    """Return a controller with the network of the law, which knows what `data_sheet` says."""
+    return make(**data_sheet(plant), network=network)
+
+
+def with_policy(network: PolicyNetwork, plant: Parameters, *_: int) -> PolicyNetwork:
+    """Return a trained policy for the actuator's limits.
+
+    If it compensates a dead zone, that is the plant's, where it is a number.
+    """
+    increments = network.increments
+    if increments and increments.dead_zone and not isinstance(plant.dead_zone, Sequence):
+        increments = replace(increments, dead_zone=plant.dead_zone)
+    return replace(network, increments=increments, **limits(plant))
+
+
+def policies(files: str) -> Mapping[str, PolicyNetwork]:
+    """Return the networks in `agents/pretrained` that match a pattern, from any learner."""
+    found = {file.name: PolicyNetwork.load(file) for file in PRETRAINED.glob(files)}
+    if not found:
+        raise FileNotFoundError(f"there is no file {PRETRAINED / files}")
+    return found
+
+
+def law() -> Mapping[str, LawNetwork]:
+    """Return the network of the law, by its file."""
+    return {"nn-smith.npz": LawNetwork.load()}
+
+
+_STEP_TEST = "gain, time constant, delay"
+_DATA_SHEET = f"{_STEP_TEST}, dead zone, limits"
+_NN = "25 weights in the run itself; 6 gains by 800 trials: 566 M samples, 6 min"
+_LAW = (
+    "8,894 weights for all plants: 46 M samples, once, 10 min; 9 such trainings, 110 settings "
+    "by hand"
+)
+_RULE = "nothing: one step test, a rule"
+
+_CONTROLLERS = (
+    Controller(
+        "nothing", "no control", ("#8C8C8C", "x"), partial(with_limits, IdleValve),
+        knows="nothing", searched="nothing", observation={}, compared=False, swept=False,
+    ),
+    Controller(
+        "nn", "NN (1992)", ("#D55E00", "o"), direct_nn,
+        knows="direction", searched=_NN, random=True, learns=True, drawn=True,
+        gains={
+            "eta": (1e-3, 10.0),
+            "eta_1": (1e-3, 1.0),
+            "eta_theta": (1e-4, 1.0),
+            "eta_1_theta": (1e-4, 1.0),
+            "input_scale": (0.02, 1.0),
+            "weight_scale": (0.05, 2.0),
+        },
+    ),
+    Controller(
+        "nn-frozen", "NN (1992), frozen", ("#7A3600", "o"), frozen_nn,
+        knows="direction", searched=f"{_NN}; 1,200 samples before", random=True, compared=False,
+    ),
+    Controller(
+        "pi", "PI (1992)", ("#CC79A7", "s"), partial(with_limits, PIController),
+        knows="gains of the paper", searched="2 gains, not stated how", drawn=True,
+        gains={"kp": (0.1, 10.0), "ki": (1e-3, 1.0)},
+    ),
+    Controller(
+        "pi-simc", "PI (SIMC)", ("#8E3B6B", "s"), simc_pi, knows=_STEP_TEST, searched=_RULE
+    ),
+    Controller(
+        "pi-searched", "PI (searched)", ("#4F1F3B", "s"),
+        searched_pi, knows="gains of the search",
+        searched="2 gains by 800 trials: 566 M samples, 3 min", swept=False,
+    ),
+    Controller(
+        "smith", "Smith", ("#56B4E9", "^"), smith,
+        knows=_DATA_SHEET, searched=_RULE, drawn=True,
+    ),
+    Controller(
+        "self-tuning", "self-tuning", ("#00B98A", "v"),
+        partial(with_data_sheet, SelfTuningController), knows=f"{_DATA_SHEET}; delay range",
+        searched="30 settings by hand, not counted; one step test",
+    ),
+    Controller(
+        "mpc", "MPC", ("#000000", "*"), PredictiveController,
+        knows="everything but the future", searched="nothing", told=True, swept=False,
+    ),
+    Controller(
+        "ppo", "PPO", ("#E69F00", "D"), with_policy, knows="dead zone", drawn=True,
+        searched="388 weights on the paper's plant: 5 M samples a policy; settings by 79 "
+        "trials: 121 M samples, 30 min",
+        networks=partial(policies, "ppo-[0-9]*.npz"),
+    ),
+    Controller(
+        "ppo-hard", "PPO (hard)", ("#8F6200", "D"), with_policy, knows="nothing",
+        searched="12,608 weights on plants that vary: 4 M samples a policy; settings by 43 "
+        "trials: 36 M samples, 12 min",
+        networks=partial(policies, "ppo-hard-*.npz"),
+    ),
+    Controller(
+        "nn-smith", "neural Smith", ("#0072B2", "^"), partial(with_law, NeuralSmithPredictor),
+        knows=_DATA_SHEET, searched=f"{_LAW}; one step test", networks=law, drawn=True,
+    ),
+    Controller(
+        "nn-self-tuning", "neural self-tuning", ("#00664B", "v"),
+        partial(with_law, NeuralSelfTuningController), knows=f"{_DATA_SHEET}; delay range",
+        searched=f"{_LAW}; 31 settings by hand; one step test", networks=law, drawn=True,
+    ),
+)  # fmt: skip
+ROSTER = {each.name: each for each in _CONTROLLERS}
+
+
 def label(agent: str) -> str:
-    """Return the name of a controller in tables and plots."""
+    """Return the name of a controller in tables and pictures."""
     return ROSTER[agent].label if agent in ROSTER else agent
 
 

@@ -177,7 +177,7 @@ def command(
     *,
     interrupted: str = "what has finished is written.",
     **_: Any,
-) -> Callable[[Sequence[str] | None], int]:
+) -> Callable[..., int]:
     """Return the `main` of the command `python -m benchmarks.NAME`.
 
     It takes the command line without the program's name, by default that of the process, and

@@ -1,4 +1,4 @@
-"""Describe the plant as a linear system, from which every analysis takes its coefficients.
+"""Describe the plant as a linear system: its step response, step test and closed loop.
 
 Between the limits of the actuator (29) the plant is
 
@@ -15,13 +15,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.polynomial import polyadd, polyval
 from numpy.typing import ArrayLike, NDArray
 
+from agents import PIController
 from mptc_gym import Parameters
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
 
 Array = NDArray[np.float64]
+
+LONGEST = 1e6  # samples within which a plant must settle for a step test
 
 
 @dataclass(frozen=True)
@@ -56,9 +60,14 @@ class LinearModel:
 
     def response(self, flow: ArrayLike) -> Array:
         """Return y(0), y(1), ..., degC, from rest, given u_a(0), u_a(1), ..., t/h."""
-        from scipy import signal  # here: slow to import
-
-        return np.asarray(signal.lfilter(*self.transfer(), np.asarray(flow, np.float64)))
+        moved = np.convolve(np.asarray(flow, np.float64), self.transfer()[0])[: np.size(flow)]
+        past = [0.0] * (len(self.a) - 1)
+        found = []
+        for value in moved.tolist():
+            value -= sum(a * y for a, y in zip(self.a[1:], past, strict=True))
+            found.append(value)
+            past = [value, *past[:-1]] if past else past
+        return np.array(found)
 
     def step_response(self, samples: int | None = None) -> Array:
         """Return y(0), y(1), ... after a step of u_a from 0 to 1 t/h at k = 0, degC per t/h.
@@ -70,9 +79,9 @@ class LinearModel:
             slowest = float(np.max(np.abs(self.poles), initial=0.0))
             if sum(self.b) == 0.0:
                 raise ValueError(f"b must have a sum other than 0 for a gain, got {self.b}")
-            # Until 1e-5 of a transient remains; in a million samples, or never.
+            # Until 1e-5 of a transient remains.
             settling = math.log(1e-5) / math.log(slowest) if 0.0 < slowest < 1.0 else 0.0
-            if slowest >= 1.0 or settling > 1e6:
+            if slowest >= 1.0 or settling > LONGEST:
                 raise ValueError(f"a must be of a stable plant for a step test, got {self.a}")
             # Twice as long, since the transients of repeated poles last longer.
             samples = self.delay + len(self.b) + 2 * math.ceil(settling) + 2
@@ -255,3 +264,36 @@ def time_varying_model(
         high=max(flows),
         numbers=numbers,
     )
+
+
+class Loop:
+    """The loop of a linear controller and a plant, (28) without the actuator, opened at e.
+
+    L is its transfer function from e to y; the controller's is what its `transfer` gives.
+    """
+
+    def __init__(self, controller: PIController, plant: LinearModel) -> None:
+        # G_u from e to u, and G from u to y: L = G_u G, in powers of z^-1.
+        (up, down), (b, a) = controller.transfer(), plant.transfer()
+        self.numerator, self.denominator = np.convolve(up, b), np.convolve(down, a)
+
+    @property
+    def largest_pole(self) -> float:
+        """Modulus of the closed loop's largest pole: it is stable if this is below 1."""
+        return float(np.abs(np.roots(polyadd(self.denominator, self.numerator))).max())
+
+    @property
+    def sensitivity(self) -> float:
+        """Ms, the most that the loop amplifies a disturbance; infinite if it is not stable.
+
+        1 / Ms is the smallest distance of the loop's frequency response from -1.
+        """
+        if self.largest_pole >= 1.0:
+            return math.inf
+        # In radians a sample: logarithmic for slow plants, linear for long delays.
+        dense = np.union1d(
+            np.geomspace(3e-5, math.pi, 20_000), np.linspace(1e-4, math.pi, 20_000)
+        )
+        back = np.exp(-1j * dense)
+        opened = polyval(back, self.numerator) / polyval(back, self.denominator)
+        return float(1.0 / np.abs(1.0 + opened).min())

@@ -63,7 +63,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     samples_itae, overshoot, settling = np.array(by_steps).T
     return {
         "mae": mean_error(trajectory),
-        "ise": interval * np.square(trajectory.error).sum(axis=0),
+        "ise": interval * np.square(trajectory.next_error).sum(axis=0),
         "itae": interval**2 * samples_itae,
         "total_variation": travel(trajectory),
         "overshoot": 100.0 * overshoot,
@@ -99,7 +99,7 @@ def held(setpoint: Array) -> list[tuple[int, int]]:
 
 def mean_error(trajectory: Trajectory) -> Array:
     """Return the mean of |e(k)| over k = 1 to N of each run, degC, shape (runs,)."""
-    return np.asarray(np.abs(trajectory.error).mean(axis=0))
+    return np.asarray(np.abs(trajectory.next_error).mean(axis=0))
 
 
 def travel(trajectory: Trajectory) -> Array:

@@ -31,29 +31,25 @@ class Agent(Protocol):
 
 
 class IdleValve:
-    """Leave the valve where it is, initially at 0 t/h.
+    """No control: leave the valve at 0 t/h.
 
     The actuator's limits are in t/h, the same for all runs or of shape (runs,).
     """
 
     def __init__(self, u_min: Any = -10.0, u_max: Any = 10.0) -> None:
-        self.u_min, self.u_max = u_min, u_max
-        self.flow = 0.0  # t/h
+        self.action = np.reshape(action_from_command(0.0, u_min, u_max), (-1, 1))
 
     def reset(self) -> None:
-        """Return the valve to 0 t/h."""
-        self.flow = 0.0
+        """Remember nothing."""
 
     def act(self, observation: NDArray[np.float32]) -> Array:
         """Return the actions that keep the flow, shape (runs, 1)."""
-        actions = np.empty((len(observation), 1))
-        actions[:, 0] = action_from_command(self.flow, self.u_min, self.u_max)
-        return actions
+        return np.broadcast_to(self.action, (len(observation), 1))
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The signals of a batch of runs; every array has shape (samples, runs)."""
+    """The signals of a batch of runs, k = 0 to N - 1; every array has shape (N, runs)."""
 
     setpoint: Array
     """y_d(k), degC."""
@@ -65,8 +61,8 @@ class Trajectory:
     """u_a(k), t/h."""
     noise: Array
     """n(k), degC."""
-    error: Array
-    """e(k + 1), degC: the error in the reward of sample k. Mean errors are over k = 1 to N."""
+    next_error: Array
+    """e(k + 1), degC, which the reward of sample k is for. Mean errors are over k = 1 to N."""
 
 
 def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vector.VectorEnv:
@@ -87,6 +83,14 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
     return PlantNumbers(
         **{name: np.broadcast_to(value, runs).copy() for name, value in numbers.items()}
     )
+
+
+def is_random(parameters: Parameters) -> bool:
+    """Return whether anything is drawn for an episode, even if only its noise."""
+    noises = "noise_variance", "measurement_noise_variance"
+    noisy = any(parameters.range_of(name)[1] > 0.0 for name in noises)
+    drawn = bool(parameters.ranges) or parameters.setpoint == "random"
+    return drawn or noisy or parameters.is_disturbed
 
 
 def rollout(
@@ -121,5 +125,5 @@ def rollout(
         # A step reports the command and the applied input of the sample that it starts at.
         trajectory.command[k] = after["command"]
         trajectory.applied[k] = after["applied"]
-        trajectory.error[k] = after["error"]
+        trajectory.next_error[k] = after["error"]
     return trajectory

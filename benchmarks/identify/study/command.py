@@ -19,7 +19,7 @@ import pandas as pd
 from rich.console import Console
 from scipy import signal
 
-from benchmarks.controllers.engineered import simc_pi
+from benchmarks.controllers.roster import simc_pi
 from benchmarks.identify.__main__ import Knowledge
 from benchmarks.identify.fit import identify
 from benchmarks.identify.log import Log
