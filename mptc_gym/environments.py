@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
 from typing import Any, Final
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import SyncVectorEnv, VectorActionWrapper, VectorEnv
-from gymnasium.vector import VectorObservationWrapper as VectorObservations
+from gymnasium.vector import (
+    SyncVectorEnv,
+    VectorActionWrapper,
+    VectorEnv,
+    VectorObservationWrapper,
+)  # fmt: skip
+from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward, vector
 
 from mptc_gym.checks import reject, shorten
@@ -20,8 +25,6 @@ from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
-Env = gymnasium.Env[Any, Any]
-
 PLANTS: Final = MiddlePointEnv, MiddlePointVectorEnv
 _INCREMENTS: Final = IncrementalAction, VectorIncrementalAction
 _INSIDE: Final = "venv", "env", "envs", "batches"  # attributes that hold the next layers
@@ -29,8 +32,8 @@ _NORMALISERS: Final = (
     NormalizeObservation, NormalizeReward, vector.NormalizeObservation, vector.NormalizeReward,
 )  # fmt: skip
 _ACTING: Final = (
-    gymnasium.ActionWrapper, gymnasium.ObservationWrapper, VectorActionWrapper,
-    VectorObservations,
+    gymnasium.ActionWrapper, gymnasium.ObservationWrapper,
+    VectorActionWrapper, VectorObservationWrapper,
 )  # fmt: skip
 _SB3: Final = "stable_baselines3.common.vec_env"
 _TOLERANCE: Final = 1e-6  # of infos, degC or t/h
@@ -65,13 +68,11 @@ def plants_of(env: Any) -> list[Any]:
 
 def increments(env: Any) -> set[Any]:
     """Return the arguments of `IncrementalAction` around plants; none if there is none."""
-    found = {each._arguments for each in layers(env) if isinstance(each, _INCREMENTS)}
-    if not any(isinstance(each, PLANTS) for each in layers(env)):  # in other processes
-        for spec in env.get_attr("spec"):
-            wrappers = spec.additional_wrappers if spec else ()
-            kept = [each.kwargs for each in wrappers if each.name == "IncrementalAction"]
-            found |= {tuple(each.values()) for each in kept if each}
-    return found
+    if any(isinstance(each, PLANTS) for each in layers(env)):
+        return {each._arguments for each in layers(env) if isinstance(each, _INCREMENTS)}
+    specs = [spec for spec in env.get_attr("spec") if spec]  # from other processes
+    wrappers = [each for spec in specs for each in spec.additional_wrappers]
+    return {tuple(w.kwargs.values()) for w in wrappers if w.name == "IncrementalAction"}
 
 
 def stacks_and_normalisers(env: Any) -> set[str]:
@@ -96,12 +97,10 @@ class Given:
     def __init__(self, env: Any) -> None:
         self.env, self.num_envs, self._vec_env = env, env.num_envs, is_vec_env(env)
         self.inner = plants_of(env)
-        prefix = "" if self._vec_env else "single_"
-        self.single_observation_space = getattr(env, f"{prefix}observation_space")
-        self.single_action_space = getattr(env, f"{prefix}action_space")
-        self.action_space = gymnasium.vector.utils.batch_space(
-            self.single_action_space, self.num_envs
-        )
+        of_one = "" if self._vec_env else "single_"
+        self.single_observation_space = getattr(env, f"{of_one}observation_space")
+        self.single_action_space = getattr(env, f"{of_one}action_space")
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(self, *, seed: Any = None) -> tuple[Any, Mapping[str, Any]]:
         """Reset all with a seed each."""
@@ -127,7 +126,9 @@ class Given:
             *others, infos = self.env.step(actions)
             return (*others, _columns(infos))
         observations, rewards, ended, infos = self.env.step(actions)
-        batch = isinstance(self.env.unwrapped, loaded("mptc_gym.sb3", "GymnasiumVecEnv"))
+        batch = isinstance(
+            self.env.unwrapped, loaded("mptc_gym.sb3_vec_env", "GymnasiumVecEnv")
+        )
         if batch and not ended.any():  # then its list is empty
             infos = self.env.unwrapped.infos
         return observations, rewards, ended, np.zeros_like(ended), _columns(infos)
@@ -135,11 +136,12 @@ class Given:
     def restart(self) -> None:
         """Reset all with fresh seeds, so that training never meets the episodes of a score."""
         seed = int(np.random.SeedSequence().generate_state(1)[0])
-        # A Monitor may not allow it, and what is broken has raised its own error.
-        with suppress(Exception):
+        with suppress(Exception):  # a Monitor may not allow it; what is broken raised its own
             if self._vec_env:
                 self.env.seed(seed)
-            self.env.reset(**({} if self._vec_env else {"seed": seed}))
+                self.env.reset()
+            else:
+                self.env.reset(seed=seed)
 
 
 def _columns(infos: Any) -> Mapping[str, Any]:
@@ -176,15 +178,14 @@ def _made(make: Any, n: int) -> VectorEnv[Any, Any, Any]:
     if not callable(make):
         reject("env", make, "an id, an EnvSpec, environments, or a function that makes one")
     envs = [make()]
-    if isinstance(envs[0], VectorEnv) or is_vec_env(envs[0]):
-        raise ValueError("env must be a function that makes one environment, not many: call it")
     if not isinstance(envs[0], gymnasium.Env):
-        reject("env", envs[0], "an open environment of MiddlePointEnv in NumPy, wrapped or not")
+        allowed = "a function that makes one environment; where it makes many, call it"
+        reject("env", envs[0], allowed)
     envs += [make() for _ in range(n - 1)]
     if len({id(each.unwrapped) for each in envs}) < n:
         raise ValueError("env must be a function that makes a new environment at each call")
-    makers: list[Callable[[], Env]] = [lambda each=each: each for each in envs]  # type: ignore[misc]
-    return SyncVectorEnv(makers)
+    following = iter(envs)
+    return SyncVectorEnv([lambda: next(following)] * n)
 
 
 @contextmanager
@@ -194,9 +195,8 @@ def _frozen(env: Any) -> Iterator[None]:
     try:
         for layer in layers(env):
             ask: Any = getattr(layer, "env_method", getattr(layer, "call", None))
-            if hasattr(layer, "processes") and any(
-                ask("has_wrapper_attr", "update_running_mean")
-            ):
+            question = "has_wrapper_attr", "update_running_mean"
+            if hasattr(layer, "processes") and any(ask(*question)):
                 raise ValueError(
                     "env must not normalise in other processes, where its statistics cannot be "
                     "frozen: make it in this one, by DummyVecEnv or SyncVectorEnv"
@@ -216,14 +216,10 @@ def _frozen(env: Any) -> Iterator[None]:
 def _check_statistics(found: Any, name: str) -> None:
     """Refuse statistics of observations that are still those of the beginning."""
     for each in found.values() if isinstance(found, dict) else (found,):
-        if (
-            each is not None
-            and each.count < 1
-            and not (each.mean.any() or (each.var != 1).any())
-        ):
+        if each and each.count < 1 and not each.mean.any() and (each.var == 1).all():
             raise ValueError(
                 f"env must have the statistics of the training in its {name}, which has seen "
-                "nothing: take those of the training, such as by VecNormalize.load"
+                "nothing: load or copy them"
             )
 
 

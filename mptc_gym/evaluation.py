@@ -11,7 +11,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import gymnasium
 import numpy as np
@@ -186,19 +186,24 @@ valve travel 0 t/h; 100 episodes, all alike
     episodes = count("episodes", episodes, 2, MOST_PLANTS)
     first = count("seed", seed, 0, 2**63)
     seeds = range(first, first + episodes)
-    with _stage(policy, env, episodes, arguments) as stage:
-        errors, travels, samples = _run(policy, stage, seeds)
-    parameters = stage.parameters
+    with _prepared(policy, env, episodes, arguments) as (
+        plants,
+        parameters,
+        name,
+        most,
+        native,
+    ):
+        check = None if native else case_of(parameters)
+        errors, travels, samples = _run(policy, plants, seeds, most, check)
     found = Evaluation(
-        stage.name, float(errors.mean()), float(travels.mean()), errors, travels, seeds
+        name, float(errors.mean()), float(travels.mean()), errors, travels, seeds
     )
     least = least_errors(parameters, samples, seeds)
     if least is None:
         return dataclasses.replace(found, missing=_missing(parameters, samples, seeds))
     rest = action_from_command(0.0, parameters.u_min, parameters.u_max)
-    with closing(MiddlePointVectorEnv(episodes, **dataclasses.asdict(parameters))) as plants:
-        alone = Stage(plants, parameters, samples, True)
-        idle, *_ = _run(lambda seen: np.full((len(seen), 1), rest), alone, seeds)
+    with closing(_native(parameters, episodes)) as plants:
+        idle, *_ = _run(lambda seen: np.full((len(seen), 1), rest), plants, seeds, samples)
     gained, possible = idle - errors, idle - least
     return dataclasses.replace(
         found,
@@ -211,46 +216,34 @@ valve travel 0 t/h; 100 episodes, all alike
     )
 
 
-class Stage(NamedTuple):
-    """Where a policy acts."""
-
-    plants: Any
-    """A batch that is reset and stepped at once."""
-    parameters: Parameters
-    """The arguments of all plants, but for what does not affect bounds."""
-    most: int
-    """Length of an episode that does not end before, samples."""
-    native: bool
-    """Whether these are the package's own plants, whose episodes need no check."""
-    name: str = ""
-    """The environment's id, or the name of its class."""
-
-
 @contextmanager
-def _stage(policy: Any, env: Any, n: int, arguments: dict[str, Any]) -> Iterator[Stage]:
-    """Yield environments for n episodes, if a policy fits them, and clean up afterwards."""
+def _prepared(policy: Any, env: Any, n: int, arguments: dict[str, Any]) -> Iterator[Any]:
+    """Yield environments for n episodes, if a policy fits them, and clean up afterwards.
+
+    With them come their arguments, their name, the length of an episode that does not end
+    before, and whether they are the package's own plants, whose episodes need no check.
+    """
     most, name, batch = SAMPLES, "", None
     if isinstance(env, str | EnvSpec):
         env = partial(make_one, env, arguments)
         with closing(env()) as single:
             spec, batch = single.spec, native_batch(single)
-        if spec is not None:
-            most, name = spec.max_episode_steps or SAMPLES, spec.id
+        most, name = spec.max_episode_steps or SAMPLES, spec.id
     elif arguments:
         raise ValueError(f"{', '.join(arguments)} must be given where env is made")
     given: Any = closing(batch(n)) if batch else environments.opened(env, n, policy)
     with given as plants:
-        inner = [plants.unwrapped] if batch else plants.inner
-        parameters = inner[0].parameters
-        if any(case_of(each.parameters) != case_of(parameters) for each in inner):
+        first, *others = [plants.unwrapped] if batch else plants.inner
+        if any(case_of(each.parameters) != case_of(first.parameters) for each in others):
             raise ValueError("env must have the same plants, but for windows and rewards")
         owner = owner_of(policy)
         if hasattr(owner, "check_environment") and not isinstance(owner, type):
-            owner.check_environment(parameters, environments.acting(plants), plants.num_envs)
+            wrappers = environments.acting(plants)
+            owner.check_environment(first.parameters, wrappers, plants.num_envs)
         if is_model(policy):
             environments.check_model(policy, plants, env)
-        name = name or (inner[0].spec.id if inner[0].spec else type(inner[0]).__name__)
-        yield Stage(plants, parameters, most, batch is not None, name)
+        name = name or (first.spec.id if first.spec else type(first).__name__)
+        yield plants, first.parameters, name, most, batch is not None
 
 
 def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
@@ -289,20 +282,25 @@ def native_batch(single: Env) -> Batch | None:
     return lambda n, **modes: VectorIncrementalAction(plants(n, **modes), **moves[0])
 
 
-def _run(policy: Any, stage: Stage, seeds: range) -> tuple[Values, Values, int]:
+def _native(parameters: Parameters, n: int) -> MiddlePointVectorEnv:
+    """Return n of the package's own plants, whose episodes do not end."""
+    return MiddlePointVectorEnv(n, **dataclasses.asdict(parameters))
+
+
+def _run(
+    policy: Any, plants: Any, seeds: range, most: int, expected: Parameters | None = None
+) -> tuple[Values, Values, int]:
     """Run one episode per seed, in rounds of as many as there are plants.
 
-    Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each episode;
-    and N.
+    Episodes are refused unless they are those of plants with the arguments `expected`, if any.
+    Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each; and N.
     """
-    errors, travels, lengths = [], [], set()
-    n = stage.plants.num_envs
+    errors, travels, lengths, n = [], [], set(), plants.num_envs
     for first in range(seeds.start, seeds.stop, n):
         own = [*range(first, first + n)]
-        steps = rollout(stage.plants, start(policy, n), stage.most, own)
-        if not stage.native:
-            native = MiddlePointVectorEnv(n, **dataclasses.asdict(case_of(stage.parameters)))
-            steps = environments.replayed(steps, native, own)
+        steps = rollout(plants, start(policy, n), most, own)
+        if expected:
+            steps = environments.replayed(steps, _native(expected, n), own)
         error, travel = np.zeros(n), np.zeros(n)
         for k, (before, after, ended) in enumerate(steps, 1):  # noqa: B007 (used below)
             error += np.abs(after["error"])
@@ -314,8 +312,8 @@ def _run(policy: Any, stage: Stage, seeds: range) -> tuple[Values, Values, int]:
             raise ValueError(f"env must end all episodes at once, got an end after {k} samples")
         errors.append(error / k)
         travels.append(travel)
-    count = len(seeds)
-    return np.concatenate(errors)[:count], np.concatenate(travels)[:count], k
+    all_errors, all_travels = np.concatenate(errors), np.concatenate(travels)
+    return all_errors[: len(seeds)], all_travels[: len(seeds)], k
 
 
 def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values | None:

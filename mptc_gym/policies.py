@@ -31,23 +31,9 @@ class Step(NamedTuple):
 def rollout(plants: Any, act: Act, samples: int, seed: int | list[int]) -> Iterator[Step]:
     """Reset a batch of plants, and step it through samples k = 0, 1, ...
 
-    This is the one loop, for scores, benchmarks and tests.
-
-    Parameters
-    ----------
-    plants
-        A vector environment of Gymnasium.
-    act
-        A function of the observations that returns the actions.
-    samples
-        Number of steps.
-    seed
-        The seed of the first plant, or a list of all seeds.
-
-    Raises
-    ------
-    ValueError
-        If actions have the wrong shape or are not finite.
+    This is the one loop, for scores, benchmarks and tests. `plants` are a vector environment of
+    Gymnasium, and `act` is a function of their observations. In place of the first seed, a list
+    may give all. Actions of the wrong shape, or not finite, are a ValueError.
     """
     observations, infos = plants.reset(seed=seed)
     for k in range(samples):
@@ -81,24 +67,19 @@ def start(policy: Any, n: int) -> Act:
     predicts, acts = (callable(getattr(policy, name, None)) for name in ("predict", "act"))
     if isinstance(policy, type) or not (predicts or acts or callable(policy)):
         reject("policy", policy, "a function, or an object with predict or act, not a class")
-    owner = owner_of(policy)
-    reset = getattr(owner, "reset", None)
-    if callable(reset) and not isinstance(owner, type):
-        _check_call(reset, "policy.reset", "no argument")
-        reset()
-    act = _predicting(policy, n) if predicts else _deterministic(policy.act if acts else policy)
-    if isinstance(owner, loaded("torch.nn", "Module")):
-        function = _unbound(policy)
-        forward = function is owner or getattr(function, "__name__", "") == "forward"
-        return _evaluating(owner, act, tensors=forward and not (predicts or acts))
-    return act
+    owner, function = owner_of(policy), _unbound(policy)
+    if callable(getattr(owner, "reset", None)) and not isinstance(owner, type):
+        owner.reset()
+    plain = policy.act if acts else policy
+    act = _predicting(policy, n) if predicts else _deterministic(plain)
+    if not isinstance(owner, loaded("torch.nn", "Module")):
+        return act
+    forward = function is owner or getattr(function, "__name__", "") == "forward"
+    return _evaluating(owner, act, tensors=forward and not (predicts or acts))
 
 
 def loaded(module: str, name: str) -> Any:
-    """Return a class of a package that is imported only where it is used.
-
-    Before that it is the empty tuple, of which nothing is an instance.
-    """
+    """Return a class if its package is imported; otherwise (), which has no instances."""
     return getattr(sys.modules.get(module), name, ())
 
 
@@ -122,31 +103,22 @@ def _unbound(function: Any) -> Any:
 
 def _deterministic(act: Any) -> Act:
     """Return a function that explores only on request as one that does not explore."""
-    function, chosen = act, False
-    while isinstance(function, partial):
-        chosen |= "deterministic" in function.keywords  # by the caller
-        function = function.func
+    function = _unbound(act)
     explores = "deterministic" in _keywords(getattr(function, "forward", function))
+    chosen = isinstance(act, partial) and "deterministic" in act.keywords
     return partial(act, deterministic=True) if explores and not chosen else cast("Act", act)
 
 
 def _predicting(policy: Any, n: int) -> Act:
     """Return the function of observations of a policy in the form of Stable-Baselines3."""
-    offered: dict[str, Any] = {"state": None, "episode_start": None, "deterministic": True}
     keywords = _keywords(policy.predict)
-    if "*" in keywords and "**" not in keywords:
+    if ("*" in keywords and "**" not in keywords) or "action_masks" in keywords:
         raise ValueError(
-            "policy.predict must name its arguments, such as state, episode_start and "
-            f"deterministic, or take **kwargs, got {inspect.signature(policy.predict)}"
+            "policy.predict must name what it takes of state, episode_start and deterministic "
+            f"and need no action_masks, got {inspect.signature(policy.predict)}: use a function"
         )
-    if "action_masks" in keywords:
-        raise ValueError(
-            "policy.predict takes action_masks, which are not handed to it: give a function "
-            "that finds them from the observations"
-        )
+    offered: dict[str, Any] = {"state": None, "episode_start": None, "deterministic": True}
     accepted = [name for name in offered if name in keywords or "**" in keywords]
-    named = dict.fromkeys(accepted)
-    _check_call(policy.predict, "policy.predict", "the observations", 0, **named)
     offered["episode_start"] = np.ones(n, np.bool_)
 
     def act(observations: Any) -> Any:
@@ -169,14 +141,6 @@ def _keywords(function: Any) -> set[str]:
         return set()
     stars: dict[Any, str] = {Parameter.VAR_POSITIONAL: "*", Parameter.VAR_KEYWORD: "**"}
     return {stars.get(each.kind, each.name) for each in parameters}
-
-
-def _check_call(method: Any, name: str, what: str, *given: Any, **named: Any) -> None:
-    """Refuse a method that needs more arguments than it gets."""
-    try:
-        inspect.signature(method).bind(*given, **named)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a method that needs {what} alone: {error}") from error
 
 
 def _evaluating(module: Any, act: Act, tensors: bool) -> Act:

@@ -16,192 +16,31 @@ import dataclasses
 import json
 import pkgutil
 import tempfile
-import time
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
-import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, VectorEnv
-from numpy.typing import NDArray
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
-    VecEnv,
-    VecEnvWrapper,
-    sync_envs_normalization,
-)  # fmt: skip
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import sync_envs_normalization as synchronise
 
 from mptc_gym import environments
 from mptc_gym.checks import MOST_PLANTS, count, plain, reject
-from mptc_gym.evaluation import (
-    EPISODES,
-    SEED,
-    WINDOWS,
-    Evaluation,
-    evaluate,
-    make_one,
-    native_batch,
-)  # fmt: skip
+from mptc_gym.evaluation import EPISODES, SEED, WINDOWS, Evaluation, evaluate, make_one
+from mptc_gym.evaluation import native_batch as batch_like
+from mptc_gym.sb3_vec_env import GymnasiumVecEnv
 from mptc_gym.wrappers import IncrementalAction
-from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
 __all__ = ["GymnasiumVecEnv", "ScoreCallback", "load", "make_vec_env", "save", "spec_of"]
 
 MEMBER = "mptc_gym.json"  # of a zip
-
-
-class GymnasiumVecEnv(VecEnv):
-    """Step whole batches at once, where `DummyVecEnv` steps one environment after another.
-
-    Observations, rewards, episode ends, terminal observations, and the infos of the last sample
-    and of a reset are bit for bit those of `DummyVecEnv` with the same environments.
-
-    Parameters
-    ----------
-    batches
-        One or more vector environments of autoreset mode "SameStep" and with the same spaces;
-        their environments are numbered one batch after another.
-    spec
-        Spec of one environment with its wrappers, if all are alike.
-    group
-        Number of neighbouring environments that share a seed, and thus what is drawn.
-
-    Attributes
-    ----------
-    infos : dict
-        The latest infos in Gymnasium's form, as arrays. The list that `step` returns holds
-        infos only where an episode ends, as dicts would take longer than the step.
-
-    Raises
-    ------
-    ValueError
-        If a batch has another autoreset mode, or spaces differ.
-    """
-
-    def __init__(
-        self, *batches: VectorEnv, spec: EnvSpec | None = None, group: int = 1
-    ) -> None:
-        spaces = batches[0].single_observation_space, batches[0].single_action_space
-        for batch in batches:
-            mode = batch.metadata.get("autoreset_mode")
-            if mode is not AutoresetMode.SAME_STEP:
-                raise ValueError(f"batches must have autoreset_mode 'SameStep', got {mode}")
-            if (batch.single_observation_space, batch.single_action_space) != spaces:
-                raise ValueError(f"batches must have the same spaces, got {batches}")
-        self.batches, self.spec, self.group = batches, spec, group
-        self.infos: dict[str, Any] = {}
-        starts = np.cumsum([0, *(batch.num_envs for batch in batches)]).tolist()
-        self._parts = list(zip(batches, map(slice, starts, starts[1:]), strict=True))
-        super().__init__(starts[-1], *spaces)
-        self._began = time.time()
-        self._returns = np.zeros(self.num_envs)
-        self._lengths = np.zeros(self.num_envs, np.int64)
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seeds of the next reset: environment i has `seed + i // group`."""
-        first, *_ = super().seed(seed)
-        self._seeds = [cast("int", first) + i // self.group for i in range(self.num_envs)]
-        return self._seeds
-
-    def reset(self) -> NDArray[Any]:
-        """Reset all environments, with the seeds set by `seed`."""
-        if any(self._options):
-            raise ValueError(f"options must be empty, got {self._options!r}")
-        # A batch takes one seed per environment, despite its annotation.
-        resets = [batch.reset(seed=cast("int", self._seeds[own])) for batch, own in self._parts]
-        self._reset_seeds()
-        self._returns[:], self._lengths[:] = 0.0, 0
-        self.reset_infos = [
-            _alone(infos, i)
-            for batch, (_, infos) in zip(self.batches, resets, strict=True)
-            for i in range(batch.num_envs)
-        ]
-        return self._joined(resets)[0]
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions, shape (num_envs, action size)."""
-        self._actions = actions
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """Step with the stored actions."""
-        steps = [batch.step(self._actions[own]) for batch, own in self._parts]
-        observations, rewards, terminated, truncated = self._joined(steps)
-        ended = terminated | truncated
-        self._returns += rewards
-        self._lengths += 1
-        infos: list[dict[str, Any]] = [{} for _ in ended]
-        for (_, own), (*_, found) in zip(self._parts, steps, strict=True):
-            for j in np.flatnonzero(ended[own]).tolist():
-                i = own.start + j
-                self.reset_infos[i] = _alone(found, j)
-                episode = {"r": float(self._returns[i]), "l": int(self._lengths[i])}
-                infos[i] = {
-                    **_alone(found["final_info"], j),
-                    "terminal_observation": found["final_obs"][j],
-                    "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                    "episode": {**episode, "t": round(time.time() - self._began, 6)},
-                }
-        self._returns[ended], self._lengths[ended] = 0.0, 0
-        return observations, rewards.astype(np.float32), ended, infos
-
-    def _joined(self, returned: list[tuple[Any, ...]]) -> list[NDArray[Any]]:
-        """Concatenate what the batches returned, and store the infos in `infos`."""
-        *arrays, infos = zip(*returned, strict=True)
-        self.infos = {
-            name: np.concatenate([each[name] for each in infos])
-            for name in set.intersection(*map(set, infos))
-            if isinstance(infos[0][name], np.ndarray)
-        }
-        return [np.concatenate(each) for each in arrays]
-
-    def get_images(self) -> list[NDArray[np.uint8]]:
-        """Return a picture of each environment, if the batch has the mode "rgb_array"."""
-        return [image for batch in self.batches for image in cast("Any", batch.render() or ())]
-
-    def close(self) -> None:
-        """Close the batches."""
-        for batch in self.batches:
-            batch.close()
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of each environment's batch, but its own `spec`."""
-        of_each = [batch for batch in self.batches for _ in range(batch.num_envs)]
-        if attr_name == "spec":
-            return [self.spec for _ in self._get_indices(indices)]
-        return [getattr(of_each[i], attr_name) for i in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refuse: an environment of a batch has no attributes of its own."""
-        raise NotImplementedError(f"{attr_name} can be set on `batches` only, for all at once")
-
-    def env_method(
-        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
-    ) -> list[Any]:
-        """Refuse: an environment of a batch has no methods of its own."""
-        raise NotImplementedError(f"{method_name} can be called on `batches` only")
-
-    def env_is_wrapped(
-        self, wrapper_class: type[Any], indices: VecEnvIndices = None
-    ) -> list[bool]:
-        """Return False for each index: a batch holds no wrapped environments."""
-        return [False for _ in self._get_indices(indices)]
-
-
-def _alone(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """Return the infos of environment i of a batch, as it would give them alone."""
-    return {
-        name: values[i].item() if isinstance(values[i], np.generic) else values[i]
-        for name, values in infos.items()
-        if f"_{name}" in infos and infos[f"_{name}"][i] and not name.startswith("final_")
-    }
 
 
 def make_vec_env(
@@ -215,12 +54,11 @@ def make_vec_env(
 ) -> GymnasiumVecEnv:
     """Make plants that are stepped together, for the algorithms of Stable-Baselines3.
 
-    At the end of an episode, its infos hold the return, as with `Monitor`.
-
     Parameters
     ----------
-    env
-        An id or an `EnvSpec`.
+    env, **arguments
+        An id or an `EnvSpec`, and further arguments for it, as in `gymnasium.make`;
+        `render_mode` may be "rgb_array".
     n_envs
         Number of plants.
     seed
@@ -230,23 +68,19 @@ def make_vec_env(
         Number of neighbouring plants that share a seed: they draw the same noise, load and
         set points, and differ only in what a policy explores.
     wrapper
-        Adds `IncrementalAction`: its arguments, or the class itself for its defaults.
-    **arguments
-        Further arguments for the id, as in `gymnasium.make`; `render_mode` may be "rgb_array".
+        Adds `IncrementalAction`: its arguments, or the class itself for its defaults. Others
+        cannot take a batch: use `stable_baselines3.common.env_util.make_vec_env`.
 
     Raises
     ------
     ValueError
-        If an argument is out of range, or the wrapper is another, which cannot take a batch:
-        for those, use `stable_baselines3.common.env_util.make_vec_env`.
+        If an argument is out of range, or the wrapper is another.
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)
     arguments = {name: plain(value) for name, value in arguments.items()}
     render_mode = arguments.pop("render_mode", None)  # of the batch alone, not of its spec
     single = make_one(env, arguments)
-    if getattr(wrapper, "func", wrapper) is VectorIncrementalAction:
-        wrapper = getattr(wrapper, "keywords", {})
     if isinstance(wrapper, Mapping):
         single = IncrementalAction(single, **wrapper)
     elif callable(wrapper):
@@ -254,7 +88,7 @@ def make_vec_env(
     elif wrapper is not None:
         reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
     with closing(single):
-        batch, spec = native_batch(single), single.spec
+        batch, spec = batch_like(single), single.spec
     if batch is None:
         raise ValueError(f"wrapper must be IncrementalAction, got {single}")
     many = batch(n_envs, autoreset_mode=AutoresetMode.SAME_STEP, render_mode=render_mode)
@@ -274,20 +108,17 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
     ----------
     policy
         A model that has its environments.
-    env
-        An id or an `EnvSpec`, whose own windows and wrappers are replaced.
-    **arguments
-        Further arguments for the environment, other than windows.
+    env, **arguments
+        An id or an `EnvSpec`, whose own windows and wrappers are replaced, and further
+        arguments for it.
 
     Raises
     ------
     ValueError
-        If the model has no environments, if these cannot be made from a spec, or if an argument
-        is another window than theirs.
+        If the model's environments cannot be made from a spec, or have other windows than
+        `arguments`.
     """
-    own = _spec(policy)
-    with closing(make_one(own, {})) as single:
-        (plant,) = environments.plants_of(single)
+    own, (plant, *_) = _spec(policy), environments.plants_of(policy.get_env())
     windows = {name: getattr(plant.parameters, name) for name in WINDOWS}
     for name, value in windows.items():
         if arguments.get(name, value) != value:
@@ -305,25 +136,21 @@ def _spec(model: Any) -> EnvSpec:
     """Return the spec of one of a model's environments, if that makes one like it."""
     plants = model.get_env() if isinstance(model, BaseAlgorithm) else None
     if plants is None:
-        raise ValueError(
-            "policy must be a model with its environments: load it by mptc_gym.sb3.load, or "
-            "give it some by set_env"
-        )
+        raise ValueError("policy must be a model with its environments: see mptc_gym.sb3.load")
     spec, *_ = plants.get_attr("spec")
     try:
         # Gymnasium cannot make the Monitor that each model adds, and it changes nothing.
-        kept = [each for each in spec.additional_wrappers if each.name != "Monitor"]
-        spec = dataclasses.replace(spec, additional_wrappers=tuple(kept))
+        kept = tuple(each for each in spec.additional_wrappers if each.name != "Monitor")
+        spec = dataclasses.replace(spec, additional_wrappers=kept)
         with closing(gymnasium.make(EnvSpec.from_json(spec.to_json()))) as single:
-            made = single.observation_space, single.action_space
-            own = plants.unwrapped
+            made, own = (single.observation_space, single.action_space), plants.unwrapped
             if made != (own.observation_space, own.action_space):
                 raise ValueError(f"it makes {single}")
     except Exception as error:  # from wrappers of anybody
         raise ValueError(
             "policy's environments must come from gymnasium.make or make_vec_env, in wrappers "
-            "that can be imported and record their arguments "
-            f"(gymnasium.utils.RecordConstructorArgs), got {spec}: {error}"
+            "that can be imported and record their arguments, as gymnasium.utils."
+            f"RecordConstructorArgs does, got {spec}: {error}"
         ) from error
     return cast("EnvSpec", spec)
 
@@ -331,14 +158,14 @@ def _spec(model: Any) -> EnvSpec:
 def save(model: BaseAlgorithm, path: str | Path) -> None:
     """Save a model atomically, with the spec of its environments.
 
-    The zip is that of `model.save` with one more member, `mptc_gym.json`.
+    The zip is that of `model.save` with one more member, `mptc_gym.json`. A `VecEnvWrapper`,
+    such as `VecNormalize` or `VecFrameStack`, is no part of a spec: a model in one is saved as
+    Stable-Baselines3 does, by `model.save` and `VecNormalize.save`.
 
     Parameters
     ----------
     model
-        A model with its environments. A `VecEnvWrapper` around them, such as `VecNormalize` or
-        `VecFrameStack`, is no part of a spec: save such a model as Stable-Baselines3 does, by
-        `model.save` and `VecNormalize.save`.
+        A model with its environments.
     path
         Path of the zip; `.zip` is added to a name without an ending.
 
@@ -368,52 +195,33 @@ def _record(model: BaseAlgorithm) -> str:
             f"policy must not be in {type(outermost).__name__} to be saved here: save it by "
             "model.save(path), and the statistics by model.get_vec_normalize_env().save(path)"
         )
-    kind = type(model)
-    return json.dumps(
-        {"algorithm": f"{kind.__module__}:{kind.__name__}", "spec": spec.to_json()}
-    )
+    algorithm = f"{type(model).__module__}:{type(model).__name__}"
+    return json.dumps({"algorithm": algorithm, "spec": spec.to_json()})
 
 
 def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
     """Load a model that `save` wrote, with as many environments like its own.
 
     Loading runs code from the zip and from the modules that it names: load only what you trust.
-
-    Parameters
-    ----------
-    path
-        Path of the zip.
-    **arguments
-        Further arguments for the `load` of the algorithm, such as `device="cpu"`.
-
-    Raises
-    ------
-    ValueError
-        If the zip cannot be read, has no spec, or cannot be loaded.
+    `arguments` are those of the algorithm's own `load`, such as `device="cpu"`. A file that
+    cannot be loaded is a ValueError.
     """
     path = _zip_path(path)
     try:
         with zipfile.ZipFile(path) as archive:
-            if MEMBER not in archive.namelist():
-                raise ValueError(
-                    "it was not saved by mptc_gym.sb3.save: load it by its algorithm, and give "
-                    "evaluate the environment that it acts in"
-                )
-            about, n = (
-                json.loads(archive.read(MEMBER)),
-                json.loads(archive.read("data"))["n_envs"],
-            )
-        spec, kind = EnvSpec.from_json(about["spec"]), pkgutil.resolve_name(about["algorithm"])
+            about, data = (json.loads(archive.read(name)) for name in (MEMBER, "data"))
+        spec, n = EnvSpec.from_json(about["spec"]), data["n_envs"]
         with closing(make_one(spec, {})) as single:
-            native = native_batch(single)
-        plants: Any = (
-            make_vec_env(spec, n)
-            if native
-            else DummyVecEnv([partial(gymnasium.make, spec)] * n)
-        )
-        return cast("BaseAlgorithm", kind.load(path, plants, **arguments))
+            native = batch_like(single) is not None
+        one = partial(gymnasium.make, spec)
+        plants: VecEnv = make_vec_env(spec, n) if native else DummyVecEnv([one] * n)
+        algorithm = pkgutil.resolve_name(about["algorithm"])
+        return cast("BaseAlgorithm", algorithm.load(path, plants, **arguments))
     except Exception as error:  # of any kind, from a damaged file or the code in it
-        raise ValueError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
+        raise ValueError(
+            f"{path} must be a zip of mptc_gym.sb3.save; others are loaded by their algorithm, "
+            f"and scored where you say that they act ({type(error).__name__}: {error})"
+        ) from error
 
 
 def _zip_path(path: str | Path) -> Path:
@@ -432,7 +240,7 @@ class ScoreCallback(BaseCallback):
 
     Parameters
     ----------
-    env
+    env, **arguments
         Where to score, as in `mptc_gym.evaluate`; never the environments of the training. An id
         or a spec takes the windows and wrappers of the training, see `spec_of`. A
         `VecNormalize` is given the statistics of the training before each score.
@@ -444,8 +252,6 @@ class ScoreCallback(BaseCallback):
         Zip in which to keep the policy with the least mean error, if any; see `save`.
     verbose
         1 prints each score, 0 does not.
-    **arguments
-        More arguments for an id or a spec.
 
     Attributes
     ----------
@@ -476,25 +282,28 @@ class ScoreCallback(BaseCallback):
         self._env, self._arguments = env, arguments
 
     def _init_callback(self) -> None:
-        self._where, self._further = self._env, self._arguments
         if isinstance(self._env, str | EnvSpec):
-            self._where, self._further = spec_of(self.model, self._env, **self._arguments), {}
+            # Not kept in place of the id: the next model may have other windows.
+            self._score_in = partial(
+                evaluate, env=spec_of(self.model, self._env, **self._arguments)
+            )
         elif not callable(self._env) and environments.shared(self._env, self.training_env):
             raise ValueError("env must not be the environments of the training: make others")
-        self._synchronise()
+        else:
+            self._score_in = partial(evaluate, env=self._env, **self._arguments)
+        self._hand_over()
         if self.path is not None:
             _record(self.model)  # now, rather than when it is to be saved
 
-    def _synchronise(self) -> None:
+    def _hand_over(self) -> None:
         """Give the statistics of the training to the environments of the scores."""
-        if isinstance(self._where, VecEnv) and environments.stacks_and_normalisers(
-            self.training_env
-        ):
+        normalises = self.model.get_vec_normalize_env() is not None
+        if normalises and isinstance(self._env, VecEnv):
             try:
-                sync_envs_normalization(self.training_env, self._where)
+                synchronise(self.training_env, self._env)
             except (AssertionError, AttributeError) as error:
                 raise ValueError(
-                    f"env must be wrapped like the environments of the training: {error}"
+                    f"env must be wrapped like that of the training: {error}"
                 ) from error
 
     def _on_training_start(self) -> None:
@@ -511,11 +320,8 @@ class ScoreCallback(BaseCallback):
             self._score()
 
     def _score(self) -> None:
-        self._synchronise()
-        seed = SEED + EPISODES
-        found = evaluate(
-            self.model, self._where, episodes=self.episodes, seed=seed, **self._further
-        )
+        self._hand_over()
+        found = self._score_in(self.model, episodes=self.episodes, seed=SEED + EPISODES)
         self._latest = self.num_timesteps
         self.scores.append((self.num_timesteps, found))
         self.logger.record("score/mean_error", found.mean_error)

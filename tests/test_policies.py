@@ -536,12 +536,12 @@ REFUSED = {
     "no policy": (3, NOISY, "policy must be a function, or an object with predict or act"),
     "a class": (PIController, NOISY, "predict or act, not a class"),
     "predict without names": (
-        SimpleNamespace(predict=lambda *seen: 0), NOISY, r"name its arguments.*got \(\*seen\)"),
+        SimpleNamespace(predict=lambda *seen: 0), NOISY, r"must name what it.*got \(\*seen\)"),
     "predict that keeps its state": (
         SimpleNamespace(predict=lambda seen: (law(seen), 1)), NOISY, "take the state that it"),
     "masked actions": (
         lambda: MaskablePPO("MlpPolicy", Levels(made())), lambda: Levels(made()),
-        "action_masks, which are not"),
+        "need no action_masks"),
     "controller of another actuator": (
         PIController(u_max=6.0), NOISY, "limits of env, u_min=-10.0, u_max=10.0"),
     "controller in a wrapper": (PIController(), lambda: moved(made()),
@@ -561,10 +561,10 @@ REFUSED = {
         law, lambda: dummy(lambda: gymnasium.make("CartPole-v1")),
         "of MiddlePointEnv in NumPy"),
     "no environment": (law, 7, "env must be an id, an EnvSpec, environments, or a function"),
-    "function that makes none": (law, lambda: int, "open environment of MiddlePointEnv",
+    "function that makes none": (law, lambda: int, "makes one environment",
         "as is"),
-    "function that makes a batch": (law, many, "not many: call it", "as is"),
-    "function that makes a VecEnv": (law, dummy, "not many: call it", "as is"),
+    "function that makes a batch": (law, many, "where it makes many, call it", "as is"),
+    "function that makes a VecEnv": (law, dummy, "where it makes many, call it", "as is"),
     "function that makes the same": (
         law, lambda e=made(): e, "new environment at each call", "as is"),  # noqa: B008
     "another seed": (law, lambda: Reseeded(made()), "of its seeds, whose noise by sample",

@@ -28,7 +28,6 @@ from mptc_gym.sb3 import (
     spec_of,
 )  # fmt: skip
 from mptc_gym.wrappers import IncrementalAction
-from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
 N = 4
 HARD = "MiddlePointHard-v0"
@@ -159,7 +158,6 @@ class TestMakeVecEnv:
         "wrapper",
         [
             VELOCITY, partial(IncrementalAction, **VELOCITY),
-            partial(VectorIncrementalAction, **VELOCITY),
             lambda env: IncrementalAction(env, **VELOCITY),
         ],
     )  # fmt: skip
@@ -258,8 +256,11 @@ class TestSave:
             (lambda record: "[" * 100_000, "RecursionError"),
             (lambda record: "{}", "KeyError"),
             (lambda record: record.replace("PPO", "PPOO"), "AttributeError"),
-            (lambda record: record.replace("wrappers:Incr", "wrappers:In"), "cannot be loaded"),
-            (None, "was not saved by mptc_gym.sb3.save: load it by its algorithm"),
+            (
+                lambda record: record.replace("wrappers:Incr", "wrappers:In"),
+                "must be a zip of mptc_gym",
+            ),
+            (None, "must be a zip of mptc_gym.sb3.save; others are loaded by"),
         ],
     )
     def test_damaged_and_other_zips_are_refused(self, edit, message, tmp_path):
@@ -275,7 +276,7 @@ class TestSave:
             load(file)
         file.write_bytes(file.read_bytes()[:500])
         for path in (file, tmp_path / "none.zip"):
-            with pytest.raises(ValueError, match="cannot be loaded"):
+            with pytest.raises(ValueError, match="must be a zip of mptc_gym"):
                 load(path)
 
 
@@ -355,7 +356,7 @@ class TestScoreCallback:
         for env, message in (
             (model.get_env(), "must not be the environments of the training"),
             (model.get_env().venv, "must not be the environments of the training"),
-            (make_vec_env(), "must be wrapped like the environments of the training"),
+            (make_vec_env(), "must be wrapped like that of the training"),
             ("MiddlePoint-v0", "wrappers of policy's training, {'VecNormalize'}"),
             (law_env, "wrappers of policy's training, {'VecNormalize'}"),
         ):
