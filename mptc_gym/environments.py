@@ -8,35 +8,27 @@ from typing import Any, Final
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import (
-    SyncVectorEnv,
-    VectorActionWrapper,
-    VectorEnv,
-    VectorObservationWrapper,
-)  # fmt: skip
+from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward, vector
 
 from mptc_gym.checks import reject, shorten
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.plant import action_from_command
-from mptc_gym.policies import Step, loaded
+from mptc_gym.policies import is_algorithm, loaded
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
 PLANTS: Final = MiddlePointEnv, MiddlePointVectorEnv
 _INCREMENTS: Final = IncrementalAction, VectorIncrementalAction
-_INSIDE: Final = "venv", "env", "envs", "batches"  # attributes that hold the next layers
 _NORMALISERS: Final = (
-    NormalizeObservation, NormalizeReward, vector.NormalizeObservation, vector.NormalizeReward,
-)  # fmt: skip
-_ACTING: Final = (
-    gymnasium.ActionWrapper, gymnasium.ObservationWrapper,
-    VectorActionWrapper, VectorObservationWrapper,
-)  # fmt: skip
+    *(NormalizeObservation, NormalizeReward),
+    *(vector.NormalizeObservation, vector.NormalizeReward),
+)
 _SB3: Final = "stable_baselines3.common.vec_env"
 _TOLERANCE: Final = 1e-6  # of infos, degC or t/h
+Infos = Mapping[str, Any]  # arrays, one element per plant
 
 
 def is_vec_env(env: Any) -> bool:
@@ -47,11 +39,16 @@ def is_vec_env(env: Any) -> bool:
 def layers(env: Any) -> Iterator[Any]:
     """Yield environments and all that is in them, in this process, the outermost first."""
     yield env
-    for name in _INSIDE:
+    for name in ("venv", "env", "envs", "batches"):
         inside = vars(env).get(name, ())
         for each in inside if isinstance(inside, list | tuple) else (inside,):
             if isinstance(each, gymnasium.Env | VectorEnv) or is_vec_env(each):
                 yield from layers(each)
+
+
+def shared(one: Any, other: Any) -> bool:
+    """Whether environments have a layer in common."""
+    return not set(map(id, layers(one))).isdisjoint(map(id, layers(other)))
 
 
 def plants_of(env: Any) -> list[Any]:
@@ -66,29 +63,27 @@ def plants_of(env: Any) -> list[Any]:
     return found
 
 
-def increments(env: Any) -> set[Any]:
-    """Return the arguments of `IncrementalAction` around plants; none if there is none."""
-    if any(isinstance(each, PLANTS) for each in layers(env)):
-        return {each._arguments for each in layers(env) if isinstance(each, _INCREMENTS)}
-    specs = [spec for spec in env.get_attr("spec") if spec]  # from other processes
-    wrappers = [each for spec in specs for each in spec.additional_wrappers]
-    return {tuple(w.kwargs.values()) for w in wrappers if w.name == "IncrementalAction"}
+def known_wrappers(env: Any) -> set[Any]:
+    """Return those wrappers that change what a policy sees or does, as far as they are known.
 
-
-def stacks_and_normalisers(env: Any) -> set[str]:
-    """Return the wrappers of Stable-Baselines3 around plants that change observations."""
-    return {
+    They are `IncrementalAction`, with its arguments, `VecNormalize` and `VecFrameStack`.
+    """
+    found = {
         name
         for name in ("VecNormalize", "VecFrameStack")
         for each in layers(env)
         if isinstance(each, loaded(_SB3, name)) and getattr(each, "norm_obs", True)
     }
-
-
-def acting(env: Any) -> str:
-    """Return the names of wrappers that change observations or actions."""
-    found = {type(each).__name__ for each in layers(env) if isinstance(each, _ACTING)}
-    return ", ".join(sorted(found | stacks_and_normalisers(env)))
+    specs: list[Any] = []
+    if not any(isinstance(each, PLANTS) for each in layers(env)):  # in other processes
+        with suppress(OSError):  # which are closed
+            specs = [spec for spec in env.get_attr("spec") if spec]
+    wrappers = [each for spec in specs for each in spec.additional_wrappers]
+    moves = [
+        tuple(each.kwargs.values()) for each in wrappers if each.name == "IncrementalAction"
+    ]
+    moves += [each._arguments for each in layers(env) if isinstance(each, _INCREMENTS)]
+    return found | {("IncrementalAction", *each) for each in moves}
 
 
 class Given:
@@ -102,16 +97,15 @@ class Given:
         self.single_action_space = getattr(env, f"{of_one}action_space")
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
-    def reset(self, *, seed: Any = None) -> tuple[Any, Mapping[str, Any]]:
+    def reset(self, *, seed: Any = None) -> tuple[Any, Infos]:
         """Reset all with a seed each."""
         try:
             if not self._vec_env:
                 observations, infos = self.env.reset(seed=seed)
                 return observations, _columns(infos)
-            inner = self.env.unwrapped
             self.env.seed(seed[0])
-            inner._seeds = list(seed)  # a batch may repeat seeds by its own `seed`
-            return self.env.reset(), _columns(inner.reset_infos)
+            self.env.unwrapped._seeds = [*seed]  # a batch may repeat seeds by its own `seed`
+            return self.env.reset(), _columns(self.env.unwrapped.reset_infos)
         except RuntimeError as error:
             if "before done" not in str(error):
                 raise
@@ -120,20 +114,18 @@ class Given:
                 "wrap it in Monitor(env, allow_early_resets=True)"
             ) from error
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Mapping[str, Any]]:
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Infos]:
         """Step all."""
         if not self._vec_env:
             *others, infos = self.env.step(actions)
             return (*others, _columns(infos))
         observations, rewards, ended, infos = self.env.step(actions)
-        batch = isinstance(
-            self.env.unwrapped, loaded("mptc_gym.sb3_vec_env", "GymnasiumVecEnv")
-        )
-        if batch and not ended.any():  # then its list is empty
-            infos = self.env.unwrapped.infos
+        inner, ours = self.env.unwrapped, loaded("mptc_gym.sb3_vec_env", "GymnasiumVecEnv")
+        if isinstance(inner, ours) and not ended.any():  # then its list is empty
+            infos = inner.infos
         return observations, rewards, ended, np.zeros_like(ended), _columns(infos)
 
-    def restart(self) -> None:
+    def restart(self, policy: Any) -> None:
         """Reset all with fresh seeds, so that training never meets the episodes of a score."""
         seed = int(np.random.SeedSequence().generate_state(1)[0])
         with suppress(Exception):  # a Monitor may not allow it; what is broken raised its own
@@ -142,9 +134,11 @@ class Given:
                 self.env.reset()
             else:
                 self.env.reset(seed=seed)
+        if is_algorithm(policy) and policy.env is not None and shared(policy.env, self.env):
+            policy._last_obs = None  # its training begins anew
 
 
-def _columns(infos: Any) -> Mapping[str, Any]:
+def _columns(infos: Any) -> Infos:
     """Return infos as arrays; a list has a dict for each environment."""
     if isinstance(infos, Mapping):
         return infos
@@ -156,20 +150,18 @@ def _columns(infos: Any) -> Mapping[str, Any]:
 def opened(env: Any, n: int, policy: Any = None) -> Iterator[Given]:
     """Yield given environments, or n that a function makes, frozen and ready for episodes.
 
-    Those of a function are closed afterwards. Others are as before, but for a new episode; if
-    they are those of `policy`, its training begins anew.
+    Those of a function are closed afterwards. Others are as before, but for a new episode.
     """
     with ExitStack() as stack:
         if isinstance(env, gymnasium.Env):
-            one = env
-            env = SyncVectorEnv([lambda: one])
+            one = iter([env])
+            env = SyncVectorEnv([lambda: next(one)])
             env.closed = True  # it is not ours to close
         elif not (isinstance(env, VectorEnv) or is_vec_env(env)):
             env = stack.enter_context(closing(_made(env, n)))
         given = Given(env)
         stack.enter_context(_frozen(env))
-        stack.callback(given.restart)
-        stack.callback(_forget, policy, env)
+        stack.callback(given.restart, policy)
         yield given
 
 
@@ -201,86 +193,69 @@ def _frozen(env: Any) -> Iterator[None]:
                     "env must not normalise in other processes, where its statistics cannot be "
                     "frozen: make it in this one, by DummyVecEnv or SyncVectorEnv"
                 )
-            normalises = isinstance(layer, loaded(_SB3, "VecNormalize"))
-            if normalises or isinstance(layer, _NORMALISERS):
-                name = "training" if normalises else "update_running_mean"
-                flags.append((layer, name, getattr(layer, name)))
-                setattr(layer, name, False)
-                _check_statistics(getattr(layer, "obs_rms", None), type(layer).__name__)
+            of_sb3 = isinstance(layer, loaded(_SB3, "VecNormalize"))
+            if not (of_sb3 or isinstance(layer, _NORMALISERS)):
+                continue
+            name = "training" if of_sb3 else "update_running_mean"
+            flags.append((layer, name, getattr(layer, name)))
+            setattr(layer, name, False)
+            found = getattr(layer, "obs_rms", {})
+            for each in found.values() if isinstance(found, dict) else (found,):
+                if each.count < 1 and not each.mean.any() and (each.var == 1.0).all():
+                    raise ValueError(
+                        f"env must have the statistics of the training in its "
+                        f"{type(layer).__name__}, which has seen nothing: load or copy them"
+                    )
         yield
     finally:
         for layer, name, flag in flags:
             setattr(layer, name, flag)
 
 
-def _check_statistics(found: Any, name: str) -> None:
-    """Refuse statistics of observations that are still those of the beginning."""
-    for each in found.values() if isinstance(found, dict) else (found,):
-        if each and each.count < 1 and not each.mean.any() and (each.var == 1).all():
-            raise ValueError(
-                f"env must have the statistics of the training in its {name}, which has seen "
-                "nothing: load or copy them"
-            )
+def check_model(model: Any, plants: Any, here: Any) -> None:
+    """Refuse environments that a model of Stable-Baselines3 was not trained for.
 
-
-def _forget(policy: Any, env: Any) -> None:
-    """Let a model's training begin anew if its environments were used."""
-    if isinstance(policy, loaded("stable_baselines3.common.base_class", "BaseAlgorithm")):
-        own = policy.get_env()
-        if own is not None and shared(own, env):
-            policy._last_obs = None
-
-
-def shared(one: Any, other: Any) -> bool:
-    """Whether environments have a layer in common."""
-    return not set(map(id, layers(one))).isdisjoint(map(id, layers(other)))
-
-
-def check_model(model: Any, given: Any, env: Any) -> None:
-    """Refuse environments that a model of Stable-Baselines3 was not trained for."""
-    way_out = (
-        "act in the environments of the training by evaluate(model, model.get_env()), or in "
-        "others like them, such as mptc_gym.sb3.spec_of(model, id)"
-    )
+    `here` are those inside the batch `plants`, or the same.
+    """
     compared: dict[str, tuple[Any, Any]] = {
-        "observation space": (model.observation_space, given.single_observation_space),
-        "action space": (model.action_space, given.single_action_space),
+        "observation space": (model.observation_space, plants.single_observation_space),
+        "action space": (model.action_space, plants.single_action_space),
     }
-    own = model.get_env() if hasattr(model, "get_env") else None
-    if own is not None and not is_vec_env(env):
-        here = given.env if isinstance(given, Given) else given
-        compared["wrappers"] = stacks_and_normalisers(own), set()
-        with suppress(ValueError):  # they are closed
-            theirs, ours = (
-                {each.parameters.windows for each in plants_of(each)} for each in (own, here)
-            )
+    own = model.env if is_algorithm(model) else None
+    if own is not None and not is_vec_env(here):
+        trained, found = known_wrappers(own), known_wrappers(here)
+        try:
+            ours, theirs = ({p.parameters.windows for p in plants_of(e)} for e in (here, own))
             compared["windows"] = theirs, ours
-            compared["IncrementalAction"] = increments(own), increments(here)
+        except ValueError:  # closed processes cannot be asked, what is around them can
+            found = set()
+        compared["wrappers"] = trained, found
     for name, (trained, found) in compared.items():
         if trained != found:
             raise ValueError(
                 f"env must have the {name} of policy's training, {trained or 'none'}, got "
-                f"{found or 'none'}: {way_out}"
+                f"{found or 'none'}: act where it was trained, by evaluate(model, "
+                "model.get_env()), or in others like that, see mptc_gym.sb3.spec_of(model, id)"
             )
 
 
-def replayed(steps: Iterable[Step], plants: Any, seeds: list[int]) -> Iterator[Step]:
+def replayed(steps: Iterable[tuple[Infos, Infos, Any]], plants: Any, seeds: list[int]) -> Any:
     """Yield steps, as long as `plants`, given the same seeds and commands, show the same."""
     expected = plants.reset(seed=seeds)[1]
     limits = [
         expected.get(each, getattr(plants.parameters, each)) for each in ("u_min", "u_max")
     ]
-    for k, step in enumerate(steps):
+    for k, (before, after, ended) in enumerate(steps):
         if k == 0:
-            step = step._replace(before=step.before or expected)
-            _check_infos(step.before, expected, k)
-        flows = np.asarray(step.after.get("command", np.zeros(plants.num_envs)))
+            before = before or expected  # where it does not keep the infos of a reset
+            _check_infos(before, expected, k)
+        flows = np.asarray(after.get("command", np.zeros(plants.num_envs)))
         expected = plants.step(action_from_command(flows, *limits)[:, np.newaxis])[-1]
-        _check_infos(step.after, expected, k + 1)
-        yield step
+        _check_infos(after, expected, k + 1)
+        yield before, after, ended
 
 
-def _check_infos(infos: Mapping[str, Any], expected: Mapping[str, Any], k: int) -> None:
+def _check_infos(infos: Infos, expected: Infos, k: int) -> None:
     """Refuse infos at sample k that are not those expected, but for rounding."""
     names = [name for name in expected if not name.startswith("_")]
     values = np.array([expected[name] for name in names])

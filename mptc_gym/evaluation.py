@@ -132,26 +132,24 @@ def evaluate(
     ----------
     policy
         A function of observations of shape (n, size), n plants side by side, that returns
-        actions of shape (n, 1); a `torch.nn.Module`, called with tensors, in evaluation mode
-        and without gradients; or an object with `predict`, such as a model of
-        Stable-Baselines3, or with `act`, such as the controllers in `agents`. `predict` is
-        given `state`, `episode_start` and `deterministic=True` as far as it takes them, others
-        `deterministic=True` where they name it. A method `reset` is called before the episodes;
-        what was learnt carries over from round to round.
+        actions of shape (n, 1); a `torch.nn.Module`, called with tensors, in evaluation mode;
+        or an object with `predict`, such as a model of Stable-Baselines3, or with `act`, such
+        as the controllers in `agents`. `predict` is given `state`, `episode_start` and
+        `deterministic=True` as far as it takes them, others the last where they name it. A
+        method `reset` is called before each round; what was learnt carries over.
     env
         An id, such as one of `IDS`, or an `EnvSpec`; a function that makes one environment; or
         environments: one, a vector environment of Gymnasium, or a `VecEnv` of
-        Stable-Baselines3, such as `model.get_env()`. What normalises is frozen meanwhile.
-        Environments that are given are not closed, and begin a new episode afterwards. If they
-        are fewer than `episodes`, they run several rounds.
+        Stable-Baselines3, such as `model.get_env()`. These are not closed, their statistics are
+        frozen meanwhile, and they begin a new episode afterwards. If they are fewer than
+        `episodes`, they run several rounds.
     episodes
         Number of episodes, at least 2.
     seed
         Seed of the first episode. The default is that of all published scores. Bounds exist for
         the 120 episodes from there on: to select a policy, use others than the first 100.
     **arguments
-        Further arguments for the id or the `EnvSpec`, as in `gymnasium.make`: those of the
-        environment and `max_episode_steps`.
+        Further arguments for an id or a spec, as in `gymnasium.make`.
 
     Returns
     -------
@@ -163,8 +161,7 @@ def evaluate(
     ------
     ValueError
         If the environment does not exist, is not one of this package or runs other episodes
-        than those of its seeds; if the policy does not fit it; or if actions have the wrong
-        shape or are not finite.
+        than those of its seeds; or if the policy or its actions do not fit it.
     TypeError
         If an argument of the environment is unknown.
 
@@ -236,12 +233,12 @@ def _prepared(policy: Any, env: Any, n: int, arguments: dict[str, Any]) -> Itera
         first, *others = [plants.unwrapped] if batch else plants.inner
         if any(case_of(each.parameters) != case_of(first.parameters) for each in others):
             raise ValueError("env must have the same plants, but for windows and rewards")
-        owner = owner_of(policy)
+        owner, here = owner_of(policy), plants if batch else plants.env
         if hasattr(owner, "check_environment") and not isinstance(owner, type):
-            wrappers = environments.acting(plants)
+            wrappers = environments.known_wrappers(here)
             owner.check_environment(first.parameters, wrappers, plants.num_envs)
         if is_model(policy):
-            environments.check_model(policy, plants, env)
+            environments.check_model(policy, plants, here)
         name = name or (first.spec.id if first.spec else type(first).__name__)
         yield plants, first.parameters, name, most, batch is not None
 

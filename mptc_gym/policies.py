@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from inspect import Parameter
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,19 +17,12 @@ from mptc_gym.checks import reject, shorten
 Act = Callable[[Any], Any]  # observations, one row a plant, to actions
 
 
-class Step(NamedTuple):
-    """What a step of a batch showed; the arrays have one element per plant."""
-
-    before: Mapping[str, Any]
-    """The infos at sample k."""
-    after: Mapping[str, Any]
-    """The infos at sample k + 1, also where that ends an episode."""
-    ended: NDArray[np.bool_]
-    """Whether the episodes have ended."""
-
-
-def rollout(plants: Any, act: Act, samples: int, seed: int | list[int]) -> Iterator[Step]:
+def rollout(
+    plants: Any, act: Act, samples: int, seed: int | list[int]
+) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any], NDArray[np.bool_]]]:
     """Reset a batch of plants, and step it through samples k = 0, 1, ...
+
+    Yield the infos at sample k, those at k + 1, and whether the episodes have ended.
 
     This is the one loop, for scores, benchmarks and tests. `plants` are a vector environment of
     Gymnasium, and `act` is a function of their observations. In place of the first seed, a list
@@ -41,7 +34,7 @@ def rollout(plants: Any, act: Act, samples: int, seed: int | list[int]) -> Itera
         before = infos
         observations, _, terminated, truncated, infos = plants.step(actions)
         # Where the same step resets a plant, the last sample's infos are apart.
-        yield Step(before, infos.get("final_info", infos), terminated | truncated)
+        yield before, infos.get("final_info", infos), terminated | truncated
 
 
 def _checked(actions: Any, shape: Any, k: int) -> NDArray[Any]:
@@ -83,10 +76,15 @@ def loaded(module: str, name: str) -> Any:
     return getattr(sys.modules.get(module), name, ())
 
 
+def is_algorithm(policy: Any) -> bool:
+    """Whether a policy is a model of Stable-Baselines3 with all its training."""
+    return isinstance(policy, loaded("stable_baselines3.common.base_class", "BaseAlgorithm"))
+
+
 def is_model(policy: Any) -> bool:
     """Whether a policy is a model of Stable-Baselines3, or the policy inside one."""
-    model = loaded("stable_baselines3.common.base_class", "BaseAlgorithm")
-    return isinstance(policy, (model, loaded("stable_baselines3.common.policies", "BaseModel")))
+    inside = loaded("stable_baselines3.common.policies", "BaseModel")
+    return is_algorithm(policy) or isinstance(policy, inside)
 
 
 def owner_of(policy: Any) -> Any:
