@@ -177,7 +177,7 @@ class Law:
         weights = xp.exp(xp.clip(weights, -40.0, 40.0))  # never beyond a float
         weights = weights / (weights @ self._alike)
         target = setpoint - (weights * means * self._shares).sum(1)
-        rate = 1.0 / (1.0 + xp.exp(0.5 - hurry - outputs[:, -1]))
+        rate = 1.0 / (1.0 + xp.exp(xp.clip(0.5 - hurry - outputs[:, -1], None, 80.0)))
         return target + rate / self.prior.unit * (target - state[0]) + added
 
     def _judge(self, load: Any) -> tuple[Any, Any, Any]:
