@@ -4,10 +4,9 @@ from agents.controller import Controller
 from agents.direct_nn import DirectNNController, Weights
 from agents.neural_law import LawNetwork, NeuralSmithPredictor
 from agents.neural_self_tuning import NeuralSelfTuningController
-from agents.pi import PIController
+from agents.pi import PIController, SmithPredictor
 from agents.policy_network import Increments, PolicyNetwork
 from agents.self_tuning import SelfTuningController
-from agents.smith import SmithPredictor
 
 __all__ = [
     "Controller",

@@ -129,7 +129,6 @@ class Controller(ABC):
     n_obs: int = field(init=False, repr=False)
     command: Values = field(init=False, repr=False)
 
-    _advice = ""  # appended to the error about an observation's shape
     _remembers = True  # past samples; if not, the batch size may change at any time
     _edge = 0.0  # of the dead zone, t/h; a command on it keeps its effect as an action
 
@@ -145,17 +144,15 @@ class Controller(ABC):
         self.command = np.float64(0.0)
         self._loops_before = None
 
-    def check_environment(self, parameters: Any, wrapped: Any, n: int) -> None:
-        """Refuse plants that the controller was not made for.
-
-        Scores would otherwise be wrong in silence.
+    def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
+        """Refuse plants that the controller was not made for: scores would be wrong in silence.
 
         Parameters
         ----------
         parameters
             The plants' arguments, by name as in `mptc_gym.Parameters`.
         wrapped
-            Whether a wrapper changes observations or actions.
+            Names of wrappers that change observations or actions; empty if there are none.
         n
             Number of plants.
 
@@ -214,7 +211,7 @@ class Controller(ABC):
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs or not len(values):
             raise ValueError(
                 f"observation must have shape (n_obs,) or (batch, n_obs), n_obs at least "
-                f"{self.n_obs}, got {values.shape}{self._advice}"
+                f"{self.n_obs}, got {values.shape}"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")

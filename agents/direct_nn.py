@@ -190,7 +190,7 @@ class DirectNNController(Controller):
         # The batch axis is last, so that sums over nodes add long rows; W is (N, N_1, batch).
         self._W, self._theta_1, self._W_1, self._theta_2 = arrays
 
-    def check_environment(self, parameters: Any, wrapped: Any, n: int) -> None:
+    def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the controller was not made for; see `Controller`."""
         super().check_environment(parameters, wrapped, n)
         if self.num_envs != n:

@@ -73,8 +73,6 @@ class PolicyNetwork(Controller):
     increments: Increments | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
-    _advice = "; the environment needs the network's `observation` as arguments"
-
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in self.observation:
@@ -136,7 +134,7 @@ class PolicyNetwork(Controller):
         with Path(path).open("wb") as file:
             np.savez_compressed(file, **arrays)
 
-    def check_environment(self, parameters: Any, wrapped: Any, n: int) -> None:
+    def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the network was not made for; see `Controller`."""
         super().check_environment(parameters, wrapped, n)
         given = {name: getattr(parameters, name) for name in WINDOWS}
@@ -153,8 +151,8 @@ class PolicyNetwork(Controller):
     def _control(self, observation: Array) -> Values:
         if observation.shape[-1] != self.n_obs:
             raise ValueError(
-                f"observation must have {self.n_obs} elements, those of {self.observation}, "
-                f"got {observation.shape[-1]}{self._advice}"
+                f"observation must have {self.n_obs} elements, got {observation.shape[-1]}: "
+                f"make the environment with the network's `observation`, {self.observation}"
             )
         outputs = forward(self.layers, self.activation, observation * self.input_scale)
         output: Values = np.clip(outputs[..., 0], -1.0, 1.0)
