@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from benchmarks.controllers.roster import ROSTER  # noqa: E402
 from benchmarks.examples import through_plant as example  # noqa: E402
 from benchmarks.loop.rollout import make_plants, rollout  # noqa: E402
 from benchmarks.train import __main__ as program  # noqa: E402
-from benchmarks.train import command, loops, through_plant  # noqa: E402
+from benchmarks.train import loops, through_plant  # noqa: E402
 from benchmarks.train.loops import Draw, Loops, environment  # noqa: E402
 from benchmarks.train.through_plant import Net, Training, loss_of, train, validate  # noqa: E402
 from mptc_gym import Parameters  # noqa: E402
@@ -111,6 +112,7 @@ class TestLaw:
             off[mask] for mask in (models["uncertainty"] < 0.05, models["uncertainty"] > 0.2)
         )
         assert unsure.std() > 1.5 * sure.std()
+        assert models["first"].float().mean() == pytest.approx(0.6, abs=0.03)
         exact = draw.models(numbers, exact=True)
         assert torch.allclose(exact["gain_factor"], numbers["gain_factor"])
 
@@ -185,7 +187,7 @@ class TestNetworks:
 def test_the_command_lists_trainings_by_their_seeds(
     network, steps, files, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(command, "Training", lambda: SMALL)
+    monkeypatch.setattr(through_plant, "Training", partial(replace, SMALL))
     arguments = [network, "--networks", "2", "--steps", str(steps), "--jobs", "1"]
     assert program.main([*arguments, "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out

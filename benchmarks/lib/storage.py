@@ -101,7 +101,9 @@ class Kept:
         name = commit()
         if not name.isalnum():  # no commit, or a dirty one
             return None
-        return self.folder / name[:12] / f"{joblib.hash(task)}.pkl"
+        with suppress(Exception):  # what cannot be pickled has no name, and is not kept
+            return self.folder / name[:12] / f"{joblib.hash(task)}.pkl"
+        return None
 
     def load(self, task: Callable[[], Any]) -> Any:
         """Return the result of a task; raise a `LookupError` if it is missing or damaged."""
