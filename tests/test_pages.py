@@ -4,12 +4,16 @@ A page says where its numbers come from by a comment above a table, a list or a 
 
     <!-- numbers: report.md -->
 
-names files in `benchmarks/published`, or none, and why. A number of a table must be in a
-line of these files that has the row's label, if there is one; any other must be anywhere in
-them. A number on a page may have fewer digits than the file, and may be in millions (M).
+names files in `benchmarks/published`, or none, and why. A column of a table must be one column
+of one table of these files, row by row: the rows are found by their labels. The rows of a table
+without such labels follow the sections of the file. A number of a text must stand in a row that
+the text names, if it names one. A page may have fewer digits than the file, or millions (M).
 """
 
+import csv
 import re
+from collections import defaultdict
+from functools import cache
 
 import pytest
 
@@ -22,70 +26,153 @@ PAGES = {
     if PUBLISHED not in path.parents
 }
 MARK = re.compile(r"<!-- numbers: (.*?) -->\n\n?(.*?)(?:\n\n|\Z)", re.DOTALL)
-# Outside rows with a label, integers without one of these units are words of the text.
 NUMBER = re.compile(r"(?<![\w.,#])(\d[\d,]*(?:\.\d+)?)(?![\w,.]*[\w])( M\b| %| t/h)?")
 INTERVAL = re.compile(r" \([^()]* to [^()]*\)")
+# Of a screen: a number with its interval, or words with one space between them.
+CELL = re.compile(r"[\d.,]+(?: \([^()]*\))?(?= |$)|\S+(?: \S+)*")
 
 
-def read(text: str) -> list[tuple[str, str]]:
-    return [(number.replace(",", ""), unit) for number, unit in NUMBER.findall(text)]
+def read(text):
+    """Return the numbers of a text and their units: first those outside of intervals."""
+    parts = INTERVAL.sub("", text), " ".join(INTERVAL.findall(text))
+    return [[(n.replace(",", ""), unit) for n, unit in NUMBER.findall(part)] for part in parts]
 
 
-def rounded(number: float, like: str) -> str:
-    return f"{number + 1e-9:.{len(like.partition('.')[2])}f}"
+def plain(label):
+    return re.sub(r"\[(.*?)\]\(.*?\)", r"\1", label).strip(" `*")
 
 
-def missing(text: str, lines: list[str], *, all_numbers: bool) -> list[str]:
-    """Return the numbers of a text that none of the lines has."""
-    means = read(INTERVAL.sub("", "\n".join(lines)))
-    ends = read("\n".join(found for line in lines for found in INTERVAL.findall(line)))
-    without = INTERVAL.sub("", text)
-    faults = []
-    for part, known in ((without, means), (" ".join(INTERVAL.findall(text)), ends)):
-        for number, unit in read(part):
-            scale = 1e-6 if unit == " M" else 1.0
-            values = {rounded(float(value) * scale, number) for value, _ in known}
-            # A half may have been rounded either way before.
-            values |= {rounded(float(value) * scale - 2e-9, number) for value, _ in known}
-            if (all_numbers or "." in number or unit) and number not in values:
-                faults.append(number)
-    return faults
+def rows_of(lines):
+    """Return the cells of the rows of a Markdown table, without its head."""
+    return [re.split(r"(?<!\\)\|", line.strip().strip("|")) for line in lines[2:]]
 
 
-def faults_of(block: str, source: str) -> list[str]:
-    lines = source.replace("*", "").splitlines()
+@cache
+def tables(file):
+    """Return the tables of a file, each as {label: {column: text}}."""
+    text = (PUBLISHED / file).read_text("utf-8")
+    if file.endswith(".csv"):
+        by_agent = defaultdict(dict)
+        for row in csv.DictReader(text.splitlines()):
+            of = row.pop("scenario"), row.pop("metric", "")
+            by_agent[row.pop("agent")] |= {(*of, name): value for name, value in row.items()}
+        return [dict(by_agent)]
+    found = []
+    for block in re.split(r"\n\s*\n", text):
+        lines = block.strip("\n").splitlines()
+        if block.lstrip().startswith("|"):
+            table = {plain(row[0]): dict(enumerate(row)) for row in rows_of(lines)}
+        else:  # columns of a screen end below one another
+            table = {}
+            for line in lines:
+                cells = {each.end(): each[0] for each in CELL.finditer(line)}
+                table[plain(next(iter(cells.values())))] = cells
+        found.append(table)
+    return found
+
+
+def same(number, unit, known):
+    scale = 1e-6 if unit == " M" else 1.0
+    digits = len(number.partition(".")[2])
+    # A half may have been rounded either way before.
+    return any(f"{float(known) * scale + e:.{digits}f}" == number for e in (1e-9, -1e-9))
+
+
+def explained(column, part, found):
+    """Return whether one column of one table has all numbers of {label: (number, unit)}."""
+    for table in found:
+        if not set(column) <= set(table):
+            continue
+        for key in {key for label in column for key in table[label]}:
+            cells = [read(table[label].get(key, ""))[part] for label in column]
+            for place in range(min(map(len, cells))):
+                known = [cell[place][0] for cell in cells]
+                if all(map(same, *zip(*column.values(), strict=True), known)):
+                    return True
+    return False
+
+
+def faults_of(block, files):
+    """Return what on a page its files do not say."""
+    found = [table for file in files for table in tables(file)]
     if not block.startswith("|"):
-        return missing(block, lines, all_numbers=False)
-    faults = []
-    for row in block.splitlines()[2:]:
-        label, *cells = (cell.strip(" `*") for cell in row.strip("|").split("|"))
-        label = re.sub(r"\[(.*?)\]\(.*?\)", r"\1", label)
-        named = re.compile(rf"(^|[|,]) *{re.escape(label)} *([|,]|  )")
-        own = [line for line in lines if named.search(line) and read(named.sub("", line))]
-        faults += [f"{label}: {each}" for each in missing(
-            " | ".join(cells), own or lines, all_numbers=bool(own)
-        )]  # fmt: skip
-    return faults
+        return faults_of_text(block, found)
+    faults, columns = [], defaultdict(dict)
+    rows = rows_of(block.splitlines())
+    sections = (PUBLISHED / files[0]).read_text("utf-8").split("\n## ")[1:]
+    if not all(any(plain(label) in table for table in found) for label, *_ in rows):
+        if len(rows) != len(sections):
+            return [f"rows that the files do not have: {[label for label, *_ in rows]}"]
+        for (_, *cells), section in zip(rows, sections, strict=True):
+            faults += unknown(" | ".join(cells), section)
+        return faults
+    for label, *cells in rows:
+        for j, cell in enumerate(cells):
+            for part, numbers in enumerate(read(cell)):
+                for place, number in enumerate(numbers):
+                    columns[j, part, place][plain(label)] = number
+    return [
+        f"column {j + 1}: {column}"
+        for (j, part, _), column in columns.items()
+        if not explained(column, part, found)
+    ]
 
 
-MARKED = [(name, *found) for name, page in PAGES.items() for found in MARK.findall(page)]
-SOURCED = [each for each in MARKED if not each[1].startswith("none")]
+def unknown(text, known):
+    """Return the numbers of a text, but for its integers without a unit, that are not known.
+
+    Means must be means, and ends of intervals such ends.
+    """
+    return [
+        number
+        for here, there in zip(read(text), read(known.replace("*", "")), strict=True)
+        for number, unit in here
+        if ("." in number or unit) and not any(same(number, unit, each) for each, _ in there)
+    ]
+
+
+def faults_of_text(text, found):
+    named = [
+        cells for table in found for label, cells in table.items()
+        if re.search(rf"(?<!\w){re.escape(label)}(?!\w)", text) and len(cells) > 1
+    ]  # fmt: skip
+    rows = named or [cells for table in found for cells in table.values()]
+    return unknown(text, " ; ".join(cell for row in rows for cell in row.values()))
+
+
+SOURCED = [
+    (name, files.split(", "), block)
+    for name, page in PAGES.items()
+    for files, block in MARK.findall(page)
+    if not files.startswith("none")
+]
 
 
 @pytest.mark.parametrize(("page", "files", "block"), SOURCED, ids=range(len(SOURCED)))
 def test_numbers_of_a_page_are_those_of_its_source(page, files, block):
-    texts = [(PUBLISHED / file).read_text("utf-8") for file in files.split(", ")]
-    source = "\n".join(texts).replace(",", ", ") if "csv" in files else "\n".join(texts)
-    assert not faults_of(block, source), f"{page}, against {files}"
-    digit = re.search(r"(?<=\.)\d(?=[ ,;|°)]|\d)", block)
-    if digit:  # changed, it is noticed
-        before, after = block[: digit.start()], block[digit.end() :]
-        assert any(faults_of(f"{before}{other}{after}", source) for other in range(10))
+    assert not faults_of(block, files), f"{page}, against {files}"
+
+
+def test_a_changed_digit_is_noticed(rng):
+    places = [
+        (number.start() + i, files, block)
+        for _, files, block in SOURCED
+        for number in NUMBER.finditer(block)
+        if "." in number[1] or number[2]
+        for i, character in enumerate(number[1])
+        if character.isdigit()
+    ]
+    noticed = 0
+    for place in rng.choice(len(places), 100, replace=False):
+        at, files, block = places[place]
+        other = str((int(block[at]) + rng.integers(1, 10)) % 10)
+        noticed += bool(faults_of(block[:at] + other + block[at + 1 :], files))
+    assert noticed >= 95
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_every_table_of_results_names_its_source(page):
-    marked = "".join(block for name, _, block in MARKED if name == page)
+    marked = "".join(block for _, block in MARK.findall(PAGES[page]))
     for table in re.findall(r"^\|.*?(?:\n\n|\Z)", PAGES[page], re.DOTALL | re.MULTILINE):
         if len(re.findall(r"\d\.\d", table)) > 8:
             assert table.strip() in marked, table[:200]
