@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mptc_gym.checks import MOST_NUMBERS, MOST_PLANTS, count, is_count, reject
-from mptc_gym.env import INFO, HasPlainSpec, action_space, observation_space
+from mptc_gym.env import INFO, HasPlainSpec, observation_space
 from mptc_gym.parameters import Parameters
 from mptc_gym.signals import FOREVER
 
@@ -44,9 +45,13 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         self.parameters = Parameters.of_environment(arguments)
         self.num_envs = _checked_count(num_envs, self.parameters)
         self._limit = _checked_limit(max_episode_steps)
-        self.autoreset_mode = _checked_mode(autoreset_mode)
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            allowed = ", ".join(repr(mode.value) for mode in AutoresetMode)
+            reject("autoreset_mode", autoreset_mode, f"one of {allowed}")
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.single_action_space = action_space()
+        self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.single_observation_space = observation_space(self.parameters)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -244,12 +249,3 @@ def _checked_limit(max_episode_steps: int | None) -> int:
         allowed = "an integer of at least 1, or None or -1 for no limit"
         reject("max_episode_steps", max_episode_steps, allowed)
     return FOREVER if max_episode_steps == -1 else min(FOREVER, int(max_episode_steps))
-
-
-def _checked_mode(autoreset_mode: str | AutoresetMode) -> AutoresetMode:
-    """Return an autoreset mode, given as such or by its value."""
-    try:
-        return AutoresetMode(autoreset_mode)
-    except ValueError:
-        allowed = ", ".join(repr(mode.value) for mode in AutoresetMode)
-        reject("autoreset_mode", autoreset_mode, f"one of {allowed}")

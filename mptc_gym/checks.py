@@ -184,16 +184,12 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     return _number_that(lambda value: True, allowed)(name, value)
 
 
-def or_range(check: Check) -> Callable[[str, Any], Number]:
-    """Return a check that takes what `check` takes, or a range [low, high] of it."""
-
-    def checked(name: str, value: Any) -> Number:
-        if not isinstance(value, list | tuple):
-            single: float = check(name, value)
-            return single
-        ends = [check(name, each) for each in value]
-        if len(ends) != 2 or ends[0] > ends[1]:
-            reject(name, value, "one number, or a range [low, high] with low <= high")
-        return ends[0], ends[1]
-
-    return checked
+def or_range(check: Check, name: str, value: Any) -> Number:
+    """Return what `check` takes, or a range [low, high] of it."""
+    if not isinstance(value, list | tuple):
+        single: float = check(name, value)
+        return single
+    ends = [check(name, each) for each in value]
+    if len(ends) != 2 or ends[0] > ends[1]:
+        reject(name, value, "one number, or a range [low, high] with low <= high")
+    return ends[0], ends[1]

@@ -29,11 +29,6 @@ Observation = NDArray[np.float32]
 Action = NDArray[np.float32]
 
 
-def action_space() -> Space[Action]:
-    """Return the bounds of the action, shape (1,), float32."""
-    return Box(-1.0, 1.0, (1,), np.float32)
-
-
 def observation_space(parameters: Parameters) -> Space[Observation]:
     """Return the bounds of the observation, shape (observation_size,), float32.
 
@@ -214,7 +209,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         one_of("render_mode", render_mode, [None, *self.metadata["render_modes"]])
         self.render_mode = render_mode
         self._record: Record | None = None  # for pictures; None if there are none
-        self.action_space = action_space()
+        self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = observation_space(parameters)
         # Used by step, in two tuples: unpacking one is faster than reading as many attributes.
         self._reward_terms = (

@@ -8,7 +8,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any, Final, Generic, TypeVar
 
@@ -169,7 +169,9 @@ class Parameters(PlantNumbers[Number]):
 
     def __post_init__(self) -> None:
         for name, argument in ARGUMENTS.items():
-            check = checks.or_range(argument.check) if name in PLANT_NUMBERS else argument.check
+            check = argument.check
+            if name in PLANT_NUMBERS:
+                check = partial(checks.or_range, check)
             object.__setattr__(self, name, check(name, checks.plain(getattr(self, name))))
         self._check_actuator()
         if self.changes_time_constant:

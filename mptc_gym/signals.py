@@ -86,23 +86,20 @@ class Streams(NamedTuple):
         return cls(*(EpisodeStream(seed, (place,)) for place in range(len(cls._fields))))
 
 
-def colour_of(name: str, parameters: Parameters) -> Sequence[float]:
-    """Return the coefficients of C in (28) for "noise"; "measurement_noise" is white."""
-    return parameters.c if name == "noise" else (1.0,)
-
-
-def is_silent(name: str, parameters: Parameters) -> bool:
-    """Whether "noise" or "measurement_noise" is always 0."""
-    return parameters.range_of(f"{name}_variance")[1] == 0.0
+def colours(parameters: Parameters) -> dict[str, Sequence[float]]:
+    """Return the coefficients of C in (28) by the name of each noise that is not always 0."""
+    of_all = {"noise": parameters.c, "measurement_noise": (1.0,)}
+    return {n: c for n, c in of_all.items() if parameters.range_of(f"{n}_variance")[1] > 0.0}
 
 
 class Noise:
     """Noise by name, 0 at k = 0: C(z^-1) xi(k) of (28), or the measurement noise."""
 
-    def __init__(self, name: str, parameters: Parameters, num_envs: int, block: int) -> None:
+    def __init__(
+        self, name: str, c: Sequence[float], parameters: Parameters, num_envs: int, block: int
+    ) -> None:
         self._name, self._variance = name, f"{name}_variance"
-        c = np.array(colour_of(name, parameters))
-        self._c = c[:, np.newaxis, np.newaxis]
+        self._c = np.array(c)[:, np.newaxis, np.newaxis]
         # C times the standard deviation of xi: [lag, plant, 0], one plant for all if alike.
         low, high = parameters.range_of(self._variance)
         self._alike = low == high
@@ -355,12 +352,16 @@ class Signals(NamedTuple):
     @classmethod
     def of(cls, parameters: Parameters, num_envs: int = 1, block: int = BLOCK) -> Signals:
         """Make the signals of an environment, with `block` samples of noise at a time."""
-        noise, measurement_noise = (
-            None if is_silent(name, parameters) else Noise(name, parameters, num_envs, block)
-            for name in ("noise", "measurement_noise")
+        noises = {
+            name: Noise(name, c, parameters, num_envs, block)
+            for name, c in colours(parameters).items()
+        }
+        return cls(
+            SetPoint(parameters, num_envs),
+            noises.get("noise"),
+            Disturbance(num_envs) if parameters.is_disturbed else None,
+            noises.get("measurement_noise"),
         )
-        disturbance = Disturbance(num_envs) if parameters.is_disturbed else None
-        return cls(SetPoint(parameters, num_envs), noise, disturbance, measurement_noise)
 
     def reset(
         self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]

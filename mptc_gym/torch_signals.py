@@ -8,7 +8,7 @@ follow, degC, shape (samples, n). All share the clock of `Episodes`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from torch import Tensor
 from mptc_gym.checks import reject
 from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, Parameters
 from mptc_gym.plant import DRIFT_INTERVAL
-from mptc_gym.signals import LOAD_INTERVAL, Levels, colour_of, is_silent
+from mptc_gym.signals import LOAD_INTERVAL, Levels, colours
 
 LONGEST = 64  # most samples in a block
 SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
@@ -118,9 +118,8 @@ class Episodes:
 class Noise:
     """Coloured noise, by name: see `mptc_gym.signals.Noise`."""
 
-    def __init__(self, name: str, parameters: Parameters, episodes: Episodes) -> None:
-        self._variance, self._c = f"{name}_variance", tuple(colour_of(name, parameters))
-        self._order = len(self._c) - 1
+    def __init__(self, name: str, c: Sequence[float], episodes: Episodes) -> None:
+        self._variance, self._c, self._order = f"{name}_variance", c, len(c) - 1
         self._episodes = episodes
 
     def reset(self, mask: Tensor | None) -> Tensor:
@@ -317,9 +316,8 @@ def make_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal
     signals: dict[str, Signal] = {"setpoint": setpoint(levels, episodes)}
     if parameters.is_disturbed:
         signals["disturbance"] = Disturbance(episodes)
-    for name in ("noise", "measurement_noise"):
-        if not is_silent(name, parameters):
-            signals[name] = Noise(name, parameters, episodes)
+    for name, c in colours(parameters).items():
+        signals[name] = Noise(name, c, episodes)
     return signals
 
 

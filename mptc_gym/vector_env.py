@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -234,27 +234,22 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return mask.copy()
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        seeds = self._checked_seeds(seed)
-        for i in np.flatnonzero(mask).tolist():
-            own = seeds[i]
-            if own is None and i not in self._streams:
-                own = cast("int", np.random.SeedSequence().entropy)
-            if own is not None:
-                self._seeds[i] = own
-                self._streams[i] = Streams.of_seed(own)
-
-    def _checked_seeds(self, seed: Any) -> list[int | None]:
         n = self.num_envs
-        if seed is None:
-            return [None] * n
         seeds = [*range(int(seed), int(seed) + n)] if is_count(seed) else plain(seed)
+        seeds = [None] * n if seed is None else seeds
         if (
             not isinstance(seeds, list | tuple)
             or len(seeds) != n
             or not all(each is None or is_count(each) for each in seeds)
         ):
             reject("seed", seed, f"an integer of at least 0, or a list of {n} of them or None")
-        return [None if each is None else int(each) for each in seeds]
+        for i in np.flatnonzero(mask).tolist():
+            own = seeds[i]
+            if own is None and i not in self._streams:
+                own = np.random.SeedSequence().entropy
+            if own is not None:
+                self._seeds[i] = int(own)
+                self._streams[i] = Streams.of_seed(int(own))
 
     def _checked_actions(self, actions: Any) -> Values:
         return many_actions(actions, self.num_envs, self._ended)
