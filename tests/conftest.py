@@ -49,15 +49,20 @@ def run(
 
 
 def native_and_sync(
-    num_envs: int, mode: str, limit: int | None = None, **arguments: Any
+    num_envs: int,
+    mode: str,
+    limit: int | None = None,
+    wrappers: Sequence[Any] = (),
+    **arguments: Any,
 ) -> tuple[VectorEnv, VectorEnv]:
-    """Return the vector environment, and Gymnasium's of one environment after the other."""
+    """Return the vector environment, and Gymnasium's of one (wrapped) after the other."""
     native = gymnasium.make_vec(
         "MiddlePoint-v0", num_envs, max_episode_steps=limit, autoreset_mode=mode, **arguments
     )
     sync = gymnasium.make_vec(
         "MiddlePoint-v0", num_envs, max_episode_steps=-1 if limit is None else limit,
-        vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **arguments,
+        vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, wrappers=wrappers,
+        **arguments,
     )  # fmt: skip
     assert type(native) is MiddlePointVectorEnv
     return native, sync

@@ -1,7 +1,6 @@
 """The wrappers whose action changes the flow."""
 
 import warnings
-from functools import partial
 
 import gymnasium
 import numpy as np
@@ -9,20 +8,17 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence
-from gymnasium.vector import SyncVectorEnv
 
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers import vector as many
-from tests.arguments import MODES
-from tests.conftest import native_and_sync
 
 RANGES = {
     "dead_zone": [2.0, 8.0], "u_min": [-14.0, -9.0], "u_max": [8.0, 12.0], "delay": [3, 9],
     "noise_variance": 0.3, "setpoint": "random", "setpoint_period": 40, "action_window": 4,
     "move_weight": 0.1,
 }  # fmt: skip
-PLANTS, LIMIT = 3, 7
+LIMIT = 7
 MANY_MODES = "sync", "vector_entry_point"
 
 
@@ -165,44 +161,3 @@ def test_the_spec_makes_it_again_and_both_checkers_have_no_complaint():
         check_env(env, skip_render_check=True)
         checker = pytest.importorskip("stable_baselines3.common.env_checker")
         checker.check_env(env)
-
-
-def batches(mode, *, compensate):
-    """Return three times the same: wrapped one by one, and two batches that are wrapped."""
-    wrapped = partial(make, RANGES, compensate_dead_zone=compensate)
-    return (
-        SyncVectorEnv([wrapped] * PLANTS, autoreset_mode=mode),
-        *(
-            many.IncrementalAction(envs, compensate_dead_zone=compensate)
-            for envs in native_and_sync(PLANTS, mode, LIMIT, **RANGES)
-        ),
-    )
-
-
-@pytest.mark.parametrize("compensate", [False, True, 4.0])
-@pytest.mark.parametrize("mode", MODES)
-def test_a_batch_is_each_of_them_wrapped(rng, mode, compensate):
-    envs = batches(mode, compensate=compensate)
-    reference = envs[0]
-    for env in envs[1:]:
-        assert env.single_action_space == reference.single_action_space
-        assert env.action_space == reference.action_space
-
-    def all_the_same(returned):
-        for each in returned[1:]:
-            assert data_equivalence(each, returned[0], exact=True)
-        return returned[0]
-
-    all_the_same([env.reset(seed=5) for env in envs])
-    ended = np.zeros(PLANTS, np.bool_)  # and reset by the next step, which takes no action
-    for k in range(60):
-        actions = rng.uniform(-1.5, 1.5, (PLANTS, 1)).astype(np.float32)
-        actions[ended] = np.nan
-        _, _, _, truncations, _ = all_the_same([env.step(actions) for env in envs])
-        # After k = 40 whoever steps resets what has ended, whatever the mode.
-        reset = truncations if mode == "Disabled" or k > 40 else np.zeros(PLANTS, np.bool_)
-        if k in (4, 29, 34):  # episodes end at different times from now on
-            reset = reset | (np.arange(PLANTS) == k % PLANTS)
-        ended = truncations & ~reset & (mode == "NextStep")
-        if reset.any():
-            all_the_same([env.reset(options={"reset_mask": reset.copy()}) for env in envs])

@@ -15,6 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mptc_gym import MiddlePointVectorEnv
+from mptc_gym.wrappers import IncrementalAction
+from mptc_gym.wrappers import vector as many
 from tests.arguments import MODES, NOISY, valid_arguments
 from tests.conftest import native_and_sync, random_actions
 
@@ -27,13 +29,15 @@ def assert_equal(ours, theirs):
 
 
 def compare(native, sync, *, steps, rng, partial_resets):
-    n = native.num_envs
+    n, mode = native.num_envs, native.metadata["autoreset_mode"]
+    ended = np.zeros(n, np.bool_)  # and reset by the next step, which takes no action
     for _ in range(steps):
         actions = random_actions(rng, n)
+        actions[ended] = np.nan
         ours, theirs = native.step(actions), sync.step(actions)
         assert_equal(ours, theirs)
         mask = rng.random(n) < partial_resets
-        if native.metadata["autoreset_mode"] is AutoresetMode.DISABLED:
+        if mode is AutoresetMode.DISABLED:
             mask |= ours[3]
         if mask.any():
             seeds = [None if rng.random() < 0.5 else int(rng.integers(100)) for _ in range(n)]
@@ -42,6 +46,7 @@ def compare(native, sync, *, steps, rng, partial_resets):
                 for envs in (native, sync)
             )
             assert_equal(*both)
+        ended = ours[3] & ~mask & (mode is AutoresetMode.NEXT_STEP)
 
 
 @settings(max_examples=80, deadline=None)
@@ -53,18 +58,25 @@ def compare(native, sync, *, steps, rng, partial_resets):
     partial_resets=st.sampled_from([0.0, 0.05, 0.3]),
     seed=st.integers(0, 2**40) | st.none(),
     randomness=st.integers(0, 2**32),
+    compensated=st.sampled_from(["no wrapper", False, True, 4.0]),
+    of_sync=st.booleans(),
 )
 def test_it_equals_one_environment_after_the_other(
-    arguments, num_envs, mode, limit, partial_resets, seed, randomness
+    arguments, num_envs, mode, limit, partial_resets, seed, randomness, compensated, of_sync
 ):
     rng = np.random.default_rng(randomness)
     if seed is None:
         seed = rng.integers(0, 2**40, num_envs).tolist()
+    moves = [] if compensated == "no wrapper" else [{"compensate_dead_zone": compensated}]
     with (  # so small that many blocks are made and the window is moved back often
         patch.multiple("mptc_gym.vector_env", BLOCK=7, STEPS_PER_SHIFT=3),
         patch.multiple("mptc_gym.signals", PLANTS_AT_A_TIME=2),
     ):
-        native, sync = native_and_sync(num_envs, mode, limit, **arguments)
+        made = partial(native_and_sync, num_envs, mode, limit, **arguments)
+        native, sync = made(wrappers=[partial(IncrementalAction, **each) for each in moves])
+        if moves:  # all at once, or one after the other
+            native = many.IncrementalAction(made()[1] if of_sync else native, **moves[0])
+            assert native.action_space == sync.action_space
         assert_equal(native.reset(seed=seed), sync.reset(seed=seed))
         compare(native, sync, steps=50, rng=rng, partial_resets=partial_resets)
         assert_equal(native.reset(), sync.reset())
