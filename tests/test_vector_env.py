@@ -36,7 +36,8 @@ def compare(native, sync, *, steps, rng, partial_resets):
         actions[ended] = np.nan
         ours, theirs = native.step(actions), sync.step(actions)
         assert_equal(ours, theirs)
-        mask = rng.random(n) < partial_resets
+        # More often of those that have ended.
+        mask = rng.random(n) < partial_resets * np.where(ours[3], 3.0, 1.0)
         if mode is AutoresetMode.DISABLED:
             mask |= ours[3]
         if mask.any():
@@ -54,7 +55,7 @@ def compare(native, sync, *, steps, rng, partial_resets):
     arguments=valid_arguments,
     num_envs=st.integers(1, 6),
     mode=st.sampled_from(MODES),
-    limit=st.none() | st.integers(1, 40),
+    limit=st.none() | st.integers(1, 10) | st.integers(11, 40),
     partial_resets=st.sampled_from([0.0, 0.05, 0.3]),
     seed=st.integers(0, 2**40) | st.none(),
     randomness=st.integers(0, 2**32),
