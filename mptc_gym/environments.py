@@ -14,8 +14,9 @@ from gymnasium.wrappers import NormalizeObservation, NormalizeReward, vector
 
 from mptc_gym.checks import reject, shorten
 from mptc_gym.env import MiddlePointEnv
+from mptc_gym.parameters import Parameters
 from mptc_gym.plant import action_from_command
-from mptc_gym.policies import is_algorithm, loaded
+from mptc_gym.policies import is_algorithm, loaded, unbound
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
@@ -212,11 +213,19 @@ def _frozen(env: Any) -> Iterator[None]:
             setattr(layer, name, flag)
 
 
-def check_model(model: Any, plants: Any, here: Any) -> None:
-    """Refuse environments that a model of Stable-Baselines3 was not trained for.
+def check_fit(policy: Any, parameters: Parameters, plants: Any) -> None:
+    """Refuse environments that a policy was not made for, if it is one that can tell."""
+    here = plants.env if isinstance(plants, Given) else plants
+    owner = getattr(unbound(policy), "__self__", unbound(policy))
+    if hasattr(owner, "check_environment") and not isinstance(owner, type):
+        owner.check_environment(parameters, known_wrappers(here), plants.num_envs)
+    inside = loaded("stable_baselines3.common.policies", "BaseModel")
+    if is_algorithm(policy) or isinstance(policy, inside):
+        _check_model(policy, plants, here)
 
-    `here` are those inside the batch `plants`, or the same.
-    """
+
+def _check_model(model: Any, plants: Any, here: Any) -> None:
+    """Refuse environments that a model of Stable-Baselines3 was not trained for."""
     compared: dict[str, tuple[Any, Any]] = {
         "observation space": (model.observation_space, plants.single_observation_space),
         "action space": (model.action_space, plants.single_action_space),

@@ -11,6 +11,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
+from types import FunctionType
 from typing import Any, Final
 
 import gymnasium
@@ -25,7 +26,7 @@ from mptc_gym.checks import MOST_PLANTS, count, reject
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
-from mptc_gym.policies import is_model, owner_of, rollout, start
+from mptc_gym.policies import rollout, start
 from mptc_gym.presets import IDS, PRESETS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
@@ -199,7 +200,7 @@ valve travel 0 t/h; 100 episodes, all alike
     if least is None:
         return dataclasses.replace(found, missing=_missing(parameters, samples, seeds))
     rest = action_from_command(0.0, parameters.u_min, parameters.u_max)
-    with closing(_native(parameters, episodes)) as plants:
+    with closing(MiddlePointVectorEnv(episodes, **dataclasses.asdict(parameters))) as plants:
         idle, *_ = _run(lambda seen: np.full((len(seen), 1), rest), plants, seeds, samples)
     gained, possible = idle - errors, idle - least
     return dataclasses.replace(
@@ -233,12 +234,8 @@ def _prepared(policy: Any, env: Any, n: int, arguments: dict[str, Any]) -> Itera
         first, *others = [plants.unwrapped] if batch else plants.inner
         if any(case_of(each.parameters) != case_of(first.parameters) for each in others):
             raise ValueError("env must have the same plants, but for windows and rewards")
-        owner, here = owner_of(policy), plants if batch else plants.env
-        if hasattr(owner, "check_environment") and not isinstance(owner, type):
-            wrappers = environments.known_wrappers(here)
-            owner.check_environment(first.parameters, wrappers, plants.num_envs)
-        if is_model(policy):
-            environments.check_model(policy, plants, here)
+        if not isinstance(policy, FunctionType):  # which cannot tell what it was made for
+            environments.check_fit(policy, first.parameters, plants)
         name = name or (first.spec.id if first.spec else type(first).__name__)
         yield plants, first.parameters, name, most, batch is not None
 
@@ -279,11 +276,6 @@ def native_batch(single: Env) -> Batch | None:
     return lambda n, **modes: VectorIncrementalAction(plants(n, **modes), **moves[0])
 
 
-def _native(parameters: Parameters, n: int) -> MiddlePointVectorEnv:
-    """Return n of the package's own plants, whose episodes do not end."""
-    return MiddlePointVectorEnv(n, **dataclasses.asdict(parameters))
-
-
 def _run(
     policy: Any, plants: Any, seeds: range, most: int, expected: Parameters | None = None
 ) -> tuple[Values, Values, int]:
@@ -297,7 +289,8 @@ def _run(
         own = [*range(first, first + n)]
         steps = rollout(plants, start(policy, n), most, own)
         if expected:
-            steps = environments.replayed(steps, _native(expected, n), own)
+            native = MiddlePointVectorEnv(n, **dataclasses.asdict(expected))
+            steps = environments.replayed(steps, native, own)
         error, travel = np.zeros(n), np.zeros(n)
         for k, (before, after, ended) in enumerate(steps, 1):  # noqa: B007 (used below)
             error += np.abs(after["error"])

@@ -60,7 +60,8 @@ def start(policy: Any, n: int) -> Act:
     predicts, acts = (callable(getattr(policy, name, None)) for name in ("predict", "act"))
     if isinstance(policy, type) or not (predicts or acts or callable(policy)):
         reject("policy", policy, "a function, or an object with predict or act, not a class")
-    owner, function = owner_of(policy), _unbound(policy)
+    function = unbound(policy)
+    owner = getattr(function, "__self__", function)  # of a method, its object
     if callable(getattr(owner, "reset", None)) and not isinstance(owner, type):
         owner.reset()
     plain = policy.act if acts else policy
@@ -81,19 +82,8 @@ def is_algorithm(policy: Any) -> bool:
     return isinstance(policy, loaded("stable_baselines3.common.base_class", "BaseAlgorithm"))
 
 
-def is_model(policy: Any) -> bool:
-    """Whether a policy is a model of Stable-Baselines3, or the policy inside one."""
-    inside = loaded("stable_baselines3.common.policies", "BaseModel")
-    return is_algorithm(policy) or isinstance(policy, inside)
-
-
-def owner_of(policy: Any) -> Any:
-    """Return a policy; of a method, such as `controller.act`, its object."""
-    function = _unbound(policy)
-    return getattr(function, "__self__", function)
-
-
-def _unbound(function: Any) -> Any:
+def unbound(function: Any) -> Any:
+    """Return what a `functools.partial`, or several, calls."""
     while isinstance(function, partial):
         function = function.func
     return function
@@ -101,7 +91,7 @@ def _unbound(function: Any) -> Any:
 
 def _deterministic(act: Any) -> Act:
     """Return a function that explores only on request as one that does not explore."""
-    function = _unbound(act)
+    function = unbound(act)
     explores = "deterministic" in _keywords(getattr(function, "forward", function))
     chosen = isinstance(act, partial) and "deterministic" in act.keywords
     return partial(act, deterministic=True) if explores and not chosen else cast("Act", act)
