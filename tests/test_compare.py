@@ -186,13 +186,13 @@ class TestReport:
             return {name: (Estimate(x, x, x, 1), {}) for name, x in values.items()}
 
         found = scores(mpc=0.998, smith=0.997, pi=0.5)
-        closest = "Smith comes closest to the least possible error: 0.997"
-        assert plots._finding(found, ["mpc"]) == f"{closest} (MPC 0.998, told the plant)"
-        assert "told the plant, has a score of 0.9" in plots._finding(scores(mpc=0.9), ["mpc"])
+        closest = "Closest to the least possible error is Smith: 0.997"
+        assert plots.closest(found, ["mpc"]) == f"{closest} (MPC: 0.998, told the plant)"
+        assert plots.closest(scores(mpc=0.9), ["mpc"]) == "Score of MPC: 0.900, told the plant"
         travels = pd.Series({"smith": 300.0, "mpc": 100.0, "pi": 50.0})
-        assert "MPC moves the valve least: 100" in plots._calmest(travels, found)
+        assert "MPC moves the valve least: 100" in plots.calmest(travels, found)
         alone = scores(smith=0.997, pi=0.5)
-        assert "Smith alone is near the best score: 300" in plots._calmest(
+        assert "Smith alone is near the best score: 300" in plots.calmest(
             travels[["smith", "pi"]], alone
         )
 
@@ -242,7 +242,7 @@ def compared(tmp_path):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Leave out the pictures, which take most of the time."""
-    monkeypatch.setattr(report, "_draw", lambda *_: "left out")
+    monkeypatch.setattr(report, "_pictures", lambda *_: {})
 
 
 def assert_golden(found, name):
@@ -287,14 +287,14 @@ class TestCompare:
             assert (one / name).read_bytes() == (two / name).read_bytes()
         assert sorted(pd.read_csv(one / "runs.csv")["policy"].unique()) == [*range(5)]
 
-    def test_a_picture_that_cannot_be_drawn_is_a_sentence(self, compared, monkeypatch):
+    def test_a_picture_that_cannot_be_drawn_costs_no_other(self, compared, monkeypatch, capsys):
         error = ValueError("Axis limits cannot be NaN or Inf")
-        monkeypatch.setattr(plots, "plot_travel", Mock(side_effect=error))
-        out = compared("--agents nothing --scenarios constant-noise --runs 1")
+        monkeypatch.setattr(plots, "plot_scores", Mock(side_effect=error))
+        out = compared("--agents nothing --scenarios constant-noise --runs 1", status=1)
+        assert "scores.png: ValueError: Axis limits cannot be" in capsys.readouterr().out
         page = (out / "report.md").read_text()
-        assert page.count("could not be drawn") == 1
-        assert "travel.png could not be drawn (ValueError: Axis limits cannot be" in page
-        assert "(travel.png)" not in page
+        assert "(bounds.png)" in page
+        assert "(scores.png)" not in page
         assert "(one run)" in page
 
     @pytest.mark.usefixtures("undrawn")

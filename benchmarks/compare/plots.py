@@ -40,13 +40,12 @@ def plot_scores(scores: Mapping[str, Score], told: Sequence[str], path: Path) ->
     The title names the best of those that are not `told` the whole plant.
     """
     style = looks([*scores])
-    with drawn(path, 1.2 + 0.3 * len(scores), _finding(scores, told)) as figure:
+    with drawn(path, 1.2 + 0.3 * len(scores), closest(scores, told)) as figure:
         axes = figure.subplots()
         for place, (agent, (overall, by_case)) in enumerate(scores.items()):
-            colour, marker = style[agent]
             away = np.clip([1.0 - score for score in by_case.values()], NEAREST, FARTHEST)
-            axes.plot(away, [place] * len(away), "|", color=colour, alpha=0.5)
-            _mark(axes, 1.0 - overall.value, place, colour, marker, (NEAREST, FARTHEST), 8)
+            axes.plot(away, [place] * len(away), "|", color=style[agent][0], alpha=0.5)
+            _mark(axes, 1.0 - overall.value, place, style[agent], across=True)
             text = written(overall.value, ".3f")
             axes.annotate(text, (1.01, place), xycoords=("axes fraction", "data"), va="center")
         _list_agents(axes, [*scores])
@@ -61,66 +60,61 @@ def plot_scores(scores: Mapping[str, Score], told: Sequence[str], path: Path) ->
         )
 
 
-def _finding(scores: Mapping[str, Score], told: Sequence[str]) -> str:
-    values = {agent: f"{overall.value:.3f}" for agent, (overall, _) in scores.items()}
-    best = next((agent for agent in values if agent not in told), "")
-    if not best:
-        first = next(iter(values))
-        return f"{label(first)}, which is told the plant, has a score of {values[first]}"
-    others = [f"{label(agent)} {values[agent]}" for agent in values if agent in told]
+def closest(scores: Mapping[str, Score], told: Sequence[str]) -> str:
+    """Return which controller has the best score of those that are not told the plant."""
+    said = {
+        agent: f"{label(agent)}: {overall.value:.3f}" for agent, (overall, _) in scores.items()
+    }
+    best = next((agent for agent in said if agent not in told), None)
+    if best is None:
+        return f"Score of {next(iter(said.values()))}, told the plant"
+    others = [said[agent] for agent in said if agent in told]
     more = f" ({', '.join(others)}, told the plant)" if others else ""
-    closest = "comes closest to the least possible error" if len(values) > 1 else "has a score"
-    return f"{label(best)} {closest}: {values[best]}{more}"
+    among = "Closest to the least possible error is " if len(said) > 1 else "Score of "
+    return f"{among}{said[best]}{more}"
 
 
 def _mark(
-    axes: Axes,
-    x: float,
-    y: float,
-    colour: str,
-    marker: str,
-    ends: tuple[float, float],
-    size: float,
+    axes: Axes, x: float, y: float, look: tuple[str, str], *, across: bool, size: int = 6
 ) -> None:
-    """Draw a marker, hollow at the end of the axis beyond which it would be."""
-    low, high = ends
-    face = colour if low < x < high else "white"
-    axes.plot(
-        min(max(x, low), high), y, marker, color=colour, markerfacecolor=face, markersize=size
-    )
+    """Draw a marker, hollow at an edge of the axis (`across` or up) that it would be beyond."""
+    value = x if across else y
+    inside = min(max(value, NEAREST), FARTHEST if size == 6 and across else math.inf)
+    place = (inside, y) if across else (x, inside)
+    face = look[0] if inside == value else "white"
+    axes.plot(*place, look[1], color=look[0], markerfacecolor=face, markersize=size)
 
 
 def plot_bounds(
     estimates: pd.DataFrame,
-    runs: pd.DataFrame,
+    worst: Mapping[tuple[str, str], float],
     agents: Sequence[str],
     told: Sequence[str],
     path: Path,
 ) -> None:
     """Draw mean errors as multiples of the least possible, with intervals and worst runs."""
-    style, worst = looks(agents), runs.groupby(["scenario", "agent"])["mae"].max()
-    cases = dict(groups(estimates, "scenario"))
+    style, cases = looks(agents), dict(groups(estimates, "scenario"))
     height = 0.8 + 0.17 * len(agents)
-    title = _least(estimates, told)
-    with panels(path, [*cases], height, 2, title) as (figure, found, free):
+    with panels(path, [*cases], height, 2, least(estimates, told)) as (figure, found, free):
         for i, (axes, (case, rows)) in enumerate(zip(found, cases.items(), strict=True)):
-            ends = [NEAREST]
+            farthest = NEAREST
             for row in rows.to_dict("records"):
-                place = agents.index(row["agent"])
-                colour, marker = style[row["agent"]]
-                ratio, end = row["ratio"], worst[case, row["agent"]] / row["limit"]
-                low, mean, high, end = (
-                    max(each - 1.0, NEAREST)
-                    for each in (ratio.low, ratio.value, ratio.high, end)
+                place, look, ratio = (
+                    agents.index(row["agent"]),
+                    style[row["agent"]],
+                    row["ratio"],
                 )
-                ends += [mean, end]
-                axes.plot([mean, end], [place] * 2, color=colour, alpha=0.4, linewidth=1)
+                ends = worst[case, row["agent"]] / row["limit"], ratio.low, ratio.high
+                end, low, high = (max(each - 1.0, NEAREST) for each in ends)
+                mean = max(ratio.value - 1.0, NEAREST)
+                axes.plot([mean, end], [place] * 2, color=look[0], alpha=0.4, linewidth=1)
                 if math.isfinite(high):
-                    axes.plot([low, high], [place] * 2, color=colour, linewidth=3)
-                _mark(axes, ratio.value - 1.0, place, colour, marker, (NEAREST, math.inf), 5)
+                    axes.plot([low, high], [place] * 2, color=look[0], linewidth=3)
+                _mark(axes, ratio.value - 1.0, place, look, across=True, size=5)
+                farthest = max(farthest, mean, end)
             _list_agents(axes, agents)
             axes.tick_params(labelleft=i % 2 == 0)
-            scale_by_excess(axes, "x", min(ends), max(ends))
+            scale_by_excess(axes, "x", NEAREST, farthest)
         for axes in found[-2:]:  # the lowest of each column
             axes.set_xlabel(MULTIPLE)
         entries = {
@@ -132,17 +126,17 @@ def plot_bounds(
         draw_legend(figure, free, entries)
 
 
-def _least(estimates: pd.DataFrame, told: Sequence[str]) -> str:
-    """Return which controller has the least error most often, of those not told the plant."""
+def least(estimates: pd.DataFrame, told: Sequence[str]) -> str:
+    """Return which controller most often has the least error, of those not told the plant."""
     means = estimates.assign(value=[mean.value for mean in estimates["mean"]])
     others = means[~means["agent"].isin(told)]
-    among = "" if others.empty or len(others) == len(means) else ", MPC told the plant aside"
     means = means if others.empty else others
+    aside = ", " + ", ".join(map(label, told)) + " aside" if len(means) < len(estimates) else ""
     best = means.loc[means.groupby("scenario", sort=False)["value"].idxmin(), "agent"]
     name = best.mode()[0]
-    count, cases = (best == name).sum(), len(best)
-    where = "each case" if count == cases else f"{count} of {cases} cases"
-    return f"{label(name)} has the least mean error in {where}{among}"
+    count = (best == name).sum()
+    where = "every case" if count == len(best) else f"{count} of {len(best)} cases"
+    return f"{label(name)} has the least mean error in {where}{aside}"
 
 
 def _list_agents(axes: Axes, agents: Sequence[str]) -> None:
@@ -164,19 +158,16 @@ def plot_travel(
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
     medians = medians[(medians["total_variation"] > 0.0) & medians["scenario"].isin([*scales])]
+    if medians.empty:
+        return
     style, cases = looks([*scores]), dict(groups(medians, "scenario"))
-    title = _calmest(medians.groupby("agent")["total_variation"].mean(), scores)
+    title = calmest(medians.groupby("agent")["total_variation"].mean(), scores)
     with panels(path, [*cases], 2.4, 2, title) as (figure, found, free):
-        entries: dict[str, Any] = {}
         for axes, (case, rows) in zip(found, cases.items(), strict=True):
             travel = rows["total_variation"]
             excess = rows["mae"] / scales[case].least.value - 1.0
             for agent, x, y in zip(rows["agent"], travel, excess, strict=True):
-                colour, marker = style[agent]
-                _mark_point(axes, x, y, colour, marker)
-                entries[label(agent)] = Line2D(
-                    [], [], marker=marker, linestyle="", color=colour
-                )
+                _mark(axes, x, y, style[agent], across=False)
             scale_by_excess(axes, "y", *excess.clip(NEAREST).agg(["min", "max"]))
             axes.set_xscale("log")
             axes.set_xlim(0.7 * travel.min(), 1.4 * travel.max())
@@ -187,26 +178,25 @@ def plot_travel(
             axes.set_ylabel(MULTIPLE)
         for axes in found[-2:]:  # the lowest of each column
             axes.set_xlabel("valve travel of the median run (t/h, log)")
+        entries = {
+            label(agent): Line2D([], [], color=colour, marker=marker, linestyle="")
+            for agent, (colour, marker) in style.items()
+        }
         draw_legend(figure, free, entries)
 
 
-def _mark_point(axes: Axes, x: float, y: float, colour: str, marker: str) -> None:
-    face = colour if y > NEAREST else "white"
-    axes.plot(x, max(y, NEAREST), marker, color=colour, markerfacecolor=face)
-
-
-def _calmest(travels: Any, scores: Mapping[str, Score]) -> str:
+def calmest(travels: Any, scores: Mapping[str, Score]) -> str:
     """Return which controller near the best score moves the valve least, "" if none moves."""
     best = max(overall.value for overall, _ in scores.values())
     near = [agent for agent in travels.index if scores[agent][0].value >= best - NEAR]
     if not near:
         return ""
-    least = str(travels[near].idxmin())
+    calm = str(travels[near].idxmin())
     if len(near) == 1:
-        return f"{label(least)} alone is near the best score: {travels[least]:,.0f} t/h a run"
+        return f"{label(calm)} alone is near the best score: {travels[calm]:,.0f} t/h a run"
     return (
-        f"Of {len(near)} controllers within {NEAR} of the best score, {label(least)} moves the "
-        f"valve least: {travels[least]:,.0f} t/h a run"
+        f"Of {len(near)} controllers within {NEAR} of the best score, {label(calm)} moves the "
+        f"valve least: {travels[calm]:,.0f} t/h a run"
     )
 
 
@@ -219,13 +209,17 @@ def plot_responses(
     load only the beginning. `responses` holds the rows of all agents, `errors` their mean
     errors.
     """
-    agents = sorted(errors, key=errors.__getitem__)
-    style, plant = looks(agents), scenario.parameters
+    agents, plant = sorted(errors, key=errors.__getitem__), scenario.parameters
     held = responses["setpoint"].nunique() == 1
-    if held and not plant.is_disturbed:
-        responses = responses[responses["time_s"] <= 60 * HELD]
+    if held:
+        if not plant.is_disturbed:
+            responses = responses[responses["time_s"] <= 60 * HELD]
+        low, high = (responses["setpoint"] - responses[f"output_{p}"] for p in ("p90", "p10"))
+        middle = responses["setpoint"] - responses["output_median"]
+        errors_of: dict[str, Any] = {"setpoint": 0.0, "output_p10": low, "output_p90": high}
+        responses = responses.assign(output_median=middle, **errors_of)
     height = 1.0 + 1.05 * len(agents)
-    title = f"{scenario.title[0].upper()}{scenario.title[1:]}: {label(agents[0])} errs least"
+    title = f"{scenario.title}: {label(agents[0])} errs least"
     with drawn(path, height, title) as figure:
         figure.set_layout_engine("none")  # which would take most of the time
         place = {"left": 0.09, "right": 0.98, "wspace": 0.14, "hspace": 0.5}
@@ -234,27 +228,21 @@ def plot_responses(
             len(agents), 2, sharex=True, sharey="col", squeeze=False, gridspec_kw=place
         )
         for (left, right), agent in zip(rows_of, agents, strict=True):
-            rows, (colour, _) = responses[responses["agent"] == agent], style[agent]
+            rows, (colour, _) = responses[responses["agent"] == agent], looks(agents)[agent]
             minutes = rows["time_s"] / 60
-            _draw_output(left, rows, colour, held=held)
+            left.step(minutes, rows["setpoint"], "k--", linewidth=0.8, where="post")
+            band = minutes, rows["output_p10"], rows["output_p90"]
+            left.fill_between(*band, color=colour, alpha=0.3, linewidth=0)
+            left.plot(minutes, rows["output_median"], color=colour, linewidth=1.2)
             left.set_title(f"{label(agent)}: {errors[agent]:.3f} °C")
             draw_actuator(right, plant)
             right.step(minutes, rows["applied_median"], color=colour, linewidth=1, where="post")
         left.set_xlim(0, minutes.max())
+        if held and plant.is_disturbed:
+            left.set_ylim(-2.0, 2.0)  # of the loads; the first step is beyond
         rows_of[0, 1].set_title("applied flow (t/h); grey: dead zone")
         figure.supylabel("error (°C)" if held else "temperature (°C)", fontsize="medium")
-        what = "lines: medians, bands: 10th to 90th percentile"
+        shown = "lines: medians, bands: 10th to 90th percentile"
         if plant.setpoint == "random":
-            what = "the first run; the errors are means of all"
-        figure.supxlabel(f"time (min); {what}", fontsize="medium")
-
-
-def _draw_output(axes: Axes, rows: pd.DataFrame, colour: str, *, held: bool) -> None:
-    minutes, setpoint = rows["time_s"] / 60, rows["setpoint"]
-    low, middle, high = (rows[f"output_{name}"] for name in ("p10", "median", "p90"))
-    if held:
-        low, middle, high = setpoint - high, setpoint - middle, setpoint - low
-        setpoint = 0.0 * setpoint
-    axes.step(minutes, setpoint, "k--", linewidth=0.8, where="post")
-    axes.fill_between(minutes, low, high, color=colour, alpha=0.3, linewidth=0)
-    axes.plot(minutes, middle, color=colour, linewidth=1.2)
+            shown = "the first run; the errors are means of all"
+        figure.supxlabel(f"time (min); {shown}", fontsize="medium")

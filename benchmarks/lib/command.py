@@ -41,6 +41,7 @@ EXTRAS = {
     "ray": "ray",
     "torch": "torch",
 }
+_HEARD: list[int] = []  # signals that interrupt the command
 FULL = errno.ENOSPC, errno.EDQUOT, errno.EPIPE  # a disk, or a reader that has gone
 
 
@@ -255,18 +256,25 @@ def _heard(*, to_the_end: bool) -> Iterator[None]:
         yield
         return
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(number, _interrupt)
+    _HEARD[:] = [number for number in before if before[number] is not signal.SIG_IGN]
+    listen()
     try:
         yield
     finally:
+        _HEARD.clear()
         for number, handler in before.items():
             signal.signal(number, signal.SIG_IGN if to_the_end else handler)
 
 
+def listen() -> None:
+    """Let the signals interrupt again, after one has."""
+    for number in _HEARD:
+        signal.signal(number, _interrupt)
+
+
 def _interrupt(number: int, _frame: object) -> NoReturn:
-    # joblib ends its processes then, of which its threads may complain.
+    for each in _HEARD:  # while joblib ends its processes, of which its threads may complain
+        signal.signal(each, signal.SIG_IGN)
     threading.excepthook = lambda _: None
     warnings.simplefilter("ignore")
     raise KeyboardInterrupt(number)

@@ -58,7 +58,7 @@ def drawn(path: Path, height: float, title: str = "", *, grid: bool = True) -> I
     with mpl.rc_context(STYLE | {"axes.grid": grid}):
         figure = Figure(figsize=(WIDTH, height))
         if title:
-            lines = textwrap.fill(title, 86)
+            lines = textwrap.fill(title[0].upper() + title[1:], 86)
             figure.suptitle(lines, x=0.01, ha="left", fontsize=10, weight="bold")
         yield figure
         canvas: Any = FigureCanvasAgg(figure)

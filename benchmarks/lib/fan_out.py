@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from benchmarks.lib.command import Count, options
+from benchmarks.lib.command import Count, listen, options
 from benchmarks.lib.storage import ROOT, Kept, UnfinishedError, UsageError
 
 # Files that are not uploaded to a cluster, in .gitignore syntax: the whole checkout except its
@@ -136,6 +136,9 @@ class FanOut:
             raise UnfinishedError(
                 "a process was killed, perhaps for lack of memory: try fewer --jobs"
             ) from error
+        except KeyboardInterrupt:
+            listen()  # now that joblib has ended its processes
+            raise
 
 
 def _attempt(name: str, task: Task) -> Answer:

@@ -50,10 +50,13 @@ class Section:
 
 
 def write_report(folder: Path, title: str, sections: Sequence[Section], made: str) -> None:
-    """Write `report.md` and `report.html`; `made` is their provenance line."""
+    """Write `report.md` and `report.html`, with the pictures that there are.
+
+    `made` is their provenance line.
+    """
     import markdown
 
-    page = _markdown(title, sections, made)
+    page = _markdown(folder, title, sections, made)
     write_text(folder / "report.md", page)
     body = markdown.markdown(page, extensions=["tables", "toc"])
     body = _INTERVAL.sub(r" <small>\1</small></td>", body)
@@ -95,7 +98,7 @@ def on_screen(table: pd.DataFrame) -> str:
     return re.sub(r"[ \\]+$", "", shown, flags=re.MULTILINE)  # pandas marks what goes on below
 
 
-def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
+def _markdown(folder: Path, title: str, sections: Sequence[Section], made: str) -> str:
     parts = [f"# {_plain(title)}"]
     for section in sections:
         parts += [f"## {_plain(section.title)}"] * bool(section.title)
@@ -103,7 +106,10 @@ def _markdown(title: str, sections: Sequence[Section], made: str) -> str:
         if section.table is not None:
             table = section.table.map(_cell).rename(columns=_cell)
             parts.append(table.to_markdown(index=False, disable_numparse=True))
-        parts += [f"![{_plain(shown)}]({name})" for name, shown in section.pictures.items()]
+        there = {
+            name: shown for name, shown in section.pictures.items() if (folder / name).exists()
+        }
+        parts += [f"![{_plain(shown)}]({name})" for name, shown in there.items()]
     return "\n\n".join([*parts, _plain(made)]) + "\n"
 
 
