@@ -21,7 +21,7 @@ from benchmarks.loop.linear import time_varying_model
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS
-from mptc_gym import PRESETS, Parameters
+from mptc_gym import Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.ranges import Ranges
 from tests.verify_bounds import beats, controllers, errors
@@ -101,7 +101,7 @@ class TestSetPointChanges:
     @pytest.mark.parametrize(
         ("name", "mae"),
         # As a linear program gave them that has nothing of this one but the solver.
-        [("square", 0.9115), ("square-noise", 1.6069), ("constant-noise", 1.0043)],
+        [("square", 0.9115), ("constant-noise", 1.0043)],
     )
     def test_the_reference_of_the_papers_cases(self, name, mae):
         case = {"samples": SCENARIOS[name].samples, **SCENARIOS[name].arguments}
@@ -127,16 +127,17 @@ class TestProgramme:
         setpoint = np.where(k % 600 < 300, 17.0, -17.0)
         assert 8.5 < found.value <= np.abs(setpoint - y)[1:].mean() < 9.5
 
-    def test_outputs_that_no_solver_bears_as_unknowns_are_what_the_flow_does(self):
-        # With the outputs among the unknowns, HiGHS fails with each of its methods.
-        a, b = [1.0, 0.234, -0.008, -0.003], [-1.858, 5.988, 6.153]
-        setpoint = np.where(np.arange(1200) % 600 < 300, 15.75, -15.75)
-        found = best_plan(setpoint, a=a, b=b, delay=11, dead_zone=0.0, u_min=0.0, u_max=2.42)
-        assert 0.0 <= found.flow.min() <= found.flow.max() <= 2.42
-        response = signal.lfilter([0.0] * 12 + b, a, found.flow)
-        np.testing.assert_allclose(found.output, response, atol=1e-6)
-        # At -15.75, no flow of the one sign is better than none; at 15.75, one is nearly right.
-        assert 0.5 * 15.75 < found.error.mean() < 0.52 * 15.75
+    def test_what_is_left_out_is_small_beside_the_largest_response(self, monkeypatch):
+        # In other units of the flow, as much is left out, and the errors are the same.
+        sizes, errors, solve = [], [], optimize.linprog
+        count = lambda *a, **k: sizes.append(k["A_eq"].nnz) or solve(*a, **k)  # noqa: E731
+        monkeypatch.setattr(optimize, "linprog", count)
+        for unit in (1.0, 1e4):
+            plant = {"a": [1.0, -0.5], "b": [0.2 * unit, -0.5 * unit], "dead_zone": 0.0}
+            limits = {"u_min": -30.0 / unit, "u_max": 20.0 / unit, "delay": 2}
+            errors.append(best_plan(np.repeat([1.5, -1.0], 40), **plant, **limits).error)
+        assert sizes[0] == sizes[1]
+        np.testing.assert_allclose(*errors, atol=1e-5)
 
     def test_what_cannot_be_solved_is_said(self, monkeypatch):
         given_up = optimize.OptimizeResult(success=False, message="Time limit reached")
@@ -172,7 +173,7 @@ class TestProgramme:
         least = best_plan(setpoint, **plant).value
         assert least * (1 - 1e-6) <= found < 1.005 * least
 
-    @pytest.mark.parametrize("period", [40, 152, 320])
+    @pytest.mark.parametrize("period", [40, 152])
     def test_a_controller_that_knows_the_future_attains_the_bound(self, period):
         # Without a dead zone, so that every flow can be applied.
         arguments = {"setpoint_period": period, "dead_zone": 0.0}
@@ -197,10 +198,6 @@ class TestProgramme:
         np.testing.assert_allclose(runs.output[:, 0], best.output[:-1], atol=1e-4)
         assert mean_error(runs)[0] == pytest.approx(best.error[1:].mean(), rel=1e-4)
 
-    def test_a_dead_zone_brings_0_within_reach(self):
-        shut_out = course_of(50, u_min=3.0, u_max=9.0, dead_zone=2.0)
-        assert (shut_out.low, shut_out.high) == (0.0, 9.0)
-
 
 class TestUnknown:
     def test_the_variance_begins_with_the_episode(self):
@@ -224,8 +221,7 @@ class TestUnknown:
         assert variance[[-1, 6]] == pytest.approx(ahead, rel=1e-6)
         assert variance[-1] > noise_variance(course_of(200, **plant, noise_variance=0.4))[-1]
 
-    @pytest.mark.parametrize("k", [603, 609])  # two changes and one within the last 19 samples
-    @pytest.mark.parametrize("R", [0.0, 0.3])
+    @pytest.mark.parametrize(("k", "R"), [(603, 0.0), (609, 0.3)])  # two changes, and one
     def test_the_load_against_many_draws(self, k, R, rng):
         load = {
             "disturbance_amplitude": 3.0, "disturbance_interval": 25.0,
@@ -271,8 +267,7 @@ class TestCausal:
     @pytest.mark.parametrize(
         ("pole", "b", "past"),
         [
-            (0.6, -0.24, [5.0]), (0.6, -0.24, [-4.0] * 3 + [2.0] * 3),
-            (0.6, -0.24, [-4.0] * 4 + [1.0] * 7), (0.9, -0.04, [5.0] * 4),
+            (0.6, -0.24, [-4.0] * 3 + [2.0] * 3), (0.9, -0.04, [5.0] * 4),
         ],
         ids=str,
     )  # fmt: skip
@@ -300,30 +295,17 @@ class TestCausal:
     def test_no_controller_beats_it_and_it_is_tighter_than_that_with_preview(self):
         arguments = {"setpoint": "random", "dead_zone": 0.0}
         kinds = {
-            kind: least_possible(samples=900, kind=kind, episodes=15, folder=None, **arguments)
-            for kind in ("preview", "causal", "reference")
+            kind: least_possible(samples=600, kind=kind, episodes=6, folder=None, **arguments)
+            for kind in ("preview", "causal")
         }
-        found = errors(MPC, 10, 600, **arguments)
+        found = errors(MPC, 6, 600, **arguments)
         assert not beats(found, kinds["causal"])
         assert kinds["preview"].value < 0.5 * kinds["causal"].value
-        assert kinds["causal"].value < kinds["reference"].value
         assert found.mean() < 1.3 * kinds["causal"].value
 
 
 class TestLeastPossible:
-    def test_by_default_it_is_what_reports_use(self):
-        # Of the kind that applies: no controller that does not count samples beats it.
-        found = [
-            least_possible(samples=samples, episodes=1, folder=None, **arguments)
-            for samples, arguments in (
-                (1200, {}), (600, {"setpoint_period": 38}), (600, {"setpoint": 5.0}),
-                (300, {"setpoint": "random"}),
-            )
-        ]  # fmt: skip
-        assert [least.kind for least in found] == ["reference", "preview", "preview", "causal"]
-        assert found[0].value == pytest.approx(0.9115, abs=1e-4)
-
-    @pytest.mark.parametrize("period", [20, 38, 76, 160])
+    @pytest.mark.parametrize("period", [20, 76])
     def test_nobody_beats_it_however_short_holds_are(self, period):
         case = {"samples": 600, "setpoint_period": period}
         least = least_possible(kind="preview", folder=None, **case)
@@ -333,24 +315,19 @@ class TestLeastPossible:
     def test_they_hold_for_those_who_read_the_transmitter(self):
         noisy = {"setpoint": 5.0, "noise_variance": 0.5, "delay": 2}
         reads = {**noisy, "measurement_noise_variance": 100.0}
-        least = least_possible(samples=600, folder=None, **reads)
+        least = least_possible(samples=300, folder=None, **reads)
         assert "reads the transmitter and not the true output" in least.holds_for
         # One that reads the true output does better.
-        assert beats(errors(MPC, 40, 600, **noisy), least)
+        assert beats(errors(MPC, 15, 300, **noisy), least)
 
     def test_drawn_episodes_are_those_of_the_environment(self):
         # Without noise, a run and the bound of its plant and set point can be compared.
         arguments = {"delay": [5, 30], "gain_factor": [0.8, 1.4], "setpoint": 4.0}
         arguments["dead_zone"] = 0.0
-        least = least_possible(samples=400, episodes=8, folder=None, **arguments)
-        found = errors(MPC, 8, 400, **arguments)
+        least = least_possible(samples=400, episodes=4, folder=None, **arguments)
+        found = errors(MPC, 4, 400, **arguments)
         assert np.all(found > np.array(least.episodes) * (1 - 1e-6))
         np.testing.assert_allclose(found, least.episodes, rtol=0.02)
-
-    def test_what_is_left_alone_stays_at_rest(self):
-        plant = {"u_min": -12.0, "u_max": 6.0, "dead_zone": 0.0, "setpoint": 4.0}
-        least = least_possible(samples=100, folder=None, **plant)
-        assert least.idle == least.idle_low == pytest.approx(4.0, abs=1e-12)
 
     def test_score(self):
         least = least_possible(samples=600, folder=None, setpoint=5.0)
@@ -398,21 +375,6 @@ class TestPredictiveController:
         assert limit * (1 - 1e-4) <= found <= 1.02 * limit
 
     @pytest.mark.parametrize(
-        ("case", "most"),
-        [
-            ({"samples": 1200, "noise_variance": 0.5}, 1.01),
-            ({"samples": 600, "noise_variance": 0.5, "setpoint": 5.0}, 1.01),
-            ({"samples": 1200, **PRESETS["disturbed"]}, 1.07),
-        ],
-    )
-    def test_it_comes_near_the_limit_with_noise_and_does_not_beat_it(self, case, most):
-        runs = 30
-        least = least_possible(kind="reference", folder=None, **case).value
-        found = mean_error(run_mpc(runs, seed=77, **case))
-        error = found.std() / np.sqrt(runs)
-        assert least - 3 * error < found.mean() < most * least + 3 * error
-
-    @pytest.mark.parametrize(
         "plant", [{}, {"a": (1.0, -0.9), "b": (-0.1, 0.0, -0.05), "c": (1.0,), "delay": 2}]
     )
     def test_it_foresees_the_plant_exactly(self, plant):
@@ -434,42 +396,33 @@ class TestPredictiveController:
     @pytest.mark.parametrize(
         ("plant", "setpoint"),
         [
-            ({}, 2.0),  # 2 degC needs 2.9 t/h, inside the dead zone
-            ({"dead_zone": 7.0}, 2.0),  # no float32 action commands 7 t/h, nor 4.1
-            ({"dead_zone": 4.1}, 1.0),
+            ({"dead_zone": 7.0}, 2.0),  # no float32 action commands 7 t/h; 2 degC needs 2.9
             ({"dead_zone": 7.0, "u_min": -6.0}, 2.0),  # -7 brings about -6, and -6 nothing
         ],
     )
     def test_the_plant_applies_what_it_believes_in(self, plant, setpoint):
         controller = PredictiveController(Parameters(**plant), 1)
         believed = []
-        plants = make_plants(1, 600, setpoint=setpoint, **plant)
+        plants = make_plants(1, 400, setpoint=setpoint, **plant)
         watch = lambda k: believed.append(controller._inputs[0, 1])  # noqa: E731
-        runs = rollout(plants, controller, 600, seed=0, before=watch)
+        runs = rollout(plants, controller, 400, seed=0, before=watch)
         np.testing.assert_allclose(believed[1:], runs.applied[:-1, 0], rtol=0, atol=1e-5)
-        assert len(np.unique(runs.applied[300:].round(3))) == 2  # it switches ...
-        assert runs.output[300:].mean() == pytest.approx(setpoint, abs=0.05)  # ... and holds
+        assert len(np.unique(runs.applied[200:].round(3))) == 2  # it switches ...
+        assert runs.output[200:].mean() == pytest.approx(setpoint, abs=0.05)  # ... and holds
 
 
-def test_command_prints_each_row_once_it_is_finished(capsys, tmp_path, monkeypatch):
-    some = {name: PRESET_SCENARIOS[name] for name in ("noisy", "hard", "fouling")}
-    monkeypatch.setattr(command, "PRESET_SCENARIOS", some)
+def test_the_command(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(command, "PRESET_SCENARIOS", {"noisy": PRESET_SCENARIOS["noisy"]})
+    monkeypatch.setattr(command, "SCENARIOS", {"constant": SCENARIOS["constant"]})
     compute = command.row
 
     def interrupted(case, *more):
-        if case.name == "fouling":
+        if case.name == "noisy":
             raise KeyboardInterrupt
         return compute(case, *more)
 
     monkeypatch.setattr(command, "row", interrupted)
-    assert main(["--episodes", "1", "--jobs", "1", "--cache", str(tmp_path)]) == 130
-    shown = capsys.readouterr().out
-    for name in (*SCENARIOS, "noisy", "hard"):
-        assert f"\n{name} " in shown
-    assert "0.9114" in shown
-
-
-def test_the_note_is_as_wide_as_the_screen(capsys, tmp_path):
-    assert main(["--preset", "paper", "--cache", str(tmp_path), "--jobs", "1"]) == 0
-    *note, _ = capsys.readouterr().out.rstrip().rpartition("\n\n")[-1].splitlines()
-    assert all(130 < len(line) <= 150 for line in note)
+    given = ["--episodes", "1", "--mpc", "1", "--jobs", "1", "--cache", str(tmp_path)]
+    assert main(given) == 130  # what came before the interruption is printed
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["constant", "5.0000", "0.2307", "0.2307", "0.2307"] in rows

@@ -10,7 +10,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from agents import PIController
 from benchmarks import datasets
 from benchmarks.datasets import main, record
 from mptc_gym import evaluate
@@ -60,15 +59,6 @@ def test_a_set_is_replayed_and_scores_a_learner(minari, tmp_path, capsys):
     least, idle = (np.array(about[n]) for n in ("least_possible_errors", "idle_errors"))
     np.testing.assert_allclose(found.scores, (idle - found.errors) / (idle - least), atol=1e-12)
     assert dataset.recover_environment(eval_env=True).spec == dataset.env_spec
-
-
-def test_the_pi_of_the_set_is_the_paper_s():
-    # That the environment answers so to these actions is tested above.
-    logged, controller = record("paper", "pi", episodes=2, seed=3)[1], PIController()
-    actions = [controller.act(observation) for observation in logged["observations"][:-1]]
-    np.testing.assert_array_equal(logged["actions"], np.clip(actions, -1.0, 1.0))
-    errors = np.abs(logged["observations"][1:, 3])
-    np.testing.assert_allclose(-logged["rewards"], errors, atol=1e-6)
 
 
 def sha256(plant, episodes):

@@ -1,9 +1,7 @@
 """Training PPO: grouped, odd, seeded, and kept in NumPy."""
 
 import json
-import pickle
 from dataclasses import asdict, replace
-from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -13,12 +11,10 @@ from stable_baselines3.common.buffers import RolloutBuffer
 
 from agents import PolicyNetwork
 from agents.networks import PRETRAINED
-from benchmarks.controllers import roster
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.examples import sb3
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.train import ppo
-from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
 from tests.conftest import ROOT
 
@@ -57,13 +53,6 @@ class TestTraining:
         assert about["validation"].keys() == {"short"}
         json.dumps(about)
 
-    def test_exploration_falls_as_set(self, monkeypatch):
-        recipe = replace(SMALL, steps=24 * 32 * 4, log_std=(-1.0, -3.0))
-        model, spreads = ppo.begin(recipe, 0), []
-        monkeypatch.setattr(model, "train", lambda: spreads.append(model.policy.log_std.item()))
-        model.learn(recipe.steps, callback=ppo.Exploration(*recipe.log_std))
-        assert spreads == pytest.approx([-1.0, -1.5, -2.0, -2.5])
-
     def test_a_group_meets_the_same_and_no_other_group_does(self):
         plants = ppo.begin(SMALL, 0).get_env()
         plants.reset()
@@ -77,17 +66,6 @@ class TestTraining:
         seeds = {seed for batch in plants.batches for seed in batch.unwrapped.np_random_seed}
         assert len(seeds) == 3
         assert min(seeds) >= 1 << 32  # no comparison has any so large
-
-    def test_the_last_observation_of_an_episode_is_seen_like_any_other(self):
-        model = ppo.begin(SMALL, 0)
-        plants = model.get_env()
-        plants.reset()
-        for _ in range(1200):
-            seen, _, ended, infos = plants.step(np.ones((24, 1), np.float32))
-        assert ended.all()
-        assert infos[0]["terminal_observation"].shape == seen[0].shape
-        # At rest where the error is the set point; before, the flow had cooled the plant.
-        assert infos[0]["terminal_observation"][0] > 1.0 + seen[0, 0]
 
     def test_what_a_group_has_in_common_is_no_advantage(self):
         model = ppo.begin(SMALL, 0)
@@ -115,15 +93,6 @@ class TestPolicy:
         # Means of 8, of 6, of 5 and 1, and of the rest.
         assert sb3.changes(window, 2)[0].tolist() == pytest.approx([2.0, 3.0, 3.0 - 8.0 / 3.0])
 
-    def test_what_the_networks_see(self):
-        recipe = replace(SMALL, levels=True, memory=32)
-        outputs, actions = np.zeros(32), np.zeros(32)
-        outputs[:4] = 1.0
-        actions[:2] = 0.5, 0.2
-        seen = ppo.features(recipe) @ np.array([5.0, 5.0, -4.0, 2.0, *outputs, *actions])
-        expected = {0: 2.0, 2: 1.8, 6: 0.5, 14: 0.3, 15: 0.2, 44: 1.0, 45: 0.5}
-        assert seen == pytest.approx([expected.get(i, 0.0) for i in range(46)])
-
     @pytest.mark.parametrize("recipe", [SMALL, replace(SMALL, levels=True, hidden=())])
     def test_it_is_as_good_upside_down(self, recipe):
         model = ppo.begin(recipe, 0)
@@ -137,14 +106,6 @@ class TestPolicy:
         down, _ = model.predict(-observations.numpy(), deterministic=True)
         assert np.abs(up).max() > 0.01
         np.testing.assert_allclose(up, -down, atol=1e-6)
-
-    def test_without_levels_it_rests_only_where_the_error_is_0(self):
-        recipe = replace(SMALL, dead_zone=0.0)
-        policy = ppo.export(louder(ppo.begin(recipe, 0)), recipe)
-        for error in (0.0, 0.5):
-            at_rest = np.array([5.0] * 3 + [error] + [5.0 - error] * 40 + [0.7] * 40)
-            policy.reset()
-            assert (abs(policy.act(at_rest)[0]) > 1e-6) == (error != 0.0)
 
     @pytest.mark.parametrize("recipe", [SMALL, replace(SMALL, hidden=(), dead_zone=0.0)])
     @pytest.mark.parametrize("scale", [1.0, 300.0])  # of the action: with limits that matter
@@ -178,33 +139,6 @@ def test_the_budget_of_the_search_is_that_of_its_log(name):
 
 
 class TestMembers:
-    def test_one_that_compensates_a_dead_zone_is_told_it(self):
-        for zone, expected in ((5.0, {7.0: 7.0, 5.0: 5.0}), (0.0, {7.0: 0.0})):
-            recipe = replace(SMALL, dead_zone=zone)
-            network = ppo.export(ppo.begin(recipe, 0), recipe)
-            for given, told in (*expected.items(), ((3.0, 7.0), zone)):
-                controller = roster.with_policy(network, Parameters(dead_zone=given), 1, 0)
-                assert controller.increments.dead_zone == told
-            assert network.increments.dead_zone == zone  # is not changed by it
-
-    def test_policies_of_any_learner_are_a_row_by_their_files(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(roster, "PRETRAINED", tmp_path)
-        layers = [(np.ones((1, 6)), np.zeros(1))]
-        windows = {"setpoint_window": 3, "error_window": 3}
-        network = PolicyNetwork(layers, observation=windows, input_scale=np.ones(6))
-        for name in ("mine-1.npz", "mine-0.npz", "other.npz"):
-            network.save(tmp_path / name)
-        read = partial(roster.policies, "mine-*.npz")
-        mine = replace(ROSTER["ppo"], networks=read)
-        first, second = mine.members()
-        assert [each.provenance["file"] for each in (first, second)] == [
-            "mine-0.npz",
-            "mine-1.npz",
-        ]
-        packed = pickle.dumps(first)
-        (tmp_path / "mine-0.npz").unlink()  # as on another machine
-        assert np.array_equal(weights(pickle.loads(packed)({}, 1, 0)), weights(network))
-
     @pytest.mark.parametrize("name", ppo.RECIPES)
     def test_those_of_the_project_are_of_the_recipes(self, name):
         recipe = ppo.RECIPES[name]

@@ -38,12 +38,3 @@ def test_it_runs_with_and_without_pytorch(torch, monkeypatch, capsys):
     for words in ("CartPole-v1", "n = 2", "MiddlePoint-v0, hard", "networks"):
         assert words in shown
     assert ("in PyTorch" in shown) is torch
-
-
-@pytest.mark.usefixtures("small")
-def test_a_device_is_measured_alone(capsys):
-    pytest.importorskip("torch")
-    assert speed.main(["--rounds", "1", "--device", "cpu"]) == 0
-    shown = capsys.readouterr().out
-    assert "on cpu, n = 3" in shown
-    assert "CartPole" not in shown

@@ -15,7 +15,6 @@ from agents.pi import SEARCHED_GAINS
 from benchmarks import tune
 from benchmarks.compare import comparison
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import SCENARIOS
 from tests.conftest import ROOT
 
@@ -34,20 +33,6 @@ class TestScore:
         assert found["objective"] == pytest.approx(
             np.mean([found[c] for c in tune.CASES]) + 5.0
         )
-
-    def test_what_comes_before_the_first_sample_does_not_count(self):
-        found = tune.score("pi", {}, 1, 0, {})["learnt"]
-        samples, first, arguments = tune.CASES["learnt"]
-        runs = rollout(make_plants(1, samples, **arguments), PIController(), samples, 0)
-        error = np.abs(runs.next_error)
-        assert found == pytest.approx(error[first:].mean())
-        assert found != pytest.approx(error.mean())
-
-    def test_the_defaults_converge_and_the_first_run_is_honoured(self):
-        first, other = (tune.score("nn", {}, 5, first_run, {}) for first_run in (0, 7))
-        assert first["not converged"] == 0.0
-        assert first["objective"] < 1.5
-        assert first["noise"] != other["noise"]
 
 
 @pytest.fixture

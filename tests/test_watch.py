@@ -74,7 +74,7 @@ def test_multiples_are_of_the_reference_on_the_same_step(tmp_path, monkeypatch):
     setpoint = np.tile(np.repeat([5.0, -5.0], 10), 2)[:, np.newaxis]
     error = np.ones((40, 1))
     runs = [
-        Mock(setpoint=setpoint, error=error * np.repeat(factors, 10)[:, np.newaxis],
+        Mock(setpoint=setpoint, next_error=error * np.repeat(factors, 10)[:, np.newaxis],
              output=setpoint, applied=setpoint)
         for factors in ([9.0, 2.0, 9.0, 3.0], [1.0, 1.0, 1.0, 1.0])
     ]  # fmt: skip
@@ -94,13 +94,6 @@ def test_what_cannot_be_written_is_said_before_anything_is_run(refused, monkeypa
     assert "--video: must end in .gif" in refused(main, ["--video", "film.avi"])
 
 
-def test_where_there_is_no_screen_it_says_so_and_writes_a_film(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(watch, "write_film", lambda path, *_: path.write_text("a film"))
-    assert main(["--agent", "smith", "--scenario", "constant"]) == 0  # of the driver "dummy"
-    assert (tmp_path / "results" / "watch" / "smith-constant.gif").is_file()
-    assert "There is no screen" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("closed_after", [None, 4])
 def test_a_window_shows_the_run_until_it_is_closed(closed_after, monkeypatch, capsys):
     monkeypatch.setattr(watch, "_has_screen", lambda: True)
@@ -114,11 +107,3 @@ def test_a_window_shows_the_run_until_it_is_closed(closed_after, monkeypatch, ca
     said = f"mean absolute error {errors[1:].mean():.3f} °C in {samples} samples"
     assert said in capsys.readouterr().out
     assert not pygame.display.get_init()
-
-
-def test_an_interrupted_film_leaves_the_one_before(tmp_path, monkeypatch, capsys):
-    (tmp_path / "film.gif").write_bytes(b"earlier")
-    monkeypatch.setattr(Image.Image, "save", Mock(side_effect=KeyboardInterrupt))
-    assert main(["--video", "film.gif"]) == 130
-    assert "Interrupted" in capsys.readouterr().out
-    assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"earlier"]
