@@ -76,22 +76,14 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         seed
             Restarts the random numbers; see the class docstring. Without it, they continue.
         options
-            `reset_mask`, a bool array of shape (num_envs,), selects the plants to reset.
-
-        Returns
-        -------
-        observations
-            Shape (num_envs, observation_size); the last one of a plant that was not reset.
-        infos
-            Arrays of shape (num_envs,), each with a mask of the plants that were reset; the
-            masks may be one array.
+            `reset_mask`, a bool array of shape (num_envs,), selects the plants to reset. The
+            first reset must include all. Plants that are not reset return their last
+            observation, and are False in the infos' masks, which may be one array.
 
         Raises
         ------
         ValueError
             If an argument is invalid. Nothing is then changed.
-        ResetNeeded
-            If the first reset does not include all plants.
         """
         if options is not None and not isinstance(options, Mapping):
             reject("options", options, "a dict or None")
@@ -105,32 +97,17 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         return self._observations(), infos
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
-        """Apply normalised actions for one sample.
+        """Apply normalised actions, shape (num_envs, 1), for one sample.
 
-        Parameters
-        ----------
-        actions
-            a(k) of each plant, shape (num_envs, 1).
-
-        Returns
-        -------
-        observations
-            Shape (num_envs, observation_size).
-        rewards
-            Shape (num_envs,).
-        terminations, truncations
-            Shape (num_envs,), bool.
-        infos
-            Arrays of shape (num_envs,) and their masks, which may be one array.
+        Returns observations, shape (num_envs, observation_size), then rewards, terminations,
+        truncations and infos, shape (num_envs,). The masks of the infos may be one array.
 
         Raises
         ------
         ValueError
-            If the actions have another shape, or one is not finite. The plants are then
-            unchanged.
+            If the actions have another shape, or one is not finite; nothing is then changed.
         ResetNeeded
-            If the environments have never been reset, or, with autoreset disabled, if one has
-            ended.
+            If plants have never been reset or, with autoreset disabled, have ended.
         """
         if not self._was_reset:
             raise ResetNeeded("call reset before step")

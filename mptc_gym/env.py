@@ -233,7 +233,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, float]]:
-        """Bring the plant to rest and start an episode at k = 0.
+        """Bring the plant to rest, start an episode, and return observation and info at k = 0.
 
         Parameters
         ----------
@@ -242,13 +242,6 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             current streams begins.
         options
             Not used.
-
-        Returns
-        -------
-        observation
-            The observation at k = 0, shape (observation_size,), float32.
-        info
-            See the class docstring.
         """
         super().reset(seed=seed)
         if self._streams is None or self._root is not self.np_random:
@@ -285,17 +278,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         return np.fromiter(self._window, _FLOAT32, size), info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
-        """Apply a normalised action for one sample.
+        """Apply a normalised action a(k), shape (1,), for one sample.
 
-        Parameters
-        ----------
-        action
-            a(k), shape (1,).
-
-        Returns
-        -------
-        observation, reward, terminated, truncated, info
-            At k+1; see the class docstring.
+        Returns observation, reward, terminated, truncated and info at k+1.
 
         Raises
         ------
@@ -357,11 +342,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     def render(self) -> rendering.Frame | None:
         """Draw the last minutes of the episode.
 
-        Returns
-        -------
-        ndarray or None
-            For "rgb_array" a picture, shape (540, 960, 3), uint8. None for "human", which shows
-            it in a window, and, after a warning, without a mode.
+        Returns a picture, shape (540, 960, 3), for "rgb_array"; None for "human", which shows
+        it in a window, and, after a warning, without a mode.
 
         Raises
         ------

@@ -123,20 +123,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return tuple(self._seeds)
 
     def render(self) -> tuple[rendering.Frame, ...] | None:
-        """Draw the last minutes of each plant's episode.
+        """Return a picture of each plant, shape (540, 960, 3), as `MiddlePointEnv` does of one.
 
-        Returns
-        -------
-        tuple of ndarray, or None
-            A picture of each plant, shape (540, 960, 3), uint8. None without a render mode,
-            after a warning.
-
-        Raises
-        ------
-        ResetNeeded
-            If the environments have never been reset.
-        DependencyNotInstalled
-            If pygame is not installed.
+        None without a render mode, after a warning.
         """
         return rendering.render(self.render_mode, [*self._records.values()])
 

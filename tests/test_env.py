@@ -267,7 +267,7 @@ def test_help_shows_every_argument():
     assert {"dead_zone", "delay", "noise_variance", "render_mode"} <= set(names)
     assert all(f"`{name}`" in MiddlePointEnv.__doc__ for name in names)
     for documented in (MiddlePointEnv, Parameters):
-        lines = [line.strip() for line in documented.__doc__.splitlines()]
+        lines = inspect.getdoc(documented).splitlines()
         assert all(row in lines for row in argument_table().splitlines())
         assert "| `delay` | 18* | samples | transport delay d of (28) |" in lines
 

@@ -26,19 +26,10 @@ class IncrementalAction(VectorActionWrapper):
     Every plant has its own wanted flow. Everything that `reset` and `step` return equals what
     the same number of single wrapped environments return.
 
-    Parameters
-    ----------
-    env
-        A `MiddlePointVectorEnv`, or another vector environment of `MiddlePointEnv` in NumPy,
-        such as Gymnasium's `SyncVectorEnv`. All three autoreset modes and partial resets work.
-    max_move, compensate_dead_zone
-        See `mptc_gym.wrappers.IncrementalAction`.
-
-    Raises
-    ------
-    ValueError, ResetNeeded
-        As for one environment; from `step` also if the shape of the actions is not
-        (num_envs, 1).
+    `env` is a `MiddlePointVectorEnv`, or another vector environment of `MiddlePointEnv` in
+    NumPy, such as Gymnasium's `SyncVectorEnv`. All three autoreset modes and partial resets
+    work. Arguments and errors are those of the wrapper of one environment; `step` also raises a
+    ValueError if the shape of the actions is not (num_envs, 1).
     """
 
     def __init__(
