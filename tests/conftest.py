@@ -130,15 +130,3 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
         return printed.err
 
     return refused
-
-
-@pytest.fixture
-def table() -> Callable[[str, object], None]:
-    """Return a function that adds a row to the file that MPTC_TABLE names, if it does."""
-
-    def row(name: str, outcome: object) -> None:
-        if path := os.environ.get("MPTC_TABLE"):
-            with Path(path).open("a", encoding="utf-8") as file:
-                file.write(f"{name}\t{outcome}\n")
-
-    return row

@@ -129,7 +129,7 @@ def model_of(algorithm, env, policy="MlpPolicy", **more):
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for weight in model.policy.parameters():
-            weight.add_(0.2 * torch.randn(weight.shape, generator=generator))
+            weight.add_(0.05 * torch.randn(weight.shape, generator=generator))
     return model
 
 
@@ -449,7 +449,7 @@ RIGHT = {
 
 
 @pytest.mark.parametrize("name", RIGHT)
-def test_it_is_the_plain_loop(name, tmp_path, table):
+def test_it_is_the_plain_loop(name, tmp_path):
     policy, env, new_act, *make = RIGHT[name](tmp_path)
     given = SHORT if env == NOISY else {}
     found = evaluate(policy, env, episodes=EPISODES, **given)
@@ -457,7 +457,6 @@ def test_it_is_the_plain_loop(name, tmp_path, table):
         seeds = iter(range(EPISODES))
         new_act = lambda: DirectNNController(seed=next(seeds), learning=False).act  # noqa: E731
     expected = errors_of(new_act, *make)
-    table(name, np.abs(found.errors - expected).max())
     np.testing.assert_allclose(found.errors, expected, rtol=0, atol=1e-6)
     assert np.ptp(found.errors) > 1e-3
     assert found.travels.min() > 1.0
@@ -598,16 +597,15 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_it_is_refused_by_a_rule(name, table):
+def test_it_is_refused_by_a_rule(name):
     policy, env, message, *is_function = REFUSED[name]
     if getattr(policy, "__name__", "") == "<lambda>" and not _takes_one(policy):
         policy = policy()
     if callable(env) and not is_function:
         env = env()
     given = SHORT if env == NOISY else {}
-    with pytest.raises(ValueError, match=message) as refusal:
+    with pytest.raises(ValueError, match=message):
         evaluate(policy, env, episodes=EPISODES, **given)
-    table(name, f"refused: {str(refusal.value)[:100]}")
 
 
 BAD_IDS = "", " ", "a\0b", "MiddlePoint-v0\n", "no_such_module:Plant-v0"
