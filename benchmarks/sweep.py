@@ -74,6 +74,14 @@ DIFFERENCES_TEXT = (
     "of runs in which it is."
 )
 
+COLUMNS = {  # of the overview: headings and formats
+    "agent": ("controller", "{}"),
+    "multiple": ("multiple, median", "{:.3f}"),
+    "multiple_p90": ("multiple, 90 %", "{:.3f}"),
+    "travel": ("travel (t/h)", "{:,.0f}"),
+    "oscillates": ("oscillates (%)", "{:.1f}"),
+    "useless": ("no better than no control (%)", "{:.1f}"),
+}
 # Plants on which this happens in half the runs or more: column, marker, size, colour, label.
 MARKS = (
     ("oscillates", "o", 12, "white", "oscillates"),
@@ -287,32 +295,25 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row of numbers for each controller; see `OVERVIEW_TEXT`."""
     import pandas as pd
 
-    ratios = runs.groupby(["agent", "plant"], sort=False)["ratio"].median()
     of = runs.groupby("agent", sort=False)
+    ratios = runs.groupby(["agent", "plant"], sort=False)["ratio"].median().groupby("agent")
     columns = {
-        "multiple": ratios.groupby("agent", sort=False).median(),
-        "multiple_p90": ratios.groupby("agent", sort=False).quantile(0.9),
+        "multiple": ratios.median(),
+        "multiple_p90": ratios.quantile(0.9),
         "travel": of["total_variation"].median(),
-        "oscillates": of["oscillates"].mean(),
-        "useless": of["useless"].mean(),
+        "oscillates": 100.0 * of["oscillates"].mean(),
+        "useless": 100.0 * of["useless"].mean(),
     }
-    return pd.DataFrame(columns).reset_index(names="agent")
+    return pd.DataFrame(columns).reindex(runs["agent"].unique()).reset_index(names="agent")
 
 
 def overview(runs: pd.DataFrame) -> pd.DataFrame:
     """Return `summarise` as text for the report."""
     found = summarise(runs)
-    shares = found[["oscillates", "useless"]].mul(100.0).map("{:.1f}".format)
-    multiples = found[["multiple", "multiple_p90"]].map("{:.3f}".format)
-    travel = found[["travel"]].map("{:,.0f}".format)
-    texts = found[["agent"]].map(label).join([multiples, travel, shares])
-    return texts.set_axis(
-        [
-            "controller", "multiple, median", "multiple, 90 %", "travel (t/h)",
-            "oscillates (%)", "no better than no control (%)",
-        ],
-        axis="columns",
-    )  # fmt: skip
+    found["agent"] = found["agent"].map(label)
+    for name, (_, form) in COLUMNS.items():
+        found[name] = found[name].map(form.format)
+    return found.rename(columns={name: heading for name, (heading, _) in COLUMNS.items()})
 
 
 def differences(

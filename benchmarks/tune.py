@@ -18,14 +18,7 @@ from cyclopts import Parameter
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Count, Folder, Runs, command, options
 from benchmarks.lib.fan_out import FanOut, progress_bar
-from benchmarks.lib.storage import (
-    UnfinishedError,
-    UsageError,
-    commit,
-    out_folder,
-    write_csv,
-    write_text,
-)
+from benchmarks.lib.storage import UnfinishedError, UsageError, origin, out_folder, write_csv
 from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.plants import PlantOptions
 
@@ -40,17 +33,11 @@ FINALISTS = 10  # of the best trials, which are evaluated again
 PENALTY = 5.0  # degC, for failing to settle: the cost of doing nothing about an error of 5 degC
 TUNED = {name: each.gains for name, each in ROSTER.items() if each.gains}
 
-PAGE = """\
-# Gains: {label}
-
-By `python -m benchmarks.tune {name} --trials {trials} --runs {runs}`. For each case, the median
-over runs of the mean absolute error, °C. The objective is their mean, plus {penalty:g} °C times
-the share of runs at the constant set point that do not settle.
-
-The best gains of the {trials} trials, on {final} new runs:
-
-{table}
-"""
+NOTE = (
+    "For each case, the median over runs of the mean absolute error, °C. The objective is "
+    f"their mean, plus {PENALTY:g} °C times the share of runs that do not settle at the "
+    "constant set point."
+)
 
 Row = dict[str, float]  # gains, and their result from `score`
 
@@ -94,37 +81,29 @@ def work(options: Options) -> str:
     """Run the search, and write and print its results."""
     import pandas as pd
 
-    from benchmarks.lib.report import on_screen
+    from benchmarks.lib.report import Section, provenance_line, show, write_report
 
-    name, plant, out = options.controller, options.plant.chosen().arguments, options.out
-    gains, judge = TUNED[name], partial(score, name, plant)
-    study = f"{name}, {options.runs} runs, {json.dumps(plant)}, {commit()}"
-    trials = search(
-        study,
-        gains,
-        partial(judge, options.runs, FIRST_RUN),
-        options.trials,
-        out_folder(out) / f"{name}.csv",
-    )
+    name, plant, made = options.controller, options.plant.chosen().arguments, origin()
+    out, judge = out_folder(options.out / name), partial(score, name, plant)
+    study = f"{name}, {options.runs} runs, {json.dumps(plant)}, {made['commit']}"
+    in_search = partial(judge, options.runs, FIRST_RUN)
+    trials = search(study, TUNED[name], in_search, options.trials, out / "trials.csv")
     # The best gains of a search owe some of their result to luck; new runs show how much.
     best = trials.nsmallest(FINALISTS, "objective")
-    rounded = best[[*gains]].map(lambda gain: float(f"{gain:.3g}"))
+    rounded = best[[*TUNED[name]]].map(lambda gain: float(f"{gain:.3g}"))
     tasks = {
-        f"trial {i}": partial(judge, FINAL_RUNS, FINAL_FIRST_RUN, best_gains)
-        for i, best_gains in rounded.to_dict("index").items()
+        f"trial {i}": partial(judge, FINAL_RUNS, FINAL_FIRST_RUN, gains)
+        for i, gains in rounded.to_dict("index").items()
     }
     table = pd.DataFrame(options.fan_out.run(tasks, "new runs for the best").values())
     table = table.assign(**{"in the search": best["objective"].to_numpy()})
-    table = table.sort_values("objective", ignore_index=True)
-    page = PAGE.format(
-        name=name, label=ROSTER[name].label, penalty=PENALTY, trials=len(trials),
-        runs=options.runs, final=FINAL_RUNS,
-        table=table.to_markdown(index=False, floatfmt=".4g"),
-    )  # fmt: skip
-    write_text(out / f"{name}.md", page)
-    shown = table[[*gains, "objective"]].head(5).map("{:.4g}".format)
-    print(f"The best, on {FINAL_RUNS} new runs\n{on_screen(shown)}")
-    return f"All trials are in {out / name}.csv, the best in {out / name}.md"
+    table = table.sort_values("objective", ignore_index=True).map("{:.4g}".format)
+    title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS} new runs"
+    sections = [Section(title, [NOTE], table)]
+    made_by = provenance_line("tune", made)
+    write_report(out, f"Gains: {ROSTER[name].label}", sections, made_by)
+    show(sections)
+    return f"All trials are in {out}/trials.csv, the best in {out}/report.md"
 
 
 def search(
@@ -151,7 +130,7 @@ def search(
         done = study.get_trials(states=[state.COMPLETE])
         rows: list[Row] = [trial.user_attrs["row"] for trial in done[:count]]
         try:
-            with progress_bar(path.stem, count - len(rows)) as advance:
+            with progress_bar("trials", count - len(rows)) as advance:
                 while len(rows) < count:
                     study.sampler = optuna.samplers.TPESampler(
                         seed=SEED * 1_000_000 + len(rows),

@@ -49,7 +49,7 @@ def search(out, controller="pi", trials=6, runs=2, status=0):
     """Run a search, and return its trials."""
     numbers = ["--trials", str(trials), "--runs", str(runs), "--jobs", "1"]
     assert tune.main([controller, *numbers, "--out", str(out)]) == status
-    return pd.read_csv(out / f"{controller}.csv")
+    return pd.read_csv(out / controller / "trials.csv")
 
 
 @pytest.mark.usefixtures("short")
@@ -59,8 +59,10 @@ class TestSearch:
         assert len(trials) == 6
         assert trials["kp"].between(*tune.TUNED["pi"]["kp"]).all()
         assert "The best" in capsys.readouterr().out
-        page = (tmp_path / "pi.md").read_text()
-        rows = [[*map(float, line.split("|")[1:-1])] for line in page.splitlines()[-2:]]
+        page = (tmp_path / "pi/report.md").read_text().splitlines()
+        table = [line for line in page if line.startswith("|")]
+        rows = [[*map(float, line.split("|")[1:-1])] for line in table[2:]]
+        assert len(rows) == 2
         for kp, ki, *_, objective, in_search in rows:
             again = tune.score("pi", {}, 3, tune.FINAL_FIRST_RUN, {"kp": kp, "ki": ki})
             assert objective == pytest.approx(again["objective"], rel=1e-3)
@@ -83,12 +85,11 @@ class TestSearch:
             patch.setattr(tune, "score", interrupted)
             assert len(search(tmp_path / "halves", status=130)) == 4
         assert "Interrupted" in capsys.readouterr().out
-        with (tmp_path / "halves/trials.log").open("a") as log:
+        with (tmp_path / "halves/pi/trials.log").open("a") as log:
             log.write('{"op_code": 5, "wor')  # as where a disk is full
         search(tmp_path / "halves")
-        for name in ("pi.csv", "pi.md"):
-            one, other = ((tmp_path / part / name).read_text() for part in ("whole", "halves"))
-            assert one == other
+        files = (tmp_path / part / "pi/trials.csv" for part in ("whole", "halves"))
+        assert len({file.read_text() for file in files}) == 1
 
     @pytest.mark.parametrize("sign", [1.0, -1.0])
     def test_it_learns_from_its_trials(self, sign, tmp_path):
@@ -109,8 +110,9 @@ class TestSearch:
             "import sys, time; from pathlib import Path; from benchmarks import tune\n"
             "with tune._storage(Path(sys.argv[1])): print('up', flush=True); time.sleep(60)"
         )
-        log = tmp_path / "trials.log"
+        log = tmp_path / "pi/trials.log"
         given = ["pi", "--trials", "1", "--runs", "1", "--out", tmp_path]
+        log.parent.mkdir()
         command = [sys.executable, "-c", held, str(log)]
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as other:
             assert other.stdout.readline() == "up\n"
@@ -119,8 +121,8 @@ class TestSearch:
         search(tmp_path, trials=1, runs=1)
 
     def test_a_damaged_log_and_one_that_is_a_folder_end_in_a_sentence(self, tmp_path, capsys):
-        log = tmp_path / "trials.log"
-        log.mkdir()
+        log = tmp_path / "pi/trials.log"
+        log.mkdir(parents=True)
         run = partial(tune.main, ["pi", "--trials", "1", "--runs", "1", "--out", str(tmp_path)])
         assert run() == 1
         assert "trials.log could not be written: Is a directory" in capsys.readouterr().out
