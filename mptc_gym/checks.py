@@ -50,18 +50,16 @@ def shorten(value: object) -> str:
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...{size}"
 
 
-def reject_action(action: object) -> NoReturn:
-    """Raise a ValueError that says what the action of one plant must be."""
-    reject("action", action, "one finite number, shape (1,)")
-
-
 def one_action(action: Any) -> float:
-    """Return the action of one plant, finite or not."""
+    """Return the action of one plant."""
     try:
         value = action.item() if hasattr(action, "item") else np.asarray(action).item()
-        return float(value - 0.0)  # text is not a number, even if float() parses it
+        checked = float(value - 0.0)  # text is not a number, even if float() parses it
     except _NO_NUMBER:
-        reject_action(action)
+        checked = math.nan
+    if not math.isfinite(checked):
+        reject("action", action, "one finite number, shape (1,)")
+    return checked
 
 
 def many_actions(

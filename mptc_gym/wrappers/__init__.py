@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,7 +15,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym.checks import is_number, one_action, reject, reject_action
+from mptc_gym.checks import is_number, one_action, reject
 from mptc_gym.parameters import Parameters
 from mptc_gym.plant import action_from_command, float32_action
 
@@ -109,10 +108,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
 
     def action(self, action: Any) -> NDArray[np.float32]:
         """Move the wanted flow by an action, shape (1,), and return the absolute action."""
-        move = one_action(action)
-        if not math.isfinite(move):
-            reject_action(action)
-        actuator = self._actuator
+        move, actuator = one_action(action), self._actuator
         flow = self._flow + actuator.move * max(-1.0, min(1.0, move))  # faster than `moved`
         self._flow = max(actuator.u_min, min(actuator.u_max, flow))
         return np.array([actuator.action(self._flow)], np.float32)
