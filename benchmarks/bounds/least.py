@@ -10,14 +10,12 @@ not the true output, `info["output"]`. It may undo the dead zone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,14 +25,19 @@ from benchmarks.bounds.unknown import unknown
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.lib.storage import ROOT, Kept
 from benchmarks.loop.linear import time_varying_model
+from benchmarks.loop.rollout import (
+    IdleValve,
+    drawn_numbers,
+    is_random,
+    make_plants,
+    rollout,
+)
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
 from mptc_gym.parameters import PlantNumbers
-from mptc_gym.plant import action_from_command
-from mptc_gym.ranges import Ranges, numbers_of_plant
+from mptc_gym.ranges import numbers_of_plant
 
 Array = NDArray[np.float64]
-Episode = tuple[PlantNumbers[float], Array]  # a plant, and y_d(k) from k = 0 to N
 
 KINDS = {  # the controllers that cannot do better
     "preview": "every controller that reads the transmitter and not the true output, even one "
@@ -153,52 +156,26 @@ def theorem(parameters: Parameters) -> str:
     return "causal" if parameters.setpoint == "random" else "preview"
 
 
-def is_random(parameters: Parameters) -> bool:
-    """Return whether episodes differ in their errors, even if only by their noise."""
-    noises = "noise_variance", "measurement_noise_variance"
-    noisy = any(parameters.range_of(name)[1] > 0.0 for name in noises)
-    return _is_drawn(parameters) or noisy or parameters.is_disturbed
-
-
-def _is_drawn(parameters: Parameters) -> bool:
-    return bool(parameters.ranges) or parameters.setpoint == "random"
-
-
 def _least_possible(
     parameters: Parameters, samples: int, kind: str, episodes: int, seed: int
 ) -> LeastPossible:
-    drawn, errors = _without_control(parameters, samples, episodes, seed)
-    # Rounded to be the same on every machine, as solvers differ in later digits.
-    values = [round(_least(parameters, kind, *each) / samples, 6) for each in drawn]
-    least, idle = student(values), student(errors)
-    return LeastPossible(
-        **vars(least), kind=kind, idle=idle.value, idle_low=idle.low, idle_high=idle.high,
-        episodes=tuple(values), seed=seed,
-    )  # fmt: skip
-
-
-def _without_control(
-    parameters: Parameters, samples: int, episodes: int, seed: int
-) -> tuple[Iterator[Episode], Array]:
-    """Return the drawn episodes, and mean |e| of as many runs at a flow of 0."""
+    # The episodes that the environment draws, with the valve left alone.
     runs = episodes if is_random(parameters) else 1
-    plants = gymnasium.make_vec(
-        "MiddlePoint-v0", runs, max_episode_steps=samples + 1, **asdict(parameters)
+    numbers = drawn_numbers(parameters, runs, seed)
+    with closing(make_plants(runs, samples + 1, **asdict(parameters))) as plants:
+        alone = IdleValve(numbers.u_min, numbers.u_max)
+        trajectory = rollout(plants, alone, samples + 1, seed)
+    idle = student(np.abs(trajectory.setpoint - trajectory.output)[1:].mean(axis=0))
+    drawn = parameters.ranges or parameters.setpoint == "random"
+    # Rounded to be the same on every machine, as solvers differ in later digits.
+    values = tuple(
+        round(_least(parameters, kind, numbers_of_plant(numbers, i), setpoint) / samples, 6)
+        for i, setpoint in enumerate(trajectory.setpoint.T[: episodes if drawn else 1])
     )
-    _, info = plants.reset(seed=seed)
-    numbers = replace(
-        Ranges(parameters).given, **{name: np.array(info[name]) for name in parameters.ranges}
-    )
-    idle = np.zeros((runs, 1))
-    idle[:, 0] = action_from_command(0.0, numbers.u_min, numbers.u_max)
-    infos = [info, *(plants.step(idle)[-1] for _ in range(samples))]
-    plants.close()
-    setpoints, outputs = (
-        np.array([at[name] for at in infos]) for name in ("setpoint", "output")
-    )
-    count = episodes if _is_drawn(parameters) else 1
-    drawn = ((numbers_of_plant(numbers, i), setpoints[:, i].copy()) for i in range(count))
-    return drawn, np.abs(setpoints - outputs)[1:].mean(axis=0)
+    return LeastPossible(
+        **vars(student(values)), kind=kind, idle=idle.value, idle_low=idle.low,
+        idle_high=idle.high, episodes=values, seed=seed,
+    )  # fmt: skip
 
 
 def _least(
