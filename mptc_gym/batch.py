@@ -44,7 +44,11 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
     ) -> None:
         self.parameters = Parameters.of_environment(arguments)
         self.num_envs = _checked_count(num_envs, self.parameters)
-        self._limit = _checked_limit(max_episode_steps)
+        limit = -1 if max_episode_steps is None else max_episode_steps
+        if not is_count(limit, -1) or limit == 0:
+            allowed = "an integer of at least 1, or None or -1 for no limit"
+            reject("max_episode_steps", max_episode_steps, allowed)
+        self._limit = FOREVER if limit == -1 else min(FOREVER, int(limit))
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -216,13 +220,3 @@ def _checked_count(num_envs: int, parameters: Parameters) -> int:
     if num_envs > most:
         reject("num_envs", num_envs, f"at most {most:,} with this delay and these windows")
     return num_envs
-
-
-def _checked_limit(max_episode_steps: int | None) -> int:
-    """Return the number of samples in an episode; `FOREVER` for None or -1."""
-    if max_episode_steps is None:
-        return FOREVER
-    if not is_count(max_episode_steps, -1) or max_episode_steps == 0:
-        allowed = "an integer of at least 1, or None or -1 for no limit"
-        reject("max_episode_steps", max_episode_steps, allowed)
-    return FOREVER if max_episode_steps == -1 else min(FOREVER, int(max_episode_steps))

@@ -253,23 +253,23 @@ class Parameters(PlantNumbers[Number]):
         names = "disturbance_amplitude", "disturbance_walk_variance"
         return any(self.range_of(name)[1] > 0.0 for name in names)
 
-    def _may_change(self, *names: str) -> bool:
-        return any(self.range_of(name) != (1.0, 1.0) for name in names)
-
     @property
     def drifts(self) -> bool:
         """Whether the dynamics change within an episode."""
-        return self._may_change("gain_drift", "time_constant_drift")
+        names = "gain_drift", "time_constant_drift"
+        return any(self.range_of(name) != (1.0, 1.0) for name in names)
 
     @property
     def changes_time_constant(self) -> bool:
         """Whether the time constant differs, or may come to differ, from that of A."""
-        return self._may_change("time_constant_factor", "time_constant_drift")
+        names = "time_constant_factor", "time_constant_drift"
+        return any(self.range_of(name) != (1.0, 1.0) for name in names)
 
     @property
     def changes_dynamics(self) -> bool:
         """Whether the coefficients of (28) differ, or may come to differ, from A and B."""
-        return self.changes_time_constant or self._may_change("gain_factor", "gain_drift")
+        gain_changes = self.range_of("gain_factor") != (1.0, 1.0)
+        return self.drifts or self.changes_time_constant or gain_changes
 
     @property
     def windows(self) -> tuple[int, int, int, int]:
