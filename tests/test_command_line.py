@@ -90,7 +90,6 @@ REFUSED = {
         (["none.csv"], "none.csv cannot be read: No such file"),
         ([LOG, "--u-min", "nan"], 'value "nan" for --u-min. Must be < inf'),
         ([LOG, "--operating-flow", "1e9"], "operating_flow must be near the flows of the log"),
-        ([LOG, "--sampling-interval", "0"], 'value "0.0" for --sampling-interval. Must be > 0'),
     ],
     "bounds": [
         (["--cache", __file__], "--cache: "),

@@ -1,4 +1,4 @@
-"""Identify a plant from a log and tune controllers: `python -m benchmarks.identify --help`."""
+"""Identify a plant from a log and tune a PI for it: `python -m benchmarks.identify --help`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.lib.command import Count, Finite, Folder, Positive, Repeated, command, options
+from benchmarks.lib.command import Finite, Folder, Repeated, command, options
 
 # NumPy reads it when it is imported. Threads for small matrices only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -25,8 +25,6 @@ class Columns:
     """Column of the temperature."""
     disturbance: Repeated = ()
     """Column of a measured disturbance (repeatable)."""
-    sampling_interval: Positive | None = None
-    """Time from one row to the next, s; the column of the times is then not read."""
     time_unit: str | None = None
     """Unit of the times: ms, s, min, h or D, days (default: that in the heading, else s)."""
     flow_unit: str | None = None
@@ -38,27 +36,25 @@ class Columns:
 @options
 @dataclass(frozen=True, kw_only=True)
 class Knowledge:
-    """Prior knowledge of the plant, and what to look for."""
+    """Prior knowledge of the plant and its valve."""
 
-    longest_delay: Count = 60
-    """Longest delay to look for, samples."""
     applied: bool = False
-    """The flow was measured after the actuator, so no dead zone is looked for."""
+    """The flow was measured behind the valve, so that nothing is asked about the valve."""
+    operating_flow: Finite | None = None
+    """Flow at the operating point, around which a dead zone lies (default: 0 or the first flow
+    if it is well inside the range of the flows, else the middle of the range)."""
     u_min: Finite | None = None
     """Smallest flow that the actuator can apply, from the operating point (default: the
     log's smallest)."""
     u_max: Finite | None = None
     """Largest flow that the actuator can apply, from the operating point (default: the
     log's largest)."""
-    operating_flow: Finite | None = None
-    """Flow at the operating point, around which a dead zone lies (default: 0 or the first flow
-    if it is well inside the range of the flows, else the middle of the range)."""
 
 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Fit the plant's equations to a recorded log, and tune controllers for it.
+    """Fit a plant to a recorded log, and tune a PI controller for it.
 
     The log is a table with a heading; each row holds the temperature at its time and the flow
     commanded from that time on.
@@ -67,13 +63,20 @@ class Options:
     log: Path = field(kw_only=False)
     """The log, a CSV file."""
     out: Folder = Path("results/identify")
+    smith: bool = False
+    """Tune a Smith predictor, too. Its delay margin must be a fifth of the delay."""
     columns: Columns = field(default_factory=Columns)
-    rows: Count = 20_000
-    """Largest number of rows to fit; of a longer log, the last ones are used."""
     knowledge: Knowledge = field(default_factory=Knowledge)
 
 
-main = command(Options, "benchmarks.identify.command", interrupted="nothing is written.")
+def work(options: Options) -> str:
+    """Identify a plant from a log and write the results."""
+    from benchmarks.identify.report import execute  # slow to import
+
+    return execute(options)
+
+
+main = command("identify", Options, work, interrupted="nothing is written.")
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

@@ -1,239 +1,243 @@
-"""Fit (28) and the dead zone of (29) to a log: choose the orders, delay and dead zone."""
+"""Fit a plant with a delay and one to three lags to a log: output error, weighted."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable
-from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
-from scipy import stats
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
-from benchmarks.identify.__main__ import Knowledge
-from benchmarks.identify.armax import Array, Orders
-from benchmarks.identify.cleaning import cleaned
-from benchmarks.identify.guards import doubts
-from benchmarks.identify.likelihood import Fit, Likelihood
-from benchmarks.identify.log import Log
-from benchmarks.identify.model import CannotTellError, HeldOut, Model
-from benchmarks.identify.plant import noise_of
-from benchmarks.identify.posterior import posterior
-from benchmarks.identify.simulation import explained, of_impulse_response
-from benchmarks.identify.valve import valve_fault
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
-FIRST_ORDERS = Orders(2, 1, 2)  # of the first search for the delay
-EVIDENT = 100.0  # gain in twice the log likelihood from which on an effect is beyond doubt
+BLOCKS = 30  # means of the temperature in a delay and a lag: more take time, and say no more
+ORDER = 8  # of the autoregressive model of the noise, in blocks
+# Shapes of plants and their parameters: the delay, the logarithm of the first lag, one more.
+SHAPES = {"one lag": 2, "two lags": 3, "three lags": 3, "a zero": 3, "a pair": 3}
 
 
-def identify(log: Log, knowledge: Knowledge | None = None) -> Model:
-    """Fit (28), and the dead zone of (29), to a log.
+@dataclass(frozen=True)
+class Plant:
+    """Lags side by side behind one delay: exp(-delay s) times the sum of gain / (1 + lag s)."""
 
-    Models with several orders of A, B and C, with and without a random walk of the base line,
-    are fitted by maximum likelihood. The best by information criteria are refitted to the first
-    part of the log and simulate the rest; clearly worse ones are dropped. The intervals of
-    delay, dead zone, gain and time constant come from the posterior over the rest. If a fault
-    of the valve explains the log clearly better, the flow that it passes is fitted.
+    delay: float
+    """s."""
+    lags: Complex
+    """Time constants, s; those of a plant that oscillates are complex."""
+    gains: Complex
+    """degC per t/h, one for each lag."""
 
-    Raises
-    ------
-    CannotTellError
-        If the log does not determine the plant; the message says why.
-    ValueError
-        If the knowledge is invalid or does not fit the log.
-    """
-    knowledge = knowledge or Knowledge()
-    log = cleaned(log, knowledge)
-    likelihood = Likelihood(log, knowledge)
-    fits = _fits(likelihood)
-    _check_answer(likelihood, fits[0])
-    rival = _of_impulse_response(likelihood)
-    fault = valve_fault(likelihood, fits)
-    if fault:
-        log = replace(log, flow=fault.passed + likelihood.operating_flow)
-        likelihood = Likelihood(
-            log, replace(knowledge, operating_flow=likelihood.operating_flow)
+    @property
+    def gain(self) -> float:
+        """Steady-state gain, degC per t/h."""
+        return float(self.gains.sum().real)
+
+    @property
+    def slowest(self) -> float:
+        """Largest time constant, s."""
+        return float(np.abs(self.lags).max())
+
+    def first_order(self) -> tuple[float, float]:
+        """Return time constant and delay, s, of a first-order plant like it.
+
+        Skogestad's half rule (Journal of Process Control 13, 2003, 291-309): of what the mean
+        lag has beyond the slowest one, half goes to the time constant and half to the delay.
+        """
+        mean = float((self.gains * self.lags).sum().real) / self.gain
+        slow = min(self.slowest, max(mean, self.slowest / 5.0))
+        half = max(mean - slow, 0.0) / 2.0
+        return slow + half, self.delay + half
+
+    def sampled(self, h: float) -> tuple[int, list[tuple[Complex, Complex]]]:
+        """Return whole samples of delay, and B and A of each lag for flows held for h, exactly.
+
+        B begins with z^-1, as in (28), and has two coefficients: the delay is continuous.
+        """
+        whole = int(self.delay / h)
+        poles = np.exp(-h / self.lags)
+        # What is left of a sample once the flow has arrived.
+        kept = np.exp((self.delay - whole * h - h) / self.lags)
+        upper = self.gains * np.array([1.0 - kept, kept - poles])
+        lower = np.array([np.ones(len(poles)), -poles])
+        return whole, list(zip(upper.T, lower.T, strict=True))
+
+    def response(self, h: float, frequency: Array) -> Complex:
+        """Return the frequency response from one sample to the next, at rad/s."""
+        back = np.exp(-1j * h * frequency)
+        whole, parts = self.sampled(h)
+        shares = [(b[0] + b[1] * back) / (1.0 + a[1] * back) for b, a in parts]
+        return np.asarray(sum(shares) * back ** (whole + 1))
+
+    def simulated(self, flow: Array, h: float) -> Array:
+        """Return the temperatures of a plant that has been at rest before the flow."""
+        whole, parts = self.sampled(h)
+        # The imaginary parts of a pair of complex lags cancel.
+        moved = sum(lfilter(np.r_[0.0, b], a, flow).real for b, a in parts)
+        return np.asarray(np.concatenate([np.zeros(whole), moved])[: len(flow)])
+
+
+def one_lag(lag: float, delay: float = 0.0) -> Plant:
+    """Return a plant of gain 1 and first order."""
+    return Plant(delay, np.array([lag + 0j]), np.ones(1, np.complex128))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The best coefficients for given parameters, and what they leave."""
+
+    c: Array
+    """The plant's first."""
+    errors: Array
+    """Of the blocks, weighted: white noise if all is right."""
+    weighted: Array
+    """The columns that the coefficients multiply, weighted."""
+    table: Array
+    """The columns themselves."""
+
+    @property
+    def deviance(self) -> float:
+        """Minus twice the logarithm of the likelihood."""
+        return len(self.errors) * float(np.log(np.mean(self.errors**2) + 1e-14))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A log as it is fitted, and what is known so far of valve, noise and loads."""
+
+    flow: Array
+    """Flow behind the valve, row by row, t/h from where it was at first."""
+    temperature: Array
+    """Means of blocks of rows, degC; NaN where unknown."""
+    h: float
+    known: tuple[Array, ...] = ()
+    """Measured disturbances, row by row."""
+    rows: int = 1
+    """Rows in a block."""
+    scale: float = 1.0
+    """Sum of delay and lag, s, roughly: the unit of the delay among the parameters."""
+    weights: Array = field(default_factory=lambda: np.array([1.0, -0.8]))
+    """Polynomial that makes the noise of the blocks white."""
+    loads: tuple[float, ...] = ()
+    """Times of steps of an unmeasured load, s."""
+    extra: tuple[Array, ...] = ()
+    """Further inputs of the plant, with gains of their own."""
+
+    @cached_property
+    def times(self) -> Array:
+        """Times of the rows, s."""
+        return np.asarray(np.arange(len(self.flow)) * self.h)
+
+    @cached_property
+    def level(self) -> float:
+        """Mean of the known temperatures."""
+        return float(np.nanmean(self.temperature))
+
+    def means(self, x: Array) -> Array:
+        """Return the means of blocks of rows."""
+        count = len(x) // self.rows
+        means: Array = x[: count * self.rows].reshape(count, self.rows).mean(axis=1)
+        return means
+
+    def in_blocks(self, rows: int) -> Problem:
+        """Return the problem of a log of single rows in blocks."""
+        blocks = replace(self, rows=rows)
+        return replace(blocks, temperature=blocks.means(self.temperature))
+
+    def behind(self, passed: Array) -> Problem:
+        """Return the problem with another flow behind the valve."""
+        return replace(self, flow=passed - passed[0])
+
+    def units(self, shape: str, p: Array) -> list[Plant]:
+        """Return the plants of gain 1 whose weighted sum is the plant of a shape."""
+        delay = self.scale * max(float(p[0]), 0.0)
+        first = float(np.exp(np.clip(p[1], np.log(self.h / 4.0), np.log(2.0 * self.times[-1]))))
+        if shape == "one lag":
+            return [one_lag(first, delay)]
+        if shape == "a pair":
+            lags = first * np.exp(1j * np.clip(p[2], 0.1, 1.45) * np.array([1.0, -1.0]))
+        else:
+            # The second is never quite the first: equal ones have no partial fractions.
+            second = first * min(np.exp(max(p[2], -6.0)), 0.97)
+            if shape == "a zero":
+                return [one_lag(first, delay), one_lag(second, delay)]
+            lags = np.array([first, second, 0.9 * second][: 3 if shape == "three lags" else 2])
+        others = lags[:, np.newaxis] - lags
+        np.fill_diagonal(others, 1.0)
+        gains = lags ** (len(lags) - 1) / np.prod(others, axis=1)
+        return [Plant(delay, lags + 0j, gains + 0j)]
+
+    def columns(self, shape: str, p: Array) -> tuple[Array, int]:
+        """Return what temperatures are a weighted sum of, and how many of these are inputs.
+
+        The plants come first, then extra inputs, the measured disturbances, what is left of
+        the time before the log, the loads and the base line.
+        """
+        units, lag = self.units(shape, p), self.units("one lag", p)[0]
+        now = one_lag(lag.lags[0].real)
+        found = [each.simulated(self.flow, self.h) for each in units]
+        found += [lag.simulated(each, self.h) for each in self.extra]
+        # A disturbance has lags of its own: three fixed ones make any slow response.
+        found += [
+            one_lag(ratio * now.slowest).simulated(each, self.h)
+            for each in self.known for ratio in (0.3, 1.0, 3.0)
+        ]  # fmt: skip
+        inputs = len(found)
+        for each in np.unique(np.concatenate([unit.lags for unit in units])):
+            decay = np.exp(-self.times / each)
+            found.append(decay.real if each.imag >= 0.0 else decay.imag)
+        found += [
+            now.simulated(np.heaviside(self.times - at, 1.0), self.h) for at in self.loads
+        ]
+        return np.column_stack(
+            [*map(self.means, found), np.ones(len(self.temperature))]
+        ), inputs
+
+    def solve(self, shape: str, p: Array) -> Solution:
+        """Return the best coefficients for the parameters of a shape."""
+        table, inputs = self.columns(shape, p)
+        whole = np.column_stack([table, self.temperature - self.level])
+        n = len(self.weights)
+        w = sum(
+            share * whole[n - 1 - i : len(whole) - i] for i, share in enumerate(self.weights)
         )
-        fits = _fits(likelihood)
-    tried = _tried(likelihood, fits, rival)
-    chosen, possible, estimates = posterior(likelihood, list(tried))
-    share = next(share for fit, share in tried.items() if fit.orders == chosen.orders)
-    plant, *of_known = likelihood.models(chosen)
-    noise, c = noise_of(
-        replace(plant, c=(1.0, *chosen.c)), chosen.orders, estimates["noise_variance"].value
-    )
-    simulated = likelihood.simulated(chosen)
-    level = float(np.nanmean(log.temperature - simulated))
-    model = Model(
-        plant=replace(plant, c=c), noise=noise,
-        known=dict(zip(log.disturbances, of_known, strict=True)),
-        estimates=estimates, possible=possible,
-        u_min=likelihood.u_min, u_max=likelihood.u_max,
-        operating_flow=likelihood.operating_flow, operating_temperature=level,
-        orders=chosen.orders, errors=likelihood.errors(chosen, bridged=False),
-        held_out=HeldOut(share, rival), held_out_rows=likelihood.last,
-        log=log, simulated=level + simulated, fault=fault,
-    )  # fmt: skip
-    longest = likelihood.knowledge.longest_delay
-    return replace(model, warnings=doubts(model, longest), notes=_notes(model, likelihood))
+        w = w[np.isfinite(w[:, -1])]
+        a, b = w[:, :-1], w[:, -1]
+        # Start, loads and base line are within a few deviations of the log.
+        weak = np.zeros(a.shape[1])
+        weak[inputs:] = b.std() / (5.0 * np.nanstd(self.temperature))
+        size = np.sqrt((a**2).sum(axis=0) + weak**2) + 1e-12
+        square = (a / size).T @ (a / size) + np.diag((weak / size) ** 2 + 1e-11)
+        c = np.linalg.solve(square, (a / size).T @ b) / size
+        return Solution(c, b - a @ c, a, table)
 
-
-def _fits(likelihood: Likelihood) -> list[Fit]:
-    """Return fits of promising orders, the best first."""
-    scanned = []
-    for base in likelihood.first_fits([FIRST_ORDERS, replace(FIRST_ORDERS, walk=True)]):
-        finer = likelihood.gaps(base.place.gap)
-        gap = likelihood.scan(base.orders, base.c, finer)[0].gap
-        for a, b in itertools.product((1, 2, 3), (1, 2, 3, 6, 12)):
-            orders = Orders(a, b, 2, base.orders.walk)
-            place = likelihood.scan(orders, base.c, [gap])[0]
-            scanned.append((orders, place, base.c))
-    scanned.sort(key=lambda each: likelihood.criterion(each[0], each[1].deviance))
-    # Keep at least one of each kind: a common C does not suit all of them.
-    of_kinds = [
-        next(each for each in scanned if (each[0].walk, each[0].b > 3) == kind)
-        for kind in itertools.product((False, True), repeat=2)
-    ]
-    fits: dict[Orders, Fit] = {}
-    for orders, place, c in [*scanned[:7], *of_kinds]:
-        if orders not in fits:
-            fits[orders] = likelihood.best_fit(place, orders, c)
-    for fit in likelihood.ranked(fits.values())[:3]:
-        for of_c in (0, 1, 3):
-            orders = replace(fit.orders, c=of_c)
-            if orders not in fits:
-                fits[orders] = likelihood.best_fit(fit.place, orders, fit.c)
-    found = likelihood.ranked(fits.values())
-    return [fit for fit in found if not fit.walks_nowhere] or found
-
-
-def _from_impulse_response(likelihood: Likelihood, best: Fit) -> list[Fit]:
-    """Return fits that start from an impulse response.
-
-    What it simulates has no noise, so that least squares find A. The search for C starts at A,
-    where the noise is white, as that of a transmitter, and at each single pole of A, which the
-    plant then does not share with the noise. The likelihood has peaks there that a search
-    from the noise of other orders may miss.
-    """
-    inputs = [likelihood.applied(best.place.gap), *likelihood.known]
-    smooth = copy(likelihood)
-    smooth.smooth(
-        of_impulse_response(inputs, likelihood.output, np.isfinite(likelihood.output))
-    )
-    found = []
-    for b in (1, 2, 3):
-        orders = Orders(2, b, 0)
-        place = smooth.scan(orders, np.zeros(0), [best.place.gap])[0]
-        a = smooth.fit(place, orders).linear[:2]
-        starts = [a, *([-pole] for pole in np.roots([1.0, *a]).real)]
-        for c in map(np.array, starts):
-            orders = Orders(2, b, len(c))
-            place = likelihood.scan(orders, c, [best.place.gap])[0]
-            found.append(likelihood.fit(place, orders, c))
-    return found
-
-
-def _tried(likelihood: Likelihood, fits: list[Fit], rival: float) -> dict[Fit, float]:
-    """Return the fits that simulate the last part well, and the shares explained there.
-
-    `rival` is the share that an impulse response explains. If it is far larger, the fits that
-    start from an impulse response are tried, however likely they are.
-    """
-    last, start = likelihood.last, likelihood.first()
-    mild = likelihood.ranked(fits, mild=True)
-    long = [fit for fit in fits if fit.orders.b > 3]  # with a response of any shape
-    shares: dict[Fit, float] = {}
-
-    def simulate(tried: Iterable[Fit]) -> None:
-        for fit in tried:
-            simulated = start.simulated(start.fit(fit.place, fit.orders, fit.c))
-            shares[fit] = explained(likelihood.output, simulated, last)
-
-    simulate(dict.fromkeys([*fits[:4], *mild[:2], *long[:1]]))
-    far_behind = 1.0 - max(shares.values()) > 1.5 * (1.0 - rival)
-    # What is worse by 25 in the Bayesian criterion is improbable: e^-12.
-    most = 25.0 + likelihood.criterion(fits[0].orders, fits[0].place.deviance)
-    simulate(
-        fit for fit in _from_impulse_response(likelihood, fits[0])
-        if far_behind or likelihood.criterion(fit.orders, fit.place.deviance) < most
-    )  # fmt: skip
-    # What the best simulation leaves unexplained, with a margin for the noise of a fifth.
-    left = 1.0 - max(shares.values())
-    good = {
-        f: share for f, share in shares.items() if 1.0 - share <= max(1.2 * left, left + 0.005)
-    }
-    return good or dict(list(shares.items())[:1])
-
-
-def _of_impulse_response(likelihood: Likelihood, *more: Array) -> float:
-    """Return the share of the last part that an impulse response explains, of more inputs."""
-    inputs = [likelihood.command, *likelihood.known, *more]
-    impulse = of_impulse_response(inputs, likelihood.output, ~likelihood.last)
-    return explained(likelihood.output, impulse, likelihood.last)
-
-
-def _check_answer(likelihood: Likelihood, best: Fit) -> None:
-    """Refuse a log in which the effect of the flow cannot be distinguished from noise."""
-    gained = likelihood.gained(best)
-    if gained < EVIDENT < _gained_when_swapped(likelihood):
-        raise CannotTellError(
-            "the direction is unusual: the flow answers the temperature rather than the "
-            "temperature the flow. The two columns seem to be swapped; name them with "
-            "--flow and --temperature. If they are not, the flow has too little effect to be "
-            "told from noise: move it further, or move the set point of a closed loop more"
-        )
-    # Many delays and dead zones have been tried, so the best of them gains by chance.
-    tried = len(likelihood.delays) * len(likelihood.gaps())
-    least = float(stats.chi2.isf(0.01 / tried, best.orders.b))
-    if gained < least:
-        raise CannotTellError(
-            "the temperature does not answer the flow in this log: a model without the "
-            f"flow explains it as well (twice the log likelihood differs by {gained:.1f}, "
-            f"and {least:.1f} are asked for). Move the flow further or longer, or look for "
-            f"a longer delay with --longest-delay. {_of_other_columns(likelihood)}"
+    def plant(self, shape: str, p: Array, c: Array) -> Plant:
+        """Return the plant of a shape with coefficients."""
+        units = self.units(shape, p)
+        gains = [share * each.gains for share, each in zip(c, units, strict=False)]
+        return Plant(
+            units[0].delay, np.concatenate([each.lags for each in units]), np.concatenate(gains)
         )
 
+    def refined(self, shape: str, p: Array, evaluations: int = 40) -> tuple[float, Array]:
+        """Return the least deviance near parameters, and where it is."""
+        # Steps are relative to the place: about 1, so that all are as long.
+        found = least_squares(
+            lambda q: self.solve(shape, p + q - 1.0).errors, np.ones(len(p)), method="lm",
+            diff_step=0.01, ftol=3e-5, xtol=1e-3, max_nfev=evaluations,
+        )  # fmt: skip
+        place = p + found.x - 1.0
+        return self.solve(shape, place).deviance, place
 
-def _gained_when_swapped(likelihood: Likelihood) -> float:
-    """Return how much the temperature adds to twice the log likelihood of the flow."""
-    log, longest_delay = likelihood.log, likelihood.knowledge.longest_delay
-    mirrored = Log(log.temperature, log.flow, log.sampling_interval)
-    try:
-        swapped = Likelihood(mirrored, Knowledge(longest_delay=longest_delay))
-        return swapped.gained(swapped.first_fits([FIRST_ORDERS])[0])
-    except ValueError:
-        return 0.0
-
-
-def _of_other_columns(likelihood: Likelihood) -> str:
-    """Return advice on columns that are held in steps and help to explain the temperature."""
-    alone = max(_of_impulse_response(likelihood), 0.0)
-    names = [
-        f"--disturbance {name}"
-        for name, each in likelihood.log.others.items()
-        if np.isfinite(each).all() and np.mean(np.diff(each) == 0.0) > 0.5 and np.ptp(each)
-        and _of_impulse_response(likelihood, each) > alone + 0.05
-    ]  # fmt: skip
-    return f"More is explained with {' or '.join(names)}: try that." if names else ""
-
-
-def _notes(model: Model, likelihood: Likelihood) -> list[str]:
-    """Return remarks for the user about the log and the fit."""
-    log = model.log
-    walk = model.noise["disturbance_walk_variance"]
-    constants = len(log.flow) * log.sampling_interval / model.estimates["time_constant"].value
-    notes = [
-        (walk > likelihood.resolution,
-         f"The base line wanders by {np.sqrt(walk):.2g} {log.temperature_unit} a sample, as a "
-         "random walk: `disturbance_walk_variance`. What the plant settles at is known less "
-         "well."),
-        (constants < 3.0,
-         "The log holds less than three time constants of the plant. Its gain rests on "
-         "how the response goes on, which no one has seen."),
-    ]  # fmt: skip
-    others = _of_other_columns(likelihood)
-    return [
-        *log.notes,
-        *(note for holds, note in notes if holds),
-        *([others] if others else []),
-    ]
+    def reweighted(self, shape: str, p: Array) -> Problem:
+        """Return the problem with weights from the noise that the parameters leave."""
+        solved, inputs = self.solve(shape, p), self.columns(shape, p)[1]
+        left = self.temperature - solved.table[:, :inputs] @ solved.c[:inputs]
+        order = min(ORDER, len(left) // 15)
+        lagged = np.column_stack([left[order - i : len(left) - i] for i in range(order + 1)])
+        lagged = lagged[np.isfinite(lagged).all(axis=1)]
+        past = np.column_stack([lagged[:, 1:], np.ones(len(lagged))])
+        c = np.linalg.lstsq(past, lagged[:, 0], rcond=None)[0]
+        return replace(self, weights=np.r_[1.0, -c[:-1]])

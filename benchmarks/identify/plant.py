@@ -3,127 +3,109 @@
 from __future__ import annotations
 
 import json
-import math
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.polynomial import polyadd
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
-from benchmarks.identify.armax import Orders
-from benchmarks.identify.model import CannotTellError, Model
-from benchmarks.loop.linear import LinearModel
+from benchmarks.identify.fit import Array
+from benchmarks.identify.model import Model
 from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
-
-
-def noise_of(
-    plant: LinearModel, orders: Orders, variance: float
-) -> tuple[dict[str, float], tuple[float, ...]]:
-    """Return the variances of the environment's noises, degC^2, by name, and C.
-
-    The plant has C, or with a walk C', and `variance` is that of xi. The noise of a log is
-    C' xi / (A (1 - z^-1)) with a walk, C xi / A without. Its limit at frequency 0 gives the
-    walk. The white part of the rest is the transmitter's noise if it is at least half;
-    otherwise (28) cannot separate the two.
-    """
-    a, c, points = np.array(plant.a), np.array(plant.c), 1024
-    of_a = np.abs(np.fft.rfft(a, points)) ** 2
-    left = variance * np.abs(np.fft.rfft(c, points)) ** 2
-    walk = 0.0
-    if orders.walk:
-        walk = float(variance * c.sum() ** 2 / a.sum() ** 2)
-        step = np.abs(np.fft.rfft([1.0, -1.0], points)) ** 2
-        left = (left - left[0]) / np.maximum(step, 1e-12)
-        left[0] = left[1]
-        left = np.maximum(left, 1e-6 * float(np.mean(np.abs(left))))
-    white = float(np.min(left / of_a))
-    if white < 0.5 * float(np.mean(left / of_a)):
-        white = 0.0
-    if white or orders.walk:
-        # The rest is C xi: C is the spectral factor with all zeros inside the unit circle, of
-        # which four coefficients are kept.
-        left = np.maximum(left - white * of_a, 1e-4 * left)
-        cepstrum = np.fft.irfft(np.log(left))
-        variance = float(np.exp(cepstrum[0]))
-        c = np.array([1.0, 0.0, 0.0, 0.0])
-        for i in range(1, 4):  # exp of the causal part, term by term
-            c[i] = sum(j * cepstrum[j] * c[i - j] for j in range(1, i + 1)) / i
-    names = "noise_variance", "measurement_noise_variance", "disturbance_walk_variance"
-    return dict(zip(names, (variance, white, walk), strict=True)), tuple(c.tolist())
 
 
 def plant_arguments(model: Model) -> dict[str, Any]:
     """Return the content of `plant.json`: the arguments of `MiddlePoint-v0` for the model.
 
-    The set point stays the environment's default if the plant can reach it in time; otherwise
-    it is made smaller and slower.
+    The plant is sampled exactly, at the log's interval. The set point stays the environment's
+    default if the plant can reach it in time; otherwise it is made smaller and slower.
     """
-    plant, defaults = model.plant, Parameters()
-    gain, limits = abs(plant.gain), (abs(model.u_min), abs(model.u_max))
-    reach, span = 0.8 * gain * (min(limits) or max(limits)), 1.5 * gain * max(limits)
+    h, plant, defaults = model.log.sampling_interval, model.plant, Parameters()
+    delay, parts = plant.sampled(h)
+    a: Any = np.ones(1)
+    b: Any = np.zeros(1)
+    for upper, lower in parts:  # a sum of fractions, over their common denominator
+        b = polyadd(np.convolve(b, lower), np.convolve(upper, a))
+        a = np.convolve(a, lower)
+    c, variance = _noise(model.log.temperature - model.simulated, a.real)
+    limits = abs(model.u_min), abs(model.u_max)
+    reach = 0.8 * abs(plant.gain) * (min(limits) or max(limits))
+    span = 1.5 * abs(plant.gain) * max(limits)
+    period = 2 * round((plant.delay + 4.0 * plant.slowest) / h)
     arguments: dict[str, Any] = {
-        "a": list(plant.a),
-        "b": list(plant.b),
-        "c": list(plant.c),
-        "delay": plant.delay,
+        "a": a.real.tolist(),
+        "b": b.real.tolist(),
+        "c": c.tolist(),
+        "delay": delay,
         "dead_zone": model.estimates["dead_zone"].value,
         "u_min": model.u_min,
         "u_max": model.u_max,
-        **{name: value for name, value in model.noise.items() if value},
-        "sampling_interval": plant.sampling_interval,
+        "noise_variance": variance,
+        "sampling_interval": h,
     }
     if reach < defaults.setpoint_amplitude:
         arguments["setpoint_amplitude"] = float(f"{reach:.2g}")
     if span > defaults.temperature_span:
         arguments["temperature_span"] = float(f"{span:.2g}")
-    if 2 * settling(plant) > defaults.setpoint_period:
-        arguments["setpoint_period"] = 2 * settling(plant)
-    return _rounded(arguments)
+    if period > defaults.setpoint_period:
+        arguments["setpoint_period"] = period
+    return _checked(arguments)
+
+
+def _noise(left: Array, a: Array) -> tuple[Array, float]:
+    """Return C, with real roots, and the variance of xi, such that C xi / A is like a series.
+
+    C begins as A, for white noise, and minimises the prediction errors xi.
+    """
+    left = np.nan_to_num(left - np.nanmean(left))
+    roots = np.clip(np.r_[np.abs(np.roots(a)), 0.1], 0.1, 0.98)
+
+    def errors(q: Array) -> Array:
+        return np.asarray(lfilter(a, np.poly(np.tanh(q)), left))
+
+    q = least_squares(errors, np.arctanh(roots), method="lm", max_nfev=60).x
+    return np.asarray(np.poly(np.tanh(q))), float(np.var(errors(q)))
 
 
 def plant_ranges(model: Model) -> dict[str, Any]:
     """Return the content of `ranges.json`: the same, with intervals as ranges to draw from."""
-    arguments, plant = plant_arguments(model), model.plant
-    names = "delay", "dead_zone", "noise_variance", "gain", "time_constant"
-    delay, zone, noise, gain, constant = (model.estimates[name] for name in names)
-    level = arguments.get("noise_variance", 0.0) / (noise.value or 1.0)
+    arguments, h = plant_arguments(model), model.log.sampling_interval
+    names = "delay", "dead_zone", "gain", "time_constant"
+    delay, zone, gain, constant = (model.estimates[name] for name in names)
+    chance = 2.0 * np.sqrt(2.0 / len(model.log.flow))  # of a variance, about
     factors = np.sort([gain.low / gain.value, gain.high / gain.value])
+    whole, most = arguments["delay"], max(-model.u_min, model.u_max)
     ranges = {
-        "delay": [int(delay.low), int(delay.high)],
-        "dead_zone": [zone.low, zone.high],
-        "noise_variance": [level * noise.low, level * noise.high],
+        "delay": [min(int(delay.low), whole), max(int(delay.high), whole)],
+        "dead_zone": [zone.low, min(zone.high, 0.99 * most)],
+        "noise_variance": [arguments["noise_variance"] * x for x in (1 - chance, 1 + chance)],
         "gain_factor": np.clip(factors, 0.1, 10.0).tolist(),
     }
-    pole = complex(slowest_pole(plant.a) or 0.0)
+    pole = complex(slowest_pole(arguments["a"]) or 0.0)
     if pole.imag == 0.0 and 0.0 < pole.real < 1.0:
         # The environment's time constant is 1 / (1 - pole) samples, at least 1.
         rate, times = 1.0 - pole.real, np.maximum([constant.low, constant.high], 1e-9)
-        fast, slow = np.maximum(-np.expm1(-plant.sampling_interval / times), 1e-12).tolist()
-        ranges["time_constant_factor"] = [
-            min(max(rate / fast, rate * 1.000001), 1.0),
+        fast, slow = np.maximum(-np.expm1(-h / times), 1e-12).tolist()
+        low, high = (
+            min(max(rate / fast, 1.000001 * rate), 1.0),
             max(min(rate / slow, 10.0), 1.0),
-        ]
-    arguments |= {name: ends for name, ends in ranges.items() if ends[0] < ends[1]}
-    arguments = _rounded(arguments)
-    try:
-        Parameters(**arguments)
-    except ValueError as error:
-        raise CannotTellError(
-            f"the environment does not have such plants: {error}. See whether the units are "
-            "right (--flow-unit, --temperature-unit, --time-unit), or scale the columns"
-        ) from error
-    return arguments
+        )
+        ranges["time_constant_factor"] = [low, high]
+    return _checked(arguments | {name: x for name, x in ranges.items() if x[0] < x[1]})
 
 
-def _rounded(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments rounded to eight digits, more than any log determines."""
+def _checked(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments with eight digits; ValueError if the environment has no such plant."""
     rounded: dict[str, Any] = json.loads(
         json.dumps(arguments), parse_float=lambda text: float(f"{float(text):.8g}")
     )
+    try:
+        Parameters(**rounded)
+    except ValueError as error:
+        raise ValueError(
+            f"the environment does not have such plants: {error}. See whether the units are "
+            "right (--flow-unit, --temperature-unit, --time-unit), or scale the columns"
+        ) from error
     return rounded
-
-
-def settling(plant: LinearModel) -> int:
-    """Return how long a step response takes to settle within 2 %, samples."""
-    size = float(np.max(np.abs(plant.poles), initial=0.0))
-    own = math.log(0.02) / math.log(size) if 0.0 < size < 1.0 else 0.0
-    return plant.delay + len(plant.b) + min(math.ceil(own), 100_000)

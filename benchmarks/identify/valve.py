@@ -1,97 +1,141 @@
-"""Find out whether something other than a dead zone lies between the command and the flow.
-
-Whatever the valve, the plant behind it is linear. So the flows that faulty valves of several
-kinds and sizes would pass are put in the place of the command, and the likelihoods of the log
-are compared. The fault that explains the log best is the one that is found.
-"""
+"""Compare what a valve may make of its commands, and what may change a plant's gain."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.identify.armax import Array
-from benchmarks.identify.likelihood import Fit, Gap, Likelihood, dead_within
-from benchmarks.identify.model import Fault
-from benchmarks.identify.simulation import held
+from benchmarks.identify.fit import Array, Problem, one_lag
 
-# Sizes that are tried, as shares of the range of the flow: smaller ones do no harm, and larger
-# ones leave too little of the log.
-WIDTHS = np.geomspace(0.15, 0.6, 12)
-CENTRES, ZONES = (-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (0.05, 0.1, 0.15, 0.2, 0.25)
-RATIOS = (0.5, 0.625, 0.8, 1.25, 1.6, 2.0)  # of the gain above a flow to that below
-# Least gain in twice the log likelihood for a fault to be reported. The log of a sound valve
-# excludes backlash of these widths, so that little is asked for. The other faults show in fewer
-# samples, and the best of many sizes gains by chance.
-LEAST = {"backlash": 1.0, "stiction": 6.0, "gain": 8.0, "zone": 10.0}
+Passed = Callable[[Array, float], Array]
 
 
-def valve_fault(likelihood: Likelihood, fits: list[Fit]) -> Fault | None:
-    """Return the fault that explains a log best, if it is evident enough.
+def following(rule: Callable[[float, float, float], float]) -> Passed:
+    """Return a valve that moves from its position by `rule(position, command, size)`."""
 
-    `fits` are those without a fault, the best first. The orders and C of the best one are
-    tried, and of the best one of the other kind: a random walk may stand for a fault.
+    def passed(flow: Array, size: float) -> Array:
+        position, found = flow[0], []
+        for command in flow.tolist():
+            position = rule(position, command, size)
+            found.append(position)
+        return np.array(found)
+
+    return passed
+
+
+def off_centre(side: float) -> Passed:
+    """Return a dead zone around another flow, on one side of the operating point."""
+    return lambda u, size: np.where(np.abs(u - side * size) < 0.6 * size, side * size, u)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What may lie between a command and its effect."""
+
+    passed: Passed
+    """The flow behind it, of a flow from the operating point and a size."""
+    sizes: tuple[float, ...] = (0.1, 0.16, 0.24, 0.34, 0.46)
+    """Sizes to try, as shares of the largest flow; of a rate, in a delay and a lag."""
+    delays: tuple[float, ...] = (1.0,)
+    """Shares of the delay to try: some valves look like a part of it."""
+    harmless: bool = False
+    """Whether a linear controller can be tuned for the plant behind it."""
+
+
+SOUND = Kind(lambda u, _: u, (0.0,), harmless=True)
+VALVES = {
+    "dead zone": Kind(lambda u, size: np.where(np.abs(u) < size, 0.0, u), harmless=True),
+    "subtractive dead zone": Kind(
+        lambda u, size: np.sign(u) * np.maximum(np.abs(u) - size, 0.0), harmless=True
+    ),
+    "saturation": Kind(
+        lambda u, size: np.clip(u, -size, size), (0.4, 0.55, 0.7, 0.85), harmless=True
+    ),
+    "rate limit": Kind(
+        following(lambda p, u, size: p + min(max(u - p, -size), size)),
+        (10.0, 3.3, 1.6, 1.0, 0.6), (1.0, 0.7, 0.4), harmless=True,
+    ),
+    "dead zone above": Kind(off_centre(1.0), (0.2, 0.35, 0.5)),
+    "dead zone below": Kind(off_centre(-1.0), (0.2, 0.35, 0.5)),
+    "few positions": Kind(lambda u, size: size * np.round(u / size), (0.15, 0.25, 0.35, 0.5)),
+    "backlash": Kind(
+        following(lambda p, u, size: min(max(p, u - size / 2), u + size / 2)),
+        (0.1, 0.2, 0.35, 0.5, 0.8), (1.0, 0.7),
+    ),
+    "stiction": Kind(
+        following(lambda p, u, size: u if abs(u - p) > size else p),
+        (0.1, 0.2, 0.3, 0.4, 0.6), (1.0, 0.7),
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A valve or a change of the plant, with the best plant for it."""
+
+    name: str
+    size: float
+    """t/h, of a rate t/h a row; of a change its share of the gain."""
+    drop: float
+    """What it takes from the deviance."""
+    problem: Problem
+    p: Array
+    gain: float
+    """Of the plant behind it."""
+    harmless: bool = False
+
+
+def with_valve(
+    problem: Problem, shape: str, p: Array, command: Array, kinds: dict[str, Kind]
+) -> list[Hypothesis]:
+    """Return each kind of valve with its best size, the likeliest first.
+
+    `command` is the flow commanded, from the operating point. A sound valve is the first kind.
     """
-    best = fits[0]
-    others = [fit for fit in fits if fit.orders.walk != best.orders.walk]
-    without = likelihood.criterion(best.orders, best.place.deviance)
-    gaps = dict.fromkeys([Gap(0.0, 0.0), best.place.gap])
-    found: list[tuple[float, Fault]] = []
-    for kind, fault in _faults(likelihood):
-        flows = [dead_within(gap, fault.passed) for gap in gaps]
-        criterion = min(
-            likelihood.criterion(fit.orders, likelihood.of_flows(flows, fit))
-            for fit in [best, *others[:1]]
+    found, largest, plain = list[Hypothesis](), float(np.abs(command).max()), 0.0
+    for name, kind in {"none": SOUND, **kinds}.items():
+        unit = largest * (problem.h / problem.scale if name == "rate limit" else 1.0)
+        sizes, places = (
+            unit * np.array(kind.sizes),
+            [np.r_[share * p[0], p[1:]] for share in kind.delays],
         )
-        if without - criterion > LEAST[kind]:
-            found.append((criterion, fault))
-    return min(found, key=lambda each: each[0])[1] if found else None
+        # A size at a place, and the place at that size, in turns.
+        for finer in ((0.75, 0.87, 1.0, 1.15, 1.33), (0.93, 1.0, 1.07), ()):
+            tried = [
+                (problem.behind(kind.passed(command, size)), size, q)
+                for size in sizes
+                for q in places
+            ]
+            behind, size, q = min(
+                tried, key=lambda each: each[0].solve(shape, each[2]).deviance
+            )
+            deviance, q = behind.refined(shape, q, 12)
+            sizes, places = size * np.array(finer), [q]
+        plain = plain if found else deviance
+        gain = behind.plant(shape, q, behind.solve(shape, q).c).gain
+        found.append(
+            Hypothesis(name, float(size), plain - deviance, behind, q, gain, kind.harmless)
+        )
+    # Of those that differ by rounding alone, the first.
+    return sorted(found, key=lambda each: -round(each.drop))
 
 
-def _faults(likelihood: Likelihood) -> Iterator[tuple[str, Fault]]:
-    """Yield faults of all kinds and sizes, with their kinds."""
-    flow, unit = held(likelihood.command), likelihood.log.flow_unit
-    span, rest = float(np.ptp(flow)), likelihood.operating_flow
-    test = (
-        "Test the valve: move the flow up and down in small steps, twice in each direction. If "
-        "it follows them all, the plant is not of the model's form."
-    )
-    for width, passed in zip(span * WIDTHS, _backlash(flow, span * WIDTHS), strict=True):
-        what = f"The flow seems to depend on its last direction: backlash of {width:.2g}"
-        yield "backlash", Fault(f"{what} {unit} explains the log better.", test, passed)
-    for least, passed in zip(
-        span * WIDTHS / 2, _stiction(flow, span * WIDTHS / 2), strict=True
-    ):
-        what = f"The valve seems to stick: stiction of ±{least:.2g}"
-        yield "stiction", Fault(f"{what} {unit} explains the log better.", test, passed)
-    for centre, ratio in itertools.product(span * np.array([-0.2, 0.0, 0.2]), RATIOS):
-        what = f"The gain above {rest + centre:.4g} {unit} seems {ratio:.2g} times that below"
-        advice = "Identify both sides from logs of their own."
-        above, below = min(ratio, 1.0), min(1.0 / ratio, 1.0)  # so that the gain is the larger
-        passed = centre + np.where(flow > centre, above, below) * (flow - centre)
-        yield "gain", Fault(f"{what}, roughly.", advice, passed)
-    for centre, zone in itertools.product(span * np.array(CENTRES), span * np.array(ZONES)):
-        within = np.abs(flow - centre) < zone
-        where = f"{rest + centre:.4g}"
-        what = f"There seems to be a dead zone around {where} {unit}, not around {rest:g}"
-        advice = f"If that is the operating point, say --operating-flow {where}. {test}"
-        for inside in (0.0, centre):
-            yield "zone", Fault(f"{what} {unit}.", advice, np.where(within, inside, flow))
-
-
-def _backlash(flow: Array, widths: Array) -> Array:
-    """Return the flow past a backlash of each width, shape (widths, rows)."""
-    passed, at = np.empty((len(widths), len(flow))), flow[0] + 0.0 * widths
-    for k, u in enumerate(flow):
-        at = passed[:, k] = np.clip(at, u - widths / 2.0, u + widths / 2.0)
-    return passed
-
-
-def _stiction(flow: Array, least: Array) -> Array:
-    """Return the flow of a valve that does not make a move of less than each of some steps."""
-    passed, at = np.empty((len(least), len(flow))), flow[0] + 0.0 * least
-    for k, u in enumerate(flow):
-        at = passed[:, k] = np.where(np.abs(u - at) > least, u, at)
-    return passed
+def with_change(problem: Problem, shape: str, p: Array) -> list[Hypothesis]:
+    """Return what changes a plant's gain or speed, each as one more input of the plant."""
+    flow, plain = problem.flow, problem.refined(shape, p, 12)[0]
+    answer = one_lag(problem.units(shape, p)[0].slowest).simulated(flow, problem.h)
+    inputs = {
+        "gain by level": flow**2 / np.abs(flow).max(),
+        "gain by time": flow * np.linspace(-1.0, 1.0, len(flow)),
+        "speed by direction": np.abs(np.gradient(answer, problem.h)) * problem.scale,
+    }
+    found = []
+    for name, each in inputs.items():
+        more = replace(problem, extra=(each,))
+        deviance, q = more.refined(shape, p, 16)
+        c, units = more.solve(shape, q).c, len(more.units(shape, q))
+        gain = float(c[:units].sum())
+        found.append(Hypothesis(name, float(c[units]) / gain, plain - deviance, more, q, gain))
+    return found
