@@ -15,7 +15,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 @options
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """The columns of a log and their units."""
+    """The columns of a log. Their units may also stand in the heading, in brackets."""
 
     time: str = "time"
     """Column of the times, numbers or dates."""
@@ -26,11 +26,11 @@ class Columns:
     disturbance: Repeated = ()
     """Column of a measured disturbance (repeatable)."""
     time_unit: str | None = None
-    """Unit of the times: ms, s, min, h or D, days (default: that in the heading, else s)."""
+    """Unit of the times: ms, s, min, h or D, days (default: s)."""
     flow_unit: str | None = None
-    """Unit of the flow, for the report (default: that in the heading, else t/h)."""
+    """Unit of the flow, for the report (default: t/h)."""
     temperature_unit: str | None = None
-    """Unit of the temperature, for the report (default: that in the heading, else °C)."""
+    """Unit of the temperature, for the report (default: °C)."""
 
 
 @options
@@ -44,11 +44,9 @@ class Knowledge:
     """Flow at the operating point, around which a dead zone lies (default: 0 or the first flow
     if it is well inside the range of the flows, else the middle of the range)."""
     u_min: Finite | None = None
-    """Smallest flow that the actuator can apply, from the operating point (default: the
-    log's smallest)."""
+    """Smallest flow, from the operating point (default: the log's)."""
     u_max: Finite | None = None
-    """Largest flow that the actuator can apply, from the operating point (default: the
-    log's largest)."""
+    """Largest flow, from the operating point (default: the log's)."""
 
 
 @options

@@ -41,6 +41,16 @@ class Recommended:
     delay_margin: float
     """Additional delay at which the loop with the most likely plant becomes unstable, s."""
 
+    @property
+    def label(self) -> str:
+        """Its name in a report."""
+        return {"pi-simc": "PI (SIMC)", "smith": "Smith"}[self.name]
+
+    @property
+    def action(self) -> str:
+        """Whether the flow rises ("direct") or falls when the temperature rises."""
+        return "reverse" if self.kp > 0.0 else "direct"
+
 
 class Loops:
     """Loops of a controller with many plants, each with its own delay and with others."""

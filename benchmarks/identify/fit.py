@@ -1,9 +1,8 @@
-"""Fit a plant with a delay and one to three lags to a log: output error, weighted."""
+"""Fit a plant with a delay and one to three lags to a log, by weighted output error."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,36 +50,36 @@ class Plant:
         half = max(mean - slow, 0.0) / 2.0
         return slow + half, self.delay + half
 
-    def sampled(self, h: float) -> tuple[int, list[tuple[Complex, Complex]]]:
-        """Return whole samples of delay, and B and A of each lag for flows held for h, exactly.
+    def sampled(self, h: float) -> tuple[int, Complex, Complex]:
+        """Return whole samples of delay, and B and A of the lags for flows held for h, exactly.
 
-        B begins with z^-1, as in (28), and has two coefficients: the delay is continuous.
+        There is a row for each lag. B begins with z^-1, as in (28), and has two coefficients,
+        as the delay is continuous.
         """
         whole = int(self.delay / h)
         poles = np.exp(-h / self.lags)
-        # What is left of a sample once the flow has arrived.
+        # What a lag forgets in the rest of a sample, once the flow has arrived.
         kept = np.exp((self.delay - whole * h - h) / self.lags)
         upper = self.gains * np.array([1.0 - kept, kept - poles])
-        lower = np.array([np.ones(len(poles)), -poles])
-        return whole, list(zip(upper.T, lower.T, strict=True))
+        return whole, upper.T, np.array([np.ones(len(poles)), -poles]).T
 
     def response(self, h: float, frequency: Array) -> Complex:
         """Return the frequency response from one sample to the next, at rad/s."""
+        whole, b, a = self.sampled(h)
         back = np.exp(-1j * h * frequency)
-        whole, parts = self.sampled(h)
-        shares = [(b[0] + b[1] * back) / (1.0 + a[1] * back) for b, a in parts]
-        return np.asarray(sum(shares) * back ** (whole + 1))
+        powers = np.array([np.ones(len(back)), back])
+        return np.asarray(((b @ powers) / (a @ powers)).sum(axis=0) * back ** (whole + 1))
 
     def simulated(self, flow: Array, h: float) -> Array:
         """Return the temperatures of a plant that has been at rest before the flow."""
-        whole, parts = self.sampled(h)
+        whole, upper, lower = self.sampled(h)
         # The imaginary parts of a pair of complex lags cancel.
-        moved = sum(lfilter(np.r_[0.0, b], a, flow).real for b, a in parts)
-        return np.asarray(np.concatenate([np.zeros(whole), moved])[: len(flow)])
+        moved = [lfilter([0.0, *b], a, flow).real for b, a in zip(upper, lower, strict=True)]
+        return np.asarray(np.concatenate([np.zeros(whole), sum(moved)])[: len(flow)])
 
 
 def one_lag(lag: float, delay: float = 0.0) -> Plant:
-    """Return a plant of gain 1 and first order."""
+    """Return a plant of first order with gain 1."""
     return Plant(delay, np.array([lag + 0j]), np.ones(1, np.complex128))
 
 
@@ -89,13 +88,15 @@ class Solution:
     """The best coefficients for given parameters, and what they leave."""
 
     c: Array
-    """The plant's first."""
+    """Those of the plants first."""
     errors: Array
     """Of the blocks, weighted: white noise if all is right."""
     weighted: Array
     """The columns that the coefficients multiply, weighted."""
-    table: Array
-    """The columns themselves."""
+    simulated: Array
+    """Temperatures of the blocks by flow and disturbances alone, without noise and loads."""
+    fitted: Array
+    """Temperatures of the blocks by all columns."""
 
     @property
     def deviance(self) -> float:
@@ -110,8 +111,9 @@ class Problem:
     flow: Array
     """Flow behind the valve, row by row, t/h from where it was at first."""
     temperature: Array
-    """Means of blocks of rows, degC; NaN where unknown."""
+    """Means of blocks of rows, degC from the mean; NaN where unknown."""
     h: float
+    """Sampling interval of the rows, s."""
     known: tuple[Array, ...] = ()
     """Measured disturbances, row by row."""
     rows: int = 1
@@ -125,21 +127,10 @@ class Problem:
     extra: tuple[Array, ...] = ()
     """Further inputs of the plant, with gains of their own."""
 
-    @cached_property
-    def times(self) -> Array:
-        """Times of the rows, s."""
-        return np.asarray(np.arange(len(self.flow)) * self.h)
-
-    @cached_property
-    def level(self) -> float:
-        """Mean of the known temperatures."""
-        return float(np.nanmean(self.temperature))
-
     def means(self, x: Array) -> Array:
         """Return the means of blocks of rows."""
         count = len(x) // self.rows
-        means: Array = x[: count * self.rows].reshape(count, self.rows).mean(axis=1)
-        return means
+        return np.asarray(x[: count * self.rows].reshape(count, self.rows).mean(axis=1))
 
     def in_blocks(self, rows: int) -> Problem:
         """Return the problem of a log of single rows in blocks."""
@@ -152,22 +143,20 @@ class Problem:
 
     def units(self, shape: str, p: Array) -> list[Plant]:
         """Return the plants of gain 1 whose weighted sum is the plant of a shape."""
-        delay = self.scale * max(float(p[0]), 0.0)
-        first = float(np.exp(np.clip(p[1], np.log(self.h / 4.0), np.log(2.0 * self.times[-1]))))
+        delay, longest = self.scale * max(float(p[0]), 0.0), len(self.flow) * self.h / 3.0
+        first = float(np.exp(np.clip(p[1], np.log(self.h / 4.0), np.log(longest))))
         if shape == "one lag":
             return [one_lag(first, delay)]
+        # The second is never quite the first: equal ones have no partial fractions.
+        second = first * min(np.exp(max(p[2], -6.0)), 0.97)
+        if shape == "a zero":
+            return [one_lag(first, delay), one_lag(second, delay)]
+        lags = np.array([first, second, 0.9 * second][: 3 if shape == "three lags" else 2]) + 0j
         if shape == "a pair":
             lags = first * np.exp(1j * np.clip(p[2], 0.1, 1.45) * np.array([1.0, -1.0]))
-        else:
-            # The second is never quite the first: equal ones have no partial fractions.
-            second = first * min(np.exp(max(p[2], -6.0)), 0.97)
-            if shape == "a zero":
-                return [one_lag(first, delay), one_lag(second, delay)]
-            lags = np.array([first, second, 0.9 * second][: 3 if shape == "three lags" else 2])
         others = lags[:, np.newaxis] - lags
         np.fill_diagonal(others, 1.0)
-        gains = lags ** (len(lags) - 1) / np.prod(others, axis=1)
-        return [Plant(delay, lags + 0j, gains + 0j)]
+        return [Plant(delay, lags, lags ** (len(lags) - 1) / np.prod(others, axis=1))]
 
     def columns(self, shape: str, p: Array) -> tuple[Array, int]:
         """Return what temperatures are a weighted sum of, and how many of these are inputs.
@@ -175,22 +164,19 @@ class Problem:
         The plants come first, then extra inputs, the measured disturbances, what is left of
         the time before the log, the loads and the base line.
         """
-        units, lag = self.units(shape, p), self.units("one lag", p)[0]
-        now = one_lag(lag.lags[0].real)
+        units, (lag,) = self.units(shape, p), self.units("one lag", p)
+        now, times = one_lag(lag.slowest), np.arange(len(self.flow)) * self.h
         found = [each.simulated(self.flow, self.h) for each in units]
         found += [lag.simulated(each, self.h) for each in self.extra]
         # A disturbance has lags of its own: three fixed ones make any slow response.
-        found += [
-            one_lag(ratio * now.slowest).simulated(each, self.h)
-            for each in self.known for ratio in (0.3, 1.0, 3.0)
-        ]  # fmt: skip
+        wide = [one_lag(ratio * lag.slowest) for ratio in (0.3, 1.0, 3.0)]
+        found += [plant.simulated(each, self.h) for each in self.known for plant in wide]
         inputs = len(found)
         for each in np.unique(np.concatenate([unit.lags for unit in units])):
-            decay = np.exp(-self.times / each)
+            decay = np.exp(-times / each)
             found.append(decay.real if each.imag >= 0.0 else decay.imag)
-        found += [
-            now.simulated(np.heaviside(self.times - at, 1.0), self.h) for at in self.loads
-        ]
+        steps = [np.heaviside(times - at, 1.0) for at in self.loads]
+        found += [now.simulated(each, self.h) for each in steps]
         return np.column_stack(
             [*map(self.means, found), np.ones(len(self.temperature))]
         ), inputs
@@ -198,8 +184,7 @@ class Problem:
     def solve(self, shape: str, p: Array) -> Solution:
         """Return the best coefficients for the parameters of a shape."""
         table, inputs = self.columns(shape, p)
-        whole = np.column_stack([table, self.temperature - self.level])
-        n = len(self.weights)
+        whole, n = np.column_stack([table, self.temperature]), len(self.weights)
         w = sum(
             share * whole[n - 1 - i : len(whole) - i] for i, share in enumerate(self.weights)
         )
@@ -211,15 +196,13 @@ class Problem:
         size = np.sqrt((a**2).sum(axis=0) + weak**2) + 1e-12
         square = (a / size).T @ (a / size) + np.diag((weak / size) ** 2 + 1e-11)
         c = np.linalg.solve(square, (a / size).T @ b) / size
-        return Solution(c, b - a @ c, a, table)
+        return Solution(c, b - a @ c, a, table[:, :inputs] @ c[:inputs], table @ c)
 
     def plant(self, shape: str, p: Array, c: Array) -> Plant:
         """Return the plant of a shape with coefficients."""
         units = self.units(shape, p)
-        gains = [share * each.gains for share, each in zip(c, units, strict=False)]
-        return Plant(
-            units[0].delay, np.concatenate([each.lags for each in units]), np.concatenate(gains)
-        )
+        gains = np.concatenate([x * each.gains for x, each in zip(c, units, strict=False)])
+        return Plant(units[0].delay, np.concatenate([each.lags for each in units]), gains)
 
     def refined(self, shape: str, p: Array, evaluations: int = 40) -> tuple[float, Array]:
         """Return the least deviance near parameters, and where it is."""
@@ -228,13 +211,11 @@ class Problem:
             lambda q: self.solve(shape, p + q - 1.0).errors, np.ones(len(p)), method="lm",
             diff_step=0.01, ftol=3e-5, xtol=1e-3, max_nfev=evaluations,
         )  # fmt: skip
-        place = p + found.x - 1.0
-        return self.solve(shape, place).deviance, place
+        return self.solve(shape, p + found.x - 1.0).deviance, p + found.x - 1.0
 
     def reweighted(self, shape: str, p: Array) -> Problem:
         """Return the problem with weights from the noise that the parameters leave."""
-        solved, inputs = self.solve(shape, p), self.columns(shape, p)[1]
-        left = self.temperature - solved.table[:, :inputs] @ solved.c[:inputs]
+        left = self.temperature - self.solve(shape, p).simulated
         order = min(ORDER, len(left) // 15)
         lagged = np.column_stack([left[order - i : len(left) - i] for i in range(order + 1)])
         lagged = lagged[np.isfinite(lagged).all(axis=1)]

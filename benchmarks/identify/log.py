@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 FEWEST, MOST = 100, 20_000  # rows; of a longer log, the last ones are used
 LONGEST_GAP = 20  # rows
+SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}
 _UNIT = re.compile(r"\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")  # in brackets, at the end of a heading
 
 
@@ -35,7 +36,9 @@ class Log:
     disturbances: dict[str, Array] = field(default_factory=dict)
     """Other measured inputs, by column."""
     flow_unit: str = "t/h"
+    """Of the flow, for reports."""
     temperature_unit: str = "°C"
+    """Of the temperature."""
     notes: tuple[str, ...] = ()
     """What was read, and what was done about numbers that are missing."""
 
@@ -52,47 +55,28 @@ def read_log(path: Path, columns: Columns | None = None) -> Log:
     """
     columns = columns or Columns()
     table, decimal = _table(path)
-    if len(table) < FEWEST:
-        raise ValueError(f"the log is too short: {len(table)} rows, and hundreds are needed")
-    time = _heading(table, "time", columns.time)
-    flow = _heading(table, "flow", columns.flow)
-    temperature = _heading(table, "temperature", columns.temperature)
-    others = [_heading(table, "disturbance", name) for name in columns.disturbance]
-    names = [flow, temperature, *others]
-    if len({time, *names}) <= len(names):
-        raise ValueError(f"each column can be one thing only, got {', '.join([time, *names])}")
+    options = "time", "flow", "temperature"
+    names = [_heading(table, option, getattr(columns, option)) for option in options]
+    time, flow, temperature = names
+    names += [_heading(table, "disturbance", each) for each in columns.disturbance]
+    if len(set(names)) < len(names):
+        raise ValueError(f"each column can be one thing only, got {', '.join(names)}")
     interval, places = _sampled(_times(table[time], decimal, columns.time_unit))
-    kept = pd.DataFrame({name: _numbers(table[name], decimal) for name in names})
+    kept = pd.DataFrame({name: _numbers(table[name], decimal) for name in names[1:]})
     kept = kept.set_index(places).reindex(range(places[-1] + 1))[-MOST:]
-    units = (
-        columns.flow_unit or _unit(flow, "t/h"),
-        columns.temperature_unit or _unit(temperature, "°C"),
-    )
-    notes = [
-        f"Read {len(table):,} rows, one every {interval:g} s: the flow from {flow!r}, "
-        f"{units[0]}, and the temperature from {temperature!r}, {units[1]}. The last "
-        f"{len(kept):,} are used."
-    ]
+    notes = [f"Read {len(table):,} rows, one every {interval:g} s; {len(kept):,} are used."]
     for name, count in kept.isna().sum().items():
-        if count:
-            done = "are left out of the fit" if name == temperature else "are the values before"
-            notes.append(f"{count} values of {name!r} are missing, and {done}.")
-    known = kept.drop(columns=temperature).ffill().bfill()
-    counts = int(kept[temperature].notna().sum()), int(kept[flow].notna().sum())
-    if min(counts) < max(FEWEST, len(kept) / 2):
-        raise ValueError(
-            f"the log is too short: {counts[0]} temperatures and {counts[1]} flows in "
-            f"{len(kept)} rows, and hundreds are needed"
-        )
-    inputs = {str(name): known[name].to_numpy(np.float64) for name in known}
+        done = "are left out of the fit" if name == temperature else "are the values before"
+        notes += [f"{count} values of {name!r} are missing, and {done}."] * bool(count)
+        if len(kept) - count < max(FEWEST, len(kept) / 2):
+            raise ValueError(f"{count} of {len(kept)} values of {name!r} are missing: too many")
+    held = kept.ffill().bfill()
     return Log(
-        inputs.pop(flow),
-        kept[temperature].to_numpy(np.float64),
-        interval,
-        inputs,
-        *units,
-        tuple(notes),
-    )
+        held[flow].to_numpy(np.float64), kept[temperature].to_numpy(np.float64), interval,
+        {name: held[name].to_numpy(np.float64) for name in names[3:]},
+        columns.flow_unit or _unit(flow, "t/h"),
+        columns.temperature_unit or _unit(temperature, "°C"), tuple(notes),
+    )  # fmt: skip
 
 
 def _table(path: Path) -> tuple[pd.DataFrame, str]:
@@ -118,18 +102,20 @@ def _table(path: Path) -> tuple[pd.DataFrame, str]:
             f"{path} is not a table: {str(error).strip()}. With decimal commas, the separator "
             "must be a semicolon or a tab, or the numbers in quotes"
         ) from error
+    if len(table) < FEWEST:
+        raise ValueError(f"the log is too short: {len(table)} rows, and hundreds are needed")
     return table.set_axis([str(name) for name in table.columns], axis=1), decimal
 
 
 def _heading(table: pd.DataFrame, option: str, name: str) -> str:
     """Return the heading that a user names, with its unit or without."""
-    found = [each for each in map(str, table) if name in (each, _UNIT.sub("", each))]
-    if not found:
-        raise ValueError(
-            f"the log has no column {name!r}; it has {', '.join(map(repr, table))}. Name the "
-            f"right one with --{option}"
-        )
-    return found[0]
+    for each in map(str, table):
+        if name in (each, _UNIT.sub("", each)):
+            return each
+    raise ValueError(
+        f"the log has no column {name!r}; it has {', '.join(map(repr, table))}. Name the right "
+        f"one with --{option}"
+    )
 
 
 def _unit(name: str, default: str) -> str:
@@ -157,21 +143,22 @@ def _times(column: pd.Series[Any], decimal: str, unit: str | None) -> Array:
     """Return times in seconds, of numbers or dates."""
     if column.isna().any():
         raise ValueError(f"line {column.isna().to_numpy().argmax() + 2}: there is no time")
-    forms: list[Any] = [{"format": "ISO8601"}, {"dayfirst": True}]
-    for form in [] if pd.api.types.is_numeric_dtype(column) else forms:
+    if not pd.api.types.is_numeric_dtype(column):
+        # In the one form the year comes first, in the other the day.
+        first = str(column.iloc[0])[:4].isdigit()
+        form: dict[str, Any] = {"format": "ISO8601"} if first else {"dayfirst": True}
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a format that is not known
+            warnings.simplefilter("ignore", UserWarning)  # of a form that is not known
             dates = pd.to_datetime(column, errors="coerce", utc=True, **form)
         if dates.notna().all():
             seconds = (dates - dates.iloc[0]) / pd.Timedelta(seconds=1)
             return np.asarray(seconds, np.float64)
     unit = unit or _unit(str(column.name), "s")
-    factors = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}
-    if unit not in factors:
+    if unit not in SECONDS:
         raise ValueError(
-            f"the unit of the times must be {', '.join(factors)}, got {unit!r}: say --time-unit"
+            f"the unit of the times must be {', '.join(SECONDS)}, got {unit!r}: say --time-unit"
         )
-    return factors[unit] * _numbers(column, decimal).to_numpy()
+    return SECONDS[unit] * _numbers(column, decimal).to_numpy()
 
 
 def _sampled(times: Array) -> tuple[float, NDArray[np.intp]]:
@@ -184,18 +171,12 @@ def _sampled(times: Array) -> tuple[float, NDArray[np.intp]]:
     late = pd.Series(np.cumsum(steps / interval - whole))
     late -= late.rolling(25, center=True, min_periods=1).median()
     for bad, what in (
-        (
-            steps <= 0.0,
-            "the time must increase. Sort the rows, and leave out what is there twice",
-        ),
+        (steps <= 0.0, "times must increase. Sort the rows, and leave out what is there twice"),
         (whole > LONGEST_GAP, "rows are missing before it. Divide the log there"),
         (late.abs() > 0.35, f"most steps are {interval:g} s. Resample the log to equal ones"),
+        (steps < 1e-4, "if the times are days, say --time-unit D"),
     ):
         if bad.any():
             row = int(np.argmax(bad))
             raise ValueError(f"line {row + 3}: a time step of {steps[row]:g} s: {what}")
-    if usual < 1e-4:
-        raise ValueError(
-            f"the rows are {usual:.3g} s apart: if the times are days, say --time-unit D"
-        )
     return interval, np.r_[0, np.cumsum(whole)].astype(np.intp)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -23,12 +22,10 @@ def plant_arguments(model: Model) -> dict[str, Any]:
     default if the plant can reach it in time; otherwise it is made smaller and slower.
     """
     h, plant, defaults = model.log.sampling_interval, model.plant, Parameters()
-    delay, parts = plant.sampled(h)
-    a: Any = np.ones(1)
-    b: Any = np.zeros(1)
-    for upper, lower in parts:  # a sum of fractions, over their common denominator
-        b = polyadd(np.convolve(b, lower), np.convolve(upper, a))
-        a = np.convolve(a, lower)
+    delay, uppers, lowers = plant.sampled(h)
+    b, a = uppers[0], lowers[0]
+    for upper, lower in zip(uppers[1:], lowers[1:], strict=True):  # a sum of fractions
+        b, a = polyadd(np.convolve(b, lower), np.convolve(upper, a)), np.convolve(a, lower)
     c, variance = _noise(model.log.temperature - model.simulated, a.real)
     limits = abs(model.u_min), abs(model.u_max)
     reach = 0.8 * abs(plant.gain) * (min(limits) or max(limits))
@@ -97,15 +94,12 @@ def plant_ranges(model: Model) -> dict[str, Any]:
 
 
 def _checked(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments with eight digits; ValueError if the environment has no such plant."""
-    rounded: dict[str, Any] = json.loads(
-        json.dumps(arguments), parse_float=lambda text: float(f"{float(text):.8g}")
-    )
+    """Return arguments; ValueError if the environment has no such plant."""
     try:
-        Parameters(**rounded)
+        Parameters(**arguments)
     except ValueError as error:
         raise ValueError(
             f"the environment does not have such plants: {error}. See whether the units are "
             "right (--flow-unit, --temperature-unit, --time-unit), or scale the columns"
         ) from error
-    return rounded
+    return arguments

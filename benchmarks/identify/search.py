@@ -60,8 +60,8 @@ def fits(problem: Problem, starts: dict[str, list[Array]]) -> Fits:
     for shape, given in starts.items():
         tried = [problem.refined(shape, p) for p in given]
         deviance, places[shape] = min(tried, key=lambda each: each[0])
-        more = SHAPES[shape] + len(problem.units(shape, places[shape]))
-        prices[shape] = deviance + 2.0 * more
+        parameters = SHAPES[shape] + len(problem.units(shape, places[shape]))
+        prices[shape] = deviance + 2.0 * parameters
     return Fits(problem, places, prices)
 
 
@@ -82,56 +82,57 @@ def search(problem: Problem, command: Array, *, applied: bool) -> Found:
 
     `command` is the flow from the operating point; the valve passes it as it is if `applied`.
     """
-    problem, delay, lag = _coarse(problem)
-    third = {"two lags": -1.0, "three lags": -1.2, "a zero": -0.8, "a pair": 0.8}
-    starts = {"one lag": [np.array([delay, lag])]} | {
-        shape: [
-            np.array([share * delay, lag - 0.7 * (shape == "a pair"), p])
-            for share in (0.8, 0.3)
-        ]
-        for shape, p in third.items()
-    }
+    problem, delay, lag = _coarse(problem, command, (0.0,) if applied else (0.0, 0.25, 0.45))
+    starts = {"one lag": [np.array([delay, lag])]}
+    for shape, third in {"two lags": -1.0, "three lags": -1.2, "a zero": -0.8}.items():
+        starts[shape] = [np.array([share * delay, lag, third]) for share in (0.8, 0.3)]
+    starts["a pair"] = [np.array([share * delay, lag - 0.7, 0.8]) for share in (0.8, 0.3)]
     found = fits(problem.reweighted("one lag", starts["one lag"][0]), starts)
-    found = found.again(found.problem, found.p)
-    found = found.again(found.problem, found.p)
+    for _ in range(2):
+        found = found.again(found.problem, found.p)
     harmless = {name: kind for name, kind in VALVES.items() if kind.harmless}
-    for kinds in (harmless, VALVES):
-        rivals = with_valve(
-            found.problem, found.shape, found.p, command, {} if applied else kinds
-        )
-        valve = max(
-            (each for each in rivals if each.harmless),
-            key=lambda each: each.drop - FAULT * (each.name != "none"),
-        )
+    for kinds in ({}, {}) if applied else (harmless, VALVES):
+        rivals = with_valve(found.problem, found.shape, found.p, command, kinds)
+        sound = [each for each in rivals if each.harmless]
+        # Of those that differ by rounding alone, the first.
+        valve = max(sound, key=lambda each: round(each.drop) - FAULT * (each.name != "none"))
         found = found.again(_with_loads(valve.problem, found.shape, valve.p), valve.p)
-    others = [each for each in rivals if not each.harmless]
-    others = [each for each in others if each.drop > max(valve.drop, 0.0) + FAULT + FAVOUR]
+    # Faults, by what they explain beyond the valve that was found.
+    bar = max(valve.drop, 0.0)
+    others = [(each.drop - bar - FAVOUR, each) for each in rivals if not each.harmless]
     changes = with_change(found.problem, found.shape, found.p)
-    others += [each for each in changes if each.drop > FAULT]
-    fault = max(
-        others, key=lambda each: each.drop - valve.drop * (each in rivals), default=None
-    )
-    return Found(found.problem, found.places, found.prices, valve, fault, rivals)
+    others += [(each.drop, each) for each in changes]
+    drop, fault = max(others, key=lambda each: each[0])
+    evident = fault if drop > FAULT else None
+    return Found(found.problem, found.places, found.prices, valve, evident, rivals)
 
 
-def _coarse(problem: Problem) -> tuple[Problem, float, float]:
+def _coarse(
+    problem: Problem, command: Array, zones: tuple[float, ...]
+) -> tuple[Problem, float, float]:
     """Return the problem in blocks for its plant, and parameters of one lag, roughly."""
-    h, end = problem.h, problem.times[-1]
-    rough = replace(problem.in_blocks(max(1, len(problem.flow) // 800)), scale=end / 50)
-    delays = np.unique(np.r_[0.0, np.geomspace(h, end / 6, 30)]) / rough.scale
+    h, end, largest = problem.h, len(command) * problem.h, np.abs(command).max()
+    rough = replace(problem.in_blocks(max(1, len(command) // 800)), scale=end / 50)
+    delays = np.unique(np.r_[0.0, np.geomspace(h, end / 6, 20)]) / rough.scale
     lags = np.geomspace(max(h, end / 2000), end / 8, 8)
-    grid = [np.array([delay, np.log(lag)]) for lag in lags for delay in delays]
-    order = np.argsort([rough.solve("one lag", p).deviance for p in grid])
-    tried = [rough.refined("one lag", grid[i]) for i in order[[0, 5]]]
-    (plant,) = rough.units("one lag", min(tried, key=lambda each: each[0])[1])
+    passed = [VALVES["dead zone"].passed(command, share * largest) for share in zones]
+    grid = [
+        (rough.behind(flow), np.array([delay, np.log(lag)]))
+        for flow in passed for lag in lags for delay in delays
+    ]  # fmt: skip
+    order = np.argsort([each.solve("one lag", p).deviance for each, p in grid])
+    nearest = [(grid[i][0], *grid[i][0].refined("one lag", grid[i][1])) for i in order[[0, 5]]]
+    best, _, p = min(nearest, key=lambda each: each[1])
+    (plant,) = best.units("one lag", p)
     scale = plant.delay + plant.slowest
-    problem = replace(problem.in_blocks(max(1, int(scale / BLOCKS / h))), scale=scale)
-    return problem, plant.delay / scale, float(np.log(plant.slowest))
+    problem = replace(problem, flow=best.flow, scale=scale)
+    rows = max(1, int(scale / BLOCKS / h))
+    return problem.in_blocks(rows), plant.delay / scale, float(np.log(plant.slowest))
 
 
 def _with_loads(problem: Problem, shape: str, p: Array) -> Problem:
     """Return the problem with the steps of loads that its temperatures ask for most."""
-    end = problem.times[-1]
+    end = len(problem.flow) * problem.h
     spacing = max(problem.scale / 4.0, end / 300.0)
     for _ in range(MOST_LOADS - len(problem.loads)):
         times = np.arange(spacing, end, spacing).tolist()
@@ -154,16 +155,13 @@ class Zones(NamedTuple):
 
 def possible_zones(found: Found, command: Array) -> Zones:
     """Return the ranges between distinct commands in which the dead zone may end."""
-    problem, valve = found.problem, found.valve
-    if (
-        valve.name not in ("none", "dead zone", "subtractive dead zone")
-        or len(found.rivals) == 1
-    ):
+    problem, name = found.problem, found.valve.name
+    if name not in ("none", "dead zone", "subtractive dead zone") or len(found.rivals) == 1:
         return Zones(np.zeros(1), np.zeros(1), np.ones(1), [problem])
-    kind = VALVES["dead zone" if valve.name == "none" else valve.name]
+    kind = VALVES["dead zone" if name == "none" else name]
     edges = np.unique(np.r_[0.0, np.abs(command)])
-    if valve.name == "subtractive dead zone":
-        edges = valve.size * np.linspace(0.4, 1.6, 61)
+    if name == "subtractive dead zone":
+        edges = found.valve.size * np.linspace(0.4, 1.6, 61)
     edges = edges[edges <= np.abs(command).max()]
     while True:
         # A flow that is never the same has thousands: few, then those near the likely ones.
@@ -189,10 +187,9 @@ def draws(
     found: Found, zones: Zones, generator: np.random.Generator
 ) -> list[tuple[Plant, int]]:
     """Return plants with ranges of dead zones from the posterior over all that is not known."""
-    least = min(found.prices.values())
+    least, drawn = min(found.prices.values()), []
     # A better shape by chance is common: the weights are milder than Akaike's.
     weights = {shape: np.exp((least - price) / 4.0) for shape, price in found.prices.items()}
-    drawn = []
     for shape, weight in weights.items():
         count = round(DRAWS * weight / sum(weights.values()))
         if count >= 4:
@@ -206,13 +203,13 @@ def _walk(
     """Return plants of a shape by Metropolis' walk over parameters and dead zones."""
     at = int(np.argmax(zones.weight))
     problem, steps = zones.problems[at], 0.01 * np.eye(len(p))
-    slopes = np.column_stack([
+    ends = [
         problem.solve(shape, p + d).errors - problem.solve(shape, p - d).errors for d in steps
-    ]) / 0.02  # fmt: skip
-    solved = problem.solve(shape, p)
+    ]
+    slopes, solved = np.column_stack(ends) / 0.02, problem.solve(shape, p)
     information = slopes.T @ slopes / np.mean(solved.errors**2) + np.eye(len(p))
     root = 1.5 * SPREAD / np.sqrt(len(p)) * np.linalg.cholesky(np.linalg.inv(information))
-    longest = max(problem.times[-1] / 5.0, problem.units(shape, p)[0].slowest)
+    longest = max(len(problem.flow) * problem.h / 5.0, problem.units(shape, p)[0].slowest)
     density = np.log(zones.weight / np.maximum(zones.high - zones.low, 1e-12))
     drawn = []
 

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +25,6 @@ FAULTS = (
     "delay that varies", "two levels, saturation",
 )  # fmt: skip
 LOGS = {"none": 72, **dict.fromkeys(FAULTS, 6)}
-Law = Callable[[int, float], float]
 
 
 class Truth(NamedTuple):
@@ -43,16 +40,21 @@ class Truth(NamedTuple):
     lead: float
 
 
-def simulate(plant: Truth, law: Law, noise: Any) -> tuple[Any, Any]:
-    """Return the flows that a law commands, and the temperatures."""
+def simulate(plant: Truth, held: Any, noise: Any, kp: float = 0.0, ti: float = 1.0) -> Any:
+    """Return flows and temperatures; `held` are flows, or set points of a PI controller."""
     fault, a, h, time = plant.fault, plant.size, plant.h, plant.delay + sum(plant.lags)
     shares, x = [1 - math.exp(-h / FINE / lag) for lag in plant.lags], [0.0] * len(plant.lags)
     pipe, p, y = [0.0] * (int(1.5 * plant.delay / h * FINE) + 3), 0.0, 0.0
     most = h / FINE / time / (4 * a) if fault == "rate limit" else 9.0
-    flows, temperatures = np.empty(len(noise)), np.empty(len(noise))
+    flows, temperatures, total = held.copy(), np.empty(len(noise)), 0.0
     for k in range(len(noise)):
         temperatures[k] = y + noise[k]
-        u = flows[k] = law(k, temperatures[k])
+        if kp:
+            error = held[k] - temperatures[k]
+            u = kp * (error + total + error * h / ti)
+            total += (abs(u) < 1) * error * h / ti
+            flows[k] = min(max(u, -1.0), 1.0)
+        u = flows[k]
         to = {
             "backlash": min(max(p, u - a), u + a),
             "stiction": u if abs(u - p) > a else p,
@@ -74,18 +76,6 @@ def simulate(plant: Truth, law: Law, noise: Any) -> tuple[Any, Any]:
                 value = x[j] = x[j] + share * (value - x[j])
             y = value + plant.lead * (value - before) / h * FINE
     return flows, temperatures
-
-
-def pi(kp: float, ti: float, h: float, setpoint: Any) -> Law:
-    """Return the law of a PI controller that stops integrating at its limits."""
-    total = [0.0]
-
-    def law(k: int, y: float) -> float:
-        u = kp * (setpoint[k] - y + total[-1] + (setpoint[k] - y) * h / ti)
-        total.append(total[-1] + (abs(u) < 1) * (setpoint[k] - y) * h / ti)
-        return float(min(max(u, -1.0), 1.0))
-
-    return law
 
 
 def sensitivity(plant: Truth, kp: float, ti: float, stretch: float) -> float:
@@ -119,9 +109,10 @@ def tried(seed: int, fault: str) -> dict[str, Any]:
     noise += np.cumsum(white[1]) * r(0, 0.2) * math.sqrt(h / time)
     late = delay + h / 2 + sum(lags[1:2]) / 2 + sum(lags[2:]) - plant.lead
     simc = (lag + sum(lags[1:2]) / 2) / gain / 2 / late, min(lag + sum(lags[1:2]) / 2, 8 * late)
-    loop = pi(0.6 * simc[0], simc[1], h, 0.7 * gain * held)
-    closed = kind == 2 and not fault.startswith("two levels")
-    flow, temperature = simulate(plant, loop if closed else lambda k, _: held[k], noise)
+    if kind == 2 and not fault.startswith("two levels"):
+        flow, temperature = simulate(plant, 0.7 * gain * held, noise, 0.6 * simc[0], simc[1])
+    else:
+        flow, temperature = simulate(plant, held, noise)
     found: dict[str, Any] = {"fault": fault, "logs": 1, "recommended": 0, "unsafe": 0}
     try:
         model = identify(Log(flow, temperature, h), Knowledge(operating_flow=0.0))
@@ -134,9 +125,11 @@ def tried(seed: int, fault: str) -> dict[str, Any]:
         found["Ms"] = sensitivity(plant, each.kp, each.ti, 1.0)
         off = [sensitivity(plant, each.kp, each.ti, stretch) for stretch in (0.8, 1.2)]
         found |= {"Ms, delay a fifth off": max(off), "recommended": 1}
-        moved = partial(pi, h=h, setpoint=0.5 * gain * np.sign(np.arange(rows) - rows / 2))
-        laws = moved(each.kp, each.ti), moved(*simc)
-        cycles = [float(np.ptp(simulate(plant, x, 0 * noise)[1][-rows // 8 :])) for x in laws]
+        moved = 0.5 * gain * np.sign(np.arange(rows) - rows / 2)
+        cycles = [
+            float(np.ptp(simulate(plant, moved, 0 * noise, *typed)[1][-rows // 8 :]))
+            for typed in ((each.kp, each.ti), simc)
+        ]
         found["unsafe"] = found["Ms"] > 2 or cycles[0] > 1.1 * cycles[1] + 0.02 * abs(gain)
     return found
 
@@ -147,11 +140,10 @@ def main(seed: int) -> None:
     found = pd.DataFrame([tried(seed + i, fault) for i, fault in enumerate(faults)])
     found.loc[found["fault"] != "none", ["delay", "gain", "dead_zone"]] = np.nan
     rows = pd.concat([found, found[found["fault"] != "none"].assign(fault="all faults")])
-    means = dict.fromkeys(["delay", "gain", "dead_zone"], "mean")
-    how = {
-        name: "max" if "Ms" in name else means.get(name, "sum") for name in found.columns[1:]
-    }
-    text = rows.groupby("fault", sort=False).agg(how).to_markdown(floatfmt=".2f")
+    how: dict[str, Any] = dict.fromkeys(found.columns[1:], "sum")
+    how |= dict.fromkeys(["delay", "gain", "dead_zone"], "mean")
+    how |= {name: "max" for name in how if "Ms" in name}
+    text = rows.groupby("fault", sort=False).agg(how).to_markdown(floatfmt=".4g")
     print(text)
     write_text(ROOT / "benchmarks/published/identify.md", f"{text}\n")
 

@@ -1,4 +1,4 @@
-"""Compare what a valve may make of its commands, and what may change a plant's gain."""
+"""Compare what a valve may make of its commands, and what may change a plant."""
 
 from __future__ import annotations
 
@@ -69,6 +69,7 @@ VALVES = {
         (0.1, 0.2, 0.3, 0.4, 0.6), (1.0, 0.7),
     ),
 }  # fmt: skip
+FINER = (0.75, 0.87, 1.0, 1.15, 1.33), (0.93, 1.0, 1.07), ()  # sizes around the best one
 
 
 @dataclass(frozen=True)
@@ -90,35 +91,26 @@ class Hypothesis:
 def with_valve(
     problem: Problem, shape: str, p: Array, command: Array, kinds: dict[str, Kind]
 ) -> list[Hypothesis]:
-    """Return each kind of valve with its best size, the likeliest first.
+    """Return a sound valve and other kinds, each with its best size, the likeliest first.
 
-    `command` is the flow commanded, from the operating point. A sound valve is the first kind.
+    `command` is the flow commanded, from the operating point.
     """
     found, largest, plain = list[Hypothesis](), float(np.abs(command).max()), 0.0
     for name, kind in {"none": SOUND, **kinds}.items():
         unit = largest * (problem.h / problem.scale if name == "rate limit" else 1.0)
-        sizes, places = (
-            unit * np.array(kind.sizes),
-            [np.r_[share * p[0], p[1:]] for share in kind.delays],
-        )
+        places = [np.r_[share * p[0], p[1:]] for share in kind.delays]
+        sizes = [unit * share for share in kind.sizes]
         # A size at a place, and the place at that size, in turns.
-        for finer in ((0.75, 0.87, 1.0, 1.15, 1.33), (0.93, 1.0, 1.07), ()):
-            tried = [
-                (problem.behind(kind.passed(command, size)), size, q)
-                for size in sizes
-                for q in places
-            ]
-            behind, size, q = min(
-                tried, key=lambda each: each[0].solve(shape, each[2]).deviance
-            )
+        for finer in FINER:
+            passed = [(problem.behind(kind.passed(command, size)), size) for size in sizes]
+            tried = [(*each, q) for each in passed for q in places]
+            behind, size, q = min(tried, key=lambda x: x[0].solve(shape, x[2]).deviance)
             deviance, q = behind.refined(shape, q, 12)
-            sizes, places = size * np.array(finer), [q]
+            sizes, places = [size * factor for factor in finer], [q]
         plain = plain if found else deviance
         gain = behind.plant(shape, q, behind.solve(shape, q).c).gain
-        found.append(
-            Hypothesis(name, float(size), plain - deviance, behind, q, gain, kind.harmless)
-        )
-    # Of those that differ by rounding alone, the first.
+        drop = plain - deviance
+        found.append(Hypothesis(name, size, drop, behind, q, gain, kind.harmless))
     return sorted(found, key=lambda each: -round(each.drop))
 
 
