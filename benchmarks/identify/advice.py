@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,40 +16,6 @@ MOST_SENSITIVE = 1.8  # largest Ms of a recommended loop
 SHARE = 0.95  # of the possible plants that must stay within it
 DELAYS = (1.0, 0.8, 0.9, 1.1, 1.2)  # of each of them, as multiples of its own
 SLOWER = 1.15 ** np.arange(30)  # closed loops that are tried, as multiples of the rule's
-
-
-@dataclass(frozen=True)
-class Recommended:
-    """A controller that is robust to what a log leaves uncertain."""
-
-    name: str
-    arguments: dict[str, Any]
-    """Of `agents.PIController` or `agents.SmithPredictor`."""
-    kp: float
-    """Kp of u = Kp ((y_d - y) + integral / Ti): its sign is that of the plant's gain."""
-    ti: float
-    """Ti, s."""
-    told: dict[str, float]
-    """The first-order model that it is made from: `gain`, `time_constant` and `delay`, s, the
-    sample included that any flow takes to show."""
-    sensitivity: float
-    """Ms with the most likely plant."""
-    worst: float
-    """Ms with 95 % of the possible plants, with the delay a fifth off."""
-    slowed: float
-    """Factor by which the closed loop is slower than the rule makes it."""
-    delay_margin: float
-    """Additional delay at which the loop with the most likely plant becomes unstable, s."""
-
-    @property
-    def label(self) -> str:
-        """Its name in a report."""
-        return {"pi-simc": "PI (SIMC)", "smith": "Smith"}[self.name]
-
-    @property
-    def action(self) -> str:
-        """Whether the flow rises ("direct") or falls when the temperature rises."""
-        return "reverse" if self.kp > 0.0 else "direct"
 
 
 class Loops:
@@ -84,43 +50,62 @@ class Loops:
         return peaks, float(left.min(initial=math.inf))
 
 
-def recommended(model: Model, *, smith: bool = False) -> list[Recommended]:
+def recommended(model: Model, *, smith: bool = False) -> list[dict[str, Any]]:
     """Return a PI controller by SIMC's rule, and a Smith predictor if it is asked for.
 
     Each is slowed until Ms is at most 1.8 with 95 % of the plants that the log leaves possible,
     with their delays a fifth longer and shorter among them. It is left out if that fails, and
     so is a Smith predictor with a delay margin of less than a fifth of the delay. Nothing is
     recommended on a model with warnings.
+
+    Returns
+    -------
+    list
+        Entries of `controllers.json`. `kp` is that of u = kp (e + integral of e / ti), positive
+        where the flow rises when the temperature is below its set point. `model` has the sample
+        in its delay that any flow takes to show. `arguments` are those of
+        `agents.PIController` or `agents.SmithPredictor`, `sensitivity` is Ms with the most
+        likely plant and with 95 % of the possible ones, `slowed` how much slower the closed
+        loop is than by the rule.
     """
-    if model.warnings:
-        return []
-    h, plant, found = model.log.sampling_interval, model.plant, list[Recommended]()
+    h, plant, found = model.log.sampling_interval, model.plant, list[dict[str, Any]]()
     lag, delay = plant.first_order()
-    told = {"gain": plant.gain, "time_constant": lag, "delay": delay + h}
-    limits = {"u_min": model.u_min, "u_max": model.u_max}
-    zone = model.estimates["dead_zone"].value
-    loops = Loops([plant, *model.possible], h)
-    for name in ["pi-simc", "smith"][: 1 + smith]:
+    told: dict[str, Any] = {"gain": plant.gain, "time_constant": lag, "delay": delay + h}
+    shared = {"sampling_interval": h, "u_min": model.u_min, "u_max": model.u_max}
+    zone, loops = model.estimates["dead_zone"].value, Loops([plant, *model.possible], h)
+
+    def pi(slower: float) -> PIController:
+        # A flow that is held for a sample is half a sample late.
+        rule = {
+            "delay": delay + h / 2.0,
+            "closed_loop_time_constant": slower * (delay + h / 2.0),
+        }
+        return PIController.simc(**told | rule | shared)
+
+    def predictor(slower: float) -> PIController:
+        rule = {"closed_loop_time_constant": slower * max(lag / 2.0, h), "dead_zone": zone}
+        return SmithPredictor(**told | rule | shared)
+
+    rules = {"pi-simc": pi, "smith": predictor} if smith else {"pi-simc": pi}
+    for name, rule in ({} if model.warnings else rules).items():
         for slower in SLOWER.tolist():
-            if name == "smith":  # at first half as slow as the plant
-                rule = {
-                    "closed_loop_time_constant": slower * max(lag / 2.0, h),
-                    "dead_zone": zone,
-                }
-                arguments: dict[str, Any] = {**told, **rule, "sampling_interval": h, **limits}
-                made: PIController = SmithPredictor(**arguments)
-            else:  # a flow that is held for a sample is half a sample late
-                late = delay + h / 2.0
-                rule = told | {"delay": late, "closed_loop_time_constant": slower * late}
-                made = PIController.simc(**rule, sampling_interval=h)
-                arguments = {"kp": made.kp, "ki": made.ki, "anti_windup": True, **limits}
+            made = rule(slower)
             (own, *others), margin = loops.judged(made)
             worst = float(np.quantile(others, SHARE, method="higher"))
-            enough = name != "smith" or margin >= delay / 5.0
-            if max(own, worst) <= MOST_SENSITIVE and enough:
-                ti = made.kp / made.ki * h
-                found.append(Recommended(
-                    name, arguments, -made.kp, ti, told, float(own), worst, slower, margin
-                ))  # fmt: skip
-                break
+            if max(own, worst) > MOST_SENSITIVE or (name == "smith" and margin < delay / 5.0):
+                continue
+            names = [each.name for each in fields(made) if each.init]
+            found.append({
+                "controller": name,
+                "kp": -made.kp,
+                "ti": made.kp / made.ki * h,
+                "action": "reverse" if made.kp < 0.0 else "direct",
+                "sampling_interval": h,
+                "model": told,
+                "arguments": {each: getattr(made, each) for each in names},
+                "sensitivity": [float(own), worst],
+                "delay_margin": margin,
+                "slowed": slower,
+            })  # fmt: skip
+            break
     return found

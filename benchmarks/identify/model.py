@@ -72,13 +72,10 @@ def identify(log: Log, knowledge: Knowledge | None = None, seed: int = 0) -> Mod
     ValueError
         If the log does not show a plant at all; the message says why.
     """
-    told, h, level = (
-        knowledge or Knowledge(),
-        log.sampling_interval,
-        np.nanmean(log.temperature),
-    )
+    told, h = knowledge or Knowledge(), log.sampling_interval
+    level = np.nanmean(log.temperature)
     _check(log)
-    rest = operating_flow(log.flow) if told.operating_flow is None else told.operating_flow
+    rest = operating_flow(log.flow, told.operating_flow)
     command, moved = log.flow - rest, log.temperature - level
     known = tuple(each - each[0] for each in log.disturbances.values())
     problem = Problem(command - command[0], moved, h, known)
@@ -122,13 +119,17 @@ def identify(log: Log, knowledge: Knowledge | None = None, seed: int = 0) -> Mod
     )  # fmt: skip
 
 
-def operating_flow(flow: Array) -> float:
+def operating_flow(flow: Array, given: float | None = None) -> float:
     """Return 0 or the first flow if it is well inside the range, else the range's middle."""
     low, high = float(flow.min()), float(flow.max())
-    inside = [
-        x for x in (0.0, float(flow[0])) if abs(2.0 * x - low - high) <= (high - low) / 2.0
-    ]
-    return inside[0] if inside else (low + high) / 2.0
+    if given is not None and not 2.0 * low - high <= given <= 2.0 * high - low:
+        raise ValueError(
+            f"operating_flow must be near the flows of the log, {low:g} to {high:g}, "
+            f"got {given:g}"
+        )
+    middle, quarter = (low + high) / 2.0, (high - low) / 4.0
+    inside = [each for each in (0.0, float(flow[0])) if abs(each - middle) <= quarter]
+    return [*inside, middle][0] if given is None else given
 
 
 def commands(flow: Array) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.identify.__main__ import Options
-from benchmarks.identify.advice import MOST_SENSITIVE, Recommended, recommended
+from benchmarks.identify.advice import MOST_SENSITIVE, recommended
 from benchmarks.identify.log import read_log
 from benchmarks.identify.model import Model, identify
 from benchmarks.identify.plant import plant_arguments, plant_ranges
@@ -19,6 +19,7 @@ from benchmarks.lib.report import Section, provenance_line, show, write_report
 from benchmarks.lib.statistics import ENDS
 from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
 
+LABELS = {"pi-simc": "PI (SIMC)", "smith": "Smith"}
 SHOWN = 4_000  # rows that are drawn, the last ones of a log: more would blur
 HOW = (
     "u is Kp times the sum of r - y and its integral over time divided by Ti, where u is "
@@ -62,25 +63,18 @@ def execute(options: Options) -> str:
     return f"{seconds:.1f} s of processor time. The plant and the report are in {out}/"
 
 
-def controllers(model: Model, found: list[Recommended]) -> dict[str, Any]:
+def controllers(model: Model, found: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the content of `controllers.json`."""
     flow, temperature, rest = _units(model)
-    listed = [
-        {
-            "controller": each.name,
-            "kp": each.kp,
-            "ti": each.ti,
-            "action": each.action,
-            "sampling_interval": model.log.sampling_interval,
-            "units": {"kp": f"{flow} per {temperature}", "ti": "s", "flow": flow,
-                      "temperature": temperature},
-            "operating_point": {"flow": rest, "temperature": model.operating_temperature},
-            "limits": {"low": rest + model.u_min, "high": rest + model.u_max},
-            "model": each.told,
-            "arguments": each.arguments,
-        }
-        for each in found
-    ]  # fmt: skip
+    shared = {
+        "units": {
+            "kp": f"{flow} per {temperature}", "ti": "s",
+            "flow": flow, "temperature": temperature,
+        },
+        "operating_point": {"flow": rest, "temperature": model.operating_temperature},
+        "limits": {"low": rest + model.u_min, "high": rest + model.u_max},
+    }  # fmt: skip
+    listed = [each | shared for each in found]
     return {"recommended": listed, "warnings": model.warnings}
 
 
@@ -88,7 +82,7 @@ def _units(model: Model) -> tuple[str, str, float]:
     return model.log.flow_unit, model.log.temperature_unit, model.operating_flow
 
 
-def report(model: Model, found: list[Recommended]) -> list[Section]:
+def report(model: Model, found: list[dict[str, Any]]) -> list[Section]:
     """Return the sections of the report."""
     flow, temperature, rest = _units(model)
     units = {"delay": "samples", "dead_zone": flow, "gain": f"{temperature} per {flow}"}
@@ -108,8 +102,8 @@ def report(model: Model, found: list[Recommended]) -> list[Section]:
         f"{100 * max(model.explained[0], 0.0):.1f} % of the temperature's variance in the "
         "last, by simulation from the flow, but for a straight line.",
         *(
-            f"Recommended: {each.label} with Kp = {each.kp:.4g} {flow} per {temperature} and "
-            f"Ti = {each.ti:.3g} s, {each.action} acting."
+            f"Recommended: {LABELS[each['controller']]} with Kp = {each['kp']:.4g} {flow} per "
+            f"{temperature} and Ti = {each['ti']:.3g} s, {each['action']} acting."
             for each in found
         ),
         *model.notes,
@@ -119,8 +113,8 @@ def report(model: Model, found: list[Recommended]) -> list[Section]:
         "are 95 % intervals.",
     ]
     loops = [
-        (each.label, f"{each.sensitivity:.2f} to {each.worst:.2f}", f"{each.delay_margin:.0f}",
-         f"{each.slowed:.2f} times")
+        (LABELS[each["controller"]], "{:.2f} to {:.2f}".format(*each["sensitivity"]),
+         f"{each['delay_margin']:.0f}", f"{each['slowed']:.2f} times")
         for each in found
     ]  # fmt: skip
     columns = ["controller", "Ms", "delay margin (s)", "slower than by the rule"]

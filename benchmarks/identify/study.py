@@ -24,7 +24,7 @@ FAULTS = (
     "subtractive dead zone", "few positions", "gain by level", "gain by time",
     "delay that varies", "two levels, saturation",
 )  # fmt: skip
-LOGS = {"none": 72, **dict.fromkeys(FAULTS, 6)}
+LOGS = {"none": 60, **dict.fromkeys(FAULTS, 6)}
 
 
 class Truth(NamedTuple):
@@ -122,13 +122,13 @@ def tried(seed: int, fault: str) -> dict[str, Any]:
         _, low, high = model.estimates[name]
         found[name] = 100.0 * (low - 1e-9 <= true <= high + 1e-9)
     for each in recommended(model):
-        found["Ms"] = sensitivity(plant, each.kp, each.ti, 1.0)
-        off = [sensitivity(plant, each.kp, each.ti, stretch) for stretch in (0.8, 1.2)]
+        found["Ms"] = sensitivity(plant, each["kp"], each["ti"], 1.0)
+        off = [sensitivity(plant, each["kp"], each["ti"], stretch) for stretch in (0.8, 1.2)]
         found |= {"Ms, delay a fifth off": max(off), "recommended": 1}
         moved = 0.5 * gain * np.sign(np.arange(rows) - rows / 2)
         cycles = [
             float(np.ptp(simulate(plant, moved, 0 * noise, *typed)[1][-rows // 8 :]))
-            for typed in ((each.kp, each.ti), simc)
+            for typed in ((each["kp"], each["ti"]), simc)
         ]
         found["unsafe"] = found["Ms"] > 2 or cycles[0] > 1.1 * cycles[1] + 0.02 * abs(gain)
     return found

@@ -25,11 +25,6 @@ def following(rule: Callable[[float, float, float], float]) -> Passed:
     return passed
 
 
-def off_centre(side: float) -> Passed:
-    """Return a dead zone around another flow, on one side of the operating point."""
-    return lambda u, size: np.where(np.abs(u - side * size) < 0.6 * size, side * size, u)
-
-
 @dataclass(frozen=True)
 class Kind:
     """What may lie between a command and its effect."""
@@ -57,9 +52,6 @@ VALVES = {
         following(lambda p, u, size: p + min(max(u - p, -size), size)),
         (10.0, 3.3, 1.6, 1.0, 0.6), (1.0, 0.7, 0.4), harmless=True,
     ),
-    "dead zone above": Kind(off_centre(1.0), (0.2, 0.35, 0.5)),
-    "dead zone below": Kind(off_centre(-1.0), (0.2, 0.35, 0.5)),
-    "few positions": Kind(lambda u, size: size * np.round(u / size), (0.15, 0.25, 0.35, 0.5)),
     "backlash": Kind(
         following(lambda p, u, size: min(max(p, u - size / 2), u + size / 2)),
         (0.1, 0.2, 0.35, 0.5, 0.8), (1.0, 0.7),
