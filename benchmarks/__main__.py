@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.lib.command import stop
+from benchmarks.lib.command import cut_off, stop
 
 FOLDER = Path(__file__).parent
 
@@ -27,16 +27,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     name, *given = [*(sys.argv[1:] if arguments is None else arguments), ""]
     modules = commands()
     if name in modules:
-        return int(importlib.import_module(modules[name]).main(given[:-1]))
+        run = importlib.import_module(modules[name]).main
+        if arguments is None:  # the command is the program, as its report says
+            sys.argv = [f"benchmarks.{name}", *given[:-1]]
+        return int(run(None if arguments is None else given[:-1]))
     if name not in ("", "-h", "--help", "help"):
         close = difflib.get_close_matches(name, modules, n=1)
         meant = f"did you mean {close[0]}?" if close else f"there are {', '.join(modules)}"
         stop(ValueError(f"no command {name!r}; {meant}"))
     page = FOLDER.joinpath("README.md").read_text(encoding="utf-8")
-    for row in page[page.index("|") :].partition("\n\n")[0].splitlines()[2:]:
-        question, command, _ = (cell.strip(" `") for cell in row.strip("|").split("|"))
-        print(f"{question.lstrip('[').partition('](')[0]}\n    {command}")
-    print("\nEach command has --help.")
+    try:
+        for row in page[page.index("|") :].partition("\n\n")[0].splitlines()[2:]:
+            question, command, _ = (cell.strip(" `") for cell in row.strip("|").split("|"))
+            print(f"{question.lstrip('[').partition('](')[0]}\n    {command}")
+        print("\nEach command has --help.", flush=True)
+    except OSError as error:
+        return cut_off(error, "python -m benchmarks")
     return 0
 
 

@@ -17,8 +17,8 @@ from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.lib.command import Runs, Seed, blame, command, options
 from benchmarks.lib.fan_out import TasksFailedError
 from benchmarks.lib.storage import Kept, UsageError, origin, out_folder, write_csv, write_json
-from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.rollout import Trajectory
+from benchmarks.loop.scenarios import PlantOptions
 from mptc_gym import Parameters
 
 if TYPE_CHECKING:

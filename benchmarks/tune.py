@@ -20,7 +20,7 @@ from benchmarks.lib.command import Count, Folder, Runs, command, options
 from benchmarks.lib.fan_out import FanOut, progress_bar
 from benchmarks.lib.storage import UnfinishedError, UsageError, origin, out_folder, write_csv
 from benchmarks.loop.metrics import mean_error, settled, split
-from benchmarks.loop.plants import PlantOptions
+from benchmarks.loop.scenarios import PlantOptions
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,9 +15,8 @@ from benchmarks.controllers.roster import ROSTER, Controller
 from benchmarks.lib.command import Count, Seed, command, options
 from benchmarks.lib.storage import UsageError, out_folder, replacing
 from benchmarks.loop.metrics import held
-from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.rollout import Trajectory
-from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS, Scenario, scenarios_of
+from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS, PlantOptions, Scenario, scenarios_of
 from mptc_gym import MiddlePointEnv
 
 OTHER = ROSTER["nn-smith"].label  # whose errors those of the film are multiples of

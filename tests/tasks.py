@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -36,15 +35,6 @@ def hears_ctrl_c() -> bool:
     except KeyboardInterrupt:
         return True
     return False
-
-
-def until(condition: Callable[[], object], seconds: float = 30.0) -> bool:
-    """Wait until a condition holds, but not for ever."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it took too long"
-        time.sleep(0.05)
-    return True
 
 
 def fail(seed: int) -> Rows:

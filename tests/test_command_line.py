@@ -1,12 +1,14 @@
 """Test what all commands have in common: their help, and how they end."""
 
 import importlib
+import os
 import re
 import shlex
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -156,14 +158,19 @@ def test_without_cyclopts_a_command_names_the_extra():
     assert "Traceback" not in done.stderr
 
 
-def test_the_map_shows_questions_and_commands_as_text(capsys):
-    assert show_map([]) == 0
+@pytest.mark.parametrize("words", [[], ["help"], ["-h"], ["--help"]])
+def test_the_map_shows_questions_and_commands_as_text(words, capsys):
+    assert show_map(words) == 0
     shown = capsys.readouterr().out
-    assert "Which gains are best?" in shown
-    assert {name for name in COMMANDS if f"benchmarks.{name}" in shown} >= {"tune", "bounds"}
-    assert "`" not in shown
-    assert "](" not in shown
-    assert ":--" not in shown  # the glossary is another table
+    assert "Which gains are best?\n    python -m benchmarks.tune nn\n" in shown
+    for mark in ("](", ":--", "Ms"):  # the glossary is another table
+        assert mark not in shown
+
+
+def test_the_map_runs_a_command_or_names_the_one_that_was_meant(refused, capsys):
+    assert show_map(["compare", "--help"]) == 0
+    assert capsys.readouterr().out.startswith("Usage: python -m benchmarks.compare")
+    assert "no command 'comprae'; did you mean compare?" in refused(show_map, ["comprae"])
 
 
 @pytest.mark.parametrize(
@@ -179,29 +186,98 @@ def test_a_command_on_a_page_can_be_typed_as_it_stands(page):
             assert read(declared, name, shlex.split(options)), name
 
 
-def test_the_map_names_the_command_that_was_meant(refused):
-    assert "no command 'comprae'; did you mean compare?" in refused(show_map, ["comprae"])
+# A command as all are: it fans out, and writes what has finished, however it ends.
+TOY = """
+import pathlib, signal, sys, time
+from dataclasses import dataclass, field
+from functools import partial
+from benchmarks.lib.command import command, options
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.storage import write_text
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # however this was started
+
+@options
+@dataclass(frozen=True)
+class Options:
+    fan_out: FanOut = field(default_factory=FanOut)
+
+def work(options):
+    try:
+        print("up", flush=True)
+        options.fan_out.run({name: partial(time.sleep, 60) for name in "abcd"})
+    finally:
+        print("writes", flush=True)
+        time.sleep(2)
+        write_text(pathlib.Path(sys.argv[1], "report.md"), "all" * 1000)
+    return "done"
+
+sys.exit(command("toy", Options, work)(sys.argv[2:]))
+"""
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT to another process")
-def test_an_interruption_while_it_imports_shows_no_traceback():
-    # A marker says that the interpreter is up: what comes before cannot be caught.
-    program = (
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from benchmarks.compare.__main__ import main; print('up', flush=True)\n"
-        "sys.exit(main(['--runs', '1']))"
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals to other processes")
+class TestEnds:
+    """Signals, a full disk and a reader that has gone end in a sentence."""
+
+    @pytest.mark.parametrize("name", COMMANDS)
+    def test_all_commands_end_alike(self, name):
+        assert main_of(name).__module__ == "benchmarks.lib.command"
+
+    @pytest.mark.parametrize(
+        ("jobs", "sent"),
+        [("1", [signal.SIGINT]), ("2", [signal.SIGTERM]), ("2", [signal.SIGINT] * 2)],
     )
-    run = subprocess.Popen(
-        [sys.executable, "-c", program], cwd=ROOT, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert run.stdout.readline() == "up\n"
-    time.sleep(0.1)
-    run.send_signal(signal.SIGINT)
-    out, err = run.communicate(timeout=60)
-    assert run.returncode == 130
-    assert "Interrupted" in out
-    assert "Traceback" not in err
+    def test_after_signals(self, jobs, sent, tmp_path):
+        run = subprocess.Popen(
+            [sys.executable, "-c", TOY, tmp_path, "--jobs", jobs], cwd=ROOT, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+        )  # fmt: skip
+        for number, said in zip(sent, ("up", "writes"), strict=False):
+            assert run.stdout.readline() == f"{said}\n"
+            time.sleep(1.0)  # the first one: until the other processes work
+            os.killpg(run.pid, number)  # as a terminal sends it
+        out, err = run.communicate(timeout=60)
+        assert run.returncode == 128 + sent[0]
+        assert out.endswith("\nInterrupted: what has finished is written.\n")
+        assert err == ""
+        # What a second Ctrl-C keeps from being written is not there in part.
+        assert len(list(tmp_path.iterdir())) == (len(sent) == 1)
+
+    def test_on_a_full_disk(self, tmp_path):
+        small = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))"
+        done = python("-c", small + TOY.replace("60)", "0)"), str(tmp_path), "--jobs", "1")
+        assert done.returncode == 1
+        assert "report.md could not be written: File too large" in done.stdout
+        assert not list(tmp_path.iterdir())
+        assert done.stderr == ""
+
+    @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+    @pytest.mark.parametrize("name", ["benchmarks", "benchmarks.bounds"])
+    def test_with_an_output_that_is_full(self, name):
+        with Path("/dev/full").open("w") as full:
+            words = [sys.executable, "-m", name, "--help"]
+            done = subprocess.run(
+                words, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True
+            )
+        assert done.returncode == 1
+        assert "the output is cut off: No space left on device" in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("out", "complaint"),
+    [
+        ("", "--out must name a folder, got ''"),
+        ("a" * 300, "cannot be written to: File name too long"),
+        (__file__, "cannot be written to: it is no folder"),
+        (f"{__file__}/below", "cannot be written to: Not a directory"),
+        ("/proc/here", "cannot be written to: No such file"),
+    ],
+)
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the words are Linux's")
+def test_a_folder_that_cannot_be_written_to(out, complaint, refused):
+    assert complaint in refused(main_of("compare"), ["--out", out])
 
 
 def test_of_a_repeated_option_the_last_counts_and_lists_add_up():

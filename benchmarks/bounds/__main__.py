@@ -14,8 +14,13 @@ from typing import Any
 from benchmarks.lib.command import Count, Runs, Seed, command, options
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import ROOT, commit, out_folder, versions, write_json
-from benchmarks.loop.plants import PlantOptions
-from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, Scenario, scenarios_of
+from benchmarks.loop.scenarios import (
+    PRESET_SCENARIOS,
+    SCENARIOS,
+    PlantOptions,
+    Scenario,
+    scenarios_of,
+)
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
 

@@ -25,8 +25,7 @@ from benchmarks.claims.runs import (
     typical,
 )
 from benchmarks.lib.statistics import Estimate, exact, median
-from benchmarks.loop.linear import nominal
-from benchmarks.loop.margins import Loop
+from benchmarks.loop import linear
 from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.scenarios import SETPOINTS as CASES
 from mptc_gym import PRESETS, Parameters
@@ -171,7 +170,7 @@ def pi_gains(batch: Batch, claim: Claim) -> None:
 
 def largest_pole(kp: float, ki: float) -> float:
     """Return the largest pole modulus of the loop of a PI controller and the linear plant."""
-    return Loop(PIController(kp, ki), nominal(Parameters())).largest_pole
+    return linear.largest_pole(PIController(kp, ki), linear.nominal(Parameters()))
 
 
 def versus_pi(gains: tuple[float, float], batch: Batch, claim: Claim) -> None:
@@ -219,7 +218,7 @@ def nn_against_searched_pi(batch: Batch, claim: Claim) -> None:
 def direction(batch: Batch, claim: Claim) -> None:
     runs = batch.run(batch.networks(direction=1), 600, **CONSTANT)
     plant = Parameters()
-    reachable = abs(nominal(plant).gain) * plant.range_of("u_max")[1]  # degC
+    reachable = abs(linear.nominal(plant).gain) * plant.range_of("u_max")[1]  # degC
     beyond = np.abs(runs.output) > 0.9 * reachable
     when = np.where(beyond.any(axis=0), np.argmax(beyond, axis=0), np.inf)
     soon = f"y beyond 90 % of what the flow can do, either way, within {SOON} samples"

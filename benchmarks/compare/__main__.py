@@ -16,11 +16,11 @@ from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Folder, Names, Runs, command, known, options
 from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
-from benchmarks.loop.plants import PlantOptions
 from benchmarks.loop.scenarios import (
     PRESET_SCENARIOS,
     SCENARIOS,
     SETPOINTS,
+    PlantOptions,
     Scenario,
     scenarios_of,
 )

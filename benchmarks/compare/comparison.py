@@ -38,7 +38,7 @@ class Case:
     policies: Sequence[Mapping[str, Any]]
     """Origin of each member, if it was trained."""
     seconds: float
-    """Duration of the runs, s."""
+    """Processor time of the runs, s."""
 
 
 def run_case(scenario: Scenario, controller: Controller, runs: int) -> Case:
@@ -46,7 +46,7 @@ def run_case(scenario: Scenario, controller: Controller, runs: int) -> Case:
 
     Where nothing is drawn, all runs are alike: then there is one, and its row is repeated.
     """
-    began = time.perf_counter()
+    began = time.process_time()
     members = controller.members()
     alike = not (controller.random or is_random(scenario.parameters))
     trajectories, tables = [], []
@@ -65,7 +65,7 @@ def run_case(scenario: Scenario, controller: Controller, runs: int) -> Case:
         pd.concat(tables, ignore_index=True),
         _responses(join(trajectories), scenario, controller.name),
         [dict(each.provenance) for each in members if each.provenance],
-        time.perf_counter() - began,
+        time.process_time() - began,
     )
 
 

@@ -255,7 +255,7 @@ _CONTROLLERS = (
     ),
     Controller(
         "smith", "Smith", ("#56B4E9", "^"), smith,
-        knows=_DATA_SHEET, searched=_RULE, drawn=True,
+        knows=_DATA_SHEET, searched=_RULE,
     ),
     Controller(
         "self-tuning", "self-tuning", ("#00B98A", "v"),
@@ -285,7 +285,7 @@ _CONTROLLERS = (
     Controller(
         "nn-self-tuning", "neural self-tuning", ("#00664B", "v"),
         partial(with_law, NeuralSelfTuningController), knows=f"{_DATA_SHEET}; delay range",
-        searched=f"{_LAW}; 31 settings by hand; one step test", networks=law, drawn=True,
+        searched=f"{_LAW}; 31 settings by hand; one step test", networks=law,
     ),
 )  # fmt: skip
 ROSTER = {each.name: each for each in _CONTROLLERS}

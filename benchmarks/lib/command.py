@@ -19,7 +19,6 @@ import inspect
 import math
 import os
 import re
-import shutil
 import signal
 import sys
 import threading
@@ -41,8 +40,8 @@ EXTRAS = {
     "ray": "ray",
     "torch": "torch",
 }
-_HEARD: list[int] = []  # signals that interrupt the command
 FULL = errno.ENOSPC, errno.EDQUOT, errno.EPIPE  # a disk, or a reader that has gone
+_HEARD: list[int] = []  # signals that interrupt the command
 
 
 def stop(error: BaseException, program: str = "python -m benchmarks") -> NoReturn:
@@ -172,46 +171,30 @@ def _missing_argument(argument: Any) -> str:
 
 
 def command(
-    name: Any,
-    declared: Any,
-    work: Any = None,
-    *,
+    name: str,
+    declared: type[Group],
+    work: Callable[[Group], str],
     interrupted: str = "what has finished is written.",
-    **_: Any,
 ) -> Callable[..., int]:
     """Return the `main` of the command `python -m benchmarks.NAME`.
 
     It takes the command line without the program's name, by default that of the process, and
     returns the exit status: 0 for success; 1 if tasks failed, a file could not be written or
-    memory ran out; 130 after Ctrl-C and 143 after SIGTERM. An invalid option or a missing
-    package ends the program with 2.
-
-    Parameters
-    ----------
-    name
-        Name of the command.
-    declared
-        Dataclass of the options.
-    work
-        Function that does the work and returns the closing line.
-    interrupted
-        Message after Ctrl-C.
+    memory ran out; 130 after Ctrl-C and 143 after SIGTERM, with the message `interrupted`. An
+    invalid option or a missing package ends the program with 2.
     """
-    if not isinstance(name, str):  # declared in the former way, by a module with `execute`
-        return _of_module(name, declared, interrupted)  # type: ignore[no-any-return]
     program = f"python -m benchmarks.{name}"
 
     def main(arguments: Sequence[str] | None = None) -> int:
+        if work.__module__ == "__main__" and (spec := sys.modules["__main__"].__spec__):
+            # Other processes find tasks by the name of a module to be imported.
+            return int(importlib.import_module(spec.name).main())
         os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever the shell has set
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")  # for "°C" on an ASCII terminal
         with _heard(to_the_end=arguments is None):
             try:
-                if work.__module__ == "__main__":
-                    # Other processes find tasks by the name of a module to be imported.
-                    spec = sys.modules["__main__"].__spec__
-                    return int(importlib.import_module(spec.name).main()) if spec else 1
                 given = sys.argv[1:] if arguments is None else arguments
                 if (chosen := read(declared, program, given)) is not None:
                     print(work(chosen), flush=True)
@@ -224,26 +207,19 @@ def command(
             except (UsageError, ImportError) as error:
                 stop(error, program)
             except OSError as error:
-                if error.errno not in FULL:
-                    raise
-                print(f"{program}: the output is cut off: {error.strerror}", file=sys.stderr)
-                sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115 (flushed at exit)
-                return 1
+                return cut_off(error, program)
         return 0
 
     return main
 
 
-def _of_module(declared: Any, work: Any, interrupted: str) -> Any:
-    from rich.console import Console
-
-    def execute(options: Any) -> str:
-        columns = shutil.get_terminal_size((150, 24)).columns
-        console = Console(width=columns, highlight=False, markup=False)
-        return str(importlib.import_module(work).execute(options, console))
-
-    name = work.removeprefix("benchmarks.").rpartition(".")[0]
-    return command(name, declared, execute, interrupted=interrupted)
+def cut_off(error: OSError, program: str) -> int:
+    """Say that the output cannot be written, and return 1; other errors are raised."""
+    if error.errno not in FULL:
+        raise error
+    print(f"{program}: the output is cut off: {error.strerror}", file=sys.stderr)
+    sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115 (what is left is flushed at exit)
+    return 1
 
 
 @contextmanager

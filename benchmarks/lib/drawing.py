@@ -12,7 +12,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
@@ -23,7 +22,7 @@ from benchmarks.lib.storage import replacing
 # Okabe and Ito's palette for colour-blind readers, for lines that stand for no controller.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 WIDTH = 7.5  # of every figure, inches
-SHADES = 128  # colours of a picture
+SHADES = 128  # colours of a picture, which make it small
 MULTIPLE = "multiple of the least possible\n(log scale of the excess over 1)"
 NEAREST = 1e-3  # excess over the least possible error at which a logarithmic axis begins
 EXCESSES = (0.001, 0.01, 0.1, 0.5, 1.0, 4.0, 9.0, 29.0)
@@ -44,16 +43,11 @@ STYLE: Any = {
 }
 
 
-def colours(names: Sequence[str]) -> dict[str, str]:
-    """Return a colour for each name; the same names in the same order get the same colours."""
-    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
-
-
 @contextmanager
 def drawn(path: Path, height: float, title: str = "", *, grid: bool = True) -> Iterator[Figure]:
     """Yield a figure of a height in inches, and save it, completely or not at all.
 
-    The title says what the figure shows. The picture has a palette, which makes it small.
+    The title says what the figure shows.
     """
     with mpl.rc_context(STYLE | {"axes.grid": grid}):
         figure = Figure(figsize=(WIDTH, height))
@@ -63,25 +57,11 @@ def drawn(path: Path, height: float, title: str = "", *, grid: bool = True) -> I
         yield figure
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()
-        (picture,) = with_few_colours(
-            [Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")], SHADES
-        )
+        picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         with replacing(path) as partial:
-            picture.save(partial, optimize=True)
-
-
-def with_few_colours(
-    pictures: Sequence[Image.Image], shades: int, lines: Sequence[tuple[int, ...]] = ()
-) -> list[Image.Image]:
-    """Return pictures with the most frequent colours of the last, and those of thin lines."""
-    coarse = [  # 5 bits a channel
-        picture.point(lambda value: value // 8 * 8 + value // 32) for picture in pictures
-    ]
-    found: Any = sorted(coarse[-1].getcolors(coarse[-1].width * coarse[-1].height) or [])
-    palette = Image.new("P", (1, 1))
-    frequent = [colour for _, colour in found[-shades:]]
-    palette.putpalette([value for colour in [*lines, *frequent] for value in colour])
-    return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in coarse]
+            # Without dithering, areas stay even and the file small.
+            few = picture.quantize(SHADES, dither=Image.Dither.NONE)
+            few.save(partial, optimize=True)
 
 
 @contextmanager
@@ -112,9 +92,8 @@ def panels(
 def draw_legend(figure: Figure, free: Sequence[Axes], entries: dict[str, Any]) -> None:
     """Put a legend of handles by label in a free place, or else below the panels."""
     if free:
-        legend = free[0].legend(
-            entries.values(), entries, loc="center left", ncols=1 + (len(entries) > 7)
-        )
+        columns = 1 + (len(entries) > 7)
+        legend = free[0].legend(entries.values(), entries, loc="center left", ncols=columns)
         legend.set_in_layout(len(free) < 2)  # with room beside it, it may be wider than a panel
     elif entries:
         figure.legend(entries.values(), entries, loc="outside lower center", ncols=4)
@@ -123,7 +102,7 @@ def draw_legend(figure: Figure, free: Sequence[Axes], entries: dict[str, Any]) -
 def scale_by_excess(axes: Axes, name: str, low: float, high: float) -> None:
     """Make the axis "x" or "y" of `multiple - 1` logarithmic, with multiples as its ticks."""
     axes.set(**{f"{name}scale": "log", f"{name}lim": (low / 1.3, high * 1.3)})
-    axis: Axis = getattr(axes, f"{name}axis")
+    axis = getattr(axes, f"{name}axis")
     axis.set_major_locator(FixedLocator(EXCESSES))
     axis.set_major_formatter(lambda excess, _: f"{1 + excess:g}")
     axis.set_minor_locator(NullLocator())

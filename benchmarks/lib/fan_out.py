@@ -40,12 +40,12 @@ class TasksFailedError(UnfinishedError):
 
     def __init__(self, errors: Mapping[str, str], tasks: int) -> None:
         self.errors = dict(errors)
-        lines = [f"{name}: {text.strip().splitlines()[-1]}" for name, text in errors.items()]
-        super().__init__(
-            f"{len(errors)} of {tasks} tasks failed; the others are done\n"
-            + "\n".join(lines[:10])
-            + f"\nThe first of them:\n{next(iter(errors.values()))}"
-        )
+        last = {name: text.strip().splitlines()[-1] for name, text in errors.items()}
+        lines = [f"{name}: {text}" for name, text in last.items()][:10]
+        long = [text for name, text in errors.items() if text != last[name]]
+        lines += [f"The first of them:\n{long[0]}"] if long else []
+        head = f"{len(errors)} of {tasks} tasks failed; the others are done"
+        super().__init__("\n".join([head, *lines]))
 
 
 @options
@@ -145,6 +145,8 @@ def _attempt(name: str, task: Task) -> Answer:
     """Run a task, and return its error as text, since not every exception can be pickled."""
     try:
         return name, task(), ""
+    except UsageError as error:  # a sentence, of a user's own controller
+        return name, None, str(error)
     except SystemExit as left:
         return name, None, f"A controller called sys.exit({left.code!r})"
     except Exception:

@@ -8,6 +8,7 @@ import re
 import shlex
 import shutil
 import sys
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -77,10 +78,12 @@ def provenance_line(command: str, origin: Mapping[str, Any]) -> str:
     return f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}"
 
 
-def show(sections: Sequence[Section], _console: Any = None) -> None:
+def show(sections: Sequence[Section]) -> None:
     """Print sections, without their pictures."""
+    width = shutil.get_terminal_size((150, 24)).columns
     for section in sections:
-        print(*filter(None, ["", section.title, *section.text]), sep="\n")
+        for text in filter(None, [section.title, *section.text]):
+            print(textwrap.fill(text, width))
         if section.table is not None:
             print(on_screen(section.table))
 

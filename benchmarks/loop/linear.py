@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.polynomial.polynomial import polyadd, polyval
+from numpy.polynomial.polynomial import polyadd
 from numpy.typing import ArrayLike, NDArray
 
 from agents import PIController
@@ -185,11 +185,7 @@ def step_test(parameters: Parameters) -> StepTest:
     outside the dead zone, and noise and load disturbances average out. A ValueError is raised
     if the plant reaches no new steady state, or if its gain is 0.
     """
-    return read_off(nominal(parameters))
-
-
-def read_off(plant: LinearModel) -> StepTest:
-    """Return what `step_test` returns, of a linear model."""
+    plant = nominal(parameters)
     response, interval = plant.step_response(), plant.sampling_interval
     early, late = (_first_reached(response / response[-1], level) for level in (0.283, 0.632))
     time_constant = 1.5 * (late - early)
@@ -266,34 +262,11 @@ def time_varying_model(
     )
 
 
-class Loop:
-    """The loop of a linear controller and a plant, (28) without the actuator, opened at e.
+def largest_pole(controller: PIController, plant: LinearModel) -> float:
+    """Return the modulus of the closed loop's largest pole: it is stable if this is below 1.
 
-    L is its transfer function from e to y; the controller's is what its `transfer` gives.
+    The plant is (28) without the actuator; the controller is linear, as its `transfer` says.
     """
-
-    def __init__(self, controller: PIController, plant: LinearModel) -> None:
-        # G_u from e to u, and G from u to y: L = G_u G, in powers of z^-1.
-        (up, down), (b, a) = controller.transfer(), plant.transfer()
-        self.numerator, self.denominator = np.convolve(up, b), np.convolve(down, a)
-
-    @property
-    def largest_pole(self) -> float:
-        """Modulus of the closed loop's largest pole: it is stable if this is below 1."""
-        return float(np.abs(np.roots(polyadd(self.denominator, self.numerator))).max())
-
-    @property
-    def sensitivity(self) -> float:
-        """Ms, the most that the loop amplifies a disturbance; infinite if it is not stable.
-
-        1 / Ms is the smallest distance of the loop's frequency response from -1.
-        """
-        if self.largest_pole >= 1.0:
-            return math.inf
-        # In radians a sample: logarithmic for slow plants, linear for long delays.
-        dense = np.union1d(
-            np.geomspace(3e-5, math.pi, 20_000), np.linspace(1e-4, math.pi, 20_000)
-        )
-        back = np.exp(-1j * dense)
-        opened = polyval(back, self.numerator) / polyval(back, self.denominator)
-        return float(1.0 / np.abs(1.0 + opened).min())
+    (up, down), (b, a) = controller.transfer(), plant.transfer()
+    closed = polyadd(np.convolve(down, a), np.convolve(up, b))
+    return float(np.abs(np.roots(closed)).max())

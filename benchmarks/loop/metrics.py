@@ -50,21 +50,17 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     """
     interval = parameters.sampling_interval / 60.0  # min
     command = trajectory.command
-    drawn = {"dead_zone", "u_min", "u_max"} & set(parameters.ranges)
     inside = saturated = np.full(command.shape, np.nan)
-    if not drawn:
+    if not {"dead_zone", "u_min", "u_max"} & set(parameters.ranges):
         zone, u_min, u_max = parameters.dead_zone, parameters.u_min, parameters.u_max
         inside = np.abs(command) < least_effective(zone, u_min, u_max)  # as the plant judges it
         saturated = (command <= u_min) | (command >= u_max)
-    by_steps = [
-        _measure_steps(setpoint, output)
-        for setpoint, output in zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
-    ]
-    samples_itae, overshoot, settling = np.array(by_steps).T
+    pairs = zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
+    itae, overshoot, settling = np.array([_measure_steps(*each) for each in pairs]).T
     return {
         "mae": mean_error(trajectory),
         "ise": interval * np.square(trajectory.next_error).sum(axis=0),
-        "itae": interval**2 * samples_itae,
+        "itae": interval**2 * itae,
         "total_variation": travel(trajectory),
         "overshoot": 100.0 * overshoot,
         "settling_time": interval * settling,
@@ -80,8 +76,7 @@ def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]
     for start, stop in held(setpoint):
         error = setpoint[start:stop] - output[start:stop]
         itae += float(np.arange(stop - start) @ np.abs(error))
-        change = setpoint[start] - before
-        before = setpoint[start]
+        change, before = setpoint[start] - before, setpoint[start]
         if change == 0.0:  # a run that begins at set point 0
             continue
         overshoot = max(overshoot, float(np.max(-error / change)))

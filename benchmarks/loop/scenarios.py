@@ -1,17 +1,24 @@
-"""Define the cases on which controllers are compared."""
+"""Define the cases on which controllers are compared, and the options that choose a plant."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
+from cyclopts import Parameter
+
+from benchmarks.lib.command import Repeated, blame, options
+from benchmarks.lib.storage import UsageError
 from mptc_gym import PRESETS, Parameters
+from mptc_gym.parameters import slowest_pole
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A plant, a set point and the length of a run."""
+    """A case: a plant, a set point and the length of a run."""
 
     name: str
     """Name in options and file names."""
@@ -40,16 +47,12 @@ SETPOINTS: tuple[tuple[str, str, int, dict[str, Any]], ...] = (
     ("square", "square wave", 1200, {}),
     ("constant", "constant set point", 600, {"setpoint": 5.0}),
 )
-
-SCENARIOS: dict[str, Scenario] = {
+SCENARIOS = {
     setpoint + suffix: Scenario(
-        name=setpoint + suffix,
-        title=f"{setpoint_title}, {plant_title}",
-        samples=samples,
-        arguments={**PRESETS[preset], **arguments},
+        setpoint + suffix, f"{title}, {plant}", samples, {**PRESETS[preset], **arguments}
     )
-    for setpoint, setpoint_title, samples, arguments in SETPOINTS
-    for suffix, preset, plant_title in _PLANTS
+    for setpoint, title, samples, arguments in SETPOINTS
+    for suffix, preset, plant in _PLANTS
 } | {
     # A boiler's daily duty. At 5 degC the required flow stays outside the dead zone.
     "load": Scenario(
@@ -59,9 +62,7 @@ SCENARIOS: dict[str, Scenario] = {
         {"setpoint": 5.0, "disturbance_amplitude": 1.5, "disturbance_interval": 200.0},
     )
 }
-
-
-PRESET_SCENARIOS: dict[str, Scenario] = {
+PRESET_SCENARIOS = {
     name: Scenario(name, f"preset {name}", 1200, dict(arguments))
     for name, arguments in PRESETS.items()
 }
@@ -79,3 +80,76 @@ def scenarios_of(name: str, arguments: Mapping[str, Any]) -> dict[str, Scenario]
         setpoint: Scenario(setpoint, f"{title}, {name}", samples, {**arguments, **more})
         for setpoint, title, samples, more in cases
     }
+
+
+@dataclass(frozen=True)
+class ChosenPlant:
+    """The plant that the user chose."""
+
+    name: str
+    """Short description of the choice; "the paper's plant" by default."""
+    arguments: dict[str, Any]
+    """Arguments of the environment that differ from the defaults."""
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class PlantOptions:
+    """Options that choose the plant: from a file, a preset or single arguments."""
+
+    plant: Path | None = None
+    """JSON file with arguments of the environment, such as the plant.json that
+    benchmarks.identify writes."""
+    preset: Annotated[str | None, Parameter(choices=PRESETS)] = None
+    """A plant that comes with the environment."""
+    set: Repeated = ()
+    """An argument of the environment, such as delay=30 or delay=[12,24] (repeatable;
+    overrides --plant, which overrides --preset)."""
+
+    def chosen(self) -> ChosenPlant:
+        """Return the chosen plant; `UsageError` if an option is invalid."""
+        names: list[str] = []
+        arguments: dict[str, Any] = {}
+        if self.preset:
+            names.append(self.preset)
+            arguments |= PRESETS[self.preset]
+        if self.plant:
+            names.append(self.plant.stem)
+            with blame("--plant"):
+                arguments |= _read(self.plant)
+        for text in self.set:
+            name, equals, value = text.partition("=")
+            if not (name and equals):
+                raise UsageError(f"--set must be ARGUMENT=VALUE, got {text!r}")
+            names.append(text)
+            try:
+                arguments[name] = json.loads(value)
+            except (ValueError, RecursionError):
+                arguments[name] = value  # a bare word, such as random
+        given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
+        try:
+            a = Parameters.of_environment(arguments).a
+            if abs(slowest_pole(a) or 0.0) > 1.0:
+                raise ValueError(
+                    "a must not have a root beyond the unit circle, as nothing holds such a "
+                    f"plant, got {list(a)}"
+                )
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"{', '.join(given)}: {error}") from error
+        return ChosenPlant(", ".join(names) or "the paper's plant", arguments)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the arguments in a JSON file such as `plant.json`."""
+    try:
+        arguments = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:  # not JSON, not text, or too deep
+        raise ValueError(f"{path} must be a JSON file: {error}") from error
+    if not isinstance(arguments, dict):
+        raise ValueError(
+            f'{path} must hold one object of arguments, such as {{"delay": 20}}, got '
+            f"{type(arguments).__name__}"
+        )
+    return arguments
