@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.lib.command import Runs, Seed, blame, command, options
-from benchmarks.lib.fan_out import TasksFailedError
 from benchmarks.lib.storage import Kept, UsageError, origin, out_folder, write_csv, write_json
 from benchmarks.loop.rollout import Trajectory
 from benchmarks.loop.scenarios import PlantOptions
@@ -120,7 +119,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run the sweep and write its results, also where some tasks have failed."""
+    """Run the sweep and write its results, also after an error: of what has finished."""
     from benchmarks.lib.report import provenance_line, show, write_report
 
     controllers = chosen(options.agents, options.controllers.agent)
@@ -140,27 +139,23 @@ def work(options: Options) -> str:
             given = factories[i % len(factories)], told[i], case, options.samples, options.runs
             tasks[f"plant {i}, {name}"] = partial(run_agent, *given)
     found: dict[str, Any] = {}
-    failed = None
     try:
         found.update(options.controllers.fan_out.stream(tasks, "sweep", Kept(out / "tasks")))
-    except TasksFailedError as error:
-        failed = error
-    seconds = time.perf_counter() - began
-    runs = table(plants, list(controllers), found)
-    if failed and runs.empty:
-        raise failed
-    sections = report(runs, out, options, Parameters(**nominal))
-    write_csv(out / "runs.csv", runs)
-    write_csv(out / "summary.csv", summarise(runs))
-    policies = {name: [dict(each.provenance) for each in of] for name, of in members.items()}
-    about = {"seconds": round(seconds, 1), "options": asdict(options), "policies": policies}
-    write_json(out / "provenance.json", {**made, **about})
-    knowing = "know" if options.told == "each" else "were not made for"
-    title = f"Controllers on plants that they {knowing}"
-    write_report(out, title, sections, provenance_line("sweep", made))
-    show(sections)
-    if failed:
-        raise failed
+    finally:
+        runs, seconds = table(plants, list(controllers), found), time.perf_counter() - began
+        if not runs.empty:
+            write_csv(out / "runs.csv", runs)
+            write_csv(out / "summary.csv", summarise(runs))
+            origins = {
+                name: [dict(each.provenance) for each in of] for name, of in members.items()
+            }
+            about = {"seconds": round(seconds), "options": asdict(options), "policies": origins}
+            write_json(out / "provenance.json", {**made, **about})
+            sections = report(runs, out, options, Parameters(**nominal))
+            knowing = "know" if options.told == "each" else "were not made for"
+            title = f"Controllers on plants that they {knowing}"
+            write_report(out, title, sections, provenance_line("sweep", made))
+            show(sections)
     return f"{len(tasks)} tasks in {seconds:.0f} s. The report, data and maps are in {out}/"
 
 
@@ -280,7 +275,7 @@ def report(
     text = [f"The plants have: {spans}.", OVERVIEW_TEXT]
     title = "How many plants each controller works on"
     sections = [Section(title, text, overview(runs), {picture: best})]
-    if options.design == "grid" or options.told == "each":
+    if options.design == "grid" or options.told == "each" or "gain_drift" not in runs:
         return sections
     for title, text_of, pairs in QUESTIONS:
         asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]

@@ -125,21 +125,23 @@ class TestCommand:
         told = run_sweep(tmp_path, f"{given} --told each")
         assert told["mae"].mean() < first["mae"].mean() - 0.05
 
-    def test_a_controller_that_fails_costs_no_other(self, tmp_path, monkeypatch, capsys):
-        run = sweep.run_agent
+    @pytest.mark.parametrize(
+        ("error", "status", "rows"), [(ArithmeticError, 1, 12), (KeyboardInterrupt, 130, 8)]
+    )
+    def test_what_has_finished_is_written(self, error, status, rows, tmp_path, monkeypatch):
+        run, calls = sweep.run_agent, []
 
-        def fails(factory, told, case, *numbers):
-            if factory is ROSTER["pi"].members()[0] and case["delay"] > 20:
-                raise ArithmeticError("no such plant")
-            return run(factory, told, case, *numbers)
+        def fails(factory, *given):
+            calls.append(factory)
+            if factory is ROSTER["pi"].members()[0] and len(calls) > 6:  # from plant 2 on
+                raise error
+            return run(factory, *given)
 
         monkeypatch.setattr(sweep, "run_agent", fails)
-        monkeypatch.setattr(storage, "commit", lambda: "")  # nothing is kept of such a task
         given = "--design random --plants 4 --agents pi pi-simc"
-        runs = run_sweep(tmp_path, given, status=1)
-        assert "no such plant" in capsys.readouterr().out
-        counts = runs["agent"].value_counts()
-        assert counts["pi-simc"] == 8 > counts["pi"] > 0
+        counts = run_sweep(tmp_path, given, status)["agent"].value_counts()
+        assert counts.sum() == rows
+        assert counts["pi"] == 4
 
 
 class TestFindings:
