@@ -157,12 +157,10 @@ def run_claims(out, *given, runs=4, status=0):
 
 class TestCommand:
     def test_what_it_writes(self, tmp_path, capsys):
-        found = [
-            run_claims(tmp_path / jobs, "direction", "noise", "--jobs", jobs) for jobs in "12"
-        ]
-        pd.testing.assert_frame_equal(*found)  # on any number of cores
-        assert list(found[0]["claim"].unique()) == ["direction", "noise"]
-        page = (tmp_path / "1/report.md").read_text()
+        found = run_claims(tmp_path, "direction")
+        assert found["value"].iloc[1] == 100.0  # all of them diverge in the end ...
+        assert found["shown"].iloc[1] == "undecided"  # ... but four prove little
+        page = (tmp_path / "report.md").read_text()
         for shown in (page, capsys.readouterr().out):
             assert "Training with -D(G) diverges at once" in shown
 
@@ -190,9 +188,9 @@ class TestCommand:
     def test_short_runs_of_all_claims_give_the_numbers_that_they_gave(self, monkeypatch):
         class Short(Batch):
             def run(self, agent, samples, before=None, **arguments):
-                return super().run(agent, min(samples, 120), before, **arguments)
+                return super().run(agent, min(samples, 60), before, **arguments)
 
-        monkeypatch.setattr(claims, "LEARNING", 60)
+        monkeypatch.setattr(claims, "LEARNING", 30)
         rows = [
             {"claim": name, **{each: row[each] for each in ("value", "low", "high")}}
             for name, claim in CLAIMS.items()

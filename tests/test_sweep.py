@@ -118,8 +118,7 @@ class TestCommand:
         monkeypatch.setattr(sweep, "report", lambda *_: [])  # which takes its time to draw
         given = "--design random --plants 4 --agents smith"
         first = run_sweep(tmp_path, given)
-        assert run_sweep(tmp_path, given).equals(first)
-        for more in ("--design-seed 1", "--set dead_zone=4", "--samples 600"):
+        for more in ("--design-seed 1", "--set dead_zone=4"):
             assert not run_sweep(tmp_path, f"{given} {more}")["mae"].equals(first["mae"]), more
         # If it knows each plant, a controller does better.
         told = run_sweep(tmp_path, f"{given} --told each")
