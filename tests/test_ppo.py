@@ -25,9 +25,13 @@ SMALL = replace(
     hidden=(8,),
     memory=40,
     steps=1024,
-    n_steps=32,
-    batch_size=64,
 )
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    for name, value in {"n_steps": 32, "batch_size": 64}.items():
+        monkeypatch.setitem(sb3.SETTINGS, name, value)
 
 
 def weights(network):
@@ -71,7 +75,7 @@ class TestTraining:
         model = ppo.begin(SMALL, 0)
         spaces = model.observation_space, model.action_space
         buffer, plain = (
-            kind(3, *spaces, gamma=0.9, n_envs=16) for kind in (ppo.GroupBuffer, RolloutBuffer)
+            kind(3, *spaces, gamma=0.9, n_envs=16) for kind in (sb3.GroupBuffer, RolloutBuffer)
         )
         rewards = np.random.default_rng(0).normal(size=(3, 16)).astype(np.float32)
         common = np.repeat([[1.0, 5.0]], ppo.GROUP, axis=1).astype(np.float32)
@@ -149,7 +153,7 @@ class TestMembers:
         ]
         for each in members:
             network = PolicyNetwork.load(PRETRAINED / each.provenance["file"])
-            assert each.provenance["recipe"] == asked
+            assert asked.items() <= each.provenance["recipe"].items()
             count = sum(W.size for W, _ in network.layers)
             assert f"{count:,} weights" in each.searched
             assert f": {recipe.steps / 1e6:g} M samples a policy" in each.searched

@@ -26,12 +26,20 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
 from mptc_gym import evaluate
 from mptc_gym.sb3 import make_vec_env, save, spec_of
 
 GROUP = 8  # plants that meet the same
+SETTINGS: dict[str, Any] = {
+    "n_steps": 64,  # samples per plant between updates
+    "batch_size": 4096,
+    "n_epochs": 5,
+    "gamma": 0.96,  # per sample
+    "gae_lambda": 1.0,  # below 1, the value function also stands in for effects in transit
+}
 WINDOWS = {"setpoint_window": 3, "error_window": 1, "output_window": 64, "action_window": 64}
 
 
@@ -90,8 +98,19 @@ class Exploration(BaseCallback):
         log_std.data.fill_(self._first + done * (self._last - self._first))
 
 
-def without_biases(model: PPO) -> PPO:
-    """Set the biases of a model's policy to 0 for good, but not those of its value function."""
+def make_ppo(plants: VecEnv, seed: int, **policy: Any) -> PPO:
+    """Return an untrained model, with arguments of its policy, which has no biases."""
+    model = PPO(
+        "MlpPolicy",
+        plants,
+        # At the last update nothing remains; the lower bound lets it have an effect.
+        learning_rate=lambda left: 2e-3 * max(left, 0.05),
+        rollout_buffer_class=GroupBuffer,
+        policy_kwargs=policy,
+        seed=seed,
+        device="cpu",
+        **SETTINGS,
+    )
     for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net):
         if isinstance(layer, nn.Linear):
             nn.init.zeros_(layer.bias)
@@ -100,7 +119,7 @@ def without_biases(model: PPO) -> PPO:
 
 
 def make_model(seed: int) -> PPO:
-    """Return an untrained model."""
+    """Return an untrained model of the plants."""
     plants = make_vec_env(
         "MiddlePoint-v0",
         512,
@@ -113,24 +132,8 @@ def make_model(seed: int) -> PPO:
         error_scale=50.0,  # for returns of order 1, which are learnt quickly
         **WINDOWS,
     )
-    model = PPO(
-        "MlpPolicy",
-        plants,
-        n_steps=64,
-        batch_size=4096,
-        n_epochs=5,
-        learning_rate=lambda left: 2e-3 * max(left, 0.05),
-        gamma=0.96,
-        gae_lambda=1.0,
-        rollout_buffer_class=GroupBuffer,
-        policy_kwargs={
-            "features_extractor_class": Changes,
-            "net_arch": {"pi": [], "vf": [64, 64]},  # the policy is linear
-        },
-        seed=seed,
-        device="cpu",
-    )
-    return without_biases(model)
+    linear = {"pi": [], "vf": [64, 64]}  # the policy; the value function has two layers
+    return make_ppo(plants, seed, features_extractor_class=Changes, net_arch=linear)
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import nn
 
 from agents import Increments, PolicyNetwork
-from benchmarks.examples.sb3 import GROUP, Exploration, GroupBuffer, inputs, without_biases
+from benchmarks.examples.sb3 import GROUP, SETTINGS, Exploration, inputs, make_ppo
 from benchmarks.lib.storage import versions
 from mptc_gym import PRESETS, evaluate
 from mptc_gym.sb3 import GymnasiumVecEnv
@@ -56,18 +56,6 @@ class Recipe:
     """Samples of experience, summed over all plants."""
     max_move: float = 2.0
     """Change of the flow at an action of 1, as a share of half its range."""
-    n_steps: int = 64
-    """Samples per plant between updates."""
-    batch_size: int = 4096
-    """Samples per gradient step."""
-    n_epochs: int = 5
-    """Passes over the samples per update."""
-    learning_rate: float = 2e-3
-    """Initial learning rate; it falls linearly to a twentieth."""
-    gamma: float = 0.96
-    """Discount factor per sample."""
-    gae_lambda: float = 1.0
-    """GAE's lambda; below 1, the value function also stands in for effects in transit."""
     log_std: tuple[float, float] = (-1.2, -3.5)
     """Logarithm of the action's standard deviation, at the start and at the end."""
 
@@ -130,7 +118,7 @@ def train(recipe: Recipe, seed: int) -> PolicyNetwork:
     }
     policy.provenance = {
         "algorithm": "PPO of Stable-Baselines3",
-        "recipe": asdict(recipe),
+        "recipe": asdict(recipe) | SETTINGS,
         "seed": seed,
         "steps": model.num_timesteps,
         "cpu_seconds": round(seconds, 1),
@@ -143,22 +131,8 @@ def train(recipe: Recipe, seed: int) -> PolicyNetwork:
 def begin(recipe: Recipe, seed: int) -> PPO:
     """Return an untrained model."""
     torch.set_num_threads(1)  # the networks are too small for more
-    model = PPO(
-        "MlpPolicy",
-        Plants(recipe),
-        # At the last update nothing remains; the lower bound lets it have an effect.
-        learning_rate=lambda remaining: recipe.learning_rate * max(remaining, 0.05),
-        n_steps=recipe.n_steps,
-        batch_size=recipe.batch_size,
-        n_epochs=recipe.n_epochs,
-        gamma=recipe.gamma,
-        gae_lambda=recipe.gae_lambda,
-        rollout_buffer_class=GroupBuffer,
-        policy_kwargs={"net_arch": {"pi": list(recipe.hidden), "vf": [64, 64]}},
-        seed=seed,
-        device="cpu",
-    )
-    return without_biases(model)
+    layers = {"pi": list(recipe.hidden), "vf": [64, 64]}
+    return make_ppo(Plants(recipe), seed, net_arch=layers)
 
 
 class Plants(GymnasiumVecEnv):
