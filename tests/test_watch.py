@@ -34,37 +34,28 @@ def test_equal_steps_by_hand():
 
 
 @pytest.mark.parametrize(
-    ("given", "panels"),
+    ("given", "plant", "samples"),
     [
-        (["--set", "setpoint_period=20", "--scenario", "run"], 2),
-        (["--scenario", "constant"], 1),
+        (["--set", "setpoint_period=400", "--scenario", "run"], {"setpoint_period": 400}, 1200),
+        (["--scenario", "constant"], {"setpoint": 5.0}, SAMPLES),  # without equal steps
     ],
 )
-def test_a_film_shows_steps_side_by_side(given, panels, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(
-        watch,
-        "scenarios_of",
-        lambda *_: {"run": replace(case, arguments={"setpoint_period": 20})},
-    ) if panels == 2 else None
-    case = watch.SCENARIOS["square"]
+def test_a_film_shows_steps_side_by_side(given, plant, samples, tmp_path, capsys):
     assert main(["--agent", "pi", *given, "--video", "new/film.gif"]) == 0
     (film,) = (tmp_path / "new").iterdir()
     with Image.open(film) as pictures:
         assert pictures.n_frames == 1 + 4
-        assert pictures.info["loop"] == 0
         inked = []
         for i in range(pictures.n_frames):
             pictures.seek(i)
             blue = np.abs(np.array(pictures.convert("RGB")) - [0, 114, 178.0]).max(axis=2) < 40
-            inked.append(blue[100:430].sum(axis=0))
+            inked.append(blue[100:430])
     total = [each.sum() for each in inked]
     # The first picture is the whole, as is the last; those between grow, and none is blank.
     assert total[0] == pytest.approx(total[-1], rel=0.02)
     assert 0 < total[1] < total[2] < total[3] < total[0]
-    halves = inked[0][:375].sum(), inked[0][375:].sum()
-    assert min(halves) > 0.3 * max(halves)
-    arguments = {"setpoint": 5.0} if panels == 1 else {"setpoint_period": 20}
-    errors = np.abs(run_closed(MiddlePointEnv(**arguments), PIController(), SAMPLES)["error"])
+    assert min(inked[0][:, :375].sum(), inked[0][:, 375:].sum()) > 0.3 * total[0]
+    errors = np.abs(run_closed(MiddlePointEnv(**plant), PIController(), samples)["error"])
     assert f"mean absolute error {errors[1:].mean():.3f} °C" in capsys.readouterr().out
 
 
