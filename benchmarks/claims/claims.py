@@ -119,10 +119,10 @@ def noise(batch: Batch, claim: Claim) -> None:
     alone = idle.output[steady].std(axis=0)
     quantity = "mean of e over the last 600 of 1,200 samples, its size, constant set point"
     claim.ask(quantity, np.abs(error.mean(axis=0)), "°C", at_most=0.05 * 5.0)
-    claim.ask(
-        "standard deviation of y over these samples, as a multiple of that without control",
-        ratio(error.std(axis=0), alone), at_most=1 + MUCH,
-    )  # fmt: skip
+    quantity = (
+        "standard deviation of y over these samples, as a multiple of that without control"
+    )
+    claim.ask(quantity, ratio(error.std(axis=0), alone), at_most=1 + MUCH)
     square = mean_error(batch.run_nn(samples, **SQUARE, **NOISY))
     better = "mean error below that of doing nothing, square wave"
     claim.ask_share(better, square < 5.0, often=True)
@@ -141,22 +141,19 @@ def noise(batch: Batch, claim: Claim) -> None:
 def pi_gains(batch: Batch, claim: Claim) -> None:
     samples = 1200
     paper = batch.run_pi(KP, KI, samples, **CONSTANT)
-    claim.ask(
-        "peak to peak of y over the last 300 of 1,200 samples, Kp = 2.2, constant set point",
-        np.ptp(paper.output[-300:]), "°C", at_least=2 * 0.05 * 5.0,
-    )  # fmt: skip
+    quantity = (
+        "peak to peak of y over the last 300 of 1,200 samples, Kp = 2.2, constant set point"
+    )
+    claim.ask(quantity, np.ptp(paper.output[-300:]), "°C", at_least=2 * 0.05 * 5.0)
     gains = np.linspace(0.1, KP, 22)  # the last is the paper's
-    for name, arguments in (
-        ("constant set point", CONSTANT), ("square wave", SQUARE), (NOISY_SQUARE, NOISY),
-    ):  # fmt: skip
+    cases = {"constant set point": CONSTANT, "square wave": SQUARE, NOISY_SQUARE: NOISY}
+    for name, arguments in cases.items():
         errors = [mean_error(batch.run_pi(kp, KI, samples, **arguments)) for kp in gains]
         medians = [float(np.median(error)) for error in errors]
         best = int(np.argmin(medians[:-1]))
-        claim.ask(
-            f"mean error with the best lower Kp ({gains[best]:.1f}) as a multiple of that with "
-            f"{KP:g}, {name}",
-            ratio(errors[best], errors[-1]), at_least=1 - NOTABLE,
-        )  # fmt: skip
+        lower = f"mean error with the best lower Kp ({gains[best]:.1f}) as a multiple of that"
+        quantity = f"{lower} with {KP:g}, {name}"
+        claim.ask(quantity, ratio(errors[best], errors[-1]), at_least=1 - NOTABLE)
     doubled = batch.run_pi(2 * KP, KI, samples, **CONSTANT)
     limited = 100 * np.mean(np.abs(doubled.applied[-300:]) == Parameters().u_max)
     quantity = f"samples of the last 300 with the flow at a limit, Kp = {2 * KP:g}"
@@ -240,11 +237,9 @@ def against_the_paper(
             n = shape.get("length", 3)
             windows: dict[str, Any] = {"setpoint_window": n, "error_window": n}
             runs = batch.run(networks, samples, **arguments, **windows)
-            claim.ask(
-                f"mean error with {name}, {GAINS[slower]}, as a multiple of that of the "
-                f"paper's network, {case}",
-                ratio(mean_error(runs), paper), at_least=1 - NOTABLE,
-            )  # fmt: skip
+            quantity = f"mean error with {name}, {GAINS[slower]}, as a multiple of that of the "
+            quantity += f"paper's network, {case}"
+            claim.ask(quantity, ratio(mean_error(runs), paper), at_least=1 - NOTABLE)
 
 
 @claimed(
@@ -322,11 +317,11 @@ def keep_learning(batch: Batch, claim: Claim) -> None:
             network.weights = learnt
             network.learning = learning
             error[learning] = mean_error(batch.run(network, 1200, **SQUARE, **plant))
-        claim.ask(
-            f"mean error of learning weights as a multiple of that of frozen ones, {name}",
-            ratio(error[True], error[False]),
-            at_most=1 - NOTABLE if plant else math.inf,
-        )  # fmt: skip
+        quantity = (
+            f"mean error of learning weights as a multiple of that of frozen ones, {name}"
+        )
+        at_most = 1 - NOTABLE if plant else math.inf
+        claim.ask(quantity, ratio(error[True], error[False]), at_most=at_most)
         claim.ask(f"mean error of frozen weights, {name}", error[False], "°C")
         useless = error[False] >= 5.0
         claim.ask_share(f"frozen weights do no better than no control, {name}", useless)
@@ -367,11 +362,9 @@ def direction_only(batch: Batch, claim: Claim) -> None:
         (0, "time constants from 0.5 to 2 times the paper's", "set point 5 °C"),
         *((1, "gains from 0.7 to 1.5 times the paper's", family) for family in families),
     ):
-        differ = {*range(3)} - {place}
-        alone = [
-            each for each in settles
-            if each[0] == family and all(each[1:][i] == paper[i] for i in differ)
-        ]  # fmt: skip
+        others = {*range(3)} - {place}
+        of_family = [each for each in settles if each[0] == family]
+        alone = [each for each in of_family if all(each[1 + i] == paper[i] for i in others)]
         ask(f"{text}, {family}", alone)
     for family in families:
         those = [each for each in settles if each[0] == family]
