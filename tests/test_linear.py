@@ -1,4 +1,4 @@
-"""The linear model against the environment, its step test and its margins."""
+"""The linear model against the environment, its step test, and the poles of loops."""
 
 import control
 import numpy as np
