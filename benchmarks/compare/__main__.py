@@ -107,8 +107,7 @@ def work(options: Options) -> str:
                 "policies": {each.agent: each.policies for each in finished if each.policies},
             }
             write_json(folder / "provenance.json", about)
-            jobs = fan_out.jobs if complete else 1
-            show(report.write(finished, scenarios, scales, controllers, folder, made, jobs)[:2])
+            show(report.write(finished, scenarios, scales, controllers, folder, made)[:2])
     return f"The report, tables, data and plots are in {out}/"
 
 

@@ -40,11 +40,10 @@ def write(
     controllers: Mapping[str, Controller],
     folder: Path,
     made: Mapping[str, Any],
-    jobs: int | None = 1,
 ) -> list[Section]:
     """Write the numbers, pictures and report of finished cases, and return the sections.
 
-    So many pictures are drawn at once. A case without a scale is in the numbers only.
+    A case without a scale is in the numbers only.
     """
     runs = pd.concat([case.runs for case in cases], ignore_index=True)
     summary = summarise(runs)
@@ -105,7 +104,8 @@ def write(
     for name in draw:
         (folder / name).unlink(missing_ok=True)  # of an earlier run
     try:
-        FanOut(jobs=jobs).run(draw, "pictures")
+        # In this process: others would spend more time on loading Matplotlib than on drawing.
+        FanOut(jobs=1).run(draw, "pictures")
     finally:  # with the pictures that there are
         made_by = provenance_line("compare", made)
         write_report(folder, "Comparison of controllers", sections, made_by)
