@@ -81,10 +81,10 @@ COLUMNS = {  # of the overview: headings and formats
     "oscillates": ("oscillates (%)", "{:.1f}"),
     "useless": ("no better than no control (%)", "{:.1f}"),
 }
-# Plants on which this happens in half the runs or more: column, marker, size, colour, label.
-MARKS = (
-    ("oscillates", "o", 12, "white", "oscillates"),
-    ("useless", "X", 64, "red", "no better than no control"),
+# Plants on which this happens in half the runs or more: column, size and look of the mark.
+MARKS: tuple[tuple[str, int, Any], ...] = (
+    ("oscillates", 12, {"color": "white", "edgecolor": "black", "label": "oscillates"}),
+    ("useless", 64, {"marker": "X", "color": "red", "label": "no better than no control"}),
 )
 
 
@@ -268,10 +268,8 @@ def report(
 
     picture = "map.png" if options.design == "grid" else "plants.png"
     best = plot_map(runs, out / picture, nominal if options.design == "grid" else None)
-    spans = ", ".join(
-        f"{name} {runs[name].min():.4g} to {runs[name].max():.4g}"
-        for name in SPANS if name in runs
-    )  # fmt: skip
+    ends = runs[[name for name in SPANS if name in runs]].agg(["min", "max"])
+    spans = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, (low, high) in ends.items())
     text = [f"The plants have: {spans}.", OVERVIEW_TEXT]
     title = "How many plants each controller works on"
     sections = [Section(title, text, overview(runs), {picture: best})]
@@ -358,24 +356,22 @@ def plot_map(runs: pd.DataFrame, path: Path, centre: Parameters | None) -> str:
         f"{found.min():.2f} times in the median plant"
     )
     names = [label(agent) for agent in runs["agent"].unique()]
-    size = 14 if centre is None else 26
+    size, scale = 14 if centre is None else 26, LogNorm(0.01, 3.0)
     with panels(path, names, 2.3, 3, title, grid=centre is None) as (figure, axes, free):
         for panel, (_, cases) in zip(axes, groups(runs, "agent"), strict=True):
             plants = cases.groupby("plant")
             where = plants[["delay", "gain", "drifts"]].first()
             excess = plants["ratio"].median().sub(1.0).clip(0.01)
             for drifts, part in where.groupby("drifts"):
+                marker, text = ("^", "drifts") if drifts else ("s", "as it is")
+                shown = excess[part.index]
                 image = panel.scatter(
-                    part["delay"], part["gain"], size, excess[part.index],
-                    marker="^" if drifts else "s", label="drifts" if drifts else "as it is",
-                    cmap="cividis_r", norm=LogNorm(0.01, 3.0),
-                )  # fmt: skip
-            for name, marker, scale, colour, text in MARKS:
+                    part["delay"], part["gain"], size, shown, marker=marker, label=text
+                )
+                image.set(cmap="cividis_r", norm=scale)
+            for name, large, look in MARKS:
                 often = where[plants[name].mean() >= 0.5]
-                panel.scatter(
-                    often["delay"], often["gain"], scale, marker=marker, color=colour,
-                    edgecolor="black", linewidth=0.8, label=text,
-                )  # fmt: skip
+                panel.scatter(often["delay"], often["gain"], large, linewidth=0.8, **look)
             if centre is not None:
                 at = (sum(centre.range_of(name)) / 2.0 for name in ("delay", "gain_factor"))
                 panel.plot(*at, "k+", markersize=12, label="the nominal plant")

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import mptc_gym.sb3
 from benchmarks.datasets import arguments_of, record
-from benchmarks.examples import offline
+from benchmarks.examples import offline, through_plant
 from mptc_gym import evaluate
 from mptc_gym.sb3 import load, spec_of
 from tests.conftest import ROOT
@@ -122,3 +122,7 @@ def test_the_notebook_runs_and_shows_what_it_showed(capsys):
         assert shown[:4] == "".join(kept).splitlines()[:4]  # what needs no training
     assert shown[4].startswith("PPO")
     plt.close("all")
+
+
+def test_one_trained_through_the_plant_learns_in_a_few_steps():
+    assert through_plant.main(6, 16, 200).mean_error < 1.5  # the paper's PI controller has 2.26
