@@ -258,7 +258,9 @@ class TestTuning:
 
 
 def closed_loop(log):
-    plant = study.Truth("none", 0.1, 0.0, 8.0, -7.0, 150.0, [161.0], 0.0)
+    plant = study.Plant(
+        fault="none", size=0.1, zone=0.0, h=8.0, gain=-7.0, delay=150.0, lags=[161.0], lead=0.0
+    )
     noise = log.temperature - good().simulated
     return study.simulate(plant, np.zeros(1200), noise, -0.1, 161.0)
 

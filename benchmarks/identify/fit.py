@@ -148,7 +148,7 @@ class Problem:
         if shape == "one lag":
             return [one_lag(first, delay)]
         # The second is never quite the first: equal ones have no partial fractions.
-        second = first * min(np.exp(max(p[2], -6.0)), 0.97)
+        second = first * min(np.exp(np.clip(p[2], -6.0, 0.0)), 0.97)
         if shape == "a zero":
             return [one_lag(first, delay), one_lag(second, delay)]
         lags = np.array([first, second, 0.9 * second][: 3 if shape == "three lags" else 2]) + 0j

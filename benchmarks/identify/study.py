@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import Any, NamedTuple
+from types import SimpleNamespace as Plant
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,28 +20,14 @@ from benchmarks.identify.model import identify
 from benchmarks.lib.storage import ROOT, write_text
 
 FINE = 5  # steps of the simulator in a sample
-FAULTS = (
-    "backlash", "stiction", "stiction with a slip", "saturation", "rate limit",
-    "subtractive dead zone", "few positions", "gain by level", "gain by time",
-    "delay that varies", "two levels, saturation",
-)  # fmt: skip
-LOGS = {"none": 60, **dict.fromkeys(FAULTS, 6)}
+LOGS = {
+    "none": 60, "backlash": 6, "stiction": 6, "stiction with a slip": 6, "saturation": 6,
+    "rate limit": 6, "subtractive dead zone": 6, "few positions": 6, "gain by level": 6,
+    "gain by time": 6, "delay that varies": 6, "two levels, saturation": 6,
+}  # fmt: skip
 
 
-class Truth(NamedTuple):
-    """A plant with lags in series, s, and a valve for flows from -1 to 1."""
-
-    fault: str
-    size: float
-    zone: float
-    h: float
-    gain: float
-    delay: float
-    lags: list[float]
-    lead: float
-
-
-def simulate(plant: Truth, held: Any, noise: Any, kp: float = 0.0, ti: float = 1.0) -> Any:
+def simulate(plant: Plant, held: Any, noise: Any, kp: float = 0.0, ti: float = 1.0) -> Any:
     """Return flows and temperatures; `held` are flows, or set points of a PI controller."""
     fault, a, h, time = plant.fault, plant.size, plant.h, plant.delay + sum(plant.lags)
     shares, x = [1 - math.exp(-h / FINE / lag) for lag in plant.lags], [0.0] * len(plant.lags)
@@ -78,7 +65,7 @@ def simulate(plant: Truth, held: Any, noise: Any, kp: float = 0.0, ti: float = 1
     return flows, temperatures
 
 
-def sensitivity(plant: Truth, kp: float, ti: float, stretch: float) -> float:
+def sensitivity(plant: Plant, kp: float, ti: float, stretch: float) -> float:
     """Return the true Ms, with the largest gain of a plant whose gain changes."""
     w = np.geomspace(1e-4 / (plant.delay + plant.lags[0]), math.pi / plant.h, 4000)
     s, z = 1j * w, np.exp(1j * w * plant.h)
@@ -98,7 +85,10 @@ def tried(seed: int, fault: str) -> dict[str, Any]:
     delay, gain = lag * math.exp(r(-2.3, 1.1)), r(0.3, 6.0) * (-1) ** int(r(0, 2))
     time, zone = delay + sum(lags), r(0.08, 0.45) * (r() < 0.5) * (fault == "none")
     h, lead = float(f"{time / math.exp(r(2.7, 4.6)):.2g}"), -r(0.1, 0.4) * lag * (r() < 0.2)
-    plant = Truth(fault, r(0.05, 0.5), zone, h, gain, delay, lags, lead * (len(lags) > 1))
+    plant = Plant(
+        fault=fault, size=r(0.05, 0.5), zone=zone, h=h, gain=gain, delay=delay, lags=lags,
+        lead=lead * (len(lags) > 1),
+    )  # fmt: skip
     # Steps, walks or a loop whose set point moves; noise with a base line that walks.
     kind, rows = int(r(0, 3)), int(min(4000, r(25, 60) * time / h))
     lengths = r(0.2 + kind / 2, 2.0 + kind, rows) * time / h
@@ -107,8 +97,9 @@ def tried(seed: int, fault: str) -> dict[str, Any]:
     white = generator.normal(size=(2, rows)) * abs(gain) * math.exp(r(-5.7, -3.2))
     noise = np.convolve(white[0], 0.8 ** np.arange(15))[:rows]
     noise += np.cumsum(white[1]) * r(0, 0.2) * math.sqrt(h / time)
-    late = delay + h / 2 + sum(lags[1:2]) / 2 + sum(lags[2:]) - plant.lead
-    simc = (lag + sum(lags[1:2]) / 2) / gain / 2 / late, min(lag + sum(lags[1:2]) / 2, 8 * late)
+    half = sum(lags[1:2]) / 2
+    late = delay + h / 2 + half + sum(lags[2:]) - plant.lead
+    simc = (lag + half) / gain / 2 / late, min(lag + half, 8 * late)
     if kind == 2 and not fault.startswith("two levels"):
         flow, temperature = simulate(plant, 0.7 * gain * held, noise, 0.6 * simc[0], simc[1])
     else:
@@ -143,7 +134,7 @@ def main(seed: int) -> None:
     how: dict[str, Any] = dict.fromkeys(found.columns[1:], "sum")
     how |= dict.fromkeys(["delay", "gain", "dead_zone"], "mean")
     how |= {name: "max" for name in how if "Ms" in name}
-    text = rows.groupby("fault", sort=False).agg(how).to_markdown(floatfmt=".4g")
+    text = rows.groupby("fault", sort=False).agg(how).to_markdown(floatfmt=".4g").replace("nan", "   ")
     print(text)
     write_text(ROOT / "benchmarks/published/identify.md", f"{text}\n")
 
