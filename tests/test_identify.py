@@ -88,19 +88,17 @@ class TestFit:
     def test_operating_point_is_found_and_deviations_are_from_it(self):
         log = recorded()
         shifted = replace(log, flow=log.flow + 480.0, temperature=log.temperature + 385.0)
+        shifted.temperature[[200, 201, 500, 777]] = np.nan  # gaps are left out
         model = identify(shifted, Knowledge(operating_flow=480.0))
-        assert model.plant.gain == pytest.approx(good().plant.gain, rel=1e-3)
+        assert model.plant.gain == pytest.approx(good().plant.gain, rel=0.05)
+        assert np.isfinite(model.simulated).all()
         assert model.operating_flow == 480.0
         assert model.operating_temperature == pytest.approx(385.0, abs=0.5)
-
-    @pytest.mark.parametrize(
-        ("flow", "found"),
-        [([480.0, 470.0, 490.0], 480.0), ([60.0, 100.0, 0.0, 40.0], 60.0), ([5.0, -10.0], 0.0),
-         ([100.0, 0.0, 100.0], 50.0), ([-1.0, 99.0], 49.0)],
-    )  # fmt: skip
-    def test_operating_point_has_room_on_both_sides(self, flow, found):
         # 0 or the first flow if it is in the middle half of the range, else the middle.
-        assert operating_flow(np.array(flow)) == found
+        for flows, found in (
+            ([480, 470, 490], 480), ([60, 100, 0, 40], 60), ([5, -10], 0), ([100, 0, 100], 50),
+        ):  # fmt: skip
+            assert operating_flow(np.array(flows)) == found
 
     def test_dead_zone_is_known_up_to_the_gap_between_commands(self):
         generator = np.random.default_rng(701)
@@ -110,14 +108,6 @@ class TestFit:
         assert (zone.low, zone.high) == (pytest.approx(3.0), pytest.approx(7.0))
         # Nor is it known whether the flow beyond it rises from 0.
         assert "Valves of two kinds" in model.warnings[0]
-
-    def test_gaps_are_left_out(self):
-        log = recorded()
-        temperature = log.temperature.copy()
-        temperature[[200, 201, 500, 777]] = np.nan
-        model = identify(replace(log, temperature=temperature))
-        assert model.plant.gain == pytest.approx(good().plant.gain, rel=0.05)
-        assert np.isfinite(model.simulated).all()
 
     def test_log_that_is_sampled_too_often_is_fitted_by_means_of_rows(self):
         # The flow is held for 120 rows and more; a delay and a lag are 234 rows.
@@ -134,7 +124,8 @@ class TestFit:
 
     def test_load_is_taken_into_account(self):
         log = recorded(noise=0.01)
-        moved = log.temperature + 4.0 * (np.arange(1200) > 650)
+        late = np.maximum(np.arange(1200) - 650, 0)
+        moved = log.temperature + 4.0 * (1.0 - np.exp(-late / 20.0))
         model = identify(replace(log, temperature=moved))
         assert any(note.startswith("Loads seem") and " 86 " in note for note in model.notes)
         assert model.plant.gain == pytest.approx(-0.6825, rel=0.05)
@@ -220,6 +211,8 @@ class TestTuning:
         ):
             assert np.sign(each["kp"]) == -direction  # the gain of the paper's B is negative
             assert each["action"] == ("reverse" if direction < 0.0 else "direct")
+            assert max(each["sensitivity"]) <= 1.8
+            assert each["delay_margin"] >= model.plant.delay / 5.0
             controller = made(**each["arguments"])
             observation, _ = env.reset(seed=0)
             for _ in range(400):
@@ -241,18 +234,9 @@ class TestTuning:
         assert pi["limits"]["low"] == pytest.approx(model.operating_flow + model.u_min)
         assert set(pi["operating_point"]) == {"flow", "temperature"}
 
-    def test_smith_predictor_needs_a_delay_margin_and_a_request(self):
-        model = good()
-        assert [each["controller"] for each in recommended(model)] == ["pi-simc"]
-        for each in recommended(model, smith=True):
-            assert max(each["sensitivity"]) <= 1.8
-            assert (
-                each["controller"] == "pi-simc"
-                or each["delay_margin"] >= model.plant.delay / 5.0
-            )
-
     def test_what_the_log_leaves_open_slows_the_loop(self):
         (known,), unknown = recommended(good()), recommended(identify(recorded(300, noise=0.3)))
+        assert known["controller"] == "pi-simc"  # a Smith predictor is made on request
         assert known["slowed"] < 1.4
         assert not unknown or unknown[0]["slowed"] > known["slowed"]
 

@@ -87,13 +87,8 @@ def report(model: Model, found: list[dict[str, Any]]) -> list[Section]:
     flow, temperature, rest = _units(model)
     units = {"delay": "samples", "dead_zone": flow, "gain": f"{temperature} per {flow}"}
     rows = [
-        (
-            name.replace("_", " "),
-            f"{value:.4g}",
-            f"[{low:.4g}, {high:.4g}]",
-            units.get(name, "s"),
-        )
-        for name, (value, low, high) in model.estimates.items()
+        (name.replace("_", " "), f"{at:.4g}", f"[{low:.4g}, {high:.4g}]", units.get(name, "s"))
+        for name, (at, low, high) in model.estimates.items()
     ]
     warned = [f"**Nothing is recommended.** {' '.join(model.warnings)}"] * bool(model.warnings)
     text = [
@@ -140,9 +135,8 @@ def draw(model: Model, path: Path) -> None:
         above.legend(loc="lower right", ncols=2)
         below.step(minutes, log.flow[shown], where="post", color=COLOURS[0], lw=1)
         zone = model.estimates["dead_zone"].value
-        below.axhspan(
-            rest - zone, rest + zone, color="0.5", alpha=0.15, lw=0, label="dead zone"
-        )
+        ends = rest - zone, rest + zone
+        below.axhspan(*ends, color="0.5", alpha=0.15, lw=0, label="dead zone")
         below.legend(loc="upper left")
         below.set(xlabel="time (min)", ylabel=f"flow ({flow})")
         samples = int((model.plant.delay + 5.0 * model.plant.slowest) / h) + 2

@@ -134,7 +134,12 @@ def main(seed: int) -> None:
     how: dict[str, Any] = dict.fromkeys(found.columns[1:], "sum")
     how |= dict.fromkeys(["delay", "gain", "dead_zone"], "mean")
     how |= {name: "max" for name in how if "Ms" in name}
-    text = rows.groupby("fault", sort=False).agg(how).to_markdown(floatfmt=".4g").replace("nan", "   ")
+    text = (
+        rows.groupby("fault", sort=False)
+        .agg(how)
+        .to_markdown(floatfmt=".4g")
+        .replace("nan", "   ")
+    )
     print(text)
     write_text(ROOT / "benchmarks/published/identify.md", f"{text}\n")
 
