@@ -132,7 +132,8 @@ def draw(model: Model, path: Path) -> None:
         above.plot(minutes, log.temperature[shown], color="0.5", lw=1, label="recorded")
         above.plot(minutes, model.simulated[shown], color=COLOURS[1], label="model")
         above.set(xlabel="time (min)", ylabel=f"temperature ({temperature})")
-        above.legend(loc="lower right", ncols=2)
+        above.legend(loc="upper left", ncols=2)
+        above.margins(y=0.2)  # room for the legend
         below.step(minutes, log.flow[shown], where="post", color=COLOURS[0], lw=1)
         zone = model.estimates["dead_zone"].value
         ends = rest - zone, rest + zone
