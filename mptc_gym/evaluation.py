@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
+import itertools
 import json
 import shlex
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from importlib import resources
 from types import FunctionType
@@ -17,24 +17,19 @@ from typing import Any, Final
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import VectorEnv
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from numpy.typing import NDArray
 
-from mptc_gym import environments
+from mptc_gym import acting
 from mptc_gym.checks import MOST_PLANTS, count, reject
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
-from mptc_gym.policies import rollout, start
 from mptc_gym.presets import IDS, PRESETS
 from mptc_gym.vector_env import MiddlePointVectorEnv
-from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
 Env = gymnasium.Env[Any, Any]
 Values = NDArray[np.float64]  # one per episode, shape (episodes,)
-Batch = Callable[..., VectorEnv[Any, Any, Any]]  # makes n environments
 
 SEED: Final = 7_000_000
 """Seed of the first fixed episode; episode i has the seed `SEED + i`. Train on other seeds."""
@@ -183,27 +178,35 @@ valve travel 0 t/h; 100 episodes, all alike
     """
     episodes = count("episodes", episodes, 2, MOST_PLANTS)
     first = count("seed", seed, 0, 2**63)
-    seeds = range(first, first + episodes)
-    with _prepared(policy, env, episodes, arguments) as (
-        plants,
-        parameters,
-        name,
-        most,
-        native,
-    ):
-        check = None if native else case_of(parameters)
-        errors, travels, samples = _run(policy, plants, seeds, most, check)
+    seeds, most, native = range(first, first + episodes), SAMPLES, None
+    if isinstance(env, str | EnvSpec):
+        env = partial(make_one, env, arguments)
+        single: Any = env()
+        most = single.spec.max_episode_steps or SAMPLES
+        native = native_batch(single, episodes)
+    elif arguments:
+        raise ValueError(f"{', '.join(arguments)} must be given where env is made")
+    given = closing(native) if native else None
+    with given or acting.opened(env, episodes, policy) as plants:
+        one, *others = [native.unwrapped] if native else plants.inner
+        if any(case_of(each.parameters) != case_of(one.parameters) for each in others):
+            raise ValueError("env must have the same plants, but for windows and rewards")
+        if not isinstance(policy, FunctionType):  # which cannot tell what it was made for
+            acting.check_fit(policy, one.parameters, plants)
+        expected = None if native else one.parameters
+        errors, travels, samples = _run(policy, plants, seeds, most, expected)
+    name = one.spec.id if one.spec else type(one).__name__
     found = Evaluation(
         name, float(errors.mean()), float(travels.mean()), errors, travels, seeds
     )
-    least = least_errors(parameters, samples, seeds)
+    least = least_errors(one.parameters, samples, seeds)
     if least is None:
-        return dataclasses.replace(found, missing=_missing(parameters, samples, seeds))
-    rest = action_from_command(0.0, parameters.u_min, parameters.u_max)
-    with closing(MiddlePointVectorEnv(episodes, **dataclasses.asdict(parameters))) as plants:
-        idle, *_ = _run(lambda seen: np.full((len(seen), 1), rest), plants, seeds, samples)
+        return replace(found, missing=_missing(one.parameters, samples, seeds))
+    rest = action_from_command(0.0, one.parameters.u_min, one.parameters.u_max)
+    plants = MiddlePointVectorEnv(episodes, **asdict(one.parameters))
+    idle, *_ = _run(lambda seen: np.full((len(seen), 1), rest), plants, seeds, samples)
     gained, possible = idle - errors, idle - least
-    return dataclasses.replace(
+    return replace(
         found,
         least_possible=float(least.mean()),
         multiple=float(errors.mean() / least.mean()),
@@ -214,66 +217,33 @@ valve travel 0 t/h; 100 episodes, all alike
     )
 
 
-@contextmanager
-def _prepared(policy: Any, env: Any, n: int, arguments: dict[str, Any]) -> Iterator[Any]:
-    """Yield environments for n episodes, if a policy fits them, and clean up afterwards.
-
-    With them come their arguments, their name, the length of an episode that does not end
-    before, and whether they are the package's own plants, whose episodes need no check.
-    """
-    most, name, batch = SAMPLES, "", None
-    if isinstance(env, str | EnvSpec):
-        env = partial(make_one, env, arguments)
-        with closing(env()) as single:
-            spec, batch = single.spec, native_batch(single)
-        most, name = spec.max_episode_steps or SAMPLES, spec.id
-    elif arguments:
-        raise ValueError(f"{', '.join(arguments)} must be given where env is made")
-    given: Any = closing(batch(n)) if batch else environments.opened(env, n, policy)
-    with given as plants:
-        first, *others = [plants.unwrapped] if batch else plants.inner
-        if any(case_of(each.parameters) != case_of(first.parameters) for each in others):
-            raise ValueError("env must have the same plants, but for windows and rewards")
-        if not isinstance(policy, FunctionType):  # which cannot tell what it was made for
-            environments.check_fit(policy, first.parameters, plants)
-        name = name or (first.spec.id if first.spec else type(first).__name__)
-        yield plants, first.parameters, name, most, batch is not None
-
-
 def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
     """Make an environment from an id or a spec; ValueError if it cannot be found."""
     try:
         return gymnasium.make(env, disable_env_checker=True, **arguments)
     except (gymnasium.error.Error, ImportError):
-        known = list(IDS.values())
-        close = difflib.get_close_matches(str(env), known, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"such as one of {', '.join(known)}"
+        close = difflib.get_close_matches(str(env), IDS.values(), n=1)
+        hint = f"did you mean {close[0]}?" if close else f"such as {IDS['paper']}"
         reject("env", env, f"the id of an environment ({hint})")
 
 
-def native_batch(single: Env) -> Batch | None:
-    """Return a function that makes many of an environment, to be stepped at once.
+def native_batch(single: Env, n: int, **modes: Any) -> Any:
+    """Return n of an environment, to be stepped at once, in an `autoreset_mode` and so on.
 
-    It takes their number and, optionally, an `autoreset_mode` and a `render_mode`. Return None
-    if there is no such batch: for another class, or wrappers other than `IncrementalAction`.
+    Return None if there is no such batch: for another class, or wrappers other than
+    `IncrementalAction`.
     """
-    inner, moves = single, []
-    while isinstance(inner, gymnasium.Wrapper):
-        if type(inner) is IncrementalAction:
-            moves.append(inner._saved_kwargs)
-        elif type(inner) not in (OrderEnforcing, PassiveEnvChecker, TimeLimit):
-            return None
-        inner = inner.env
-    spec = single.spec
-    if type(inner) is not MiddlePointEnv or spec is None or len(moves) > 1:
+    spec, plant = single.spec, single.unwrapped
+    if spec is None or type(plant) is not MiddlePointEnv:
         return None
-    limit = spec.max_episode_steps
-    plants: Batch = partial(
-        MiddlePointVectorEnv, max_episode_steps=limit, **dataclasses.asdict(inner.parameters)
-    )
-    if not moves:
-        return plants
-    return lambda n, **modes: VectorIncrementalAction(plants(n, **modes), **moves[0])
+    wrappers = [each.entry_point for each in spec.additional_wrappers]
+    if wrappers not in ([], ["mptc_gym.wrappers:IncrementalAction"]):
+        return None
+    modes["max_episode_steps"] = spec.max_episode_steps
+    plants = MiddlePointVectorEnv(n, **modes, **asdict(plant.parameters))
+    plants.spec = spec
+    moves: Any = [each.kwargs for each in spec.additional_wrappers]
+    return VectorIncrementalAction(plants, **moves[0]) if moves else plants
 
 
 def _run(
@@ -284,26 +254,24 @@ def _run(
     Episodes are refused unless they are those of plants with the arguments `expected`, if any.
     Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each; and N.
     """
-    errors, travels, lengths, n = [], [], set(), plants.num_envs
+    rounds, samples, n = [], 0, plants.num_envs
     for first in range(seeds.start, seeds.stop, n):
         own = [*range(first, first + n)]
-        steps = rollout(plants, start(policy, n), most, own)
+        steps = acting.rollout(plants, acting.start(policy, n), most, own)
         if expected:
-            native = MiddlePointVectorEnv(n, **dataclasses.asdict(expected))
-            steps = environments.replayed(steps, native, own)
-        error, travel = np.zeros(n), np.zeros(n)
+            native = MiddlePointVectorEnv(n, **asdict(expected))
+            steps = acting.replayed(steps, native, own)
+        totals = np.zeros((2, n))
         for k, (before, after, ended) in enumerate(steps, 1):  # noqa: B007 (used below)
-            error += np.abs(after["error"])
-            travel += np.abs(after["applied"] - before["applied"])
+            totals += np.abs((after["error"], after["applied"] - before["applied"]))
             if ended.any():
                 break
-        lengths.add(k)
-        if len(lengths) > 1 or ended.any() != ended.all():
+        samples = samples or k
+        if samples != k or ended.any() != ended.all():
             raise ValueError(f"env must end all episodes at once, got an end after {k} samples")
-        errors.append(error / k)
-        travels.append(travel)
-    all_errors, all_travels = np.concatenate(errors), np.concatenate(travels)
-    return all_errors[: len(seeds)], all_travels[: len(seeds)], k
+        rounds.append(totals)
+    errors, travels = np.hstack(rounds)[:, : len(seeds)]
+    return errors / samples, travels, samples
 
 
 def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values | None:
@@ -331,28 +299,26 @@ def _kept() -> dict[Parameters, Values]:
 
 def case_of(parameters: Parameters) -> Parameters:
     """Return the arguments, with those that do not affect the bound at their defaults."""
-    defaults = {name: ARGUMENTS[name].default for name in _NO_MATTER}
-    return dataclasses.replace(parameters, **defaults)
+    return replace(parameters, **{name: ARGUMENTS[name].default for name in _NO_MATTER})
 
 
 def _missing(parameters: Parameters, samples: int, seeds: range) -> str:
     """Return a message with the command that computes a missing bound."""
-    case, options = case_of(parameters), []
-    for name, given in PRESETS.items():
-        if case == case_of(Parameters(**given)):
-            options = ["--preset", name]
-    if not options:
-        for name, value in dataclasses.asdict(case).items():
-            if value != ARGUMENTS[name].default:
-                text = json.dumps(value, separators=(",", ":")).strip('"')
-                options += ["--set", f"{name}={text}"]
-    asked = {"samples": samples, "episodes": len(seeds), "seed": seeds.start}
+    case = case_of(parameters)
+    presets = {case_of(Parameters(**given)): name for name, given in PRESETS.items()}
+    as_json = partial(json.dumps, separators=(",", ":"))
+    changed = {
+        name: as_json(value).strip('"')
+        for name, value in asdict(case).items()
+        if value != ARGUMENTS[name].default
+    }
+    sets = [("--set", f"{name}={value}") for name, value in changed.items()]
+    pairs = [("--preset", presets[case])] if case in presets else sets
     usual = {"samples": SAMPLES, "episodes": EPISODES, "seed": SEED}
-    for name, value in asked.items():
-        if value != usual[name]:
-            options += [f"--{name}", str(value)]
-    command = shlex.join(["python", "-m", "benchmarks.bounds", *options])
-    return f"no bound is kept for this case: {command}"
+    asked = {"samples": samples, "episodes": len(seeds), "seed": seeds.start}
+    pairs += [(f"--{name}", str(n)) for name, n in asked.items() if n != usual[name]]
+    words = ["python", "-m", "benchmarks.bounds", *itertools.chain(*pairs)]
+    return f"no bound is kept for this case: {shlex.join(words)}"
 
 
 def _interval(gained: Values, possible: Values) -> tuple[float, float]:

@@ -18,7 +18,6 @@ import pkgutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Mapping
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -31,10 +30,17 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env import sync_envs_normalization as synchronise
 
-from mptc_gym import environments
-from mptc_gym.checks import MOST_PLANTS, count, plain, reject
-from mptc_gym.evaluation import EPISODES, SEED, WINDOWS, Evaluation, evaluate, make_one
-from mptc_gym.evaluation import native_batch as batch_like
+from mptc_gym import acting
+from mptc_gym.checks import MOST_PLANTS, count, reject
+from mptc_gym.evaluation import (
+    EPISODES,
+    SEED,
+    WINDOWS,
+    Evaluation,
+    evaluate,
+    make_one,
+    native_batch,
+)
 from mptc_gym.sb3_vec_env import GymnasiumVecEnv
 from mptc_gym.wrappers import IncrementalAction
 
@@ -78,7 +84,6 @@ def make_vec_env(
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)
-    arguments = {name: plain(value) for name, value in arguments.items()}
     render_mode = arguments.pop("render_mode", None)  # of the batch alone, not of its spec
     single = make_one(env, arguments)
     if isinstance(wrapper, Mapping):
@@ -87,12 +92,11 @@ def make_vec_env(
         single = wrapper(single)
     elif wrapper is not None:
         reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
-    with closing(single):
-        batch, spec = batch_like(single), single.spec
+    mode = AutoresetMode.SAME_STEP
+    batch = native_batch(single, n_envs, autoreset_mode=mode, render_mode=render_mode)
     if batch is None:
         raise ValueError(f"wrapper must be IncrementalAction, got {single}")
-    many = batch(n_envs, autoreset_mode=AutoresetMode.SAME_STEP, render_mode=render_mode)
-    plants = GymnasiumVecEnv(many, spec=spec, group=group)
+    plants = GymnasiumVecEnv(batch, spec=single.spec, group=group)
     plants.seed(seed)
     return plants
 
@@ -118,17 +122,14 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
         If the model's environments cannot be made from a spec, or have other windows than
         `arguments`.
     """
-    own, (plant, *_) = _spec(policy), environments.plants_of(policy.get_env())
-    windows = {name: getattr(plant.parameters, name) for name in WINDOWS}
+    own, (plant, *_) = _spec(policy), acting.plants_of(policy.get_env())
+    windows = dict(zip(WINDOWS, plant.parameters.windows, strict=True))
     for name, value in windows.items():
         if arguments.get(name, value) != value:
             raise ValueError(
                 f"{name} must be that of policy's training, {value}, got {arguments[name]}"
             )
-    if isinstance(env, EnvSpec):
-        env = dataclasses.replace(env, additional_wrappers=())
-    with closing(make_one(env, {**arguments, **windows})) as single:
-        spec = cast("EnvSpec", single.spec)  # gymnasium.make sets it
+    spec = cast("EnvSpec", make_one(env, {**arguments, **windows}).spec)
     return dataclasses.replace(spec, additional_wrappers=own.additional_wrappers)
 
 
@@ -142,9 +143,9 @@ def _spec(model: Any) -> EnvSpec:
         # Gymnasium cannot make the Monitor that each model adds, and it changes nothing.
         kept = tuple(each for each in spec.additional_wrappers if each.name != "Monitor")
         spec = dataclasses.replace(spec, additional_wrappers=kept)
-        with closing(gymnasium.make(EnvSpec.from_json(spec.to_json()))) as single:
-            made, own = (single.observation_space, single.action_space), plants.unwrapped
-            if made != (own.observation_space, own.action_space):
+        single, own = gymnasium.make(EnvSpec.from_json(spec.to_json())), plants.unwrapped
+        for name in ("observation_space", "action_space"):
+            if getattr(single, name) != getattr(own, name):
                 raise ValueError(f"it makes {single}")
     except Exception as error:  # from wrappers of anybody
         raise ValueError(
@@ -211,9 +212,8 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
         with zipfile.ZipFile(path) as archive:
             about, data = (json.loads(archive.read(name)) for name in (MEMBER, "data"))
         spec, n = EnvSpec.from_json(about["spec"]), data["n_envs"]
-        with closing(make_one(spec, {})) as single:
-            native = batch_like(single) is not None
         one = partial(gymnasium.make, spec)
+        native = native_batch(one(), 1) is not None
         plants: VecEnv = make_vec_env(spec, n) if native else DummyVecEnv([one] * n)
         algorithm = pkgutil.resolve_name(about["algorithm"])
         return cast("BaseAlgorithm", algorithm.load(path, plants, **arguments))
@@ -282,59 +282,52 @@ class ScoreCallback(BaseCallback):
         self._env, self._arguments = env, arguments
 
     def _init_callback(self) -> None:
-        if isinstance(self._env, str | EnvSpec):
-            # Not kept in place of the id: the next model may have other windows.
-            self._score_in = partial(
-                evaluate, env=spec_of(self.model, self._env, **self._arguments)
-            )
-        elif not callable(self._env) and environments.shared(self._env, self.training_env):
+        env, arguments = self._env, self._arguments
+        if isinstance(env, str | EnvSpec):
+            env, arguments = spec_of(self.model, env, **arguments), {}
+        elif not callable(env) and acting.shared(env, self.training_env):
             raise ValueError("env must not be the environments of the training: make others")
-        else:
-            self._score_in = partial(evaluate, env=self._env, **self._arguments)
+        # Not kept in place of the id: the next model may have other windows.
+        self._score_in: Any = partial(evaluate, env=env, **arguments)
         self._hand_over()
         if self.path is not None:
             _record(self.model)  # now, rather than when it is to be saved
 
     def _hand_over(self) -> None:
         """Give the statistics of the training to the environments of the scores."""
-        normalises = self.model.get_vec_normalize_env() is not None
-        if normalises and isinstance(self._env, VecEnv):
-            try:
-                synchronise(self.training_env, self._env)
-            except (AssertionError, AttributeError) as error:
-                raise ValueError(
-                    f"env must be wrapped like that of the training: {error}"
-                ) from error
+        if self.model.get_vec_normalize_env() is None or not isinstance(self._env, VecEnv):
+            return
+        try:
+            synchronise(self.training_env, self._env)
+        except (AssertionError, AttributeError) as error:
+            raise ValueError(
+                f"env must be wrapped like that of the training: {error}"
+            ) from error
 
     def _on_training_start(self) -> None:
-        self._latest, self._next = -1, self.num_timesteps + self.every
+        self._latest = self.num_timesteps
 
     def _on_step(self) -> bool:
-        if self.num_timesteps >= self._next:
-            self._next += self.every
+        if self.num_timesteps >= self._latest + self.every:
             self._score()
         return True
 
     def _on_training_end(self) -> None:
-        if self._latest < self.num_timesteps:
+        if self.num_timesteps > self._latest:
             self._score()
 
     def _score(self) -> None:
         self._hand_over()
+        self._latest = now = self.num_timesteps
         found = self._score_in(self.model, episodes=self.episodes, seed=SEED + EPISODES)
-        self._latest = self.num_timesteps
-        self.scores.append((self.num_timesteps, found))
+        self.scores.append((now, found))
         self.logger.record("score/mean_error", found.mean_error)
         if found.score is not None:
             self.logger.record("score/score", found.score)
         best = self.best is None or found.mean_error < self.best.mean_error
-        if best:
-            self.best = found
-            if self.path is not None:
-                save(self.model, self.path)
+        self.best = found if best else self.best
+        if best and self.path is not None:
+            save(self.model, self.path)
         if self.verbose:
-            total = self.locals.get("total_timesteps", 0)
-            share = f" of {total:,}" if total else ""
-            print(
-                f"{self.num_timesteps:,}{share} samples: {found}{'; best' * best}", flush=True
-            )
+            total = self.locals.get("total_timesteps", now)
+            print(f"{now:,} of {total:,} samples: {found}{'; best' * best}", flush=True)

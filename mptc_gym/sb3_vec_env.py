@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
@@ -48,9 +48,11 @@ class GymnasiumVecEnv(VecEnv):
                 raise ValueError(f"batches must have the same spaces, got {batches}")
         self.batches, self.spec, self.group = batches, spec, group
         self.infos: dict[str, Any] = {}
-        starts = np.cumsum([0, *(batch.num_envs for batch in batches)]).tolist()
-        self._parts = list(zip(batches, map(slice, starts, starts[1:]), strict=True))
-        super().__init__(starts[-1], *spaces)
+        sizes = [batch.num_envs for batch in batches]
+        self._edges = np.cumsum(sizes)[:-1]
+        # Of each environment, the number of its batch and its own number there.
+        self._places = [(batch, j) for batch, size in enumerate(sizes) for j in range(size)]
+        super().__init__(sum(sizes), *spaces)
         self._began = time.time()
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, np.int64)
@@ -65,38 +67,40 @@ class GymnasiumVecEnv(VecEnv):
         """Reset all environments, with the seeds set by `seed`."""
         if any(self._options):
             raise ValueError(f"options must be empty, got {self._options!r}")
-        # A batch takes one seed per environment, despite its annotation.
-        resets = [batch.reset(seed=cast("int", self._seeds[own])) for batch, own in self._parts]
+        seeds: Any = np.split(np.array(self._seeds, object), self._edges)
+        resets = [
+            batch.reset(seed=own.tolist())
+            for batch, own in zip(self.batches, seeds, strict=True)
+        ]
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0
-        counts = [range(batch.num_envs) for batch in self.batches]
-        pairs = zip(resets, counts, strict=True)
-        self.reset_infos = [_alone(infos, i) for (_, infos), count in pairs for i in count]
+        self.reset_infos = [_alone(resets[batch][-1], j) for batch, j in self._places]
         return self._joined(resets)[0]
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Store the actions, shape (num_envs, action size)."""
-        self._actions = actions
+        self._actions = np.split(actions, self._edges)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step with the stored actions."""
-        steps = [batch.step(self._actions[own]) for batch, own in self._parts]
+        pairs = zip(self.batches, self._actions, strict=True)
+        steps = [batch.step(actions) for batch, actions in pairs]
         observations, rewards, terminated, truncated = self._joined(steps)
         ended = terminated | truncated
         self._returns += rewards
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in ended]
-        for (_, own), (*_, found) in zip(self._parts, steps, strict=True):
-            for j in np.flatnonzero(ended[own]).tolist():
-                i = own.start + j
-                self.reset_infos[i] = _alone(found, j)
-                episode = {"r": float(self._returns[i]), "l": int(self._lengths[i])}
-                infos[i] = {
-                    **_alone(found["final_info"], j),
-                    "terminal_observation": found["final_obs"][j],
-                    "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                    "episode": {**episode, "t": round(time.time() - self._began, 6)},
-                }
+        for i in np.flatnonzero(ended).tolist():
+            batch, j = self._places[i]
+            found = steps[batch][-1]
+            self.reset_infos[i] = _alone(found, j)
+            episode = {"r": float(self._returns[i]), "l": int(self._lengths[i])}
+            infos[i] = {
+                **_alone(found["final_info"], j),
+                "terminal_observation": found["final_obs"][j],
+                "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
+                "episode": {**episode, "t": round(time.time() - self._began, 6)},
+            }
         self._returns[ended], self._lengths[ended] = 0.0, 0
         return observations, rewards.astype(np.float32), ended, infos
 
@@ -121,24 +125,18 @@ class GymnasiumVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of each environment's batch, but its own `spec`."""
-        of_each = [batch for batch in self.batches for _ in range(batch.num_envs)]
+        chosen = [self._places[i][0] for i in self._get_indices(indices)]
         if attr_name == "spec":
-            return [self.spec for _ in self._get_indices(indices)]
-        return [getattr(of_each[i], attr_name) for i in self._get_indices(indices)]
+            return [self.spec] * len(chosen)
+        return [getattr(self.batches[batch], attr_name) for batch in chosen]
 
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refuse: an environment of a batch has no attributes of its own."""
-        raise NotImplementedError(f"{attr_name} can be set on `batches` only, for all at once")
+    def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
+        """Refuse: an environment of a batch has no methods or attributes of its own."""
+        raise NotImplementedError(f"{args[0]} is that of all at once: use `batches`")
 
-    def env_method(
-        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
-    ) -> list[Any]:
-        """Refuse: an environment of a batch has no methods of its own."""
-        raise NotImplementedError(f"{method_name} can be called on `batches` only")
+    set_attr = env_method
 
-    def env_is_wrapped(
-        self, wrapper_class: type[Any], indices: VecEnvIndices = None
-    ) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
         """Return False for each index: a batch holds no wrapped environments."""
         return [False for _ in self._get_indices(indices)]
 

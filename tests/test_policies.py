@@ -521,8 +521,6 @@ REFUSED = {
         lambda seen: torch.zeros(len(seen), 1, requires_grad=True), NOISY, r"tensor\.detach\("),
     "no policy": (3, NOISY, "policy must be a function, or an object with predict or act"),
     "a class": (PIController, NOISY, "predict or act, not a class"),
-    "predict without names": (
-        SimpleNamespace(predict=lambda *seen: 0), NOISY, r"must name what it.*got \(\*seen\)"),
     "predict that keeps its state": (
         SimpleNamespace(predict=lambda seen: (law(seen), 1)), NOISY, "take the state that it"),
     "masked actions": (
@@ -551,7 +549,7 @@ REFUSED = {
         law, told(lambda info: {k: info[k] for k in info if k != "error"}),
         "whose error by sample 1 is.* got None", "as is"),
     "another plant": (
-        law, lambda: wrappers.TimeLimit(Faster(**BARE), 40), "whose output by sample 2",
+        law, lambda: wrappers.TimeLimit(Faster(**BARE), 40), "whose error by sample 2",
         "as is"),
     "plants that differ": (law, lambda: unlike({}, {"delay": 3}), "must have the same plants"),
     "episodes that differ": (
@@ -581,13 +579,13 @@ REFUSED = {
         "observation space of"),
     "model whose IncrementalAction is forgotten": (
         lambda: model_of(PPO, make_vec_env(NOISY, N, wrapper=VELOCITY)), NOISY,
-        "wrappers of policy's training, .*IncrementalAction.*, got none"),
+        "action wrappers of policy's training, .*IncrementalAction.*, got none"),
     "model in another IncrementalAction": (
         lambda: model_of(PPO, moved(made())), lambda: IncrementalAction(made()),
-        "wrappers of policy's training, .*IncrementalAction", "as is"),
+        "action wrappers of policy's training, .*IncrementalAction", "as is"),
     "the same, in processes": (
         lambda: model_of(PPO, SubprocVecEnv([lambda: moved(made())], "fork")), NOISY,
-        "wrappers of policy's training, .*IncrementalAction"),
+        "action wrappers of policy's training, .*IncrementalAction"),
     "model whose VecNormalize is forgotten": (
         lambda: model_of(PPO, normal(VecNormalize(dummy()))), NOISY,
         "wrappers of policy's training, {'VecNormalize'}, got none"),

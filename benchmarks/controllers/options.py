@@ -29,9 +29,8 @@ from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import UsageError
 from benchmarks.loop.rollout import make_plants
 from mptc_gym import MiddlePointEnv, Parameters
-from mptc_gym.environments import opened
+from mptc_gym.acting import opened, start
 from mptc_gym.evaluation import case_of
-from mptc_gym.policies import start
 from mptc_gym.wrappers.vector import IncrementalAction
 
 AgentNames = Annotated[Names, Parameter(help="Controllers to run.", choices=ROSTER)]

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
+from mptc_gym.acting import rollout as run_batch
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import action_from_command
-from mptc_gym.policies import rollout as run_batch
 from mptc_gym.ranges import Ranges
 
 Array = NDArray[np.float64]
@@ -102,7 +102,7 @@ def rollout(
 ) -> Trajectory:
     """Run a controller on a batch of plants for k = 0 to samples - 1. Both are reset first.
 
-    Plants are a vector environment, or given ones as `mptc_gym.environments` opens them. Run i
+    Plants are a vector environment, or given ones as `mptc_gym.acting` opens them. Run i
     has the noise and the set point of seed `seed + i`. `before` is called with k before
     the controller acts at sample k, to observe or to damage it.
     """
