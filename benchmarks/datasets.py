@@ -35,10 +35,9 @@ IDS = {
 VARIABLE = "MINARI_DATASETS_PATH"
 DESCRIPTION = """\
 Middle-point temperature of a once-through boiler, preset {plant!r}, random set points, under
-{controllers}. The reward of a step is -|error| in degC. On the episodes of `evaluation_seeds`,
-`least_possible_error` is the least possible mean |error| and `idle_error` that without control;
-`least_possible_errors` and `idle_errors` are those of each episode.
-`mptc_gym.evaluate(policy, dataset.env_spec, episodes=50)` scores a policy on them."""
+{controllers}. The reward of a step is -|error| in degC. `mptc_gym.evaluate(policy,
+dataset.env_spec, episodes=50)` scores a policy on the episodes of `evaluation_seeds`, where
+`least_possible_error` is the least possible mean |error|, `idle_error` that without control."""
 
 
 @options

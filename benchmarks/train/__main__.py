@@ -24,7 +24,8 @@ NETWORKS = {"nn-smith": 1, "ppo": 5, "ppo-hard": 5}  # and how many are trained 
 class Options:
     """Train the neural controllers: by the gradient through the plant, or by PPO.
 
-    Finished networks are kept: the same command, run again, trains only the missing ones.
+    Finished networks are kept, if no file of the checkout differs from its commit: the same
+    command, run again, trains only the missing ones.
     """
 
     network: Annotated[str, Parameter(choices=NETWORKS)] = field(kw_only=False)
