@@ -63,7 +63,8 @@ class Panel:
             x = self.x(value * minute)
             pygame.draw.line(self._surface, _GRID, (x, self._top), (x, bottom))
             self.write(f"{value:.6g}", _INK, midtop=(x, bottom + 6))
-        self.write("min", _INK, midtop=(self._left - 24, bottom + 6))
+        # Left of where a number at the edge begins.
+        self.write("min", _INK, topright=(self._left - 34, bottom + 6))
         frame = self._left, self._top, self._width + 1, self._height + 1
         pygame.draw.rect(self._surface, LIMIT, frame, 1)
 

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mptc_gym import MiddlePointEnv, Parameters
@@ -36,6 +36,7 @@ def test_the_checker_of_a_library_is_content_with_any_valid_arguments(library, a
     actions=st.lists(st.floats(-1e3, 1e3, width=32), min_size=1, max_size=60),
     seed=st.integers(0, 2**31),
 )
+@example({"a": [1.0, -3.0, 4.0], "output_window": 1}, [1.0] * 1500, 0)  # beyond all floats
 def test_observations_stay_in_their_space_whatever_the_actions(arguments, actions, seed):
     env = MiddlePointEnv(**arguments)
     record = run(env, np.array(actions, dtype=np.float32), seed)
@@ -64,13 +65,6 @@ def test_spaces_whose_bounds_are_those_of_the_span_unless_a_set_point_is_beyond(
     assert list(beyond.observation_space.high) == [60, 110]
     amplitude = MiddlePointEnv(setpoint_amplitude=60.0, setpoint_window=1, error_window=1)
     assert amplitude.observation_space == beyond.observation_space
-
-
-def test_an_unstable_plant_stays_in_its_observation_space():
-    env = MiddlePointEnv(a=[1.0, -3.0, 4.0], output_window=1)
-    record = run(env, np.ones(1500))
-    assert not np.isfinite(record["output"][-1])
-    assert all(env.observation_space.contains(each) for each in record["observation"])
 
 
 def test_reset_is_at_rest():
@@ -107,17 +101,6 @@ def test_timeline_by_hand():
     assert list(run(square, np.zeros(8))["setpoint"]) == [2, 2, 2, -2, -2, -2, 2, 2, 2]
     # y_d newest first, e, y, and actions as the actuator limits them
     assert list(record["observation"][4]) == [1, 1, 1, -2.5, 2, 3, 3.5, -1, 0, -1]
-
-
-@pytest.mark.parametrize(("windows", "expected"), [
-    ((0, 3, 0, 0), [4, 3, 2]), ((3, 0, 0, 0), [5, 5, 5]), ((1, 2, 0, 0), [5, 4, 3]),
-    ((0, 0, 4, 0), [1, 2, 3, 0]), ((0, 0, 0, 2), [0.25, 0.5]), ((0, 1, 1, 0), [4, 1]),
-])  # fmt: skip
-def test_windows(windows, expected):
-    plant = {"a": [1.0], "b": [1.0], "delay": 0, "dead_zone": 0.0, "u_min": -4.0, "u_max": 4.0}
-    env = MiddlePointEnv(setpoint=5.0, **plant, **dict(zip(WINDOWS, windows, strict=True)))
-    record = run(env, [0.75, 0.5, 0.25])  # y = 3, 2, 1
-    assert list(record["observation"][-1]) == expected
 
 
 def test_measurement_saturates_and_truth_does_not():
@@ -174,23 +157,24 @@ BAD = {
     "u_min": [10.0, 11.0, -INF], "u_max": [INF], "noise_variance": [-0.5, INF, None],
     "disturbance_interval": [0.9], "gain_factor": [0.0],
     "a": [[2.0, 0.5], [], [1.0, NAN], 1.0, "1", [1.0] + [0.1] * 1000],
-    "b": [[], [INF], [None], [0.1] * 1001], "c": [[0.9], {}, [1.0] + [0.1] * 1000],
+    "b": [[], [INF], [None], [0.1] * 1001], "c": [[0.9], {}, [1.0] * 900 + [NAN]],
     "drift_samples": [10**10, 0], "sampling_interval": [0.0, -8.0],
     "setpoint": ["triangle", [], [1.0, NAN], NAN, None, 10**400, 1e300],
     "setpoint_amplitude": [-1.0], "setpoint_period": [0, 2.5, 10**400],
     "setpoint_window": [-1], "error_window": [1.0, 10_001], "output_window": ["2"],
     "action_window": [-3, 10**9], "temperature_span": [0.0, INF],
     "reward": ["cubic", 2], "error_scale": [0.0, -5.0], "move_weight": [-1.0, NAN],
+    "render_mode": ["depth_array", "", 3],
 }  # fmt: skip
-BAD = [(name, value) for name, values in BAD.items() for value in values]
 
 
-@pytest.mark.parametrize(("name", "value"), BAD, ids=[f"{n}={v!r:.20}" for n, v in BAD])
-def test_bad_arguments_are_named(name, value):
-    with pytest.raises(ValueError, match=rf"{name}.* must be .*got") as error:
-        MiddlePointEnv(**{name: value})
-    assert repr(value)[:80] in str(error.value)
-    assert len(str(error.value)) < 300
+@pytest.mark.parametrize("name", BAD)
+def test_bad_arguments_are_named(name):
+    for value in BAD[name]:
+        with pytest.raises(ValueError, match=rf"{name}.* must be .*got") as error:
+            MiddlePointEnv(**{name: value})
+        assert repr(value)[:80] in str(error.value)
+        assert len(str(error.value)) < 300
 
 
 @pytest.mark.parametrize("made", [gymnasium.make, partial(gymnasium.make_vec, num_envs=2)])
@@ -199,15 +183,6 @@ def test_misspelt_argument_is_refused_and_the_right_one_named(made):
     for name, hint in {"dead_zon": r": did you mean 'dead_zone'\?", "xyz": ""}.items():
         with pytest.raises(TypeError, match=f"{message}'{name}'{hint}"):
             made("MiddlePoint-v0", **{name: 5.0})
-
-
-@pytest.mark.parametrize("name", ["setpoint", "a", "b"])
-def test_a_long_list_is_not_repeated_in_an_error(name):
-    values = [1.0] * 10_000
-    values[777] = float("nan")
-    with pytest.raises(ValueError, match=r"10000 elements.*where element 777 is nan") as error:
-        MiddlePointEnv(**{name: values})
-    assert len(str(error.value)) < 300
 
 
 def test_arrays_are_taken_where_lists_are():
@@ -233,33 +208,23 @@ def test_the_longest_delay_and_window_are_taken():
     assert run(env, np.ones(2))["observation"].shape == (3, 10_006)
 
 
-@pytest.mark.parametrize(
-    "action",
-    [
-        np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.zeros(0), None, "up",
-        "0.3", b"0.3", np.str_("0.3"), np.bytes_(b"0.3"), np.array(["0.3"]), ["0.3"],
-        np.array("0.3", object), np.array([10**400], object), 0.3 + 0j,
-    ],
-    ids=repr,
-)  # fmt: skip
-def test_bad_action_leaves_the_plant_untouched(action):
+BAD_ACTIONS = [
+    np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.zeros(0), None, "up", "0.3", b"0.3",
+    np.str_("0.3"), np.bytes_(b"0.3"), np.array(["0.3"]), ["0.3"], np.array("0.3", object),
+    np.array([10**400], object), 0.3 + 0j,
+]  # fmt: skip
+
+
+def test_bad_action_leaves_the_plant_untouched():
     reference = run(MiddlePointEnv(noise_variance=0.5), np.ones(40))
     env = MiddlePointEnv(noise_variance=0.5)
     env.reset(seed=0)
     for k in range(40):
-        with pytest.raises(ValueError, match="action"):
-            env.step(action)
+        for action in BAD_ACTIONS:
+            with pytest.raises(ValueError, match="action"):
+                env.step(action)
         _, _, _, _, info = env.step(np.ones(1, np.float32))
         assert info["output"] == reference["output"][k + 1]
-
-
-def test_a_tensor_of_two_numbers_is_refused_as_an_array_of_two_is():
-    torch = pytest.importorskip("torch", reason="the action is a tensor")
-    env = MiddlePointEnv()
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="action must be one finite number"):
-        env.step(torch.zeros(2))
-    env.step(torch.zeros(1))
 
 
 def test_help_shows_every_argument():
@@ -267,9 +232,9 @@ def test_help_shows_every_argument():
     assert {"dead_zone", "delay", "noise_variance", "render_mode"} <= set(names)
     assert all(f"`{name}`" in MiddlePointEnv.__doc__ for name in names)
     for documented in (MiddlePointEnv, Parameters):
-        lines = inspect.getdoc(documented).splitlines()
-        assert all(row in lines for row in argument_table().splitlines())
-        assert "| `delay` | 18* | samples | transport delay d of (28) |" in lines
+        found = inspect.getdoc(documented)
+        assert f"\n\n{argument_table()}\n" in found
+        assert "\n| `delay` | 18* | samples | transport delay d of (28) |\n" in found
 
 
 @pytest.mark.parametrize(
