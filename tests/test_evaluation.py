@@ -136,11 +136,11 @@ class TestEvaluate:
     @pytest.mark.parametrize(
         ("arguments", "advice"),
         [
-            ({"max_episode_steps": 60}, "--preset paper --samples 60 --episodes 2"),
-            ({"env": HARD, "seed": 3, "max_episode_steps": 60},
-             "--preset hard --samples 60 --episodes 2 --seed 3"),
-            ({"delay": [5, 9], "setpoint": "random", "seed": 7, "max_episode_steps": 60},
-             "--set 'delay=[5,9]' --set setpoint=random --samples 60 --episodes 2 --seed 7"),
+            ({"max_episode_steps": 25}, "--preset paper --samples 25 --episodes 2"),
+            ({"env": HARD, "seed": 3, "max_episode_steps": 25},
+             "--preset hard --samples 25 --episodes 2 --seed 3"),
+            ({"delay": [5, 9], "setpoint": "random", "seed": 7, "max_episode_steps": 25},
+             "--set 'delay=[5,9]' --set setpoint=random --samples 25 --episodes 2 --seed 7"),
             ({"setpoint": [1, 2.5], "a": (1.0, -0.9), "b": (0.2,), "max_episode_steps": 30},
              "--set 'a=[1.0,-0.9]' --set 'b=[0.2]' --set 'setpoint=[1.0,2.5]' --samples 30 "
              "--episodes 2"),
@@ -152,7 +152,7 @@ class TestEvaluate:
         found = str(evaluate(idle, episodes=2, **arguments))
         command = f"python -m benchmarks.bounds {advice}"
         assert found.endswith(f"no bound is kept for this case: {command}")
-        case = {"samples": arguments.pop("max_episode_steps", 1200), "episodes": 2, **arguments}
+        case = {"samples": arguments.pop("max_episode_steps"), "episodes": 2, **arguments}
         case = {**PRESETS["hard" if case.pop("env", "") else "paper"], **case}
         least = least_possible(kind="preview", folder=None, **case)
         assert bounds_command([*shlex.split(command)[3:], f"--cache={tmp_path}"]) == 0

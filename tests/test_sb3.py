@@ -48,24 +48,26 @@ def two_batches():
 
 def make_both(kind):
     """Return a batch, and the same in Stable-Baselines3's own way, both with the seed 3."""
-    if kind == "wrapped":
-        given = {**TRAINING, "max_episode_steps": 7}
-        ours = make_vec_env(HARD, N, seed=3, wrapper=VELOCITY, **given)
-        made = [lambda: IncrementalAction(gymnasium.make(HARD, **given), **VELOCITY)] * N
-    elif kind == "two":
-        ours = two_batches()
-        made = [
-            partial(gymnasium.make, "MiddlePoint-v0", **each)
-            for n, each in TWO
-            for _ in range(n)
-        ]
-    else:
-        made = [partial(gymnasium.make, "CartPole-v1", max_episode_steps=15)] * N
-        ours = GymnasiumVecEnv(SyncVectorEnv(made, autoreset_mode="SameStep"))
-    theirs = DummyVecEnv([lambda one=one: Monitor(one()) for one in made])
-    for each in (theirs,) if kind == "wrapped" else (ours, theirs):
+    given = {**TRAINING, "max_episode_steps": 7}
+    cart_pole = [partial(gymnasium.make, "CartPole-v1", max_episode_steps=15)] * N
+    ours, made = {
+        "wrapped": (
+            lambda: make_vec_env(HARD, N, wrapper=VELOCITY, **given),
+            [lambda: IncrementalAction(gymnasium.make(HARD, **given), **VELOCITY)] * N,
+        ),
+        "two": (
+            two_batches,
+            [partial(gymnasium.make, "MiddlePoint-v0", **x) for n, x in TWO for _ in range(n)],
+        ),
+        "terminate": (
+            lambda: GymnasiumVecEnv(SyncVectorEnv(cart_pole, autoreset_mode="SameStep")),
+            cart_pole,
+        ),
+    }[kind]
+    both = ours(), DummyVecEnv([lambda one=one: Monitor(one()) for one in made])
+    for each in both:
         each.seed(3)
-    return ours, theirs
+    return both
 
 
 def test_a_group_draws_the_same_and_no_other_does(rng):
@@ -109,64 +111,43 @@ def test_trajectories_equal_those_of_dummy_vec_env(kind, rng):
     assert set(truncated) == ({True, False} if kind == "terminate" else {True})
 
 
-def test_pictures_are_those_of_the_batch():
-    ours = make_vec_env("MiddlePoint-v0", 2, render_mode="rgb_array")
-    ours.reset()
-    np.testing.assert_array_equal(ours.get_images(), ours.batches[0].render())
-    assert ours.render().shape == (2 * 540, 960, 3)
-
-
-def test_batches_of_another_mode_or_of_other_spaces_are_refused():
-    with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
-        GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", N))
-    batches = [
-        gymnasium.make_vec("MiddlePoint-v0", 2, autoreset_mode="SameStep", action_window=window)
-        for window in (0, 1)
-    ]
-    with pytest.raises(ValueError, match="same spaces"):
-        GymnasiumVecEnv(*batches)
-
-
-def test_infos_and_attributes_are_those_of_the_batches():
+def test_what_is_shown_is_of_the_batches_and_what_they_cannot_do_is_refused():
+    pictured = make_vec_env("MiddlePoint-v0", 2, render_mode="rgb_array")
+    pictured.reset()
+    np.testing.assert_array_equal(pictured.get_images(), pictured.batches[0].render())
     ours = two_batches()
     ours.reset()
     ours.step(np.ones((N, 1), np.float32))
     assert list(ours.infos["command"]) == [10.0] * N
-    assert np.all(ours.infos["noise"][:3] != 0.0)
-    assert ours.infos["noise"][3] == 0.0
-    assert [p.noise_variance for p in ours.get_attr("parameters")] == [0.5, 0.5, 0.5, 0.0]
+    assert list(ours.infos["noise"] != 0.0) == [True, True, True, False]
     assert [p.noise_variance for p in ours.get_attr("parameters", [0, 3])] == [0.5, 0.0]
-    assert ours.get_attr("render_mode") == [None] * N
     assert ours.env_is_wrapped(Monitor) == [False] * N
-    with pytest.raises(NotImplementedError, match="parameters"):
-        ours.set_attr("parameters", None)
-    with pytest.raises(NotImplementedError, match="reset"):
-        ours.env_method("reset")
+    for refuse in (ours.set_attr, ours.env_method):
+        with pytest.raises(NotImplementedError, match="parameters is that of all at once"):
+            refuse("parameters", None)
     ours.set_options({"level": 3})
     with pytest.raises(ValueError, match="options"):
         ours.reset()
+    with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
+        GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", N))
+    with pytest.raises(ValueError, match="same spaces"):
+        GymnasiumVecEnv(*ours.batches, make_vec_env(action_window=1).batches[0])
 
 
 def model_of(plants, **arguments):
-    return PPO(
-        "MlpPolicy", plants, n_steps=32, batch_size=32, n_epochs=2, device="cpu", **arguments
-    )
+    small = {"n_steps": 32, "batch_size": 32, "n_epochs": 2, "device": "cpu"}
+    return PPO("MlpPolicy", plants, **small, **arguments)
 
 
 class TestMakeVecEnv:
-    @pytest.mark.parametrize(
-        "wrapper",
-        [
-            VELOCITY, partial(IncrementalAction, **VELOCITY),
-            lambda env: IncrementalAction(env, **VELOCITY),
-        ],
-    )  # fmt: skip
-    def test_the_spec_makes_the_same_environment(self, wrapper):
-        spec = make_vec_env("MiddlePoint-v0", 2, wrapper=wrapper, **TRAINING).spec
-        env = gymnasium.make(EnvSpec.from_json(spec.to_json()))
-        assert isinstance(env, IncrementalAction)
-        assert spec.additional_wrappers[0].kwargs == VELOCITY
-        assert env.unwrapped.parameters.action_window == 20
+    def test_the_spec_makes_the_same_environment(self):
+        by_class = partial(IncrementalAction, **VELOCITY)
+        for wrapper in (VELOCITY, by_class, lambda env: by_class(env)):
+            spec = make_vec_env("MiddlePoint-v0", 2, wrapper=wrapper, **TRAINING).spec
+            env = gymnasium.make(EnvSpec.from_json(spec.to_json()))
+            assert isinstance(env, IncrementalAction)
+            assert spec.additional_wrappers[0].kwargs == VELOCITY
+            assert env.unwrapped.parameters.action_window == 20
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
@@ -175,10 +156,7 @@ class TestMakeVecEnv:
             ({"wrapper": 3}, "wrapper must be the arguments of IncrementalAction"),
             ({"wrapper": partial(DelayObservation, delay=2)}, "wrapper must be IncrementalAct"),
             ({"wrapper": {"max_move": 7}}, "max_move must be"),
-            *(
-                ({"env": env}, "env must be the id of an environment")
-                for env in ("", "Point-v0")
-            ),
+            ({"env": "Point-v0"}, "env must be the id of an environment"),
             ({"delay": -2}, "delay must be"),
         ],
     )
@@ -224,20 +202,17 @@ class TestSave:
     @pytest.mark.parametrize(
         ("make", "message"),
         [
-            (
-                lambda: VecNormalize(make_vec_env()),
-                "in VecNormalize to be saved here: .*env",
-            ),
+            (lambda: VecNormalize(make_vec_env()), "in VecNormalize to be saved here: .*env"),
             (lambda: VecFrameStack(make_vec_env(), 2), "in VecFrameStack to be saved here"),
             (MiddlePointEnv, "must come from gymnasium.make or make_vec_env, .* got None"),
             (two_batches, "must come from gymnasium.make or make_vec_env"),
             (
-                lambda: TransformObservation(gymnasium.make(HARD), abs, None),
-                "that can be impor",
+                lambda: TransformObservation(law_env(), abs, None),
+                "that can be imported and rec",
             ),
             (
-                lambda: type("Local", (DelayObservation,), {})(gymnasium.make(HARD), 2),
-                "that can",
+                lambda: type("Local", (DelayObservation,), {})(law_env(), 2),
+                "that can be imported",
             ),
         ],
     )
@@ -250,30 +225,24 @@ class TestSave:
         assert model.num_timesteps == 0
         assert not [*tmp_path.iterdir()]
 
-    @pytest.mark.parametrize(
-        ("edit", "message"),
-        [
-            (lambda record: "[" * 100_000, "RecursionError"),
-            (lambda record: "{}", "KeyError"),
-            (lambda record: record.replace("PPO", "PPOO"), "AttributeError"),
-            (
-                lambda record: record.replace("wrappers:Incr", "wrappers:In"),
-                "must be a zip of mptc_gym",
-            ),
-            (None, "must be a zip of mptc_gym.sb3.save; others are loaded by"),
-        ],
-    )
-    def test_damaged_and_other_zips_are_refused(self, edit, message, tmp_path):
+    def test_damaged_and_other_zips_are_refused(self, tmp_path):
         model, file = model_of(make_vec_env(wrapper=VELOCITY)), tmp_path / "model.zip"
         save(model, file)
         with zipfile.ZipFile(file) as archive:
             record = archive.read(MEMBER).decode()
-        model.save(file)
-        if edit:
-            with zipfile.ZipFile(file, "a") as archive:
-                archive.writestr(MEMBER, edit(record))
-        with pytest.raises(ValueError, match=message):
-            load(file)
+        for edited, message in (
+            ("[" * 100_000, "RecursionError"),
+            ("{}", "KeyError"),
+            (record.replace("PPO", "PPOO"), "AttributeError"),
+            (record.replace("wrappers:Incr", "wrappers:In"), "must be a zip of mptc_gym"),
+            (None, "must be a zip of mptc_gym.sb3.save; others are loaded by"),
+        ):
+            model.save(file)
+            if edited:
+                with zipfile.ZipFile(file, "a") as archive:
+                    archive.writestr(MEMBER, edited)
+            with pytest.raises(ValueError, match=message):
+                load(file)
         file.write_bytes(file.read_bytes()[:500])
         for path in (file, tmp_path / "none.zip"):
             with pytest.raises(ValueError, match="must be a zip of mptc_gym"):
@@ -326,16 +295,11 @@ class TestScoreCallback:
         assert "score/score" in logged
 
     def test_each_training_has_its_own_scores(self):
-        model = model_of(
-            make_vec_env("MiddlePointNoisy-v0", 2, seed=0, max_episode_steps=5)
-        ).learn(256)
+        model = model_of(make_vec_env("MiddlePointNoisy-v0", 2, max_episode_steps=5)).learn(64)
         callback = ScoreCallback(every=64, episodes=2, verbose=0, max_episode_steps=5)
         model.learn(128, callback=callback, reset_num_timesteps=False)
-        assert [samples for samples, _ in callback.scores] == [320, 384]
         model.learn(96, callback=callback)
-        assert [samples for samples, _ in callback.scores[2:]] == [64, 128]
-        model.learn(128, callback=callback)
-        assert [samples for samples, _ in callback.scores[4:]] == [64, 128]
+        assert [samples for samples, _ in callback.scores] == [128, 192, 64, 128]
 
     def test_statistics_of_the_training_are_handed_over(self):
         model = model_of(VecNormalize(make_vec_env(HARD, 2, seed=0)))
