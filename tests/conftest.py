@@ -107,7 +107,7 @@ def trajectory(
     still = np.zeros(len(setpoint))
     command = still if command is None else command
     columns = setpoint, output, command, command if applied is None else applied, still
-    columns = (*columns, np.subtract(setpoint, output))
+    columns = (*columns, np.subtract(setpoint, output), setpoint)
     return Trajectory(*(np.array(column, dtype=float)[:, np.newaxis] for column in columns))
 
 

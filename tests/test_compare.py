@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
@@ -51,6 +52,19 @@ class TestMeasures:
         assert values["overshoot"] == pytest.approx(50)
         downwards = measured(trajectory([0, -4, -4], [9, 0, -5]))
         assert downwards["overshoot"] == pytest.approx(25)
+
+    def test_what_the_parts_of_a_run_add_to_its_error(self):
+        runs = rollout(
+            make_plants(2, 1200, noise_variance=0.5), PIController(2.2, 0.3), 1200, 0
+        )
+        names = "mae_start", "mae_changes", "mae_steady"
+        values = measure(runs, Parameters())
+        np.testing.assert_allclose(sum(values[name] for name in names), values["mae"])
+        one = np.ones_like(runs.output)  # an error of 1 degC throughout counts the samples
+        counted = measure(replace(runs, next_error=one), Parameters())
+        # The set point changes at k = 300, 600, 900 and 1200, the last sample that counts.
+        for name, samples in zip(names, (299, 181, 720), strict=True):
+            np.testing.assert_allclose(1200 * counted[name], samples)
 
     @pytest.mark.parametrize(
         ("setpoint", "output", "time"),

@@ -30,6 +30,7 @@ PAIRED = "Below 0 a controller is better; in % the share of runs in which it is.
 COSTS = (
     "What it is told; what was searched or trained beforehand; the processor time of its runs."
 )
+PARTS = "Contributions to the mean error, °C: means of all runs."
 STEP_METRICS = ("overshoot", "settling_time")  # meaningless in noise
 
 
@@ -69,6 +70,7 @@ def write(
         [PAIRED],
         paired_table(estimates),
     )
+    hard = runs[runs["scenario"] == "hard"]
     sections = [
         Section(
             "Score: 0 without control, 1 at the least possible error",
@@ -88,6 +90,11 @@ def write(
             pictures={"travel.png": "The mean error over valve travel, a panel for each case"},
         ),
         *([paired] if len(scores) > 1 else []),
+        *(
+            [Section("Where the error arises: `hard`", [PARTS], parts_table(hard))]
+            if len(hard)
+            else []
+        ),
         Section("What each controller costs", [COSTS], costs_table(cases, controllers)),
         Section(
             f"All measures: median (10th to 90th percentile) of {runs['seed'].nunique()} runs",
@@ -206,6 +213,13 @@ def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataF
     )
     table = table.loc[[*agents]].fillna("").rename(index=label)
     return table.rename_axis(index="controller", columns=None).reset_index()
+
+
+def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean error of a case and its parts, one row for each controller, in order."""
+    names = ["mae_start", "mae_changes", "mae_steady", "mae"]
+    means = runs.groupby("agent")[names].mean().sort_values("mae").map("{:.3f}".format)
+    return means.rename(index=label, columns=METRICS).rename_axis("controller").reset_index()
 
 
 def costs_table(cases: Sequence[Case], controllers: Mapping[str, Controller]) -> pd.DataFrame:

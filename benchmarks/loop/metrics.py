@@ -16,11 +16,18 @@ from mptc_gym.plant import least_effective
 Array = NDArray[np.float64]
 
 SETTLING_BAND = 0.05  # fraction of the set-point change, or of the set point
+START, CHANGE = (
+    300,
+    60,
+)  # samples: the start of a run, and how long a change of set point counts
 LAST = 50  # samples at the end of a run that decide whether it has settled
 
 # Names in CSV files, and headings.
 METRICS: dict[str, str] = {
     "mae": "mean |e| (°C)",
+    "mae_start": f"first {START} samples",
+    "mae_changes": f"{CHANGE} samples after later changes",
+    "mae_steady": "the rest",
     "ise": "ISE (°C² min)",
     "itae": "ITAE (°C min²)",
     "total_variation": "total variation (t/h)",
@@ -35,6 +42,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     """Compute the measures in `METRICS` for each run, each of shape (runs,).
 
     - `mae`: mean of |e(k)| over k = 1 to N, the errors in the rewards;
+    - `mae_start`, `mae_changes`, `mae_steady`: what it is the sum of; see `_parts`;
     - `ise`: integral of e^2 over the same samples;
     - `itae`: integral of t |e|, with t counted from the latest set-point change;
     - `total_variation`: total variation of the applied input; see `travel`;
@@ -59,6 +67,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     itae, overshoot, settling = np.array([_measure_steps(*each) for each in pairs]).T
     return {
         "mae": mean_error(trajectory),
+        **_parts(trajectory),
         "ise": interval * np.square(trajectory.next_error).sum(axis=0),
         "itae": interval**2 * itae,
         "total_variation": travel(trajectory),
@@ -67,6 +76,21 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
         "dead_zone_share": 100.0 * inside.mean(axis=0),
         "saturation_share": 100.0 * saturated.mean(axis=0),
     }
+
+
+def _parts(trajectory: Trajectory) -> dict[str, Array]:
+    """Return what the parts of each run contribute to its mean error, degC.
+
+    They are the samples before `START`, the `CHANGE` samples from a later change of the set
+    point on, with what reaches beyond `START` of an earlier one, and the rest.
+    """
+    error, setpoint = np.abs(trajectory.next_error), trajectory.next_setpoint
+    k = np.arange(1, len(error) + 1)[:, np.newaxis]
+    changed = np.diff(setpoint, axis=0, prepend=trajectory.setpoint[:1]) != 0.0
+    latest = np.maximum.accumulate(np.where(changed, k, -CHANGE), axis=0)
+    start, moved = k < START, k < latest + CHANGE
+    parts = {"start": start, "changes": ~start & moved, "steady": ~start & ~moved}
+    return {f"mae_{name}": (error * part).mean(axis=0) for name, part in parts.items()}
 
 
 def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]:

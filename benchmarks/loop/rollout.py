@@ -63,6 +63,8 @@ class Trajectory:
     """n(k), degC."""
     next_error: Array
     """e(k + 1), degC, which the reward of sample k is for. Mean errors are over k = 1 to N."""
+    next_setpoint: Array
+    """y_d(k + 1), degC."""
 
 
 def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vector.VectorEnv:
@@ -126,4 +128,5 @@ def rollout(
         trajectory.command[k] = after["command"]
         trajectory.applied[k] = after["applied"]
         trajectory.next_error[k] = after["error"]
+        trajectory.next_setpoint[k] = after["setpoint"]
     return trajectory
