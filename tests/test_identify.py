@@ -16,11 +16,12 @@ from scipy import signal
 
 from agents import PIController, SmithPredictor
 from benchmarks.identify import study
-from benchmarks.identify.__main__ import Columns, Knowledge, main
+from benchmarks.identify.__main__ import main
 from benchmarks.identify.advice import Loops, recommended
 from benchmarks.identify.fit import Plant
 from benchmarks.identify.log import Log, read_log
 from benchmarks.identify.model import identify, operating_flow
+from benchmarks.identify.options import Columns, Knowledge
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.identify.report import controllers, report
 from mptc_gym import Parameters

@@ -3,68 +3,12 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
-from pathlib import Path
 
-from benchmarks.lib.command import Finite, Folder, Repeated, command, options
+from benchmarks.identify.options import Options
+from benchmarks.lib.command import command
 
 # NumPy reads it when it is imported. Threads for small matrices only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-
-@options
-@dataclass(frozen=True, kw_only=True)
-class Columns:
-    """The columns of a log. Their units may also stand in the heading, in brackets."""
-
-    time: str = "time"
-    """Column of the times, numbers or dates."""
-    flow: str = "flow"
-    """Column of the flow."""
-    temperature: str = "temperature"
-    """Column of the temperature."""
-    disturbance: Repeated = ()
-    """Column of a measured disturbance (repeatable)."""
-    time_unit: str | None = None
-    """Unit of the times: ms, s, min, h or D, days (default: s)."""
-    flow_unit: str | None = None
-    """Unit of the flow, for the report (default: t/h)."""
-    temperature_unit: str | None = None
-    """Unit of the temperature, for the report (default: °C)."""
-
-
-@options
-@dataclass(frozen=True, kw_only=True)
-class Knowledge:
-    """Prior knowledge of the plant and its valve."""
-
-    applied: bool = False
-    """The flow was measured behind the valve, so that nothing is asked about the valve."""
-    operating_flow: Finite | None = None
-    """Flow at the operating point, around which a dead zone lies (default: 0 or the first flow
-    if it is well inside the range of the flows, else the middle of the range)."""
-    u_min: Finite | None = None
-    """Smallest flow, from the operating point (default: the log's)."""
-    u_max: Finite | None = None
-    """Largest flow, from the operating point (default: the log's)."""
-
-
-@options
-@dataclass(frozen=True, kw_only=True)
-class Options:
-    """Fit a plant to a recorded log, and tune a PI controller for it.
-
-    The log is a table with a heading; each row holds the temperature at its time and the flow
-    commanded from that time on.
-    """
-
-    log: Path = field(kw_only=False)
-    """The log, a CSV file."""
-    out: Folder = Path("results/identify")
-    smith: bool = False
-    """Tune a Smith predictor, too. Its delay margin must be a fifth of the delay."""
-    columns: Columns = field(default_factory=Columns)
-    knowledge: Knowledge = field(default_factory=Knowledge)
 
 
 def work(options: Options) -> str:

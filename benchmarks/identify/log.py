@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.identify.__main__ import Columns
+from benchmarks.identify.options import Columns
 
 Array = NDArray[np.float64]
 

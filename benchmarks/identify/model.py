@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.identify.__main__ import Knowledge
 from benchmarks.identify.fit import Array, Plant, Problem
 from benchmarks.identify.log import Log
+from benchmarks.identify.options import Knowledge
 from benchmarks.identify.search import FAULT, FAVOUR, Found, draws, possible_zones, search
 from benchmarks.identify.valve import SOUND, VALVES
 

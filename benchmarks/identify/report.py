@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.identify.__main__ import Options
 from benchmarks.identify.advice import MOST_SENSITIVE, recommended
 from benchmarks.identify.log import read_log
 from benchmarks.identify.model import Model, identify
+from benchmarks.identify.options import Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
 from benchmarks.lib.drawing import COLOURS, drawn
 from benchmarks.lib.report import Section, provenance_line, show, write_report

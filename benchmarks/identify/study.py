@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.identify.__main__ import Knowledge
 from benchmarks.identify.advice import recommended
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import identify
+from benchmarks.identify.options import Knowledge
 from benchmarks.lib.storage import ROOT, write_text
 
 FINE = 5  # steps of the simulator in a sample
