@@ -2,7 +2,6 @@
 
 import gc
 from collections import defaultdict
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -15,13 +14,17 @@ from hypothesis import strategies as st  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
 from agents.actuator import applied_flow  # noqa: E402
-from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv, Parameters  # noqa: E402
+from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters  # noqa: E402
 from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
 from mptc_gym.ranges import Ranges  # noqa: E402
 from mptc_gym.signals import Signals, Streams  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv  # noqa: E402
 from tests.arguments import MODES, valid_arguments  # noqa: E402
 from tests.conftest import random_actions  # noqa: E402
+
+
+def make(num_envs=2, **arguments):
+    return MiddlePointTorchEnv(num_envs, **{"dtype": torch.float64, **arguments})
 
 
 def met(envs, seed, *, episodes, samples):
@@ -116,85 +119,61 @@ def test_it_equals_the_environment_in_numpy(
     ],
 )
 def test_it_equals_it_over_long_episodes_in_both_types(mode, dtype, rtol, atol, rng):
-    arguments = {
-        **PRESETS["hard"], "action_window": 20, "output_window": 2, "move_weight": 0.1,
-        "max_episode_steps": 400, "autoreset_mode": mode,
-    }  # fmt: skip
+    shown = {"action_window": 20, "output_window": 2, "move_weight": 0.1, **PRESETS["hard"]}
+    arguments = {"max_episode_steps": 400, "autoreset_mode": mode, **shown}
     env, envs = make(3, dtype=dtype, **arguments), MiddlePointVectorEnv(3, **arguments)
-    compare(
-        env, envs, steps=600, rng=rng, partial_resets=0.002, limit=400, rtol=rtol, atol=atol
-    )
+    of = {"rtol": rtol, "atol": atol}
+    compare(env, envs, steps=600, rng=rng, partial_resets=0.002, limit=400, **of)
 
 
-class TestEdgeOfTheDeadZone:
-    """Where a command has an effect if it is as large as the dead zone, and none if smaller."""
-
-    @pytest.mark.parametrize(
-        ("dtype", "action_of", "atol"),
-        [
-            (torch.float64, lambda u, dead_zone, **of: action_from_command(u, **of), 1e-13),
-            (torch.float64, float32_action, 1e-5),
-            (torch.float32, float32_action, 1e-5),
-        ],
-    )  # fmt: skip
-    def test_it_passes_in_numpy_and_in_pytorch(self, rng, dtype, action_of, atol):
-        # Of plants with limits of their own.
-        n, ranges = 600, {"u_min": [-12, -5], "u_max": [5, 12], "dead_zone": [0.1, 5]}
-        envs, env = MiddlePointVectorEnv(n, **ranges), make(n, dtype=dtype, **ranges)
-        _, infos = envs.reset(seed=int(rng.integers(2**30)))
-        drawn = {name: infos[name] for name in ranges}
-        env.reset(options={"signals": {k: torch.tensor(each) for k, each in drawn.items()}})
-        commands = rng.choice([-1, 1], n) * drawn["dead_zone"]
-        actions = action_of(commands, **drawn)[:, None]
-        for applied in (env.step(torch.tensor(actions)), envs.step(actions)):
-            np.testing.assert_allclose(applied[-1]["applied"], commands, rtol=0, atol=atol)
-
-    @pytest.mark.parametrize(
-        "numbers",
-        [
-            {}, {"dead_zone": 0.0}, {"dead_zone": 4.0, "u_min": -12.0, "u_max": 6.0},
-            {"dead_zone": 5.0, "u_min": -3.0},  # this limit lies inside
-            {"dead_zone": 2.0, "u_min": 6.0, "u_max": 8.0},
-            {"dead_zone": 10.0, "u_min": -8.62},  # the way to an action and back is not exact
-        ],
-    )  # fmt: skip
-    def test_the_actuator_is_one_for_plants_and_controllers(self, numbers):
-        sizes = np.r_[0.0, 1e-9, 1.0, 2.0, 3.0, 3.999, 4.0, 4.001, 5.0, 6.0, 10.0, 12.0, 1e3]
-        commands = np.r_[-sizes, sizes]
-        n, parameters = len(commands), Parameters(**numbers)
-        limits = parameters.dead_zone, parameters.u_min, parameters.u_max
-        actions = action_from_command(commands, *limits[1:])[:, np.newaxis]
-        one, many, tensors = (
-            MiddlePointEnv(**numbers),
-            MiddlePointVectorEnv(n, **numbers),
-            make(n, **numbers),
-        )
-        for env in (one, many, tensors):
-            env.reset(seed=0)
-        alone = [one.step(action)[-1]["applied"] for action in actions]
-        batches = [env.step(torch.tensor(actions))[-1]["applied"] for env in (many, tensors)]
-        for found in (alone, *batches):
-            expected = applied_flow(commands, *limits)
-            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+@pytest.mark.parametrize(
+    ("dtype", "action_of", "atol"),
+    [
+        (torch.float64, lambda u, dead_zone, **of: action_from_command(u, **of), 1e-13),
+        (torch.float64, float32_action, 1e-5),
+        (torch.float32, float32_action, 1e-5),
+    ],
+)
+def test_a_command_on_the_edge_of_the_dead_zone_passes(rng, dtype, action_of, atol):
+    # Of plants with limits of their own.
+    n, ranges = 600, {"u_min": [-12, -5], "u_max": [5, 12], "dead_zone": [0.1, 5]}
+    envs, env = MiddlePointVectorEnv(n, **ranges), make(n, dtype=dtype, **ranges)
+    _, infos = envs.reset(seed=int(rng.integers(2**30)))
+    drawn = {name: infos[name] for name in ranges}
+    env.reset(options={"signals": {k: torch.tensor(each) for k, each in drawn.items()}})
+    commands = rng.choice([-1, 1], n) * drawn["dead_zone"]
+    actions = action_of(commands, **drawn)[:, None]
+    for applied in (env.step(torch.tensor(actions)), envs.step(actions)):
+        np.testing.assert_allclose(applied[-1]["applied"], commands, rtol=0, atol=atol)
 
 
-def make(num_envs=2, **arguments):
-    return MiddlePointTorchEnv(num_envs, **{"dtype": torch.float64, **arguments})
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {}, {"dead_zone": 0.0}, {"dead_zone": 5.0, "u_min": -3.0},  # this limit lies inside
+        {"dead_zone": 2.0, "u_min": 6.0, "u_max": 8.0},
+        {"dead_zone": 10.0, "u_min": -8.62},  # the way to an action and back is not exact
+    ],
+)  # fmt: skip
+def test_the_actuator_is_one_for_plants_and_controllers(numbers):
+    sizes = np.r_[0.0, 1e-9, 1.0, 2.0, 3.0, 3.999, 4.0, 5.0, 6.0, 10.0, 12.0, 1e3]
+    commands = np.r_[-sizes, sizes]
+    n, parameters = len(commands), Parameters(**numbers)
+    limits = parameters.dead_zone, parameters.u_min, parameters.u_max
+    actions = action_from_command(commands, *limits[1:])[:, np.newaxis]
+    for env in (MiddlePointVectorEnv(n, **numbers), make(n, **numbers)):
+        env.reset(seed=0)
+        found = env.step(torch.tensor(actions))[-1]["applied"]
+        expected = applied_flow(commands, *limits)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
 class TestGradients:
-    HARD: ClassVar = {
-        **PRESETS["hard"], "delay": 2, "dead_zone": 1.0, "action_window": 3,
-        "output_window": 2, "move_weight": 0.1, "u_min": [-12.0, -10.0], "differentiable": True,
-    }  # fmt: skip
-
-    @pytest.mark.parametrize(
-        "plant",
-        [
-            {"dead_zone": 0.0, "action_window": 2}, {"delay": [2, 4], "gain_factor": [0.5, 2]},
-            HARD,
-        ],
-    )  # fmt: skip
+    @pytest.mark.parametrize("plant", [
+        {"dead_zone": 0.0, "action_window": 2}, {"delay": [2, 4], "gain_factor": [0.5, 2]},
+        {**PRESETS["hard"], "delay": 2, "dead_zone": 1.0, "action_window": 3,
+         "output_window": 2, "move_weight": 0.1, "u_min": [-12.0, -10.0]},
+    ])  # fmt: skip
     def test_it_is_that_of_differences_away_from_the_kinks(self, plant):
         env = make(2, **{"delay": 2, "output_window": 1, "differentiable": True, **plant})
 
@@ -225,9 +204,8 @@ class TestGradients:
 
     def test_detach_cuts_what_was_before_and_nothing_else(self):
         def gradients(cut):
-            env = make(
-                2, differentiable=True, action_window=3, move_weight=0.1, noise_variance=1.0
-            )
+            shown = {"action_window": 3, "move_weight": 0.1, "noise_variance": 1.0}
+            env = make(2, differentiable=True, **shown)
             env.reset(seed=0)
             actions = torch.full((60, 2, 1), 0.8, dtype=torch.float64)
             actions[1::2] = 0.6
@@ -258,28 +236,18 @@ class TestGradients:
         assert not actions.grad[:30].any()
         assert actions.grad[30:40].abs().min() > 0
 
-    def test_without_gradients_nothing_of_a_graph_is_kept(self):
-        env = make(2, action_window=3, output_window=1, move_weight=0.1, **PRESETS["hard"])
+    @pytest.mark.parametrize("differentiable", [False, True])
+    def test_memory_does_not_grow_and_a_graph_is_kept_only_if_wanted(self, differentiable):
+        shown = {"action_window": 5, "output_window": 1, "move_weight": 0.1, **PRESETS["hard"]}
+        env = make(3, differentiable=differentiable, max_episode_steps=None, **shown)
         env.reset(seed=0)
         weight = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
-        for _ in range(30):
-            observation, reward, *_, infos = env.step(torch.full((2, 1), 0.7) * weight)
-            assert not any(
-                each.requires_grad for each in (observation, reward, *infos.values())
-            )
-
-    @pytest.mark.parametrize("differentiable", [False, True])
-    def test_memory_does_not_grow(self, differentiable):
-        env = make(
-            3, differentiable=differentiable, max_episode_steps=None, action_window=5,
-            **PRESETS["hard"],
-        )  # fmt: skip
-        env.reset(seed=0)
-        weight = torch.ones(1, 1, dtype=torch.float64, requires_grad=differentiable)
         counts = []
-        for steps in (100, 500):
+        for steps in (60, 450):
             for _ in range(steps):
-                env.step(torch.full((3, 1), 0.7) * weight)
+                observation, reward, *_, infos = env.step(torch.full((3, 1), 0.7) * weight)
+                returned = observation, reward, *infos.values()
+                assert any(each.requires_grad for each in returned) is differentiable
                 env.detach()
             gc.collect()
             counts.append(sum(type(each) is torch.Tensor for each in gc.get_objects()))
@@ -299,10 +267,8 @@ class Waiting(TorchDispatchMode):
         name = func._schema.name.partition("::")[2]
         assert name not in self.REFUSED, name
         indices = args[1] if name.startswith(("index", "_index")) else ()
-        if isinstance(indices, list | tuple):
-            assert not any(each is not None and each.dtype == torch.bool for each in indices), (
-                f"{name} by a mask"
-            )
+        for each in indices if isinstance(indices, list | tuple) else ():
+            assert each is None or each.dtype != torch.bool, f"{name} by a mask"
         if name == "lift_fresh":
             self.on_host.append(args[0])
         elif any(each is other for each in args for other in self.on_host):
@@ -313,12 +279,10 @@ class Waiting(TorchDispatchMode):
 @pytest.mark.parametrize("differentiable", [False, True])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_step_never_waits_for_the_device(mode, differentiable):
-    arguments = {
-        **PRESETS["hard"], "action_window": 5, "move_weight": 0.1, "autoreset_mode": mode,
-        "max_episode_steps": 30, "u_max": [9.0, 10.0], "differentiable": differentiable,
-    }  # fmt: skip
-    for plant in (arguments, {"max_episode_steps": 30, "autoreset_mode": mode}):
-        env = make(3, **plant)
+    shell = {"max_episode_steps": 30, "autoreset_mode": mode, "differentiable": differentiable}
+    most = {**PRESETS["hard"], "action_window": 5, "move_weight": 0.1, "u_max": [9.0, 10.0]}
+    for plant in (most, {}):
+        env = make(3, **shell, **plant)
         env.checks_actions = False  # as on any device but the CPU
         env.reset(seed=0)
         env.step(torch.zeros(3, 1, dtype=torch.float64))
@@ -359,10 +323,9 @@ def test_what_is_refused_is_named(given, named):
 def test_signals_end_with_an_error_and_with_a_reset_without():
     env = make(noise_variance=0.5)
     env.reset(seed=0, options={"signals": {"noise": torch.ones(4, 2)}})
+    some = {"reset_mask": torch.tensor([True, False]), "signals": {"noise": 1.0}}
     with pytest.raises(ValueError, match="signals"):
-        env.reset(
-            options={"reset_mask": torch.tensor([True, False]), "signals": {"noise": 1.0}}
-        )
+        env.reset(options=some)
     for _ in range(3):
         assert env.step(torch.zeros(2, 1))[-1]["noise"].tolist() == [1.0, 1.0]
     with pytest.raises(ValueError, match="end at sample 3"):
