@@ -303,8 +303,6 @@ def _batch(env: Any, n: int) -> Any:
         if not isinstance(envs[-1], gymnasium.Env):
             allowed = "a function that makes one environment; where it makes many, call it"
             reject("env", envs[-1], allowed)
-    if len({id(each.unwrapped) for each in envs}) < len(envs):
-        raise ValueError("env must be a function that makes a new environment at each call")
     following = iter(envs)
     batch = SyncVectorEnv([lambda: next(following)] * len(envs))
     batch.closed = exists  # then it is not ours to close

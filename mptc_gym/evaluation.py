@@ -307,13 +307,13 @@ def _missing(parameters: Parameters, samples: int, seeds: range) -> str:
     case = case_of(parameters)
     presets = {case_of(Parameters(**given)): name for name, given in PRESETS.items()}
     as_json = partial(json.dumps, separators=(",", ":"))
-    changed = {
-        name: as_json(value).strip('"')
+    pairs = [
+        ("--set", name + "=" + as_json(value).strip('"'))
         for name, value in asdict(case).items()
         if value != ARGUMENTS[name].default
-    }
-    sets = [("--set", f"{name}={value}") for name, value in changed.items()]
-    pairs = [("--preset", presets[case])] if case in presets else sets
+    ]
+    if case in presets:
+        pairs = [("--preset", presets[case])]
     usual = {"samples": SAMPLES, "episodes": EPISODES, "seed": SEED}
     asked = {"samples": samples, "episodes": len(seeds), "seed": seeds.start}
     pairs += [(f"--{name}", str(n)) for name, n in asked.items() if n != usual[name]]

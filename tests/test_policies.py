@@ -117,15 +117,17 @@ def frozen(statistics):
     return lambda: lambda seen: ((seen - kept.mean) / np.sqrt(kept.var + 1e-8)).astype("f4")
 
 
-def model_of(algorithm, env, policy="MlpPolicy", **more):
+def model_of(algorithm, env, policy="MlpPolicy"):
     """Return an untrained model whose actions are large and differ."""
-    short = {"n_steps": 32} if algorithm in (PPO, A2C, RecurrentPPO) else {}
+    tiny = {"learning_starts": 8, "buffer_size": 200, "batch_size": 8}
+    tiny |= {"policy_kwargs": {"net_arch": [16]}}
+    if algorithm is A2C:
+        tiny = {"n_steps": 32}
     if algorithm in (PPO, RecurrentPPO):
-        short["batch_size"] = 32
-    if algorithm in (SAC, TD3, TQC, DQN):
-        small = {"net_arch": [16]}
-        short = {"learning_starts": 8, "buffer_size": 200, "policy_kwargs": small}
-    model = algorithm(policy, env, seed=0, device="cpu", **{**short, **more})
+        tiny = {"n_steps": 32, "batch_size": 32, "n_epochs": 1}
+    if algorithm is RecurrentPPO:
+        tiny["policy_kwargs"] = {"lstm_hidden_size": 8}
+    model = algorithm(policy, env, seed=0, device="cpu", **tiny)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for weight in model.policy.parameters():
@@ -358,13 +360,13 @@ RIGHT = {
     "object with act and reset": lambda _: memory(NOISY),
     "its bound method": lambda _: (Integrator().act, NOISY, Integrator),
     "predict of one's own": lambda _: (
-        SimpleNamespace(predict=(i := Integrator()).act, reset=i.reset), NOISY, Integrator),
+        SimpleNamespace(reset=(i := Integrator()).reset, predict=lambda seen: i(seen)),
+        NOISY, Integrator),
     "predict with a state": lambda _: (
         Recurrent(), NOISY, lambda: Integrator()),
     "predict behind **keywords": lambda _: (
         SimpleNamespace(predict=lambda seen, **k: Exploring().act(seen, k["deterministic"])),
         NOISY, lambda: law),
-    "function that remembers": lambda _: (Integrator().__call__, NOISY, Integrator),
     "act that explores on request": lambda _: (Exploring(), NOISY, lambda: law),
     "partial that wants to explore": lambda _: (
         partial(Exploring().act, deterministic=False), NOISY, lambda: lambda s: law(s) + 0.5),
@@ -510,7 +512,7 @@ REFUSED = {
     "function that makes none": (lambda: (law, lambda: int), "makes one environment"),
     "function that makes a batch": (lambda: (law, many), "where it makes many, call it"),
     "function that makes the same": (
-        lambda: (law, lambda e=made(): e), "new environment at each call"),  # noqa: B008
+        lambda: (law, lambda e=made(): e), "must run the episodes of its seeds"),  # noqa: B008
     "another seed": (
         lambda: (law, odd(reset=lambda env, seed, options: env.reset(seed=5))),
         "of its seeds, whose noise by sample"),
