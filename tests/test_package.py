@@ -91,16 +91,6 @@ def test_no_import_circle():
         pytest.fail(f"these import each other: {' <- '.join(error.args[1])}")
 
 
-def test_questions_do_not_import_each_other():
-    # What several need is beside them, in controllers/, train/ or lib/.
-    questions = {"compare", "sweep", "tune", "identify", "examples"}
-    for name, targets in imports_between_modules().items():
-        own = name.split(".")[1] if "." in name else ""
-        targets = targets - {"benchmarks.examples.sb3"}  # the recipe, which others build on
-        others = {target.split(".")[1] for target in targets if "." in target} & questions
-        assert others <= {own}, name
-
-
 PAGES = [
     page
     for page in [
