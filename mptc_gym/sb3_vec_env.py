@@ -132,7 +132,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Refuse: an environment of a batch has no methods or attributes of its own."""
-        raise NotImplementedError(f"{args[0]} is that of all at once: use `batches`")
+        raise NotImplementedError(f"use `batches`, for all at once, got {args or kwargs}")
 
     set_attr = env_method
 

@@ -361,7 +361,7 @@ RIGHT = {
     "its bound method": lambda _: (Integrator().act, NOISY, Integrator),
     "predict of one's own": lambda _: (
         SimpleNamespace(reset=(i := Integrator()).reset, predict=lambda seen: i(seen)),
-        NOISY, Integrator),
+        many(), Integrator),
     "predict with a state": lambda _: (
         Recurrent(), NOISY, lambda: Integrator()),
     "predict behind **keywords": lambda _: (
