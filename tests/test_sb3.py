@@ -123,7 +123,7 @@ def test_what_is_shown_is_of_the_batches_and_what_they_cannot_do_is_refused():
     assert [p.noise_variance for p in ours.get_attr("parameters", [0, 3])] == [0.5, 0.0]
     assert ours.env_is_wrapped(Monitor) == [False] * N
     for refuse in (ours.set_attr, ours.env_method):
-        with pytest.raises(NotImplementedError, match="use `batches`, .*parameters"):
+        with pytest.raises(NotImplementedError, match=r"use `batches`, .*parameters"):
             refuse("parameters", None)
     ours.set_options({"level": 3})
     with pytest.raises(ValueError, match="options"):
