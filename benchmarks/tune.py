@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import sqlite3
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -18,7 +14,7 @@ from cyclopts import Parameter
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Count, Folder, Runs, command, options
 from benchmarks.lib.fan_out import FanOut, progress_bar
-from benchmarks.lib.storage import UnfinishedError, UsageError, origin, out_folder, write_csv
+from benchmarks.lib.storage import Kept, origin, out_folder, write_csv
 from benchmarks.loop.metrics import mean_error, settled, split
 from benchmarks.loop.scenarios import PlantOptions
 
@@ -47,8 +43,9 @@ Row = dict[str, float]  # gains, and their result from `score`
 class Options:
     """Tune a controller's gains with Optuna.
 
-    All trials use the same set points and seeds, which no comparison uses. The search is saved
-    after every trial; the same command resumes it and gives the same result.
+    All trials use the same set points and seeds, which no comparison uses. Finished trials are
+    kept, if no file of the checkout differs from its commit: the same command, run again, goes
+    on from there and gives the same result.
     """
 
     controller: Annotated[str, Parameter(choices=TUNED)] = field(kw_only=False)
@@ -85,9 +82,8 @@ def work(options: Options) -> str:
 
     name, plant, made = options.controller, options.plant.chosen().arguments, origin()
     out, judge = out_folder(options.out / name), partial(score, name, plant)
-    study = f"{name}, {options.runs} runs, {json.dumps(plant)}, {made['commit']}"
     in_search = partial(judge, options.runs, FIRST_RUN)
-    trials = search(study, TUNED[name], in_search, options.trials, out / "trials.csv")
+    trials = search(TUNED[name], in_search, options.trials, out)
     # The best gains of a search owe some of their result to luck; new runs show how much.
     best = trials.nsmallest(FINALISTS, "objective")
     rounded = best[[*TUNED[name]]].map(lambda gain: float(f"{gain:.3g}"))
@@ -107,74 +103,36 @@ def work(options: Options) -> str:
 
 
 def search(
-    name: str,
     gains: Mapping[str, tuple[float, float]],
     judge: Callable[[Row], Row],
     count: int,
-    path: Path,
+    out: Path,
 ) -> pd.DataFrame:
-    """Try gains until there are `count` trials, and return and write one row for each.
+    """Try `count` gains within these ranges, and return and write one row for each.
 
-    Each trial has a sampler of its own, seeded with the search's seed and the number of trials
-    before, so that an interrupted search, found by its name, goes on as it would have.
+    What a trial tries follows from those before it. So an interrupted search takes the same
+    course again, and finds the results of its first trials in the folder.
     """
     import optuna
     import pandas as pd
 
     optuna.logging.set_verbosity(optuna.logging.CRITICAL)
-    with _storage(path.with_name("trials.log")) as storage:
-        study = optuna.create_study(study_name=name, storage=storage, load_if_exists=True)
-        state = optuna.trial.TrialState
-        for trial in study.get_trials(states=[state.RUNNING]):  # it was interrupted
-            study.tell(trial.number, state=state.FAIL)
-        done = study.get_trials(states=[state.COMPLETE])
-        rows: list[Row] = [trial.user_attrs["row"] for trial in done[:count]]
-        try:
-            with progress_bar("trials", count - len(rows)) as advance:
-                while len(rows) < count:
-                    study.sampler = optuna.samplers.TPESampler(
-                        seed=SEED * 1_000_000 + len(rows),
-                        n_startup_trials=STARTUP,
-                        multivariate=True,
-                    )
-                    new, spans = study.ask(), gains.items()
-                    rows.append(
-                        judge({k: new.suggest_float(k, *v, log=True) for k, v in spans})
-                    )
-                    new.set_user_attr("row", rows[-1])
-                    study.tell(new, rows[-1]["objective"])
-                    advance()
-        finally:
-            write_csv(path, pd.DataFrame(rows))
-    return pd.DataFrame(rows)
-
-
-@contextmanager
-def _storage(log: Path) -> Iterator[Any]:
-    """Yield Optuna's storage in a file; a second search at the same time is refused."""
-    from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend
-
-    # Released when the process ends, even if it is killed, which Optuna's own lock is not.
-    guard = sqlite3.connect(log.with_suffix(".lock"), timeout=0.0)
-    no_lock: Any = SimpleNamespace(acquire=lambda: True, release=lambda: None)
+    study, run = optuna.create_study(), partial(FanOut(jobs=1).run, kept=Kept(out / "tasks"))
+    rows: list[Row] = []
     try:
-        guard.execute("BEGIN EXCLUSIVE")
-        with log.open("a+b") as file:
-            file.seek(0)
-            # Optuna cannot read an unfinished line, which a process that is killed leaves.
-            file.truncate(file.read().rfind(b"\n") + 1)
-        try:
-            storage = JournalStorage(JournalFileBackend(str(log), no_lock))
-        except (LookupError, TypeError, ValueError) as error:
-            raise UnfinishedError(f"{log} is damaged; delete it: {error}") from error
-        yield storage
-    except sqlite3.OperationalError as error:
-        raise UsageError(f"--out: another search is under way in {log.parent}") from error
-    except OSError as error:
-        raise UnfinishedError(f"{log} could not be written: {error.strerror}") from error
+        with progress_bar("trials", count) as advance:
+            for i in range(count):
+                study.sampler = optuna.samplers.TPESampler(
+                    seed=SEED * 1_000_000 + i, n_startup_trials=STARTUP, multivariate=True
+                )
+                trial, spans = study.ask(), gains.items()
+                new = {name: trial.suggest_float(name, *span, log=True) for name, span in spans}
+                rows += run({f"trial {i}": partial(judge, new)}).values()
+                study.tell(trial, rows[-1]["objective"])
+                advance()
     finally:
-        guard.close()
+        write_csv(out / "trials.csv", pd.DataFrame(rows))
+    return pd.DataFrame(rows)
 
 
 def score(name: str, plant: Mapping[str, Any], runs: int, first_run: int, gains: Row) -> Row:

@@ -1,12 +1,6 @@
 """The search for gains, on small budgets."""
 
-import subprocess
-import sys
-import time
-from functools import partial
-
 import numpy as np
-import optuna
 import pandas as pd
 import pytest
 
@@ -15,6 +9,7 @@ from agents.pi import SEARCHED_GAINS
 from benchmarks import tune
 from benchmarks.compare import comparison
 from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib import storage
 from benchmarks.loop.scenarios import SCENARIOS
 from tests.conftest import ROOT
 
@@ -45,11 +40,11 @@ def short(monkeypatch):
     monkeypatch.setattr(tune, "CASES", cases)
 
 
-def search(out, controller="pi", trials=6, runs=2, status=0):
+def search(out, runs=2, status=0):
     """Run a search, and return its trials."""
-    numbers = ["--trials", str(trials), "--runs", str(runs), "--jobs", "1"]
-    assert tune.main([controller, *numbers, "--out", str(out)]) == status
-    return pd.read_csv(out / controller / "trials.csv")
+    given = f"pi --trials 6 --runs {runs} --jobs 1 --out {out}"
+    assert tune.main(given.split()) == status
+    return pd.read_csv(out / "pi/trials.csv")
 
 
 @pytest.mark.usefixtures("short")
@@ -68,89 +63,23 @@ class TestSearch:
             assert objective == pytest.approx(again["objective"], rel=1e-3)
             assert np.isclose(trials["objective"], in_search, rtol=1e-3).any()
 
-    def test_a_stopped_search_ends_where_it_would_have_ended(
-        self, tmp_path, monkeypatch, capsys
-    ):
-        search(tmp_path / "whole")
-        judged = []
+    def test_a_stopped_search_goes_on_where_it_was(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.setattr(storage, "commit", lambda: "abc")
+        whole, judge, calls = search(tmp_path / "whole"), tune.settled, []
 
-        def interrupted(*arguments):
-            judged.append(arguments)
-            if len(judged) == 5:
+        def settled(runs):  # called once a trial
+            calls.append(runs)
+            if len(calls) == 5:
                 raise KeyboardInterrupt
-            return score(*arguments)
+            return judge(runs)
 
-        score = tune.score
-        with monkeypatch.context() as patch:
-            patch.setattr(tune, "score", interrupted)
-            assert len(search(tmp_path / "halves", status=130)) == 4
+        monkeypatch.setattr(tune, "settled", settled)
+        assert len(search(tmp_path / "halves", status=130)) == 4
         assert "Interrupted" in capsys.readouterr().out
-        with (tmp_path / "halves/pi/trials.log").open("a") as log:
-            log.write('{"op_code": 5, "wor')  # as where a disk is full
-        search(tmp_path / "halves")
-        files = (tmp_path / part / "pi/trials.csv" for part in ("whole", "halves"))
-        assert len({file.read_text() for file in files}) == 1
-
-    @pytest.mark.parametrize("sign", [1.0, -1.0])
-    def test_it_learns_from_its_trials(self, sign, tmp_path):
-        # The best is the lowest gain, or the highest.
-        judge = lambda gains: {"objective": sign * gains["kp"]}  # noqa: E731
-        rows = tune.search("by hand", tune.TUNED["pi"], judge, 25, tmp_path / "pi.csv")
-        tried = np.log(rows["objective"].abs())
-        assert sign * tried[15:].mean() < sign * tried[:10].mean() - 0.3
-
-    def test_trials_of_another_search_are_not_mixed(self, tmp_path, monkeypatch):
-        first = search(tmp_path, trials=2)
-        assert not search(tmp_path, trials=2, runs=1).equals(first)
-        monkeypatch.setattr(optuna.Study, "ask", None)  # none is new
-        assert search(tmp_path, trials=2).equals(first)
-
-    def test_a_second_search_in_the_same_folder_is_refused(self, tmp_path, refused):
-        held = (
-            "import sys, time; from pathlib import Path; from benchmarks import tune\n"
-            "with tune._storage(Path(sys.argv[1])): print('up', flush=True); time.sleep(60)"
-        )
-        log = tmp_path / "pi/trials.log"
-        given = ["pi", "--trials", "1", "--runs", "1", "--out", tmp_path]
-        log.parent.mkdir()
-        command = [sys.executable, "-c", held, str(log)]
-        with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as other:
-            assert other.stdout.readline() == "up\n"
-            assert "--out: another search is under way" in refused(tune.main, given)
-            other.kill()  # which leaves nothing that would refuse the next one
-        search(tmp_path, trials=1, runs=1)
-
-    def test_a_damaged_log_and_one_that_is_a_folder_end_in_a_sentence(self, tmp_path, capsys):
-        log = tmp_path / "pi/trials.log"
-        log.mkdir(parents=True)
-        run = partial(tune.main, ["pi", "--trials", "1", "--runs", "1", "--out", str(tmp_path)])
-        assert run() == 1
-        assert "trials.log could not be written: Is a directory" in capsys.readouterr().out
-        log.rmdir()
-        for line in ("no JSON\n{}\n", '{"worker_id": 1}\n', "[]\n"):
-            log.write_text(line)
-            assert run() == 1
-            assert "trials.log is damaged; delete it" in capsys.readouterr().out
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no SIGTERM to another process")
-def test_an_ended_search_shows_no_traceback(tmp_path):
-    # Ended at any time of a trial: in the storage, too, where most of the time goes here.
-    program = (
-        "import sys; from benchmarks import tune\n"
-        "tune.score = lambda *a: {'objective': 1.0, **a[-1]}; print('up', flush=True)\n"
-        "sys.exit(tune.main(sys.argv[1:]))"
-    )
-    given = ["pi", "--trials", "100000", "--runs", "1", "--out", str(tmp_path)]
-    command = [sys.executable, "-c", program, *given]
-    ends = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, cwd=ROOT, **ends) as run:
-        assert run.stdout.readline() == "up\n"
-        time.sleep(1.0)
-        run.terminate()
-        out, err = run.communicate(timeout=60)
-    assert (run.returncode, err) == (143, "")
-    assert "Interrupted" in out
+        assert search(tmp_path / "halves").equals(whole)
+        assert len(calls) == 5 + 2 + 2  # the first four are kept; the last two are finalists
+        # Those of another search are not mixed with them.
+        assert not search(tmp_path / "halves", runs=1).equals(whole)
 
 
 def test_defaults_are_the_best_of_the_published_searches():
