@@ -11,10 +11,10 @@ import pytest
 from agents import DirectNNController
 from benchmarks.claims import claims
 from benchmarks.claims.__main__ import main, sections, table
-from benchmarks.claims.claims import CLAIMS, largest_pole
+from benchmarks.claims.claims import CLAIMS
 from benchmarks.claims.runs import Batch, Claim, converged_at, fail_node, typical
 from benchmarks.lib.statistics import Estimate
-from benchmarks.loop.metrics import join, mean_error, settled, split
+from benchmarks.loop.metrics import join, settled
 from tests.conftest import ROOT, trajectory
 
 GOOD, BAD = {"at_least": 1.0}, {"at_least": 2.5}
@@ -34,10 +34,8 @@ class TestVerdicts:
         ("bounds", "criterion", "shown"),
         [
             ({"at_least": 0.5}, "at least 0.5", "yes"),
-            ({"at_least": 1.5}, "at least 1.5", "undecided"),
-            ({"at_least": 2.5}, "at least 2.5", "no"),
-            ({"at_most": 2.5}, "at most 2.5", "yes"),
             ({"at_most": 1.5}, "at most 1.5", "undecided"),
+            ({"at_least": 2.5}, "at least 2.5", "no"),
             ({"at_most": 0.5}, "at most 0.5", "no"),
             ({"at_least": 0.5, "at_most": 1.9}, "at least 0.5 and at most 1.9", "undecided"),
             ({}, "", ""),
@@ -50,14 +48,11 @@ class TestVerdicts:
     @pytest.mark.parametrize(
         ("findings", "expected"),
         [
-            ([GOOD, GOOD], "holds"),
             ([GOOD, INFORMATION], "holds"),
-            ([GOOD, BAD], "holds in part"),
             ([GOOD, UNDECIDED], "holds in part"),
             ([BAD, BAD, INFORMATION], "does not hold"),
             ([UNDECIDED], "does not hold"),
             ([INFORMATION], "cannot be tested from the text"),
-            ([], "cannot be tested from the text"),
         ],
     )
     def test_verdicts(self, findings, expected):
@@ -83,87 +78,52 @@ class TestVerdicts:
         assert list(table([good, none])["claim"]) == ["good"] * 4 + ["none"]
 
 
-def paths(*distances):
-    """One weight of each run, with these distances to where it ends."""
-    return np.array(distances, dtype=float).T[:, :, np.newaxis]
-
-
-class TestConvergence:
-    def test_known_sequences(self):
-        k = np.arange(400)
-        at = converged_at(
-            paths(
-                np.where(k < 70, 1.0, 0.0),  # a jump
-                0.9**k,  # 0.9^28 = 0.052, 0.9^29 = 0.047
-                np.where(k == 200, 0.06, 0.0) + (k == 0),  # leaves the band once more
-                np.zeros(400),  # nothing to learn
-            )
-        )
-        assert list(at) == [70, 29, 201, 0]
+def test_known_sequences_converge_where_they_should():
+    k = np.arange(400)
+    distances = [
+        np.where(k < 70, 1.0, 0.0),  # a jump
+        0.9**k,  # 0.9^28 = 0.052, 0.9^29 = 0.047
+        np.where(k == 200, 0.06, 0.0) + (k == 0),  # leaves the band once more
+        np.zeros(400),  # nothing to learn
+    ]
+    paths = np.array(distances).T[:, :, np.newaxis]  # of one weight of each run
+    assert list(converged_at(paths)) == [70, 29, 201, 0]
 
 
 @pytest.mark.parametrize(
-    ("early", "output", "has"),
-    [(50, 5.2, True), (50, 4.8, True), (50, 5.3, False), (51, 5.0, False)],
+    ("early", "output", "has"), [(50, 5.2, True), (50, 5.3, False), (51, 5.0, False)]
 )
 def test_settled_are_the_last_50_samples(early, output, has):
     outputs = np.array([0.0] * early + [output] * (100 - early))
     for sign in (1.0, -1.0):
-        run = trajectory([sign * 5.0] * 100, sign * outputs)
-        assert settled(run) == [has]
-        before, after = split(run, early)
-        assert mean_error(before) == [5.0]
-        assert mean_error(after) == pytest.approx([abs(5.0 - output)])
+        assert settled(trajectory([sign * 5.0] * 100, sign * outputs)) == [has]
 
 
-class TestFailure:
-    @pytest.mark.parametrize("num_envs", [None, 4])
-    @pytest.mark.parametrize("stuck_at", [0, 1])
-    def test_a_failed_node_gives_the_same_whatever_it_is_fed(self, stuck_at, num_envs, rng):
-        network = DirectNNController(num_envs=num_envs, eta=0.0, eta_theta=0.0)
-        fail_node(network, stuck_at)
-        W_1 = network.weights.W_1
-        healthy = DirectNNController(num_envs=num_envs, n_hidden=2)
-        weights = network.weights
-        # A network of the other two nodes, with the stuck output in the threshold.
-        healthy.weights = type(weights)(
-            weights.W[..., 1:, :], weights.theta_1[..., 1:], W_1[..., 1:],
-            weights.theta_2 + stuck_at * W_1[..., 0],
-        )  # fmt: skip
-        network.learning = healthy.learning = False
-        for _ in range(5):
-            observation = rng.normal(scale=5, size=(6,) if num_envs is None else (num_envs, 6))
-            network.act(observation)
-            healthy.act(observation)
-            np.testing.assert_allclose(network.command, healthy.command, rtol=1e-12)
+@pytest.mark.parametrize("stuck_at", [0, 1])
+def test_a_failed_node_gives_the_same_whatever_it_is_fed(stuck_at, rng):
+    network = DirectNNController(num_envs=4, eta=0.0, eta_theta=0.0)
+    fail_node(network, stuck_at)
+    weights = network.weights
+    healthy = DirectNNController(num_envs=4, n_hidden=2)
+    # A network of the other two nodes, with the stuck output in the threshold.
+    healthy.weights = type(weights)(
+        weights.W[..., 1:, :], weights.theta_1[..., 1:], weights.W_1[..., 1:],
+        weights.theta_2 + stuck_at * weights.W_1[..., 0],
+    )  # fmt: skip
+    network.learning = healthy.learning = False
+    for observation in rng.normal(scale=5, size=(5, 4, 6)):
+        network.act(observation)
+        healthy.act(observation)
+        np.testing.assert_allclose(network.command, healthy.command, rtol=1e-12)
 
 
-class TestPlants:
-    @pytest.mark.parametrize(("kp", "ki"), [(3.2, 0.05), (3.4, 0.05), (2.8, 0.1), (1.7, 0.15)])
-    def test_poles_of_a_pi_loop(self, kp, ki):
-        # A linear loop's swings grow or die by its largest pole in each sample. This loop is
-        # linear: it has no dead zone and stays far from the limits.
-        y = Batch(1).run_pi(kp, ki, 2000, dead_zone=0.0, setpoint=0.01).output[:, 0]
-        growth = np.ptp(y[-200:]) / np.ptp(y[800:1000])
-        assert growth == pytest.approx(largest_pole(kp, ki) ** 1000, rel=0.05)
-
-
-def run_claims(out, *given, runs=4, status=0):
-    # In this process, unless an option says otherwise.
+def run_claims(out, *given, runs, status=0):
     options = ["--jobs", "1", "--runs", str(runs), "--out", str(out)]
     assert main([*options, *given]) == status
     return pd.read_csv(out / "claims.csv")
 
 
 class TestCommand:
-    def test_what_it_writes(self, tmp_path, capsys):
-        found = run_claims(tmp_path, "direction")
-        assert found["value"].iloc[1] == 100.0  # all of them diverge in the end ...
-        assert found["shown"].iloc[1] == "undecided"  # ... but four prove little
-        page = (tmp_path / "report.md").read_text()
-        for shown in (page, capsys.readouterr().out):
-            assert "Training with -D(G) diverges at once" in shown
-
     def test_the_figures(self, tmp_path, capsys):
         run_claims(tmp_path, "figures", runs=2)
         assert "cannot be tested from the text" in capsys.readouterr().out
@@ -175,15 +135,17 @@ class TestCommand:
         noisy = curves[curves["case"].str.contains("NN.*R = 0.5")]
         assert (noisy["noise_p10"] < noisy["noise_p90"])[1:].all()  # at k = 0 there is none
 
-    @pytest.mark.parametrize(
-        ("error", "status"), [(KeyboardInterrupt, 130), (ArithmeticError("no weights"), 1)]
-    )
-    def test_what_has_finished_is_written(self, error, status, tmp_path, monkeypatch, capsys):
-        stopped = Claim("noise", "", "", "", Mock(side_effect=error))
-        monkeypatch.setitem(CLAIMS, "noise", stopped)
-        found = run_claims(tmp_path, "noise", "direction", runs=2, status=status)
-        assert ("Interrupted" if status == 130 else "no weights") in capsys.readouterr().out
+    def test_what_has_finished_is_written(self, tmp_path, monkeypatch, capsys):
+        fails = Claim("noise", "", "", "", Mock(side_effect=ArithmeticError("no weights")))
+        monkeypatch.setitem(CLAIMS, "noise", fails)
+        found = run_claims(tmp_path, "noise", "direction", runs=4, status=1)
         assert set(found["claim"]) == {"direction"}
+        assert found["value"].iloc[1] == 100.0  # all of them diverge in the end ...
+        assert found["shown"].iloc[1] == "undecided"  # ... but four prove little
+        shown = capsys.readouterr().out
+        assert "no weights" in shown
+        for each in (shown, (tmp_path / "report.md").read_text()):
+            assert "Training with -D(G) diverges at once" in each
 
     def test_short_runs_of_all_claims_give_the_numbers_that_they_gave(self, monkeypatch):
         class Short(Batch):

@@ -1,6 +1,5 @@
 """The examples run, with little to learn from, and do what they say."""
 
-import importlib
 import json
 import re
 import runpy
@@ -13,9 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
-import yaml
-from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3 import PPO
 
 import mptc_gym.sb3
 from benchmarks.datasets import arguments_of, record
@@ -25,22 +22,17 @@ from mptc_gym.sb3 import load, spec_of
 from tests.conftest import ROOT
 
 
-def weights(network):
-    return torch.cat([p.detach().flatten() for p in network.parameters()])
-
-
-class TestSB3:
-    def test_it_runs_as_one_file_of_its_own(self, tmp_path, monkeypatch, capsys):
-        for package in ("benchmarks", "agents"):
-            monkeypatch.setitem(sys.modules, package, None)  # an import is an error
-        given = ["page", "--steps", "1", "--seed", "3", "--out", str(tmp_path)]
-        monkeypatch.setattr(sys, "argv", given)
-        runpy.run_path(str(ROOT / "benchmarks/examples/sb3.py"), run_name="__main__")
-        shown = capsys.readouterr().out
-        found = re.search(r"MiddlePointNoisy-v0: mean error ([\d.]+)", shown)
-        kept = load(tmp_path / "ppo-3.zip", device="cpu")
-        noisy = evaluate(kept, spec_of(kept, "MiddlePointNoisy-v0"))
-        assert f"{noisy.mean_error:.3f}" == found[1]
+def test_ppo_runs_as_one_file_of_its_own(tmp_path, monkeypatch, capsys):
+    for package in ("benchmarks", "agents"):
+        monkeypatch.setitem(sys.modules, package, None)  # an import is an error
+    given = ["page", "--steps", "1", "--seed", "3", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", given)
+    runpy.run_path(str(ROOT / "benchmarks/examples/sb3.py"), run_name="__main__")
+    shown = capsys.readouterr().out
+    found = re.search(r"MiddlePointNoisy-v0: mean error ([\d.]+)", shown)
+    kept = load(tmp_path / "ppo-3.zip", device="cpu")
+    noisy = evaluate(kept, spec_of(kept, "MiddlePointNoisy-v0"))
+    assert f"{noisy.mean_error:.3f}" == found[1]
 
 
 def test_stable_baselines3_learns_with_the_lines_of_the_page():
@@ -54,61 +46,25 @@ def test_stable_baselines3_learns_with_the_lines_of_the_page():
         assert model.learn(1).num_timesteps == 8 * model.n_envs
 
 
-@pytest.mark.parametrize("algorithm", [PPO, SAC])
-def test_settings_for_rl_zoo_make_a_model_that_learns(algorithm):
-    file = ROOT / f"benchmarks/examples/rl_zoo/{algorithm.__name__.lower()}.yml"
-    text = file.read_text(encoding="utf-8")
-    (settings,) = yaml.safe_load(text).values()
-    (wrapper,) = settings.pop("env_wrapper")
-    ((path, arguments),) = wrapper.items()
-    module, _, name = path.rpartition(".")
-    wrapped = getattr(importlib.import_module(module), name)
-    plant, n, _ = (settings.pop(key) for key in ("env_kwargs", "n_envs", "n_timesteps"))
-    plants = DummyVecEnv(
-        [lambda: wrapped(gymnasium.make("MiddlePoint-v0", **plant), **arguments)] * n
-    )
-    # As the Zoo reads them.
-    settings["policy_kwargs"] = eval(settings["policy_kwargs"])
-    if isinstance(rate := settings["learning_rate"], str):
-        kind, initial = rate.split("_")
-        assert kind == "lin"
-        settings["learning_rate"] = lambda left: max(left, 0.0) * float(initial)
-    quick = {"n_epochs": 1} if algorithm is PPO else {"learning_starts": n}
-    model = algorithm(env=plants, device="cpu", seed=0, **{**settings, **quick})
-    before = weights(model.policy)
-    # Two updates of PPO: the last one has no learning rate left.
-    model.learn((2 * 64 if algorithm is PPO else 8) * n)
-    assert not torch.equal(before, weights(model.policy))
-    assert f"--algo {file.stem} " in text
-    assert file.name in text
+def test_offline_transitions_follow_one_another_within_an_episode():
+    episodes = (SimpleNamespace(**episode) for episode in record("paper", "smith", 2))
+    observations, actions, rewards, following = offline.transitions_of(episodes).tensors
+    assert observations.shape == following.shape == (2400, 26)
+    assert torch.equal(following[:1199], observations[1:1200])
+    assert not torch.equal(following[1199], observations[1200])
+    # The reward is minus the error that the step leads to, and the action is seen after it.
+    torch.testing.assert_close(rewards[:, 0], -following[:, 3].abs())
+    assert torch.equal(following[:, offline.LAST_ACTION], actions[:, 0])
 
 
-class TestOffline:
-    HIGH = np.repeat([50.0, 100.0, 1.0], [3, 3, 20]).astype(np.float32)
-
-    @pytest.fixture
-    def data(self):
-        return offline.transitions_of(
-            SimpleNamespace(**episode) for episode in record("paper", "smith", 2)
-        )
-
-    def test_transitions_follow_one_another_within_an_episode(self, data):
-        observations, actions, rewards, following = data.tensors
-        assert observations.shape == following.shape == (2400, 26)
-        assert torch.equal(following[:1199], observations[1:1200])
-        assert not torch.equal(following[1199], observations[1200])
-        # The reward is minus the error that the step leads to, and the action is seen after it.
-        torch.testing.assert_close(rewards[:, 0], -following[:, 3].abs())
-        assert torch.equal(following[:, offline.LAST_ACTION], actions[:, 0])
-
-    def test_an_actor_that_changes_nothing_leaves_the_valve_alone(self):
-        actor = offline.Actor(self.HIGH)
-        torch.nn.init.zeros_(actor.layers[-1].weight)
-        torch.nn.init.zeros_(actor.layers[-1].bias)
-        # 5 degC, and nothing done: the square wave's error is 5 all the time.
-        arguments = {**arguments_of("paper"), "setpoint": "square"}
-        found = evaluate(offline.policy_of(actor), episodes=2, **arguments)
-        assert found.mean_error == pytest.approx(5.0)
+def test_an_offline_actor_that_changes_nothing_leaves_the_valve_alone():
+    actor = offline.Actor(np.repeat([50.0, 100.0, 1.0], [3, 3, 20]).astype(np.float32))
+    torch.nn.init.zeros_(actor.layers[-1].weight)
+    torch.nn.init.zeros_(actor.layers[-1].bias)
+    # 5 degC, and nothing done: the square wave's error is 5 all the time.
+    arguments = {**arguments_of("paper"), "setpoint": "square"}
+    found = evaluate(offline.policy_of(actor), episodes=2, **arguments)
+    assert found.mean_error == pytest.approx(5.0)
 
 
 def test_the_notebook_runs_and_shows_what_it_showed(capsys):

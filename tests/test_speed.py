@@ -14,25 +14,14 @@ def test_ratios_compare_rounds_with_each_other(monkeypatch):
     assert list(table["ratio to slow"]) == ["1.00 (1.00 to 1.00)", "2.00 (1.20 to 6.80)"]
 
 
-@pytest.fixture
-def small(monkeypatch):
-    for name, value in {
-        "EPISODE": 3,
-        "BATCHES": (2,),
-        "ON_DEVICE": (3,),
-        "LEARNERS": 2,
-    }.items():
-        monkeypatch.setattr(speed, name, value)
-
-
-@pytest.mark.usefixtures("small")
 @pytest.mark.parametrize("torch", [True, False])
 def test_it_runs_with_and_without_pytorch(torch, monkeypatch, capsys):
     if torch:
         pytest.importorskip("torch")
-    monkeypatch.setattr(
-        speed.importlib.util, "find_spec", lambda _: object() if torch else None
-    )
+    small = {"EPISODE": 3, "BATCHES": (2,), "ON_DEVICE": (3,), "LEARNERS": 2}
+    for name, value in small.items():
+        monkeypatch.setattr(speed, name, value)
+    monkeypatch.setattr(speed.importlib.util, "find_spec", lambda _: torch or None)
     assert speed.main(["--rounds", "1"]) == 0
     shown = capsys.readouterr().out
     for words in ("CartPole-v1", "n = 2", "MiddlePoint-v0, hard", "networks"):

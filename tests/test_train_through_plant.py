@@ -80,13 +80,6 @@ class TestLaw:
         assert np.ptp(error) > 3.0
         np.testing.assert_allclose(error, errors.numpy() * reach, atol=0.02)
 
-    def test_in_numpy_it_is_what_it_was_in_torch(self):
-        net = lively(SMALL)
-        seen, at_rest = torch.randn(2, 50, through_plant.INPUTS)
-        found = net.export()(seen.double().numpy(), at_rest.double().numpy())
-        for ours, theirs in zip(found, net(seen, at_rest), strict=True):
-            np.testing.assert_allclose(ours, theirs.detach().numpy(), atol=1e-5)
-
     def test_plants_can_be_made_and_their_set_points_held(self):
         numbers = Draw(500, 60, SMALL.spread, 0).plants()
         room = torch.minimum(-numbers["u_min"], numbers["u_max"])
