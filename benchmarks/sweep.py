@@ -123,7 +123,7 @@ def work(options: Options) -> str:
     from benchmarks.lib.report import provenance_line, show, write_report
 
     controllers = chosen(options.agents, options.controllers.agent)
-    nominal = options.plant.chosen().arguments
+    nominal = options.plant.arguments()
     plants = _plants(options, nominal)
     told = [{**nominal, **each} if options.told == "each" else nominal for each in plants]
     made, began = origin(), time.perf_counter()
@@ -197,7 +197,7 @@ def run_agent(
     """Run a controller that is made for the plant it is `told` on another plant.
 
     Run i has the noise and the initial weights of seed `SEED + i`. Returned are, for each run,
-    all measures of `METRICS`; `late`, the mean |e| of its second half, degC; and `swing`.
+    all that `measure` returns; `late`, the mean |e| of its second half, degC; and `swing`.
     """
     from benchmarks.loop.metrics import mean_error, measure, split
 

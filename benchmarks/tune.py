@@ -80,7 +80,7 @@ def work(options: Options) -> str:
 
     from benchmarks.lib.report import Section, provenance_line, show, write_report
 
-    name, plant, made = options.controller, options.plant.chosen().arguments, origin()
+    name, plant, made = options.controller, options.plant.arguments(), origin()
     out, judge = out_folder(options.out / name), partial(score, name, plant)
     in_search = partial(judge, options.runs, FIRST_RUN)
     trials = search(TUNED[name], in_search, options.trials, out)

@@ -16,7 +16,7 @@ from benchmarks.lib.command import Count, Seed, command, options
 from benchmarks.lib.storage import UsageError, out_folder, replacing
 from benchmarks.loop.metrics import held
 from benchmarks.loop.rollout import Trajectory
-from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS, PlantOptions, Scenario, scenarios_of
+from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS, PlantOptions, Scenario
 from mptc_gym import MiddlePointEnv
 
 OTHER = ROSTER["nn-smith"].label  # whose errors those of the film are multiples of
@@ -167,8 +167,7 @@ def write_film(
 
 def _case(options: Options) -> Scenario:
     """Return the case to run; `UsageError` if there is none of this name."""
-    plant, another = options.plant.chosen(), options.plant != PlantOptions()
-    cases = scenarios_of(plant.name, plant.arguments) if another else SCENARIOS
+    cases = options.plant.cases(SCENARIOS)
     if options.scenario not in cases:
         raise UsageError(
             f"--scenario: no {options.scenario!r} on this plant; there are {', '.join(cases)}"

@@ -24,7 +24,7 @@ from benchmarks.controllers.roster import ROSTER, looks
 from benchmarks.lib import storage
 from benchmarks.lib.report import Best, Section, on_screen, write_report
 from benchmarks.lib.statistics import Estimate, percentiles
-from benchmarks.loop.metrics import METRICS, measure
+from benchmarks.loop.metrics import measure
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
@@ -37,7 +37,6 @@ GOLDEN = Path(__file__).parent / "golden"  # numbers of earlier versions
 def measured(runs, **arguments):
     # One sample a minute, so that minutes are samples.
     values = measure(runs, Parameters(sampling_interval=60.0, **arguments))
-    assert set(values) == set(METRICS)
     return {name: value[0] for name, value in values.items()}
 
 
@@ -276,7 +275,6 @@ class TestCompare:
         for shown in (page, (out / "report.html").read_text(), screen):
             assert f"{limit:.3f}" in shown
             assert f"{error / limit:.2f}" in shown
-        assert "not settled" in page
         # The best comes first.
         assert page.index("| **MPC**") < page.index("| NN (1992)") < page.index("| PI (1992)")
         assert "6 gains by 800 trials: 566 M samples" in page
@@ -368,4 +366,4 @@ class TestCompare:
         assert main(["--preset", "hard", "--agents", "pi", "--runs", "2", "--jobs", "1"]) == 0
         (folder,) = (tmp_path / "results").iterdir()  # of its own, as it is a part
         assert folder.name == "compare-pi-hard-2-runs"
-        assert "not measured" in (folder / "report.md").read_text()
+        assert pd.read_csv(folder / "runs.csv")["saturation_share"].isna().all()

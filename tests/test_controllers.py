@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 from benchmarks.compare.comparison import run_case
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import UsageError
+from benchmarks.lib.storage import UsageError
 from benchmarks.loop.metrics import mean_error
 from benchmarks.loop.rollout import IdleValve
 from benchmarks.loop.scenarios import Scenario

@@ -10,9 +10,8 @@ from functools import partial
 import pytest
 
 from benchmarks.lib import storage
-from benchmarks.lib.command import UsageError
 from benchmarks.lib.fan_out import FanOut, TasksFailedError
-from benchmarks.lib.storage import Kept, UnfinishedError
+from benchmarks.lib.storage import Kept, UnfinishedError, UsageError
 from tests import tasks
 from tests.conftest import ROOT, python
 

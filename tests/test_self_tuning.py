@@ -1,6 +1,5 @@
 """The bank of models and the trained network: what they find out, settle to and resist."""
 
-from dataclasses import asdict
 from functools import partial
 
 import numpy as np
@@ -255,7 +254,7 @@ def test_neither_a_wrong_gain_nor_a_steady_load_leaves_an_offset():
     ],
 )
 def test_a_plant_unlike_those_of_the_training(plant):
-    shown = asdict(step_test(Parameters(**plant)))
+    shown = step_test(Parameters(**plant))
     amplitude = 5.0 * abs(shown["gain"])
     square = {"setpoint_amplitude": amplitude, "dead_zone": 2.0}
     run = control(neural(**shown, dead_zone=2.0), 300, **plant, **square)
@@ -269,7 +268,7 @@ LOAD = {"disturbance_amplitude": 1.5, "disturbance_interval": 150.0}
 def test_a_load_is_told_from_noise(outside, times):
     # Once it has seen some; what knows the plant and its noise sets the scale.
     plant = {"setpoint": 5.0, "delay": 14, **outside}
-    ours = neural(**asdict(step_test(Parameters(**plant))), dead_zone=5.0)
+    ours = neural(**step_test(Parameters(**plant)), dead_zone=5.0)
     best = PredictiveController(Parameters(**plant), 10)
     runs = (control(each, 900, 10, 7_000_000, **plant) for each in (ours, best))
     error, least = (mean_error(run, 300) for run in runs)

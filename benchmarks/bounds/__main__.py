@@ -14,13 +14,7 @@ from typing import Any
 from benchmarks.lib.command import Count, Runs, Seed, command, options
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.storage import ROOT, commit, out_folder, versions, write_json
-from benchmarks.loop.scenarios import (
-    PRESET_SCENARIOS,
-    SCENARIOS,
-    PlantOptions,
-    Scenario,
-    scenarios_of,
-)
+from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, PlantOptions, Scenario
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
 
@@ -68,19 +62,16 @@ def work(options: Options) -> str:
     """Print the bounds of the cases and of the presets, or of another plant."""
     from benchmarks.bounds.least import CACHE
 
-    plant, one = options.plant.chosen(), options.plant != PlantOptions()
+    cases = options.plant.cases(SCENARIOS | PRESET_SCENARIOS)
     folder = out_folder(options.cache or CACHE, "--cache")
     if options.package:
         return write_package(folder, options.fan_out)
-    cases = {**SCENARIOS, **PRESET_SCENARIOS}
-    if one:
-        cases = scenarios_of(plant.name, plant.arguments)
     drawn = {"episodes": options.episodes, "seed": options.seed, "folder": folder}
     tasks = {
         name: partial(row, case, options.samples or case.samples, drawn, options.mpc)
         for name, case in cases.items()
     }
-    print(f"Mean |e| in °C, {plant.name}:" if one else "Mean |e| in °C:")
+    print(", ".join(filter(None, ["Mean |e| in °C", options.plant.name])) + ":")
     _show("", ["no control", *HEADINGS.values(), *["MPC"] * bool(options.mpc)])
     for name, cells in options.fan_out.stream(tasks):
         _show(name, cells)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import re
 from dataclasses import asdict, dataclass, field
@@ -22,7 +21,6 @@ from benchmarks.loop.scenarios import (
     SETPOINTS,
     PlantOptions,
     Scenario,
-    scenarios_of,
 )
 from mptc_gym.evaluation import SEED
 
@@ -113,12 +111,9 @@ def work(options: Options) -> str:
 
 def _scenarios(options: Options) -> dict[str, Scenario]:
     """Return the cases that the options choose."""
-    plant, another = options.plant.chosen(), options.plant != PlantOptions()
-    if options.presets and another:
+    there = options.plant.cases(PRESET_SCENARIOS if options.presets else SCENARIOS)
+    if options.presets and options.plant.name:
         raise UsageError("--presets cannot be combined with --plant, --preset and --set")
-    there = PRESET_SCENARIOS if options.presets else SCENARIOS
-    if another:
-        there = scenarios_of(plant.name, plant.arguments)
     given = [*there] if options.scenarios is None else options.scenarios
     names = known("--scenarios", given, [*there])
     if not names:
@@ -128,19 +123,13 @@ def _scenarios(options: Options) -> dict[str, Scenario]:
 
 def _folder(options: Options, names: list[str]) -> Path:
     """Return a folder named after the differences from the default comparison."""
-    plant = options.plant
     own = dict.fromkeys(text.partition("=")[0] for text in options.controllers.agent)
     parts = ["compare", *(options.agents if options.agents != COMPARED else ()), *own]
-    if options.scenarios is not None:
-        parts += names
-    if plant != PlantOptions():
-        parts.append(plant.chosen().name)
-    parts += ["presets"] * options.presets
+    parts += names if options.scenarios is not None else []
+    parts += [options.plant.name] * bool(options.plant.name) + ["presets"] * options.presets
     parts += [f"{options.runs}-runs"] * (options.runs != RUNS)
-    name = re.sub(r"[^\w.-]", "-", "-".join(parts))
-    if len(name) > 70:
-        name = f"{name[:60]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-    return Path("results", name)
+    # Names of files may have 255 bytes; where this is cut, an older result may be replaced.
+    return Path("results", re.sub(r"[^\w.-]", "-", "-".join(parts))[:200])
 
 
 main = command("compare", Options, work)

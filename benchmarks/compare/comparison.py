@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks.controllers.roster import Controller
 from benchmarks.lib.statistics import Estimate, bootstrap, groups, improvement, percentiles
-from benchmarks.loop.metrics import METRICS, join, measure
+from benchmarks.loop.metrics import join, measure
 from benchmarks.loop.rollout import Trajectory, is_random
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES, SEED
@@ -168,12 +168,13 @@ def ranked(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> dict[str, Score]:
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     """Return percentiles over the runs, one row for each case, agent and metric."""
+    metrics = runs.columns.drop(["scenario", "agent", "policy", "seed"])
     return pd.DataFrame(
         [
             {"scenario": scenario, "agent": agent, "metric": metric, "runs": len(group)}
             | percentiles(group[metric].to_numpy())
             for (scenario, agent), group in runs.groupby(["scenario", "agent"], sort=False)
-            for metric in METRICS
+            for metric in metrics
         ]
     )
 

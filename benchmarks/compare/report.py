@@ -15,9 +15,9 @@ from benchmarks.compare.comparison import Case, Scale, Score, estimate, ranked, 
 from benchmarks.controllers.roster import Controller, label
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.report import Best, Section, provenance_line, write_report
-from benchmarks.lib.statistics import PERCENTILES, Estimate, groups, written
+from benchmarks.lib.statistics import Estimate, groups, written
 from benchmarks.lib.storage import write_csv
-from benchmarks.loop.metrics import METRICS
+from benchmarks.loop.metrics import CHANGE, START
 from benchmarks.loop.scenarios import Scenario
 
 SCORE = "Mean over the cases, 95 % interval; travel of the valve in the median run."
@@ -30,8 +30,12 @@ PAIRED = "Below 0 a controller is better; in % the share of runs in which it is.
 COSTS = (
     "What it is told; what was searched or trained beforehand; the processor time of its runs."
 )
-PARTS = "Contributions to the mean error, °C: means of all runs."
-STEP_METRICS = ("overshoot", "settling_time")  # meaningless in noise
+PARTS = {
+    "mae_start": f"first {START} samples",
+    "mae_changes": f"{CHANGE} samples after later changes",
+    "mae_steady": "the rest",
+    "mae": "together",
+}
 
 
 def write(
@@ -65,12 +69,7 @@ def write(
     write_numbers(folder / "estimates.csv", estimates)
     scores = ranked(runs, scales)
     titles = {name: scenarios[name].title for name in scales}
-    paired = Section(
-        f"Difference to {label(reference)} (°C), 95 % interval",
-        [PAIRED],
-        paired_table(estimates),
-    )
-    hard = runs[runs["scenario"] == "hard"]
+    paired = f"Difference to {label(reference)} (°C), 95 % interval"
     sections = [
         Section(
             "Score: 0 without control, 1 at the least possible error",
@@ -89,23 +88,20 @@ def write(
             ["Down and left is better."],
             pictures={"travel.png": "The mean error over valve travel, a panel for each case"},
         ),
-        *([paired] if len(scores) > 1 else []),
-        *(
-            [Section("Where the error arises: `hard`", [PARTS], parts_table(hard))]
-            if len(hard)
-            else []
+        Section(paired, [PAIRED], paired_table(estimates)),
+        Section(
+            "Where the error arises: `hard`",
+            ["Contributions to the mean error, °C: means of all runs."],
+            parts_table(runs[runs["scenario"] == "hard"]),
         ),
         Section("What each controller costs", [COSTS], costs_table(cases, controllers)),
-        Section(
-            f"All measures: median (10th to 90th percentile) of {runs['seed'].nunique()} runs",
-            table=metrics_table(summary, scenarios),
-        ),
         Section(
             "Cases",
             table=pd.DataFrame(titles.items(), columns=["case", "what it is"]),
             pictures={f"{name}.png": f"Responses: {title}" for name, title in titles.items()},
         ),
     ]
+    sections = [each for each in sections if each.table is None or len(each.table)]
     tasks = _pictures(cases, scenarios, scales, controllers, summary, estimates, scores)
     draw = {name: partial(task, folder / name) for name, task in tasks.items()}
     for name in draw:
@@ -197,10 +193,10 @@ def ratio_table(
     return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
 
 
-def paired_table(estimates: pd.DataFrame) -> pd.DataFrame | None:
-    """Return differences from the reference, one row for each other agent, if there is one."""
+def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
+    """Return differences from the reference, one row for each other agent."""
     if "difference" not in estimates:
-        return None
+        return pd.DataFrame()
     others = estimates.dropna(subset=["difference"])
     pairs = zip(others["difference"], others["improvement"], strict=True)
     cells = [f"{mean:+.3f}; {100 * better.value:.0f} %" for mean, better in pairs]
@@ -216,10 +212,9 @@ def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataF
 
 
 def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean error of a case and its parts, one row for each controller, in order."""
-    names = ["mae_start", "mae_changes", "mae_steady", "mae"]
-    means = runs.groupby("agent")[names].mean().sort_values("mae").map("{:.3f}".format)
-    return means.rename(index=label, columns=METRICS).rename_axis("controller").reset_index()
+    """Return the mean error of a case and its parts, the least first."""
+    means = runs.groupby("agent")[[*PARTS]].mean().sort_values("mae").map("{:.3f}".format)
+    return means.rename(index=label, columns=PARTS).rename_axis("controller").reset_index()
 
 
 def costs_table(cases: Sequence[Case], controllers: Mapping[str, Controller]) -> pd.DataFrame:
@@ -227,35 +222,16 @@ def costs_table(cases: Sequence[Case], controllers: Mapping[str, Controller]) ->
     rows = []
     for name, controller in controllers.items():
         own = [case for case in cases if case.agent == name]
-        about = own[0].policies if own else []  # a user's own says there what it knows
+        about = own[0].policies if own else []
         training = [each["cpu_seconds"] for each in about if "cpu_seconds" in each]
-        said = {"knows": controller.knows, "searched": controller.searched}
-        said = {
-            key: text or (about[0].get(key, "") if about else "") for key, text in said.items()
-        }
+        said = dict(about[0]) if about else {}  # of a user's own; the roster's is in its record
         rows.append(
             {
                 "controller": label(name),
-                "prior knowledge": said["knows"],
-                "searched or trained": said["searched"],
+                "prior knowledge": controller.knows or said.get("knows", ""),
+                "searched or trained": controller.searched or said.get("searched", ""),
                 "training (s)": f"{np.median(training):.0f}" if training else "",
                 "runs (s)": f"{sum(case.seconds for case in own):.1f}",
             }
         )
     return pd.DataFrame(rows)
-
-
-def metrics_table(summary: pd.DataFrame, scenarios: Mapping[str, Scenario]) -> pd.DataFrame:
-    """Return all metrics, one row for each case and agent, one column for each metric."""
-    rows: dict[tuple[str, str], dict[str, str]] = {}
-    for row in summary.to_dict("records"):
-        case, agent, metric = row["scenario"], row["agent"], row["metric"]
-        noisy = scenarios[case].parameters.range_of("noise_variance")[1] > 0.0
-        form = ".3f" if metric == "mae" else ",.0f"
-        words = {"inf": "not settled", "nan": "not measured"}
-        values = [format(row[name], form) for name in PERCENTILES]
-        median, p10, p90 = (words.get(value, value) for value in values)
-        cell = median if p10 == p90 else f"{median} ({p10} to {p90})"
-        cells = rows.setdefault((case, agent), {"case": case, "controller": label(agent)})
-        cells[METRICS[metric]] = "" if noisy and metric in STEP_METRICS else cell
-    return pd.DataFrame(rows.values())

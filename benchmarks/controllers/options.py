@@ -126,25 +126,20 @@ def _function(location: str) -> Own:
             f"observation of {made_by!r} must be a dict with names out of "
             f"{', '.join(WINDOWS)}, got {observation!r}"
         )
-    told = [getattr(made_by, name, "") for name in ("parameters", "samples", "search")]
-    about = {
-        "file": location,
-        "knows": str(getattr(made_by, "prior_knowledge", "")),
-        "searched": "; ".join(filter(None, map(str, told))),
-    }
+    about = {name: str(getattr(made_by, name, "")) for name in ("knows", "searched")}
     source = getattr(sys.modules[made_by.__module__], "__file__", None)
     if source:
         about["sha256"] = hashlib.sha256(Path(source).read_bytes()).hexdigest()
     return Own(made_by, dict(observation), about)
 
 
-def _make(own: Own, plant: Parameters, runs: int, seed: int) -> Any:
+def _make(plant: Parameters, runs: int, seed: int, *, network: Own) -> Any:
     """Call a user's factory with the arguments that it accepts, by name."""
     offered = {"parameters": plant, "num_envs": runs, "seed": seed, **limits(plant)}
-    accepted = inspect.signature(own.make).parameters
+    accepted = inspect.signature(network.make).parameters
     if not any(each.kind is each.VAR_KEYWORD for each in accepted.values()):
         offered = {name: offered[name] for name in offered if name in accepted}
-    made = own.make(**offered)
+    made = network.make(**offered)
     if hasattr(made, "reset") and hasattr(made, "act"):
         return made
     policy, env = made if isinstance(made, tuple) else (made, None)
@@ -185,7 +180,23 @@ class Policy:
 
 def _saved(algorithm: str, file: Path) -> Own:
     """Return a model, which acts as its file says, or else in the plain environment."""
-    model, windows, moves = _loaded(algorithm, file)
+    from mptc_gym.sb3 import MEMBER, load, spec_of  # here: PyTorch takes seconds to load
+
+    says, windows, moves = True, dict(PAPER_WINDOWS), None
+    with suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
+        says = MEMBER in archive.namelist()
+    model = load(file, device="cpu") if says else _plain(algorithm, file)
+    if type(model).__name__ != algorithm:
+        raise ValueError(f"{file} holds a model of {type(model).__name__}, not of {algorithm}")
+    if says:
+        spec = spec_of(model)
+        names = [each.name for each in spec.additional_wrappers]
+        if names not in ([], ["IncrementalAction"]):
+            acts_in = f"{', '.join(names)}, not in IncrementalAction alone"
+            raise ValueError(f"{file} acts in {acts_in}: {_ADVICE}")
+        moves = spec.additional_wrappers[0].kwargs if names else None
+        plant = Parameters.of_environment(spec.kwargs)
+        windows = {name: getattr(plant, name) for name in WINDOWS}
     weights = sum(weight.numel() for weight in model.policy.parameters())
     samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
     about = {
@@ -194,26 +205,6 @@ def _saved(algorithm: str, file: Path) -> Own:
         "searched": f"{weights:,} weights: {samples}",
     }
     return Own(lambda: (model, moves), windows, about)
-
-
-def _loaded(algorithm: str, file: Path) -> tuple[Any, dict[str, int], Any]:
-    """Return a model, its windows and, if it moves the flow, the arguments of that wrapper."""
-    from mptc_gym.sb3 import MEMBER, load, spec_of  # here: PyTorch takes seconds to load
-
-    with suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
-        if MEMBER not in archive.namelist():
-            return _plain(algorithm, file), dict(PAPER_WINDOWS), None
-    model = load(file, device="cpu")
-    if type(model).__name__ != algorithm:
-        raise ValueError(f"{file} holds a model of {type(model).__name__}, not of {algorithm}")
-    spec = spec_of(model)
-    names = [each.name for each in spec.additional_wrappers]
-    if names not in ([], ["IncrementalAction"]):
-        acts_in = ", ".join(names)
-        raise ValueError(f"{file} acts in {acts_in}, not in IncrementalAction alone: {_ADVICE}")
-    moves = spec.additional_wrappers[0].kwargs if names else None
-    plant = Parameters.of_environment(spec.kwargs)
-    return model, {name: getattr(plant, name) for name in WINDOWS}, moves
 
 
 def _plain(algorithm: str, file: Path) -> Any:

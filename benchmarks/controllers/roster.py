@@ -48,7 +48,7 @@ class Controller:
     """Colour and marker in pictures; relatives have shades of one hue and the same marker."""
     make: Callable[..., Agent] = field(kw_only=False)
     """Function of the plant that it is made for (`Parameters`), the number of runs, and a seed;
-    run i uses `seed + i`. Searched gains are passed by name, a network before all others."""
+    run i uses `seed + i`. Searched gains are passed by name, and a `network` of its own."""
     knows: str = ""
     """Prior knowledge: what it is told about the plant."""
     searched: str = ""
@@ -80,7 +80,7 @@ class Controller:
         return [
             replace(
                 self,
-                make=partial(self.make, network),
+                make=partial(self.make, network=network),
                 observation=getattr(network, "observation", self.observation),
                 provenance={"file": file, **network.provenance},
                 networks=None,
@@ -134,7 +134,7 @@ def limits(plant: Parameters) -> dict[str, Any]:
 def data_sheet(plant: Parameters) -> dict[str, Any]:
     """Return a step test and the actuator's data sheet, the middle of a drawn dead zone."""
     dead_zone = sum(plant.range_of("dead_zone")) / 2
-    return {**asdict(step_test(plant)), **limits(plant), "dead_zone": dead_zone}
+    return {**step_test(plant), **limits(plant), "dead_zone": dead_zone}
 
 
 def with_limits(make: Callable[..., Any], plant: Parameters, *_: int, **gains: Any) -> Any:
@@ -142,19 +142,16 @@ def with_limits(make: Callable[..., Any], plant: Parameters, *_: int, **gains: A
     return make(**gains, **limits(plant))
 
 
-def searched_pi(plant: Parameters, *_: int) -> PIController:
-    """Return a PI controller with the gains of a search on the paper's plant."""
-    return PIController(**{**limits(plant), **SEARCHED_GAINS})
-
-
-def with_data_sheet(make: Callable[..., Agent], plant: Parameters, *_: int) -> Agent:
-    """Return a controller that knows a step test and the actuator's data sheet."""
-    return make(**data_sheet(plant))
+def with_data_sheet(
+    make: Callable[..., Agent], plant: Parameters, *_: int, **network: LawNetwork
+) -> Agent:
+    """Return a controller that knows what `data_sheet` says, perhaps with a network."""
+    return make(**data_sheet(plant), **network)
 
 
 def simc_pi(plant: Parameters, runs: int = 1, seed: int = 0) -> PIController:
     """Return a PI controller tuned by the SIMC rule from a step test alone."""
-    return PIController.simc(**asdict(step_test(plant)), **limits(plant))
+    return PIController.simc(**step_test(plant), **limits(plant))
 
 
 def smith(plant: Parameters, runs: int = 1, seed: int = 0) -> SmithPredictor:
@@ -179,14 +176,7 @@ def frozen_nn(plant: Parameters, runs: int, seed: int) -> Agent:
     return controller  # type: ignore[no-any-return]
 
 
-def with_law(
-    make: Callable[..., Agent], network: LawNetwork, plant: Parameters, *_: int
-) -> Agent:
-    """Return a controller with the network of the law, which knows what `data_sheet` says."""
-    return make(**data_sheet(plant), network=network)
-
-
-def with_policy(network: PolicyNetwork, plant: Parameters, *_: int) -> PolicyNetwork:
+def with_policy(plant: Parameters, *_: int, network: PolicyNetwork) -> PolicyNetwork:
     """Return a trained policy for the actuator's limits.
 
     If it compensates a dead zone, that is the plant's, where it is a number.
@@ -250,7 +240,8 @@ _CONTROLLERS = (
     ),
     Controller(
         "pi-searched", "PI (searched)", ("#4F1F3B", "s"),
-        searched_pi, knows="gains of the search",
+        partial(with_limits, PIController, kp=SEARCHED_GAINS["kp"], ki=SEARCHED_GAINS["ki"]),
+        knows="gains of the search",
         searched="2 gains by 800 trials: 566 M samples, 3 min", swept=False,
     ),
     Controller(
@@ -279,12 +270,14 @@ _CONTROLLERS = (
         networks=partial(policies, "ppo-hard-*.npz"),
     ),
     Controller(
-        "nn-smith", "neural Smith", ("#0072B2", "^"), partial(with_law, NeuralSmithPredictor),
-        knows=_DATA_SHEET, searched=f"{_LAW}; one step test", networks=law, drawn=True,
+        "nn-smith", "neural Smith", ("#0072B2", "^"),
+        partial(with_data_sheet, NeuralSmithPredictor), knows=_DATA_SHEET,
+        searched=f"{_LAW}; one step test", networks=law, drawn=True,
     ),
     Controller(
         "nn-self-tuning", "neural self-tuning", ("#00664B", "v"),
-        partial(with_law, NeuralSelfTuningController), knows=f"{_DATA_SHEET}; delay range",
+        partial(with_data_sheet, NeuralSelfTuningController),
+        knows=f"{_DATA_SHEET}; delay range",
         searched=f"{_LAW}; 31 settings by hand; one step test", networks=law,
     ),
 )  # fmt: skip

@@ -28,9 +28,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
-from benchmarks.lib.storage import UnfinishedError, UsageError, out_folder
-
-__all__ = ["UsageError", "out_folder"]
+from benchmarks.lib.storage import UnfinishedError, UsageError
 
 EXTRAS = {
     "compare": "cyclopts joblib markdown matplotlib pandas rich scipy tabulate",
@@ -100,7 +98,6 @@ Count = Annotated[int, _integers(1, 1_000_000_000)]
 Runs = Annotated[int, _integers(1, 100_000)]
 Seed = Annotated[int, _integers(0, 2**63)]
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
-Positive = Annotated[float, Parameter(validator=Number(gt=0.0, lt=math.inf))]
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
 Repeated = tuple[str, ...]
 Folder = Annotated[Path, Parameter(help="Folder to write to.", converter=_folder, n_tokens=1)]
@@ -154,20 +151,11 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
             r"^Invalid value for (\S+): must", r"\1 must", " ".join(str(error).split())
         )
         if isinstance(error, MissingArgumentError) and error.argument:
-            documented = app.assemble_argument_collection(parse_docstring=True)
-            (asked,) = (each for each in documented if each.name == error.argument.name)
-            text = _missing_argument(asked)
+            choices = ", ".join(error.argument.get_choices() or ())
+            text = f"{error.argument.names[0].lstrip('-').upper()} is missing"
+            text += f": one of {choices}" if choices else "; --help says what it is"
         raise UsageError(text) from error
     return found if isinstance(found, declared) else None
-
-
-def _missing_argument(argument: Any) -> str:
-    """Return a sentence such as "LOG is missing: name the log, a CSV file"."""
-    asked = str(argument.parameter.help or "a value").strip().rstrip(".")
-    choices = argument.get_choices()
-    listed = f", one of {', '.join(choices)}" if choices else ""
-    name = argument.names[0].lstrip("-").upper()
-    return f"{name} is missing: name {asked[0].lower()}{asked[1:]}{listed}"
 
 
 def command(

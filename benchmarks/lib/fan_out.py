@@ -41,11 +41,10 @@ class TasksFailedError(UnfinishedError):
     def __init__(self, errors: Mapping[str, str], tasks: int) -> None:
         self.errors = dict(errors)
         last = {name: text.strip().splitlines()[-1] for name, text in errors.items()}
-        lines = [f"{name}: {text}" for name, text in last.items()][:10]
-        long = [text for name, text in errors.items() if text != last[name]]
-        lines += [f"The first of them:\n{long[0]}"] if long else []
-        head = f"{len(errors)} of {tasks} tasks failed; the others are done"
-        super().__init__("\n".join([head, *lines]))
+        lines = [f"{len(errors)} of {tasks} tasks failed; the others are done"]
+        lines += [f"{name}: {text}" for name, text in last.items()][:10]
+        tracebacks = [text for name, text in errors.items() if text != last[name]]
+        super().__init__("\n".join([*lines, *tracebacks[:1]]))
 
 
 @options
@@ -169,14 +168,12 @@ def _deaf() -> Iterator[None]:
 @contextmanager
 def progress_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
     """Show a progress bar on a terminal, and yield what moves it on by one task."""
-    if not (title and sys.stderr.isatty()):
-        yield lambda: None
-        return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    console, hidden = Console(stderr=True), not (title and sys.stderr.isatty())
+    with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
         bar = progress.add_task(title, total=total)
         yield lambda: progress.advance(bar)
 

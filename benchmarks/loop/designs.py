@@ -70,15 +70,12 @@ def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
     """
     ratios = np.array(_scales(Parameters(**plant))) / np.array(_scales(Parameters()))
     by_name = dict(zip(SPANS, ratios.tolist(), strict=True))
-    moved = [
-        {name: by_name.get(name, 1.0) * value for name, value in each.items()}
-        for each in design
-    ]  # fmt: skip
-    integers = "delay", "drift_samples"
-    return [
-        {name: round(value) if name in integers else value for name, value in each.items()}
-        for each in moved
-    ]
+
+    def moved(name: str, value: float) -> float:
+        there: float = by_name.get(name, 1.0) * value
+        return round(there) if name in ("delay", "drift_samples") else there
+
+    return [{name: moved(name, each[name]) for name in each} for each in design]
 
 
 def _scales(plant: Parameters) -> list[float]:

@@ -159,21 +159,7 @@ def nominal(parameters: Parameters) -> LinearModel:
     )
 
 
-@dataclass(frozen=True)
-class StepTest:
-    """A first-order model with delay; its fields are arguments of SIMC and `SmithPredictor`."""
-
-    gain: float
-    """Steady-state gain, degC per t/h."""
-    time_constant: float
-    """Time constant, s."""
-    delay: float
-    """Delay, s, including the one sample that any input takes to show."""
-    sampling_interval: float
-    """Sampling interval, s."""
-
-
-def step_test(parameters: Parameters) -> StepTest:
+def step_test(parameters: Parameters) -> dict[str, float]:
     """Return what an engineer would read off the plant's response to a step of the flow.
 
     The time constant and the delay follow from the times at which the response reaches 28.3 %
@@ -184,6 +170,9 @@ def step_test(parameters: Parameters) -> StepTest:
     A range is replaced by its middle, and a drifting plant is tested at k = 0. The flow moves
     outside the dead zone, and noise and load disturbances average out. A ValueError is raised
     if the plant reaches no new steady state, or if its gain is 0.
+
+    These are arguments of `PIController.simc` and `SmithPredictor`: degC per t/h, and s. The
+    delay includes the one sample that any input takes to show.
     """
     plant = nominal(parameters)
     response, interval = plant.step_response(), plant.sampling_interval
@@ -191,12 +180,12 @@ def step_test(parameters: Parameters) -> StepTest:
     time_constant = 1.5 * (late - early)
     # In samples, u(k) shows at y(k + 1) at the earliest.
     delay = max(1, round(late - time_constant + 1.0))
-    return StepTest(
-        gain=float(f"{plant.gain:.4g}"),
-        time_constant=float(f"{time_constant * interval:.3g}"),
-        delay=delay * interval,
-        sampling_interval=interval,
-    )
+    return {
+        "gain": float(f"{plant.gain:.4g}"),
+        "time_constant": float(f"{time_constant * interval:.3g}"),
+        "delay": delay * interval,
+        "sampling_interval": interval,
+    }
 
 
 def _first_reached(response: Array, level: float) -> float:

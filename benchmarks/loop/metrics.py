@@ -22,24 +22,9 @@ START, CHANGE = (
 )  # samples: the start of a run, and how long a change of set point counts
 LAST = 50  # samples at the end of a run that decide whether it has settled
 
-# Names in CSV files, and headings.
-METRICS: dict[str, str] = {
-    "mae": "mean |e| (°C)",
-    "mae_start": f"first {START} samples",
-    "mae_changes": f"{CHANGE} samples after later changes",
-    "mae_steady": "the rest",
-    "ise": "ISE (°C² min)",
-    "itae": "ITAE (°C min²)",
-    "total_variation": "total variation (t/h)",
-    "overshoot": "overshoot (%)",
-    "settling_time": "settling time (min)",
-    "dead_zone_share": "in dead zone (%)",
-    "saturation_share": "saturated (%)",
-}
-
 
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
-    """Compute the measures in `METRICS` for each run, each of shape (runs,).
+    """Compute the measures of each run by their names in CSV files, each of shape (runs,).
 
     - `mae`: mean of |e(k)| over k = 1 to N, the errors in the rewards;
     - `mae_start`, `mae_changes`, `mae_steady`: what it is the sum of; see `_parts`;

@@ -68,30 +68,6 @@ PRESET_SCENARIOS = {
 }
 
 
-def scenarios_of(name: str, arguments: Mapping[str, Any]) -> dict[str, Scenario]:
-    """Return the cases for another plant, given its name and arguments.
-
-    They use the set points of the paper's cases, unless the arguments define a set point: then
-    there is one case, with that set point.
-    """
-    own = {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments)
-    cases = [("run", "its own set point", 1200, {})] if own else SETPOINTS
-    return {
-        setpoint: Scenario(setpoint, f"{title}, {name}", samples, {**arguments, **more})
-        for setpoint, title, samples, more in cases
-    }
-
-
-@dataclass(frozen=True)
-class ChosenPlant:
-    """The plant that the user chose."""
-
-    name: str
-    """Short description of the choice; "the paper's plant" by default."""
-    arguments: dict[str, Any]
-    """Arguments of the environment that differ from the defaults."""
-
-
 @options
 @dataclass(frozen=True, kw_only=True)
 class PlantOptions:
@@ -106,22 +82,38 @@ class PlantOptions:
     """An argument of the environment, such as delay=30 or delay=[12,24] (repeatable;
     overrides --plant, which overrides --preset)."""
 
-    def chosen(self) -> ChosenPlant:
-        """Return the chosen plant; `UsageError` if an option is invalid."""
-        names: list[str] = []
-        arguments: dict[str, Any] = {}
-        if self.preset:
-            names.append(self.preset)
-            arguments |= PRESETS[self.preset]
+    @property
+    def name(self) -> str:
+        """Short description of the choice; "" for the paper's plant."""
+        file = self.plant.stem if self.plant else None
+        return ", ".join(filter(None, [self.preset, file, *self.set]))
+
+    def cases(self, others: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
+        """Return the cases for the chosen plant, or the others if none is chosen.
+
+        They use the set points of the paper's cases, unless the arguments define a set point:
+        then there is one case, with that set point.
+        """
+        arguments = self.arguments()
+        if not self.name:
+            return others
+        own = {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments)
+        cases = [("run", "its own set point", 1200, {})] if own else SETPOINTS
+        return {
+            name: Scenario(name, f"{title}, {self.name}", samples, {**arguments, **more})
+            for name, title, samples, more in cases
+        }
+
+    def arguments(self) -> dict[str, Any]:
+        """Return those that differ from the defaults; `UsageError` if one is invalid."""
+        arguments: dict[str, Any] = dict(PRESETS[self.preset]) if self.preset else {}
         if self.plant:
-            names.append(self.plant.stem)
             with blame("--plant"):
                 arguments |= _read(self.plant)
         for text in self.set:
             name, equals, value = text.partition("=")
             if not (name and equals):
                 raise UsageError(f"--set must be ARGUMENT=VALUE, got {text!r}")
-            names.append(text)
             try:
                 arguments[name] = json.loads(value)
             except (ValueError, RecursionError):
@@ -136,7 +128,7 @@ class PlantOptions:
                 )
         except (TypeError, ValueError) as error:
             raise UsageError(f"{', '.join(given)}: {error}") from error
-        return ChosenPlant(", ".join(names) or "the paper's plant", arguments)
+        return arguments
 
 
 def _read(path: Path) -> dict[str, Any]:
