@@ -42,6 +42,8 @@ def member(entry):
 
 
 def test_it_is_told_the_plant_that_it_is_made_for(entry, member):
+    assert entry.knows
+    assert entry.searched
     plant = ACTUATOR if entry.name in UNTOLD else OTHER
     found = run_case(Scenario("other", "", 900, plant), member, 2).runs["mae"].to_numpy()
     if entry.name == "nothing":
@@ -112,11 +114,6 @@ def test_a_copy_goes_on_like_the_original_in_mid_episode(member, rng):
     assert len(np.unique(ours)) > 1 or isinstance(controller, IdleValve)
 
 
-def test_what_it_knows_and_what_was_searched_for_it_are_said(entry):
-    assert entry.knows
-    assert entry.searched
-
-
 @pytest.fixture
 def written(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
@@ -153,10 +150,6 @@ class TestOwnControllers:
             "num_envs", "seed", "u_min", "u_max", "parameters",
         }  # fmt: skip
 
-    def test_those_of_the_project_ask_for_their_windows(self):
-        (member,) = members_of("agents:PIController")
-        assert errors(member, 1, 60, setpoint_window=7) == errors(member, 1, 60)
-
     @pytest.mark.parametrize("location", ["agents", "agents:No", "nowhere:x", ".:y", "..a:y"])
     def test_bad_locations(self, location):
         with pytest.raises(UsageError, match=re.escape(f"--agent: {location!r} ")):
@@ -188,6 +181,7 @@ class TestOwnControllers:
         other = written("from agents import PIController as Mine")
         found = members_of("agents:PIController", other)
         assert [each.provenance["file"] for each in found] == ["agents:PIController", other]
+        assert errors(found[0], 1, 60, setpoint_window=7) == errors(found[0], 1, 60)
 
 
 @pytest.fixture(scope="module")

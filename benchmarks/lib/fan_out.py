@@ -35,18 +35,6 @@ Task = Callable[[], Any]
 Answer = tuple[str, Any, str]  # the name of a task, its result, and its error or ""
 
 
-class TasksFailedError(UnfinishedError):
-    """Some tasks failed; `errors` maps the name of each to a traceback or a sentence."""
-
-    def __init__(self, errors: Mapping[str, str], tasks: int) -> None:
-        self.errors = dict(errors)
-        last = {name: text.strip().splitlines()[-1] for name, text in errors.items()}
-        lines = [f"{len(errors)} of {tasks} tasks failed; the others are done"]
-        lines += [f"{name}: {text}" for name, text in last.items()][:10]
-        tracebacks = [text for name, text in errors.items() if text != last[name]]
-        super().__init__("\n".join([*lines, *tracebacks[:1]]))
-
-
 @options
 @dataclass(frozen=True, kw_only=True)
 class FanOut:
@@ -81,10 +69,9 @@ class FanOut:
 
         Raises
         ------
-        TasksFailedError
-            At the end, if tasks raised an exception.
         UnfinishedError
-            If a process was killed, perhaps for lack of memory.
+            At the end, with the errors, if tasks raised an exception; or if a process was
+            killed, perhaps for lack of memory.
         UsageError
             If there is no cluster.
         """
@@ -106,7 +93,11 @@ class FanOut:
                     kept.save(tasks[name], result)
                 yield name, result
         if errors:
-            raise TasksFailedError(errors, len(tasks))
+            last = {name: text.strip().splitlines()[-1] for name, text in errors.items()}
+            lines = [f"{len(errors)} of {len(tasks)} tasks failed; the others are done"]
+            lines += [f"{name}: {text}" for name, text in last.items()][:10]
+            tracebacks = [text for name, text in errors.items() if text != last[name]]
+            raise UnfinishedError("\n".join([*lines, *tracebacks[:1]]))
 
     def _answers(self, tasks: Mapping[str, Task]) -> Iterator[Answer]:
         """Run tasks, and yield each answer as it comes."""

@@ -109,13 +109,10 @@ class Kept:
         """Return the result of a task; raise a `LookupError` if it is missing or damaged."""
         import joblib
 
-        path = self.path(task)
         try:
-            if path and path.exists():
-                return joblib.load(path)
-        except Exception as error:  # whatever a damaged file raises
+            return joblib.load(self.path(task))
+        except Exception as error:  # there is none, or whatever a damaged file raises
             raise LookupError(str(error)) from error
-        raise LookupError("it is not kept")
 
     def save(self, task: Callable[[], Any], result: Any) -> None:
         """Write the result of a task, completely or not at all."""
