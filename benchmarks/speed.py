@@ -57,6 +57,8 @@ def work(options: Options) -> str:
 
 def tables(device: str | None) -> Iterator[tuple[str, Cases]]:
     """Yield the title and the cases of each table; those of a device are PyTorch's alone."""
+    from benchmarks.loop.rollout import make_plants, rollout
+
     if device is not None:
         for n in ON_DEVICE:
             yield f"In PyTorch on {device}, n = {n:,}", in_torch(n, device, steps=200)
@@ -66,7 +68,11 @@ def tables(device: str | None) -> Iterator[tuple[str, Cases]]:
     for n in BATCHES:
         cases = in_batch(REFERENCE, n, {"": {}}) | in_batch(PLANT, n, PLANTS)
         yield f"Vector environments, n = {n:,}", cases | (in_torch(n) if has_torch else {})
-    cases = in_batch(REFERENCE, LEARNERS, {"": {}}) | learners(LEARNERS)
+    plants = make_plants(LEARNERS, EPISODE, **NOISE)
+    networks = DirectNNController(num_envs=LEARNERS)
+    cases = in_batch(REFERENCE, LEARNERS, {"": {}})
+    episode = partial(rollout, plants, networks, EPISODE, seed=0)
+    cases["plants and networks"] = episode, LEARNERS * EPISODE
     yield f"Noisy plants and their networks, which learn, n = {LEARNERS:,}", cases
 
 
@@ -155,19 +161,6 @@ def _cycle(
     for k in range(steps):
         step(actions[k % len(actions)])
     wait()
-
-
-def learners(n: int) -> Cases:
-    """Return the case of plants and their networks, over an episode."""
-    from benchmarks.loop.rollout import make_plants, rollout
-
-    plants, networks = make_plants(n, EPISODE, **NOISE), DirectNNController(num_envs=n)
-    return {
-        "plants and networks": (
-            partial(rollout, plants, networks, EPISODE, seed=0),
-            n * EPISODE,
-        )
-    }
 
 
 main = command("speed", Options, work, interrupted="nothing is kept.")

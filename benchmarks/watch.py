@@ -1,4 +1,4 @@
-"""Watch a controller at work, in a window or in a film: `python -m benchmarks.watch --help`."""
+"""Make a film of a controller at work: `python -m benchmarks.watch --help`."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 
-from benchmarks.controllers.roster import ROSTER, Controller
-from benchmarks.lib.command import Count, Seed, command, options
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.command import Seed, command, known, options
 from benchmarks.lib.storage import UsageError, out_folder, replacing
 from benchmarks.loop.metrics import held
 from benchmarks.loop.rollout import Trajectory
-from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS, PlantOptions, Scenario
-from mptc_gym import MiddlePointEnv
+from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS, PlantOptions
 
-OTHER = ROSTER["nn-smith"].label  # whose errors those of the film are multiples of
+REFERENCE = ROSTER["nn-smith"]  # whose errors those of the film are multiples of
 PICTURES = 60  # of a film
 SIZE = 7.5, 5.0  # inches, of 100 pixels
 SHADES = 24  # colours
@@ -36,58 +35,39 @@ _CASES = (
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Watch a controller at work, in a window or in a film."""
+    """Make a film of a controller at work."""
 
     agent: Annotated[str, Parameter(help=_AGENTS)] = "nn"
     scenario: Annotated[str, Parameter(help=_CASES)] = "square"
     plant: PlantOptions = field(default_factory=PlantOptions)
     seed: Seed = 0
     """Seed of noise and initial weights."""
-    speed: Count = MiddlePointEnv.metadata["render_fps"]
-    """Samples per second in the window."""
     video: Path | None = None
-    """Write a film to this file, .gif, instead of opening a window."""
+    """The film, a .gif file (default: in results/watch)."""
 
 
 def work(options: Options) -> str:
-    """Run a controller on a case and show it."""
-    path, seed = options.video, options.seed
-    controller, case = _controller(options.agent), _case(options)
-    factory = controller.members()[0]
-    if path and path.suffix != ".gif":
+    """Run a controller on a case and write a film of it."""
+    from benchmarks.controllers.options import own_entry
+
+    cases = options.plant.cases(SCENARIOS)
+    case = cases[known("--scenario", [options.scenario], cases)[0]]
+    name, equals, location = options.agent.partition("=")
+    if ":" in options.agent:
+        controller = own_entry(name, [location if equals else name])
+    else:
+        controller = ROSTER[known("--agent", [name], ROSTER)[0]]
+    path = options.video or Path("results/watch", f"{name.replace(':', '.')}-{case.name}.gif")
+    if path.suffix != ".gif":
         raise UsageError(f"--video: must end in .gif, got {path}")
-    if path is None and not _has_screen():
-        path = Path("results/watch", f"{options.agent.replace(':', '.')}-{case.name}.gif")
-        print(f"There is no screen to open a window on: writing a film, {path}")
-    if path is None:
-        return f"{controller.label} on {case.title}: {show(factory, case, seed, options.speed)}"
     out_folder(path.absolute().parent, "--video")
     run, reference = (
-        each.run(case.arguments, case.samples, 1, seed)
-        for each in (factory, ROSTER["nn-smith"].members()[0])
+        each.members()[0].run(case.arguments, case.samples, 1, options.seed)
+        for each in (controller, REFERENCE)
     )
     write_film(path, controller.label, case.parameters.sampling_interval, run, reference)
     error = f"mean absolute error {np.abs(run.next_error).mean():.3f} °C"
     return f"{controller.label} on {case.title}: {error}\nThe film is {path}"
-
-
-def show(factory: Controller, case: Scenario, seed: int, speed: int) -> str:
-    """Run a controller in a window, and return its mean error in words."""
-    import pygame
-
-    arguments = factory.arguments(case.arguments)
-    plant = MiddlePointEnv(render_mode="human", **arguments)
-    plant.metadata = {**plant.metadata, "render_fps": speed}
-    controller, errors = factory(arguments, 1, seed), []
-    controller.reset()
-    seen, _ = plant.reset(seed=seed)
-    for _ in range(case.samples):
-        seen, _, _, _, info = plant.step(controller.act(seen[np.newaxis])[0])
-        errors.append(abs(info["error"]))
-        if pygame.event.get(pygame.QUIT):
-            break
-    plant.close()
-    return f"mean absolute error {np.mean(errors):.3f} °C in {len(errors)} samples"
 
 
 def equal_steps(setpoint: NDArray[np.float64]) -> list[tuple[int, int]]:
@@ -133,7 +113,7 @@ def write_film(
             column[0].plot(minutes, setpoint, "--", color="0.3", label="set point")
             for panel, name in zip(column, ("output", "applied"), strict=True):
                 for each, colour, who in (
-                    (reference, "#E69F00", OTHER),
+                    (reference, "#E69F00", REFERENCE.label),
                     (run, "#0072B2", label),
                 ):
                     values = getattr(each, name)[start:stop, 0]
@@ -144,7 +124,8 @@ def write_film(
         handles, names = panels[0, 0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False)
         change = " and ".join(f"{multiple:.2f}" for multiple in multiples)
-        title = f"{label}: error {change} times that of the {OTHER} predictor on the same step"
+        title = f"{label}: error {change} times that of the {REFERENCE.label} predictor"
+        title += " on the same step"
         figure.suptitle(textwrap.fill(title, 62), x=0.01, ha="left", weight="bold", size=15)
         canvas: Any = FigureCanvasAgg(figure)
         drawn = [line.get_data() for line in lines]
@@ -163,43 +144,6 @@ def write_film(
     durations = [2500, *[100] * (PICTURES - 1), 1000]  # ms
     with replacing(path) as partial:
         first.save(partial, save_all=True, append_images=others, duration=durations, loop=0)
-
-
-def _case(options: Options) -> Scenario:
-    """Return the case to run; `UsageError` if there is none of this name."""
-    cases = options.plant.cases(SCENARIOS)
-    if options.scenario not in cases:
-        raise UsageError(
-            f"--scenario: no {options.scenario!r} on this plant; there are {', '.join(cases)}"
-        )
-    return cases[options.scenario]
-
-
-def _controller(agent: str) -> Controller:
-    """Return the controller of a name or a location; `UsageError` if there is none."""
-    from benchmarks.controllers.options import own_entry
-
-    name, equals, location = agent.partition("=")
-    if ":" in agent:
-        return own_entry(name, [location if equals else agent])
-    if agent not in ROSTER:
-        raise UsageError(
-            f"--agent: no {agent!r}; there are {', '.join(ROSTER)}, and "
-            "NAME=MODULE:FACTORY or NAME=PPO:FILE.zip of your own"
-        )
-    return ROSTER[agent]
-
-
-def _has_screen() -> bool:
-    import pygame
-
-    try:
-        pygame.display.init()
-    except pygame.error:
-        return False
-    driver = pygame.display.get_driver()
-    pygame.display.quit()
-    return driver not in ("dummy", "offscreen")
 
 
 main = command("watch", Options, work, interrupted="nothing is kept.")

@@ -99,7 +99,7 @@ REFUSED = {
         (["--agent", "lqr"], "--agent: no 'lqr'; there are nothing, nn"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
         (["--scenario", "triangle"], "--scenario.*constant-noise"),
-        (["--preset", "paper", "--scenario", "load"], "no 'load' on this plant"),
+        (["--preset", "paper", "--scenario", "load"], "no 'load'; there are square, constant"),
         (["--video", "film.avi"], "--video: must end in .gif"),
         (["--seed", "-1"], "--seed. Must be >= 0"),
     ],
@@ -128,7 +128,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_run_or_written(
 @pytest.mark.parametrize(
     ("given", "package", "extra"),
     [
-        ("datasets", "minari", "data"), ("watch", "pygame", "render"),
+        ("datasets", "minari", "data"),
         ("train nn-smith", "torch", "torch"), ("tune pi", "optuna", "bench"),
         ("claims --backend ray", "ray", "ray"),
     ],
