@@ -56,7 +56,7 @@ def work(options: Options) -> str:
     if ":" in options.agent:
         controller = own_entry(name, [location if equals else name])
     else:
-        controller = ROSTER[known("--agent", [name], ROSTER)[0]]
+        controller = ROSTER[known("--agent", [options.agent], ROSTER)[0]]
     path = options.video or Path("results/watch", f"{name.replace(':', '.')}-{case.name}.gif")
     if path.suffix != ".gif":
         raise UsageError(f"--video: must end in .gif, got {path}")
