@@ -24,13 +24,6 @@ def step(action: float, **arguments: float) -> tuple[float, float, float]:
     return Plant(parameters, Ranges(parameters).given).step(action, 0.0, 0.0)
 
 
-def applied(
-    command: float, u_min: float = -10.0, u_max: float = 10.0, **others: float
-) -> float:
-    action = action_from_command(command, u_min, u_max)
-    return step(action, u_min=u_min, u_max=u_max, **others)[1]
-
-
 @pytest.mark.parametrize(
     ("a", "b", "c", "delay"),
     [
@@ -66,7 +59,9 @@ SIZES = [(0, 0), (5 - 1e-12, 0), (5, 5), (7.5, 7.5), (10, 10), (10.001, 10), (1e
     ],
 )
 def test_actuator_whose_edge_passes(command, arguments, expected):
-    assert applied(command, **arguments) == pytest.approx(expected, abs=1e-12)
+    limits = (arguments.get("u_min", -10.0), arguments.get("u_max", 10.0))
+    found = step(action_from_command(command, *limits), **arguments)[1]
+    assert found == pytest.approx(expected, abs=1e-12)
 
 
 def test_scaling_by_hand():

@@ -254,11 +254,10 @@ def test_neither_a_wrong_gain_nor_a_steady_load_leaves_an_offset():
     ],
 )
 def test_a_plant_unlike_those_of_the_training(plant):
-    shown = step_test(Parameters(**plant))
-    amplitude = 5.0 * abs(shown["gain"])
-    square = {"setpoint_amplitude": amplitude, "dead_zone": 2.0}
-    run = control(neural(**shown, dead_zone=2.0), 300, **plant, **square)
-    assert mean_error(run, 250) < 0.05 * amplitude
+    shown = step_test(Parameters(**plant)) | {"dead_zone": 2.0}
+    size = 5.0 * abs(shown["gain"])
+    run = control(neural(**shown), 300, **plant, dead_zone=2.0, setpoint_amplitude=size)
+    assert mean_error(run, 250) < 0.05 * size
 
 
 LOAD = {"disturbance_amplitude": 1.5, "disturbance_interval": 150.0}
