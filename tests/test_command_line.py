@@ -73,10 +73,7 @@ REFUSED = {
         (["--agent", "PI=agents:PIController"], "'PI' is taken"),
         (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
     ],
-    "datasets": [
-        (["middlepoint/paper/ppo-v0"], 'Choose from: "middle'),
-        (["middlepoint/paper/mixed-v0", "--episodes", "3"], "--episodes: must be at least 4"),
-    ],
+    "datasets": [(["middlepoint/paper/ppo-v0"], 'Choose from: "middle')],
     "identify": [
         (["none.csv"], "none.csv cannot be read: No such file"),
         ([LOG, "--u-min", "nan"], 'value "nan" for --u-min. Must be < inf'),
