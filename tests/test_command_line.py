@@ -79,9 +79,6 @@ REFUSED = {
         ([LOG, "--u-min", "nan"], 'value "nan" for --u-min. Must be < inf'),
         ([LOG, "--operating-flow", "1e9"], "operating_flow must be near the flows of the log"),
     ],
-    "bounds": [
-        (["--cache", __file__], "--cache: "),
-    ],
     "speed": [
         (["--device", "toaster"], "--device: device must be one that PyTorch can use"),
     ],

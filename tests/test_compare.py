@@ -128,7 +128,7 @@ class TestEstimates:
         scales = {name: scale_of(SCENARIOS[name], 1) for name in ("constant", "square")}
         rows = []
         for name, scale in scales.items():
-            least, idle = scale.least.value, scale.least.idle
+            least, idle = scale.least.value, scale.least.idle.value
             half = (least + idle) / 2
             runs = some_runs(a=[[idle, half]], b=[[least, half]])
             rows.append(runs.assign(scenario=name, total_variation=12.0))

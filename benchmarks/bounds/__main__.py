@@ -8,12 +8,11 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from benchmarks.lib.command import Count, Runs, Seed, command, options
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.storage import ROOT, commit, out_folder, versions, write_json
+from benchmarks.lib.storage import ROOT, commit, versions, write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, PlantOptions, Scenario
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
@@ -54,19 +53,14 @@ class Options:
     """Episodes to average a bound over, where plants or set points are drawn."""
     seed: Seed = SEED
     """Seed of the first episode."""
-    cache: Path | None = None
-    """Folder in which computed bounds are kept (default: results/bounds)."""
 
 
 def work(options: Options) -> str:
     """Print the bounds of the cases and of the presets, or of another plant."""
-    from benchmarks.bounds.least import CACHE
-
     cases = options.plant.cases(SCENARIOS | PRESET_SCENARIOS)
-    folder = out_folder(options.cache or CACHE, "--cache")
     if options.package:
-        return write_package(folder, options.fan_out)
-    drawn = {"episodes": options.episodes, "seed": options.seed, "folder": folder}
+        return write_package(options.fan_out)
+    drawn = {"episodes": options.episodes, "seed": options.seed}
     tasks = {
         name: partial(row, case, options.samples or case.samples, drawn, options.mpc)
         for name, case in cases.items()
@@ -85,21 +79,20 @@ def _show(name: str, cells: list[str]) -> None:
 def row(case: Scenario, samples: int, drawn: Mapping[str, Any], mpc: int | None) -> list[str]:
     """Return the bounds of a case, and the error of `mpc` runs of MPC, if any.
 
-    `drawn` holds the number and first seed of the episodes, and the folder of kept bounds.
+    `drawn` holds the number and first seed of the episodes.
     """
     from benchmarks.bounds.least import least_possible
     from benchmarks.controllers.roster import ROSTER
-    from benchmarks.lib.statistics import Estimate, bootstrap
+    from benchmarks.lib.statistics import bootstrap
     from benchmarks.loop.metrics import mean_error
 
-    ask = {"samples": samples, **drawn, **case.arguments}
-    of = least_possible(kind="preview", **ask)
-    cells = [f"{Estimate(of.idle, of.idle_low, of.idle_high, of.runs):.4f}"]
+    least = partial(least_possible, samples=samples, **drawn, **case.arguments)
+    cells = [f"{least(kind='preview').idle:.4f}"]
     for kind in HEADINGS:
         cells.append("")
         # "causal" needs random set points, "reference" those that are held long enough.
         with suppress(ValueError):
-            cells[-1] = f"{least_possible(kind=kind, **ask):.4f}"
+            cells[-1] = f"{least(kind=kind):.4f}"
     if mpc:
         (predictive,) = ROSTER["mpc"].members()
         runs = predictive.run(case.arguments, samples, mpc, drawn["seed"])
@@ -107,25 +100,24 @@ def row(case: Scenario, samples: int, drawn: Mapping[str, Any], mpc: int | None)
     return cells
 
 
-def write_package(folder: Path, fan_out: FanOut) -> str:
+def write_package(fan_out: FanOut) -> str:
     """Write the least possible error of each case, for every episode where they differ."""
     from benchmarks.bounds.least import least_possible
 
     case: dict[str, Any] = {"samples": SAMPLES, "seed": SEED, "episodes": EPISODES + MORE}
-    tasks = {
-        name: partial(least_possible, folder=folder, **{**case, **arguments})
-        for name, arguments in PACKAGED.items()
-    }
-    found = fan_out.run(tasks, "bounds")
-    cases = {
-        name: {"arguments": arguments, "kind": found[name].kind, "least": found[name].episodes}
-        for name, arguments in PACKAGED.items()
-    }
+    found = fan_out.run(
+        {name: partial(least_possible, **case, **each) for name, each in PACKAGED.items()},
+        "bounds",
+    )
     about = {
         "command": "python -m benchmarks.bounds --package",
         "commit": commit(),
         "versions": versions(),
         "unit": "degC, mean of |e(k)| over k = 1 to samples",
+    }
+    cases = {
+        name: {"arguments": arguments, "kind": found[name].kind, "least": found[name].episodes}
+        for name, arguments in PACKAGED.items()
     }
     write_json(PACKAGE, {**about, **case, "cases": cases})
     return f"Written to {PACKAGE}"

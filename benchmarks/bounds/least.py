@@ -39,13 +39,7 @@ from mptc_gym.ranges import numbers_of_plant
 
 Array = NDArray[np.float64]
 
-KINDS = {  # the controllers that cannot do better
-    "preview": "every controller that reads the transmitter and not the true output, even one "
-    "that knows the set point beforehand",
-    "causal": "controllers that read the transmitter and not the true output, and that learn "
-    "of a change of the set point when it happens",
-    "reference": "none: a reference, if each change finds the plant settled",
-}
+KINDS = "preview", "causal", "reference"
 CACHE = ROOT / "results" / "bounds"
 
 
@@ -59,20 +53,11 @@ class LeastPossible(Estimate):
 
     kind: str
     """One of `KINDS`."""
-    idle: float
-    """Mean |e| of the same episodes without control, degC, and its interval."""
-    idle_low: float
-    idle_high: float
+    idle: Estimate
+    """Mean |e| of the same episodes without control, degC."""
     episodes: tuple[float, ...]
     """Terms of the mean, degC; element i is for the episode of seed `seed + i`. For the kind
     "causal" only their mean is a bound."""
-    seed: int
-    """Seed of the first episode."""
-
-    @property
-    def holds_for(self) -> str:
-        """The controllers that cannot do better."""
-        return KINDS[self.kind]
 
     def score(self, errors: ArrayLike) -> Array:
         """Return scores: 0 for the mean error without control, 1 for `value`.
@@ -80,10 +65,10 @@ class LeastPossible(Estimate):
         `errors` are mean |e| of runs, degC, of any shape; a single run may exceed 1 by chance.
         A ValueError is raised if nothing is better than no control.
         """
-        room = self.idle - self.value
-        if room <= 1e-9 * max(self.idle, 1.0):
-            raise ValueError(f"there is nothing to gain: doing nothing gives {self.idle:g} °C")
-        scores: Array = (self.idle - np.asarray(errors, dtype=np.float64)) / room
+        idle = self.idle.value
+        if idle - self.value <= 1e-9 * max(idle, 1.0):
+            raise ValueError(f"there is nothing to gain: doing nothing gives {idle:g} °C")
+        scores: Array = (idle - np.asarray(errors, np.float64)) / (idle - self.value)
         return scores
 
 
@@ -127,7 +112,8 @@ def least_possible(
     for name, count in (("samples", samples), ("episodes", episodes)):
         if not isinstance(count, int) or count < 1:
             raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
-    if kind is None and theorem(parameters) == "preview":
+    drawn = parameters.setpoint == "random"
+    if kind is None and not drawn:
         case = {**arguments, "samples": samples, "episodes": episodes, "seed": seed}
         preview = least_possible(kind="preview", folder=folder, **case)
         with suppress(ValueError):  # the plant does not settle between changes
@@ -138,22 +124,17 @@ def least_possible(
     kind = kind or "causal"
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
-    if kind == "causal" and theorem(parameters) != "causal":
+    if kind == "causal" and not drawn:
         raise ValueError(f'kind must not be "causal" for the set point {parameters.setpoint!r}')
     task = partial(_least_possible, parameters, samples, kind, episodes, seed)
     if folder is None:
         return task()
-    try:
+    with suppress(LookupError):
         found: LeastPossible = Kept(folder).load(task)
-    except LookupError:
-        found = task()
-        Kept(folder).save(task, found)
+        return found
+    found = task()
+    Kept(folder).save(task, found)
     return found
-
-
-def theorem(parameters: Parameters) -> str:
-    """Return the kind of the highest proven bound; the reference may be beaten."""
-    return "causal" if parameters.setpoint == "random" else "preview"
 
 
 def _least_possible(
@@ -165,31 +146,26 @@ def _least_possible(
     with closing(make_plants(runs, samples + 1, **asdict(parameters))) as plants:
         alone = IdleValve(numbers.u_min, numbers.u_max)
         trajectory = rollout(plants, alone, samples + 1, seed)
-    idle = student(np.abs(trajectory.setpoint - trajectory.output)[1:].mean(axis=0))
     drawn = parameters.ranges or parameters.setpoint == "random"
     # Rounded to be the same on every machine, as solvers differ in later digits.
     values = tuple(
         round(_least(parameters, kind, numbers_of_plant(numbers, i), setpoint) / samples, 6)
         for i, setpoint in enumerate(trajectory.setpoint.T[: episodes if drawn else 1])
     )
-    return LeastPossible(
-        **vars(student(values)), kind=kind, idle=idle.value, idle_low=idle.low,
-        idle_high=idle.high, episodes=values, seed=seed,
-    )  # fmt: skip
+    idle = student(np.abs(trajectory.setpoint - trajectory.output)[1:].mean(axis=0))
+    return LeastPossible(**vars(student(values)), kind=kind, idle=idle, episodes=values)
 
 
 def _least(
     parameters: Parameters, kind: str, numbers: PlantNumbers[float], setpoint: Array
 ) -> float:
     """Return the least sum of |e(k)| over k = 1 to N of an episode, degC."""
-    samples = len(setpoint)
-    longer = samples + int(numbers.delay) + len(parameters.b) + TAIL
-    model = time_varying_model(parameters, numbers, longer)
-    unforeseen = unknown(model)
+    # A reference looks beyond the end.
+    ahead = int(numbers.delay) + len(parameters.b) + TAIL if kind == "reference" else 0
+    model = time_varying_model(parameters, numbers, len(setpoint) + ahead)
+    unforeseen, penalty = unknown(model), None
     if kind == "reference":
         return reference(model, unforeseen, setpoint).cost
-    model, unforeseen = model.first(samples), unforeseen.of(0, samples)
-    penalty = None
     if kind == "causal" and parameters.setpoint_amplitude > 0.0:
         penalty = SetPointLaw(parameters, model, unforeseen).penalty(setpoint)
     return plan(model, unforeseen, setpoint, penalty=penalty).cost

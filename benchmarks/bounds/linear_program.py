@@ -27,10 +27,6 @@ LEVEL = 0.001  # least slope of the error in plans, so that they end at the set 
 SMOOTH = 1e-4  # price per t/h of travel, which selects the quietest of equal plans
 
 
-class NotSolvedError(RuntimeError):
-    """The optimum of a linear program was not found; the message says why."""
-
-
 @dataclass(frozen=True)
 class Plan:
     """A solution of the linear program. All arrays have the shape (samples,)."""
@@ -41,13 +37,8 @@ class Plan:
     """The mean of y(k), degC."""
     flow: Array
     """The mean of u_a(k), t/h."""
-    value: float
-    """The minimum of the objective, degC times samples."""
-
-    @property
-    def cost(self) -> float:
-        """The value over k = 1 to N, as no flow changes e(0)."""
-        return self.value - float(self.error[0])
+    cost: float
+    """The minimum of the objective over k = 1 to N, as no flow changes e(0); degC."""
 
 
 def plan(
@@ -75,9 +66,9 @@ def plan(
 
     The model covers at least the samples of `setpoint`, y_d(k) in degC. Outputs up to sample
     `start`, and flows before it, are those of the plan `before`; without one, the plant has
-    been at rest. The value counts the samples from `start` on, with a `penalty` in degC for
+    been at rest. The cost counts the samples from `start` on, with a `penalty` in degC for
     each t/h of u_a(k), shape (samples,). A `quiet` plan is, of equally good ones, the one that
-    comes to the set point with the least travel. `NotSolvedError` is raised if all attempts
+    comes to the set point with the least travel. A RuntimeError is raised if all attempts
     fail or take too long.
     """
     samples = len(setpoint)
@@ -95,8 +86,8 @@ def plan(
     flow[-1] = flow[-2] if samples > 1 else 0.0
     error = np.zeros(samples)
     error[start:] = of_now.mean_error(setpoint[start:] - output[start:])
-    value = error[start:].sum() + penalty[start:] @ flow[start:]
-    return Plan(error, output, flow, float(value))
+    cost = error[1:].sum() + penalty[start:] @ flow[start:]
+    return Plan(error, output, flow, float(cost))
 
 
 def _solve(
@@ -169,7 +160,7 @@ def _solve(
             return idle + G @ solved.x[:n], solved.x[:n]
         if solved.success:
             return solved.x[:n], solved.x[n : 2 * n]
-    raise NotSolvedError(
+    raise RuntimeError(
         f"the linear program of {n} samples was not solved in any of {len(attempts)} ways: "
         f"{solved.message}"
     )
@@ -218,4 +209,4 @@ def reference(model: TimeVaryingModel, unknown: Unknown, setpoint: Array) -> Pla
             )
     assert found is not None
     travel = np.abs(np.diff(found.flow, prepend=0.0)).sum()
-    return replace(found, error=error, value=float(error.sum() + SMOOTH * travel))
+    return replace(found, error=error, cost=float(error[1:].sum() + SMOOTH * travel))

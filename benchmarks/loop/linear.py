@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -215,11 +215,6 @@ class TimeVaryingModel(Coefficients):
         """Samples from a flow to the first output that it can affect."""
         shows = np.flatnonzero(self.beta.any(axis=0))
         return self.delay + 1 + int(shows[0]) if len(shows) else len(self.beta)
-
-    def first(self, samples: int) -> TimeVaryingModel:
-        """Return the model of the first `samples` samples."""
-        cut = slice(samples)
-        return replace(self, alpha=self.alpha[cut], beta=self.beta[cut], load=self.load[cut])
 
     def flow_response(self) -> Array:
         """Return G, shape (samples, samples): 1 t/h at j adds G[k, j] to y(k)."""
