@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mptc_gym.checks import MOST_NUMBERS, MOST_PLANTS, count, is_count, reject
+from mptc_gym.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.env import INFO, HasPlainSpec, observation_space
 from mptc_gym.parameters import Parameters
 from mptc_gym.signals import FOREVER
@@ -43,7 +43,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         arguments: Mapping[str, Any],
     ) -> None:
         self.parameters = Parameters.of_environment(arguments)
-        self.num_envs = _checked_count(num_envs, self.parameters)
+        self.num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
         limit = -1 if max_episode_steps is None else max_episode_steps
         if not is_count(limit, -1) or limit == 0:
             allowed = "an integer of at least 1, or None or -1 for no limit"
@@ -210,13 +210,3 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
     @abstractmethod
     def _final(self, ended: Mask, observations: Array) -> Array:
         """Return `final_obs`, given the plants whose episode has ended."""
-
-
-def _checked_count(num_envs: int, parameters: Parameters) -> int:
-    """Return the number of plants, if they fit in the memory of a typical machine."""
-    num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
-    inputs = parameters.range_of("delay")[1] + len(parameters.b)
-    most = int(MOST_NUMBERS // (3 * inputs + parameters.observation_size))
-    if num_envs > most:
-        reject("num_envs", num_envs, f"at most {most:,} with this delay and these windows")
-    return num_envs

@@ -18,7 +18,6 @@ LARGEST: Final[Any] = 10**9
 LONGEST: Final = 10_000  # samples of a delay or of a window
 MOST_COEFFICIENTS: Final = 1_000
 MOST_PLANTS: Final = 10_000_000  # in one environment
-MOST_NUMBERS: Final = 1_000_000_000  # kept by all plants of one environment together
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
 _COEFFICIENTS = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"

@@ -8,8 +8,15 @@ from functools import cache
 from itertools import chain, pairwise
 
 import numpy as np
-import pygame
+from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
+
+try:
+    import pygame
+except ImportError as error:
+    raise DependencyNotInstalled(
+        'pygame is not installed, run `pip install "mptc_gym[render]"`'
+    ) from error
 
 from mptc_gym.record import Record
 
@@ -161,6 +168,11 @@ def show(record: Record, fps: float) -> None:
     pygame.event.pump()
     clock().tick(fps)
     pygame.display.flip()
+
+
+def close() -> None:
+    """Close the window."""
+    pygame.display.quit()
 
 
 @cache

@@ -9,22 +9,26 @@ from typing import Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
+from gymnasium import logger
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
-from mptc_gym import rendering
 from mptc_gym.checks import one_action, one_of, plain
 from mptc_gym.parameters import Parameters, insert_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
-from mptc_gym.ranges import Ranges, numbers_of_plant
 from mptc_gym.record import Record
-from mptc_gym.signals import ONE, Signals, Streams
+from mptc_gym.signals import ONE, Ranges, Signals, Streams, numbers_of_plant
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys, see `reset`
 _FLOAT32 = np.dtype(np.float32)  # faster to pass than the type
 
+NO_MODE = (
+    "render does nothing without a render mode: give one to gymnasium.make, as in "
+    'make("MiddlePoint-v0", render_mode="rgb_array")'
+)
+Frame = NDArray[np.uint8]  # a picture, shape (540, 960, 3)
 Observation = NDArray[np.float32]
 Action = NDArray[np.float32]
 
@@ -249,7 +253,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
             self._streams = Streams.spawn(seeds)
         parameters = self.parameters
-        drawn = self._ranges.draw([self._streams.plant])
+        drawn = self._ranges.draw([self._streams])
         setpoint = self._signals.reset(ONE, [self._streams], drawn).item()
         numbers = numbers_of_plant(drawn, 0)
         self._plant = Plant(parameters, numbers)
@@ -269,7 +273,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         self._window[action_head] = rest_action
         if self.render_mode is not None:
             self._record = Record(numbers, parameters.sampling_interval, setpoint)
-            self._show()
+        if self.render_mode == "human":
+            self.render()
         info = dict.fromkeys(INFO, 0.0)
         info["setpoint"] = info["error"] = setpoint
         if self._has_more_info:
@@ -336,10 +341,11 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             self._add_more_info(info, load)
         if self._record is not None:
             self._record.add(setpoint, output, command, applied)
-            self._show()
+            if self.render_mode == "human":
+                self.render()
         return observation, reward, False, False, info
 
-    def render(self) -> rendering.Frame | None:
+    def render(self) -> Frame | None:
         """Draw the last minutes of the episode.
 
         Returns a picture, shape (540, 960, 3), for "rgb_array"; None for "human", which shows
@@ -352,19 +358,25 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         DependencyNotInstalled
             If pygame is not installed.
         """
-        records = [] if self._record is None else [self._record]
-        frames = rendering.render(self.render_mode, records, self.metadata["render_fps"])
-        return None if frames is None else frames[0]
+        if self.render_mode is None:
+            logger.warn(NO_MODE)
+            return None
+        if self._record is None:
+            raise ResetNeeded("call reset before render")
+        from mptc_gym import drawing  # which needs pygame
+
+        if self.render_mode == "rgb_array":
+            return drawing.frame(self._record)
+        drawing.show(self._record, self.metadata["render_fps"])
+        return None
 
     def close(self) -> None:
         """Close the window, if there is one."""
         if self.render_mode == "human" and self._record is not None:
-            rendering.close_window()
-        self._record = None
+            from mptc_gym import drawing
 
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            self.render()
+            drawing.close()
+        self._record = None
 
     def _add_more_info(self, info: dict[str, float], load: float) -> None:
         """Add the info that belongs to arguments that are off by default."""

@@ -1,4 +1,4 @@
-"""Generate the external signals of an episode: set point, noise and load disturbance.
+"""Draw what an episode meets: plant numbers, set point, noise and load disturbance.
 
 Every signal has the same methods. `reset` begins an episode of some plants at k = 0. `next`
 returns the next sample of all plants, and `ahead` the next `BLOCK` samples of a single plant.
@@ -12,16 +12,18 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import Parameters, PlantNumbers
+from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, Parameters, PlantNumbers
 
-Values = NDArray[np.float64]  # one per plant
+Values = NDArray[np.float64]  # one per plant; of plant numbers, () where all share one value
 Indices = NDArray[np.intp]  # of some plants, sorted
 
+DRAWS = 32  # of plant numbers per episode: enough for all, and for future ones
 BLOCK = 600  # samples of a signal generated together
 FOREVER = 1 << 62  # samples
 PLANTS_AT_A_TIME = 32  # few enough that their draws stay in the processor's cache
@@ -86,6 +88,51 @@ class Streams(NamedTuple):
         return cls(*(EpisodeStream(seed, (place,)) for place in range(len(cls._fields))))
 
 
+class Ranges:
+    """Draw arguments that are ranges, uniformly; a delay is an integer, both ends included.
+
+    Every plant number has its own draw, whether it is a range or not, so that one more range
+    does not change the others' draws. `names` are the arguments that are ranges. `given` are
+    all plant numbers, with the lower end of a range, as arrays of shape ().
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self.names = parameters.ranges
+        # The disturbance's draws follow those of the plant numbers.
+        self._draws = bool(self.names) or parameters.is_disturbed
+        self._ranges = {name: parameters.range_of(name) for name in self.names}
+        self.given: PlantNumbers[Values] = PlantNumbers(
+            **{name: np.array(parameters.range_of(name)[0]) for name in PLANT_NUMBERS}
+        )
+
+    def draw(self, streams: Sequence[Streams]) -> PlantNumbers[Values]:
+        """Begin an episode of each plant, and draw its numbers.
+
+        Drawn numbers have the shape (len(streams),), others the shape ().
+        """
+        if not self._draws:
+            return self.given
+        draws = np.empty((len(streams), DRAWS))
+        for own, row in zip(streams, draws, strict=True):
+            own.plant.next_episode().random(out=row)
+        drawn = {}
+        for name, (low, high) in self._ranges.items():
+            share = draws[:, PLANT_NUMBERS[name]]
+            if ARGUMENTS[name].is_integer:
+                drawn[name] = low + np.floor(share * (high + 1 - low)).astype(int)
+            else:
+                drawn[name] = low + share * (high - low)
+        return replace(self.given, **drawn)
+
+
+def numbers_of_plant(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
+    """Return the numbers of plant i of many."""
+    arrays = numbers.chosen(tuple(PLANT_NUMBERS))
+    return PlantNumbers(
+        **{name: (array[i] if array.ndim else array).item() for name, array in arrays.items()}
+    )
+
+
 def colours(parameters: Parameters) -> dict[str, Sequence[float]]:
     """Return the coefficients of C in (28) by the name of each noise that is not always 0."""
     of_all = {"noise": parameters.c, "measurement_noise": (1.0,)}
@@ -95,15 +142,10 @@ def colours(parameters: Parameters) -> dict[str, Sequence[float]]:
 class Noise:
     """Noise by name, 0 at k = 0: C(z^-1) xi(k) of (28), or the measurement noise."""
 
-    def __init__(
-        self, name: str, c: Sequence[float], parameters: Parameters, num_envs: int, block: int
-    ) -> None:
-        self._name, self._variance = name, f"{name}_variance"
-        self._c = np.array(c)[:, np.newaxis, np.newaxis]
-        # C times the standard deviation of xi: [lag, plant, 0], one plant for all if alike.
-        low, high = parameters.range_of(self._variance)
-        self._alike = low == high
-        self._colour = np.repeat(math.sqrt(low) * self._c, 1 if self._alike else num_envs, 1)
+    def __init__(self, name: str, c: Sequence[float], num_envs: int, block: int) -> None:
+        self._name, self._c = name, np.array(c)[:, np.newaxis, np.newaxis]
+        # C times the standard deviation of xi: [lag, plant, 0].
+        self._colour = np.zeros((len(c), num_envs, 1))
         self._past = np.zeros((num_envs, len(c) - 1))
         self._generators: dict[int, np.random.Generator] = {}
         # One row per sample, so that what all plants need at once is contiguous.
@@ -114,9 +156,8 @@ class Noise:
         self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
     ) -> None:
         """Begin an episode of some plants, with the streams of each."""
-        if not self._alike:
-            deviations = np.sqrt(getattr(numbers, self._variance))
-            self._colour[:, which] = deviations[:, np.newaxis] * self._c
+        deviations = np.sqrt(getattr(numbers, f"{self._name}_variance"))
+        self._colour[:, which] = deviations[..., np.newaxis] * self._c
         self._past[which] = 0.0
         for i, own in zip(which.tolist(), streams, strict=True):
             self._generators[i] = getattr(own, self._name).next_episode()
@@ -151,13 +192,13 @@ class Noise:
             for i, row in zip(plants.tolist(), draws[:, order:], strict=True):
                 self._generators[i].standard_normal(out=row)
             self._past[plants] = draws[:, samples:]
-            colour = self._colour if self._alike else self._colour[:, plants]
-            noise = colour[0] * draws[:, order:]
-            for lag, coefficient in enumerate(colour[1:], start=1):
-                noise += coefficient * draws[:, order - lag : -lag]
             # If there are no gaps, a slice is much faster.
             gaps = plants[-1] - plants[0] >= len(plants)
             columns = plants if gaps else slice(plants[0], plants[-1] + 1)
+            colour = self._colour[:, columns]
+            noise = colour[0] * draws[:, order:]
+            for lag, coefficient in enumerate(colour[1:], start=1):
+                noise += coefficient * draws[:, order - lag : -lag]
             self._block[first_row:, columns] = noise.T
 
 
@@ -352,10 +393,8 @@ class Signals(NamedTuple):
     @classmethod
     def of(cls, parameters: Parameters, num_envs: int = 1, block: int = BLOCK) -> Signals:
         """Make the signals of an environment, with `block` samples of noise at a time."""
-        noises = {
-            name: Noise(name, c, parameters, num_envs, block)
-            for name, c in colours(parameters).items()
-        }
+        colour_of = colours(parameters).items()
+        noises = {name: Noise(name, c, num_envs, block) for name, c in colour_of}
         return cls(
             SetPoint(parameters, num_envs),
             noises.get("noise"),

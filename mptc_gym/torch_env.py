@@ -149,7 +149,6 @@ class MiddlePointTorchEnv(BatchEnv):
         self.device, self.dtype = _check_device(device), dtype
         self.differentiable = differentiable
         self.checks_actions = self.device.type == "cpu"
-        self._seed: int | None = None  # None until the first reset
         self._zeros = torch.zeros(num_envs, dtype=dtype, device=self.device)
         self._action = self._zeros  # of the last step
         self._move_weight = self.parameters.move_weight
@@ -170,11 +169,6 @@ class MiddlePointTorchEnv(BatchEnv):
         self._shown = _Window(self.parameters.windows, self._episodes, differentiable)
 
     __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
-
-    @property
-    def np_random_seed(self) -> int | None:
-        """The seed of the generator; None before the first reset."""
-        return self._seed
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions, for truncated backpropagation.
@@ -285,10 +279,8 @@ class MiddlePointTorchEnv(BatchEnv):
         elif "signals" in options:
             raise ValueError("options['signals'] needs a reset of all plants, not of some")
         if seed is not None:
-            self._seed = int(seed)
-            self._episodes.generator.manual_seed(self._seed)
-        elif self._seed is None:
-            self._seed = self._episodes.generator.seed()
+            self._episodes.generator.manual_seed(int(seed))
+        self._np_random_seed = self._episodes.generator.initial_seed()
 
     def _checked_actions(self, actions: Any) -> Tensor:
         given = actions

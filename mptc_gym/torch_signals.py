@@ -33,8 +33,6 @@ def select(mask: Tensor | None, new: Tensor, old: Tensor) -> Tensor:
 
 def as_tensor(values: Any, like: Tensor) -> Tensor | None:
     """Return real numbers as a tensor of the type and device of `like`, otherwise None."""
-    if "complex" in str(getattr(values, "dtype", "")):  # PyTorch would drop the imaginary part
-        return None
     try:
         return torch.as_tensor(values, dtype=like.dtype, device=like.device)
     except (TypeError, ValueError, RuntimeError, OverflowError):
@@ -52,6 +50,7 @@ class Episodes:
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
         self.zeros, self.generator = zeros, torch.Generator(zeros.device)
+        self.generator.seed()  # of the system's own, until `reset` is given one
         self.clock = self.unused = 0
         self._ranges = {name: parameters.range_of(name) for name in parameters.ranges}
         # If one limit is drawn, both are tensors: PyTorch clamps either between two numbers or

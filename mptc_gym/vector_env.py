@@ -8,18 +8,26 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from gymnasium import logger
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym import rendering
 from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.checks import is_count, many_actions, one_of, plain, reject
-from mptc_gym.env import MiddlePointEnv
+from mptc_gym.env import NO_MODE, Frame, MiddlePointEnv
 from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
-from mptc_gym.ranges import Ranges, numbers_of_plant
 from mptc_gym.record import Record
-from mptc_gym.signals import BLOCK, Indices, Signals, Streams, Values
+from mptc_gym.signals import (
+    BLOCK,
+    Indices,
+    Ranges,
+    Signals,
+    Streams,
+    Values,
+    numbers_of_plant,
+)
 
 Observations = NDArray[np.float32]  # shape (num_envs, observation_size)
 
@@ -122,12 +130,19 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         """The seed of each plant; None before the first reset."""
         return tuple(self._seeds)
 
-    def render(self) -> tuple[rendering.Frame, ...] | None:
+    def render(self) -> tuple[Frame, ...] | None:
         """Return a picture of each plant, shape (540, 960, 3), as `MiddlePointEnv` does of one.
 
         None without a render mode, after a warning.
         """
-        return rendering.render(self.render_mode, [*self._records.values()])
+        if self.render_mode is None:
+            logger.warn(NO_MODE)
+            return None
+        if not self._records:
+            raise ResetNeeded("call reset before render")
+        from mptc_gym import drawing  # which needs pygame
+
+        return tuple(map(drawing.frame, self._records.values()))
 
     def _advance(self, a: Values) -> tuple[Observations, Values, Mask, Mask, Infos]:
         # This is the hot path: for few plants, the number of calls determines its speed.
@@ -190,7 +205,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
         which, parameters = np.flatnonzero(mask), self.parameters
         streams = [self._streams[i] for i in which.tolist()]
-        numbers = self._ranges.draw([each.plant for each in streams])
+        numbers = self._ranges.draw(streams)
         self._plants.reset(which, numbers)
         setpoint = self._signals.reset(which, streams, numbers)
         rest_action = action_from_command(0.0, numbers.u_min, numbers.u_max)

@@ -135,16 +135,6 @@ def test_an_error_shows_the_beginning_of_a_large_array_and_its_shape(library):
     assert "\n" not in str(error.value)
 
 
-def test_more_plants_than_a_memory_holds_are_refused(library, monkeypatch):
-    with pytest.raises(ValueError, match=r"^num_envs must be at most 33,\d+ with this delay"):
-        library.make(1_000_000, delay=[0, 10_000])
-    # A plant keeps 3 (d + 2) + 6 numbers, so 10 plants keep 660.
-    monkeypatch.setattr("mptc_gym.batch.MOST_NUMBERS", 660)
-    assert library.make(10).num_envs == 10
-    with pytest.raises(ValueError, match=r"^num_envs must be at most 10 with"):
-        library.make(11)
-
-
 def test_any_numbers_are_actions(library):
     objects = np.array([[0.75], [-1]], object if library.cls is MiddlePointVectorEnv else float)
     large = np.array([[1e200], [-1e200]])

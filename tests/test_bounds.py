@@ -22,7 +22,7 @@ from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS
 from mptc_gym import Parameters
 from mptc_gym.plant import action_from_command
-from mptc_gym.ranges import Ranges
+from mptc_gym.signals import Ranges
 from tests.verify_bounds import beats, controllers, errors
 
 CALM = Parameters()

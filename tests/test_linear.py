@@ -18,7 +18,7 @@ from benchmarks.loop.linear import (
 )
 from benchmarks.loop.scenarios import PlantOptions
 from mptc_gym import MiddlePointEnv, Parameters
-from mptc_gym.ranges import Ranges, numbers_of_plant
+from mptc_gym.signals import Ranges, numbers_of_plant
 from tests.conftest import run
 
 OTHER = {"delay": 7, "gain_factor": 1.3, "time_constant_factor": 2.0, "dead_zone": 0.0}

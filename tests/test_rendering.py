@@ -16,10 +16,11 @@ from gymnasium.utils.env_checker import data_equivalence
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import mptc_gym
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, drawing
 from mptc_gym.parameters import Parameters
-from mptc_gym.ranges import Ranges
 from mptc_gym.record import Record
+from mptc_gym.signals import Ranges
 from tests.arguments import MODES, NOISY
 from tests.conftest import native_and_sync
 
@@ -212,6 +213,8 @@ def test_what_cannot_be_drawn_is_said(made, monkeypatch):
     with pytest.warns(UserWarning, match="render mode"):
         assert env.render() is None
     monkeypatch.setitem(sys.modules, "pygame", None)  # not installed
+    monkeypatch.delitem(sys.modules, "mptc_gym.drawing")
+    monkeypatch.delattr(mptc_gym, "drawing")
     for draw in (drawn.render, MiddlePointEnv(render_mode="human").reset):
         with pytest.raises(DependencyNotInstalled, match=r'pip install "mptc_gym\[render\]"'):
             draw()

@@ -16,8 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 from agents.actuator import applied_flow  # noqa: E402
 from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters  # noqa: E402
 from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
-from mptc_gym.ranges import Ranges  # noqa: E402
-from mptc_gym.signals import Signals, Streams  # noqa: E402
+from mptc_gym.signals import Ranges, Signals, Streams  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv  # noqa: E402
 from tests.arguments import MODES, valid_arguments  # noqa: E402
 from tests.conftest import random_actions  # noqa: E402
@@ -34,7 +33,7 @@ def met(envs, seed, *, episodes, samples):
     streams = [Streams.of_seed(seed + i) for i in range(n)]
     found = defaultdict(list)
     for _ in range(episodes):
-        numbers = ranges.draw([each.plant for each in streams])
+        numbers = ranges.draw(streams)
         first = {"setpoint": signals.reset(np.arange(n), streams, numbers)}
         for name, signal in signals._asdict().items():
             if signal is not None:

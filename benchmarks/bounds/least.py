@@ -35,7 +35,7 @@ from benchmarks.loop.rollout import (
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
 from mptc_gym.parameters import PlantNumbers
-from mptc_gym.ranges import numbers_of_plant
+from mptc_gym.signals import numbers_of_plant
 
 Array = NDArray[np.float64]
 

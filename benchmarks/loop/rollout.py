@@ -15,7 +15,7 @@ from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.acting import rollout as run_batch
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import action_from_command
-from mptc_gym.ranges import Ranges
+from mptc_gym.signals import Ranges
 
 Array = NDArray[np.float64]
 

@@ -66,8 +66,10 @@ class IncrementalAction(VectorActionWrapper):
     def step(self, actions: Any) -> Any:
         """Move the wanted flows by actions, shape (num_envs, 1), and step the environments."""
         moves = many_actions(actions, self.num_envs, self._ended)
-        flows = self._actuator.moved(self._flows, moves)
-        returned = self.env.step(self._actuator.action(flows).astype(np.float32)[:, np.newaxis])
+        actuator = self._actuator
+        flows = self._flows + actuator.move * moves.clip(-1.0, 1.0)
+        flows = flows.clip(actuator.u_min, actuator.u_max)
+        returned = self.env.step(actuator.action(flows).astype(np.float32)[:, np.newaxis])
         _, _, terminations, truncations, infos = returned
         self._flows = flows
         ended = terminations | truncations
