@@ -161,7 +161,7 @@ def work(options: Options) -> str:
 
 def _plants(options: Options, nominal: Arguments) -> list[Arguments]:
     """Return the arguments in which the plants of the design differ from the nominal one."""
-    from benchmarks.loop.designs import around, grid, random_design
+    from benchmarks.loop.scenarios import around, grid, random_design
 
     design = grid()
     if options.design == "random":
@@ -199,7 +199,7 @@ def run_agent(
     Run i has the noise and the initial weights of seed `SEED + i`. Returned are, for each run,
     all that `measure` returns; `late`, the mean |e| of its second half, degC; and `swing`.
     """
-    from benchmarks.loop.metrics import mean_error, measure, split
+    from benchmarks.loop.rollout import mean_error, measure, split
 
     controller = factory.in_service({**told, **SETPOINT}, runs, SEED)
     trajectory = factory.run(case, samples, runs, SEED, controller)
@@ -216,7 +216,7 @@ def swing(trajectory: Trajectory) -> NDArray[np.float64]:
 
     This is the root mean square of the standard deviations in the second half of each hold.
     """
-    from benchmarks.loop.metrics import held
+    from benchmarks.loop.rollout import held
 
     error = trajectory.setpoint - trajectory.output
     variances = [
@@ -264,7 +264,7 @@ def report(
     `QUESTIONS` are asked unless the design is a grid or controllers are told each plant.
     """
     from benchmarks.lib.report import Section
-    from benchmarks.loop.designs import SPANS
+    from benchmarks.loop.scenarios import SPANS
 
     picture = "map.png" if options.design == "grid" else "plants.png"
     best = plot_map(runs, out / picture, nominal if options.design == "grid" else None)
@@ -344,7 +344,7 @@ def plot_map(runs: pd.DataFrame, path: Path, centre: Parameters | None) -> str:
     import pandas as pd
     from matplotlib.colors import LogNorm
 
-    from benchmarks.lib.drawing import MULTIPLE, draw_legend, panels, scale_by_excess
+    from benchmarks.lib.report import MULTIPLE, draw_legend, panels, scale_by_excess
     from benchmarks.lib.statistics import groups
 
     drift = runs.get("gain_drift", pd.Series(np.nan, runs.index))

@@ -12,10 +12,9 @@ import numpy as np
 from cyclopts import Parameter
 
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Count, Folder, Runs, command, options
-from benchmarks.lib.fan_out import FanOut, progress_bar
+from benchmarks.lib.command import Count, FanOut, Folder, Runs, command, options, progress_bar
 from benchmarks.lib.storage import Kept, origin, out_folder, write_csv
-from benchmarks.loop.metrics import mean_error, settled, split
+from benchmarks.loop.rollout import mean_error, settled, split
 from benchmarks.loop.scenarios import PlantOptions
 
 if TYPE_CHECKING:

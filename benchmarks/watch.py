@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Seed, command, known, options
 from benchmarks.lib.storage import UsageError, out_folder, replacing
-from benchmarks.loop.metrics import held
-from benchmarks.loop.rollout import Trajectory
+from benchmarks.loop.rollout import Trajectory, held
 from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS, PlantOptions
 
 REFERENCE = ROSTER["nn-smith"]  # whose errors those of the film are multiples of

@@ -17,8 +17,7 @@ from benchmarks.bounds.unknown import noise_variance, unknown
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.lib import storage
 from benchmarks.loop.linear import time_varying_model
-from benchmarks.loop.metrics import mean_error
-from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.rollout import make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS
 from mptc_gym import Parameters
 from mptc_gym.plant import action_from_command

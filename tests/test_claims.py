@@ -14,7 +14,7 @@ from benchmarks.claims.__main__ import main, sections, table
 from benchmarks.claims.claims import CLAIMS
 from benchmarks.claims.runs import Batch, Claim, converged_at, fail_node, typical
 from benchmarks.lib.statistics import Estimate
-from benchmarks.loop.metrics import join, settled
+from benchmarks.loop.rollout import join, settled
 from tests.conftest import ROOT, trajectory
 
 GOOD, BAD = {"at_least": 1.0}, {"at_least": 2.5}

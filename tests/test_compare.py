@@ -24,8 +24,7 @@ from benchmarks.controllers.roster import ROSTER, looks
 from benchmarks.lib import storage
 from benchmarks.lib.report import Best, Section, on_screen, write_report
 from benchmarks.lib.statistics import Estimate, percentiles
-from benchmarks.loop.metrics import measure
-from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.rollout import make_plants, measure, rollout
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED

@@ -15,8 +15,7 @@ from benchmarks.compare.comparison import run_case
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.storage import UsageError
-from benchmarks.loop.metrics import mean_error
-from benchmarks.loop.rollout import IdleValve
+from benchmarks.loop.rollout import IdleValve, mean_error
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED

@@ -10,7 +10,7 @@ from functools import partial
 import pytest
 
 from benchmarks.lib import storage
-from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.command import FanOut
 from benchmarks.lib.storage import Kept, UnfinishedError, UsageError
 from tests import tasks
 from tests.conftest import ROOT, python
@@ -19,7 +19,7 @@ from tests.conftest import ROOT, python
 CTRL_C = """
 import os, signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.command import FanOut
 from tests.tasks import hears_ctrl_c
 print([*FanOut(jobs=2).run({"a": hears_ctrl_c, "b": hears_ctrl_c}).values(), hears_ctrl_c()])
 """

@@ -15,8 +15,7 @@ from agents import (
 )
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.linear import step_test
-from benchmarks.loop.metrics import travel
-from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.rollout import make_plants, rollout, travel
 from mptc_gym import PRESETS, Parameters
 
 SHOWN = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}

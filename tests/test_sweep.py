@@ -11,7 +11,7 @@ from benchmarks import sweep
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage
 from benchmarks.lib.storage import Kept
-from benchmarks.loop.designs import SPANS, around, random_design
+from benchmarks.loop.scenarios import SPANS, around, random_design
 from benchmarks.sweep import SETPOINT, least_error, main
 from tests.conftest import ROOT, trajectory
 

@@ -15,7 +15,7 @@ from benchmarks.bounds.least import LeastPossible, least_possible
 from benchmarks.controllers.roster import ROSTER, Controller
 from benchmarks.lib.statistics import student
 from benchmarks.loop.linear import nominal
-from benchmarks.loop.metrics import mean_error
+from benchmarks.loop.rollout import mean_error
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.evaluation import SEED
 from mptc_gym.plant import action_from_command

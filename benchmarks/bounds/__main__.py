@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from benchmarks.lib.command import Count, Runs, Seed, command, options
-from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.command import Count, FanOut, Runs, Seed, command, options
 from benchmarks.lib.storage import ROOT, commit, versions, write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, PlantOptions, Scenario
 from mptc_gym import PRESETS
@@ -84,7 +83,7 @@ def row(case: Scenario, samples: int, drawn: Mapping[str, Any], mpc: int | None)
     from benchmarks.bounds.least import least_possible
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.lib.statistics import bootstrap
-    from benchmarks.loop.metrics import mean_error
+    from benchmarks.loop.rollout import mean_error
 
     least = partial(least_possible, samples=samples, **drawn, **case.arguments)
     cells = [f"{least(kind='preview').idle:.4f}"]

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from benchmarks.bounds.unknown import Unknown
 from benchmarks.loop.linear import Coefficients, TimeVaryingModel
-from benchmarks.loop.metrics import held
+from benchmarks.loop.rollout import held
 from mptc_gym import Parameters
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.bounds.unknown import Unknown
 from benchmarks.loop.linear import TimeVaryingModel
-from benchmarks.loop.metrics import held
+from benchmarks.loop.rollout import held
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.lib.command import Folder, Names, Runs, command, known, options
-from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.command import FanOut, Folder, Names, Runs, command, known, options
 from benchmarks.lib.storage import origin, out_folder, write_csv
 from mptc_gym import Parameters
 
@@ -133,7 +132,7 @@ def _three_digits(value: float) -> str:
 def plot_figures(curves: pd.DataFrame, path: Path) -> None:
     """Draw counterparts of Figs 5 to 12: a typical run, and the spread of all runs."""
     from benchmarks.claims.runs import FIGURES
-    from benchmarks.lib.drawing import draw_legend, panels
+    from benchmarks.lib.report import draw_legend, panels
 
     signals = [
         (f"Fig. {number}: {case.title}", signal, case)
@@ -158,7 +157,7 @@ def plot_figures(curves: pd.DataFrame, path: Path) -> None:
 
 
 def _draw_signal(axes: Axes, signal: str, curves: pd.DataFrame, plant: Parameters) -> None:
-    from benchmarks.lib.drawing import draw_actuator
+    from benchmarks.lib.report import draw_actuator
 
     minutes = curves["time_s"] / 60
     name, colour = SIGNALS[signal]

@@ -26,7 +26,7 @@ from benchmarks.claims.runs import (
 )
 from benchmarks.lib.statistics import Estimate, exact, median
 from benchmarks.loop import linear
-from benchmarks.loop.metrics import mean_error, settled, split
+from benchmarks.loop.rollout import mean_error, settled, split
 from benchmarks.loop.scenarios import SETPOINTS as CASES
 from mptc_gym import PRESETS, Parameters
 

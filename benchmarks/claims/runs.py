@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from agents import DirectNNController, PIController
 from agents.direct_nn import Weights
 from benchmarks.lib.statistics import Estimate, exact, median, percentiles, quantile, share
-from benchmarks.loop.metrics import mean_error
-from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
+from benchmarks.loop.rollout import Agent, Trajectory, make_plants, mean_error, rollout
 from mptc_gym import PRESETS, Parameters
 
 Array = NDArray[np.floating]

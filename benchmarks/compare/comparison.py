@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks.controllers.roster import Controller
 from benchmarks.lib.statistics import Estimate, bootstrap, groups, improvement, percentiles
-from benchmarks.loop.metrics import join, measure
-from benchmarks.loop.rollout import Trajectory, is_random
+from benchmarks.loop.rollout import Trajectory, is_random, join, measure
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES, SEED
 

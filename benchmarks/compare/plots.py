@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from benchmarks.compare.comparison import Scale, Score
 from benchmarks.controllers.roster import label, looks
-from benchmarks.lib.drawing import (
+from benchmarks.lib.report import (
     MULTIPLE,
     NEAREST,
     draw_actuator,

@@ -13,11 +13,11 @@ import pandas as pd
 
 from benchmarks.compare.comparison import Case, Scale, Score, estimate, ranked, summarise
 from benchmarks.controllers.roster import Controller, label
-from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.command import FanOut
 from benchmarks.lib.report import Best, Section, provenance_line, write_report
 from benchmarks.lib.statistics import Estimate, groups, written
 from benchmarks.lib.storage import write_csv
-from benchmarks.loop.metrics import CHANGE, START
+from benchmarks.loop.rollout import CHANGE, START
 from benchmarks.loop.scenarios import Scenario
 
 SCORE = "Mean over the cases, 95 % interval; travel of the valve in the median run."

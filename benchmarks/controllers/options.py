@@ -24,8 +24,7 @@ from cyclopts import Parameter
 from agents.controller import PAPER_WINDOWS
 from agents.policy_network import WINDOWS
 from benchmarks.controllers.roster import OWN, ROSTER, Controller, limits
-from benchmarks.lib.command import Names, Repeated, blame, options
-from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.command import FanOut, Names, Repeated, blame, options
 from benchmarks.lib.storage import UsageError
 from benchmarks.loop.rollout import make_plants
 from mptc_gym import MiddlePointEnv, Parameters

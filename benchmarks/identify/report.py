@@ -14,8 +14,7 @@ from benchmarks.identify.log import read_log
 from benchmarks.identify.model import Model, identify
 from benchmarks.identify.options import Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
-from benchmarks.lib.drawing import COLOURS, drawn
-from benchmarks.lib.report import Section, provenance_line, show, write_report
+from benchmarks.lib.report import COLOURS, Section, drawn, provenance_line, show, write_report
 from benchmarks.lib.statistics import ENDS
 from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
 

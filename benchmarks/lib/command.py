@@ -1,4 +1,4 @@
-"""Declare and run the commands `python -m benchmarks.NAME`.
+"""Declare and run the commands `python -m benchmarks.NAME`, and their tasks in parallel.
 
 A command is one file, `benchmarks/NAME.py`, or a folder with a `__main__.py`, in which stand
 
@@ -16,30 +16,31 @@ from __future__ import annotations
 import errno
 import importlib
 import inspect
+import logging
 import math
 import os
 import re
 import signal
 import sys
 import threading
+import traceback
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
-from benchmarks.lib.storage import UnfinishedError, UsageError
+from benchmarks.lib.storage import ROOT, Kept, UnfinishedError, UsageError
 
 EXTRAS = {
     "compare": "cyclopts joblib markdown matplotlib pandas rich scipy tabulate",
-    "render": "pygame",
     "data": "h5py minari",
     "bench": "optuna PIL stable_baselines3",
     "ray": "ray",
     "torch": "torch",
 }
 FULL = errno.ENOSPC, errno.EDQUOT, errno.EPIPE  # a disk, or a reader that has gone
-_HEARD: list[int] = []  # signals that interrupt the command
 
 
 def stop(error: BaseException, program: str = "python -m benchmarks") -> NoReturn:
@@ -48,17 +49,15 @@ def stop(error: BaseException, program: str = "python -m benchmarks") -> NoRetur
     If a package is missing, the sentence names the extra that installs it. An import that fails
     for another reason is a bug, and is raised.
     """
-    cause, said = error, str(error)
+    said, cause = str(error), error
     while cause.__cause__ is not None:
         cause = cause.__cause__
     name = (cause.name or "").partition(".")[0] if isinstance(cause, ImportError) else ""
-    for extra, packages in EXTRAS.items():
-        if name in packages.split():
-            said = f'{name} is not installed: pip install -e ".[{extra}]" ({cause})'
-            break
-    else:
-        if isinstance(error, ImportError):
-            raise error
+    extras = [extra for extra, packages in EXTRAS.items() if name in packages.split()]
+    if extras:
+        said = f'{name} is not installed: pip install -e ".[{extras[0]}]" ({cause})'
+    elif isinstance(error, ImportError):
+        raise error
     print(f"{program}: error: {said}", file=sys.stderr)
     raise SystemExit(2) from error
 
@@ -108,8 +107,6 @@ def blame(option: str) -> Iterator[None]:
     """Turn a ValueError into a `UsageError` that names the option."""
     try:
         yield
-    except UsageError:
-        raise
     except ValueError as error:
         raise UsageError(f"{option}: {error}") from error
 
@@ -147,9 +144,8 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
     try:
         found = app(list(given), exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        text = re.sub(
-            r"^Invalid value for (\S+): must", r"\1 must", " ".join(str(error).split())
-        )
+        text = " ".join(str(error).split())
+        text = re.sub(r"^Invalid value for (\S+): must", r"\1 must", text)
         if isinstance(error, MissingArgumentError) and error.argument:
             choices = ", ".join(error.argument.get_choices() or ())
             text = f"{error.argument.names[0].lstrip('-').upper()} is missing"
@@ -181,24 +177,35 @@ def command(
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")  # for "°C" on an ASCII terminal
-        with _heard(to_the_end=arguments is None):
-            try:
-                given = sys.argv[1:] if arguments is None else arguments
-                if (chosen := read(declared, program, given)) is not None:
-                    print(work(chosen), flush=True)
-            except KeyboardInterrupt as stopped:
-                print(f"\nInterrupted: {interrupted}", flush=True)
-                return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
-            except (UnfinishedError, MemoryError) as error:
-                print(str(error) or "There is not enough memory for so many runs or samples.")
-                return 1
-            except (UsageError, ImportError) as error:
-                stop(error, program)
-            except OSError as error:
-                return cut_off(error, program)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if arguments is None and signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, _interrupt)
+        try:
+            given = sys.argv[1:] if arguments is None else arguments
+            if (chosen := read(declared, program, given)) is not None:
+                print(work(chosen), flush=True)
+        except KeyboardInterrupt as stopped:
+            print(f"\nInterrupted: {interrupted}", flush=True)
+            return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+        except (UnfinishedError, MemoryError) as error:
+            print(str(error) or "There is not enough memory for so many runs or samples.")
+            return 1
+        except (UsageError, ImportError) as error:
+            stop(error, program)
+        except OSError as error:
+            return cut_off(error, program)
         return 0
 
     return main
+
+
+def _interrupt(number: int, _frame: object) -> NoReturn:
+    """Raise KeyboardInterrupt; later signals are ignored while what has finished is written."""
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, signal.SIG_IGN)
+    threading.excepthook = lambda _: None  # of joblib's threads, as its processes end
+    warnings.simplefilter("ignore")
+    raise KeyboardInterrupt(number)
 
 
 def cut_off(error: OSError, program: str) -> int:
@@ -210,35 +217,157 @@ def cut_off(error: OSError, program: str) -> int:
     return 1
 
 
-@contextmanager
-def _heard(*, to_the_end: bool) -> Iterator[None]:
-    """Raise KeyboardInterrupt for SIGTERM, and for Ctrl-C unless the shell has it ignored.
+Task = Callable[[], Any]
+Answer = tuple[str, Any, str]  # the name of a task, its result, and its error or ""
 
-    At the end, the signals are ignored if the process ends: nothing is left to be interrupted.
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class FanOut:
+    """Where tasks run, by joblib, and how many at once. With one job they run in this process.
+
+    A result does not depend on which process runs the task, or when, as long as all its
+    randomness comes from its arguments.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    _HEARD[:] = [number for number in before if before[number] is not signal.SIG_IGN]
-    listen()
+
+    jobs: Count | None = None
+    """Number of tasks run at once (default: one per core)."""
+    backend: Literal["loky", "ray"] = "loky"
+    """Where tasks run: loky for this machine, ray for the Ray cluster at RAY_ADDRESS."""
+
+    def run(
+        self, tasks: Mapping[str, Task], title: str = "", kept: Kept | None = None
+    ) -> dict[str, Any]:
+        """Run tasks, and return their results in the order of `tasks`; see `stream`."""
+        results = dict(self.stream(tasks, title, kept))
+        return {name: results[name] for name in tasks}
+
+    def stream(
+        self, tasks: Mapping[str, Task], title: str = "", kept: Kept | None = None
+    ) -> Iterator[tuple[str, Any]]:
+        """Run tasks, and yield the name and result of each as it finishes; on Ray, at the end.
+
+        Parameters
+        ----------
+        tasks
+            Functions without arguments, by name, such as a `functools.partial` of a function of
+            a module.
+        title
+            Label of the progress bar; "" for no bar.
+        kept
+            Where results are kept; those that are there already are yielded first.
+
+        Raises
+        ------
+        UnfinishedError
+            At the end, with the errors, if tasks raised an exception; or if a process was
+            killed, perhaps for lack of memory.
+        UsageError
+            If there is no cluster.
+        """
+        missing, errors = dict(tasks), {}
+        with progress_bar(title, len(tasks)) as advance:
+            if kept:
+                for name, task in tasks.items():
+                    with suppress(LookupError):
+                        result = kept.load(task)
+                        del missing[name]
+                        advance()
+                        yield name, result
+            for name, result, error in self._answers(missing):
+                advance()
+                if error:
+                    errors[name] = error
+                    continue
+                if kept:
+                    kept.save(tasks[name], result)
+                yield name, result
+        if errors:
+            last = [f"{name}: {text.split(chr(10))[-1]}" for name, text in errors.items()]
+            said = f"{len(errors)} of {len(tasks)} tasks failed; the others are done"
+            whole = [text for text in errors.values() if "\n" in text]  # with a traceback
+            raise UnfinishedError("\n".join([said, *last[:10], *whole[:1]]))
+
+    def _answers(self, tasks: Mapping[str, Task]) -> Iterator[Answer]:
+        """Run tasks, and yield each answer as it comes."""
+        import joblib  # here: slow to import
+        from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+        calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]
+        if self.backend == "ray":
+            _connect()
+            with joblib.parallel_config("ray", n_jobs=self.jobs or -1):
+                yield from joblib.Parallel()(calls)
+            return
+        jobs = max(1, min(self.jobs or joblib.cpu_count(), len(calls)))
+        try:
+            with joblib.parallel_config("loky", inner_max_num_threads=1):
+                parallel = joblib.Parallel(
+                    jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs"
+                )
+                # Processes that start now ignore Ctrl-C: this one ends them.
+                before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+                answers: Iterator[Answer] = parallel(calls)
+                signal.signal(signal.SIGINT, before)
+            with warnings.catch_warnings():
+                # Of tasks that nobody waits for any more, as an error ends the command.
+                warnings.filterwarnings("ignore", module="joblib")
+                yield from answers
+        except TerminatedWorkerError as error:
+            raise UnfinishedError(
+                "a process was killed, perhaps for lack of memory: try fewer --jobs"
+            ) from error
+
+
+def _attempt(name: str, task: Task) -> Answer:
+    """Run a task, and return its error as text, since not every exception can be pickled."""
     try:
-        yield
-    finally:
-        _HEARD.clear()
-        for number, handler in before.items():
-            signal.signal(number, signal.SIG_IGN if to_the_end else handler)
+        return name, task(), ""
+    except UsageError as error:  # a sentence, of a user's own controller
+        return name, None, str(error)
+    except SystemExit as left:
+        return name, None, f"A controller called sys.exit({left.code!r})"
+    except Exception:
+        return name, None, traceback.format_exc().strip()
 
 
-def listen() -> None:
-    """Let the signals interrupt again, after one has."""
-    for number in _HEARD:
-        signal.signal(number, _interrupt)
+@contextmanager
+def progress_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
+    """Show a progress bar on a terminal, and yield what moves it on by one task."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
+    columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    console, hidden = Console(stderr=True), not (title and sys.stderr.isatty())
+    with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
+        bar = progress.add_task(title, total=total)
+        yield lambda: progress.advance(bar)
 
 
-def _interrupt(number: int, _frame: object) -> NoReturn:
-    for each in _HEARD:  # while joblib ends its processes, of which its threads may complain
-        signal.signal(each, signal.SIG_IGN)
-    threading.excepthook = lambda _: None
-    warnings.simplefilter("ignore")
-    raise KeyboardInterrupt(number)
+def _connect() -> None:
+    """Connect to the cluster at RAY_ADDRESS, or the one that was started on this machine.
+
+    Its nodes need Ray and the packages that a task imports. They need no checkout: Ray unpacks
+    the packages of this one, and the modules beside them, where its workers run.
+    """
+    import ray  # here: an optional package that takes a second to import
+    from ray.util.joblib import register_ray
+
+    register_ray()
+    if ray.is_initialized():
+        return
+    # `ray job submit` has uploaded the same code.
+    os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
+    stays = "/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py", "published", "*.md"
+    try:
+        ray.init(
+            address=os.environ.get("RAY_ADDRESS", "auto"),
+            runtime_env={"working_dir": str(ROOT), "excludes": [*stays]},
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+        )
+    except (OSError, RuntimeError, ValueError) as error:
+        raise UsageError(
+            "--backend: no Ray cluster can be reached: start one with `ray start --head`, or "
+            f"set RAY_ADDRESS ({error})"
+        ) from error

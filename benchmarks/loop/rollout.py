@@ -1,9 +1,10 @@
-"""Roll out a controller on a batch of plants, in the loop that all comparisons share."""
+"""Roll out a controller on a batch of plants, and measure its runs."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol
 
@@ -14,10 +15,15 @@ from numpy.typing import NDArray
 from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.acting import rollout as run_batch
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
-from mptc_gym.plant import action_from_command
+from mptc_gym.plant import action_from_command, least_effective
 from mptc_gym.signals import Ranges
 
 Array = NDArray[np.float64]
+
+SETTLING_BAND = 0.05  # fraction of the set-point change, or of the set point
+START = 300  # samples of the start of a run
+CHANGE = 60  # samples that a change of the set point counts
+LAST = 50  # samples at the end of a run that decide whether it has settled
 
 
 class Agent(Protocol):
@@ -130,3 +136,111 @@ def rollout(
         trajectory.next_error[k] = after["error"]
         trajectory.next_setpoint[k] = after["setpoint"]
     return trajectory
+
+
+def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
+    """Compute the measures of each run by their names in CSV files, each of shape (runs,).
+
+    - `mae`: mean of |e(k)| over k = 1 to N, the errors in the rewards;
+    - `mae_start`, `mae_changes`, `mae_steady`: what it is the sum of; see `_parts`;
+    - `ise`: integral of e^2 over the same samples;
+    - `itae`: integral of t |e|, with t counted from the latest set-point change;
+    - `total_variation`: total variation of the applied input; see `travel`;
+    - `overshoot`: excursion of the output beyond the new set point, as a percentage of the
+      set-point change; the largest over all changes;
+    - `settling_time`: time from a set-point change until the error stays within `SETTLING_BAND`
+      of the change; the longest over all changes, infinite if the output has not settled by the
+      next change or the end of the run;
+    - `dead_zone_share`: share of samples with the command inside the dead zone;
+    - `saturation_share`: share of samples with the command at or beyond a limit.
+
+    The last two are NaN if the actuator's numbers are drawn from ranges.
+    """
+    interval = parameters.sampling_interval / 60.0  # min
+    command = trajectory.command
+    inside = saturated = np.full(command.shape, np.nan)
+    if not {"dead_zone", "u_min", "u_max"} & set(parameters.ranges):
+        zone, u_min, u_max = parameters.dead_zone, parameters.u_min, parameters.u_max
+        inside = np.abs(command) < least_effective(zone, u_min, u_max)  # as the plant judges it
+        saturated = (command <= u_min) | (command >= u_max)
+    pairs = zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
+    itae, overshoot, settling = np.array([_measure_steps(*each) for each in pairs]).T
+    return {
+        "mae": mean_error(trajectory),
+        **_parts(trajectory),
+        "ise": interval * np.square(trajectory.next_error).sum(axis=0),
+        "itae": interval**2 * itae,
+        "total_variation": travel(trajectory),
+        "overshoot": 100.0 * overshoot,
+        "settling_time": interval * settling,
+        "dead_zone_share": 100.0 * inside.mean(axis=0),
+        "saturation_share": 100.0 * saturated.mean(axis=0),
+    }
+
+
+def _parts(trajectory: Trajectory) -> dict[str, Array]:
+    """Return what the parts of each run contribute to its mean error, degC.
+
+    They are the samples before `START`, the `CHANGE` samples from a later change of the set
+    point on, with what reaches beyond `START` of an earlier one, and the rest.
+    """
+    error, setpoint = np.abs(trajectory.next_error), trajectory.next_setpoint
+    k = np.arange(1, len(error) + 1)[:, np.newaxis]
+    changed = np.diff(setpoint, axis=0, prepend=trajectory.setpoint[:1]) != 0.0
+    latest = np.maximum.accumulate(np.where(changed, k, -CHANGE), axis=0)
+    start, moved = k < START, k < latest + CHANGE
+    parts = {"start": start, "changes": ~start & moved, "steady": ~start & ~moved}
+    return {f"mae_{name}": (error * part).mean(axis=0) for name, part in parts.items()}
+
+
+def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]:
+    """Return one run's ITAE (degC samples^2), overshoot (share), settling time (samples)."""
+    itae, overshoot, settling = 0.0, 0.0, 0.0
+    before = 0.0  # the set point before k = 0
+    for start, stop in held(setpoint):
+        error = setpoint[start:stop] - output[start:stop]
+        itae += float(np.arange(stop - start) @ np.abs(error))
+        change, before = setpoint[start] - before, setpoint[start]
+        if change == 0.0:  # a run that begins at set point 0
+            continue
+        overshoot = max(overshoot, float(np.max(-error / change)))
+        outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(change))
+        last = outside[-1] if len(outside) else -1
+        settling = max(settling, math.inf if last == stop - start - 1 else float(last + 1))
+    return itae, overshoot, settling
+
+
+def held(setpoint: Array) -> list[tuple[int, int]]:
+    """Return the start and stop sample of each stretch of constant set point."""
+    changes = np.flatnonzero(np.diff(setpoint)) + 1
+    return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
+
+
+def mean_error(trajectory: Trajectory) -> Array:
+    """Return the mean of |e(k)| over k = 1 to N of each run, degC, shape (runs,)."""
+    return np.asarray(np.abs(trajectory.next_error).mean(axis=0))
+
+
+def travel(trajectory: Trajectory) -> Array:
+    """Return the valve travel of each run, from rest at 0, t/h, shape (runs,)."""
+    moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
+    return np.asarray(np.abs(moves).sum(axis=0))
+
+
+def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
+    """Return whether the last `LAST` errors of each run are all within `SETTLING_BAND`."""
+    setpoint, output = trajectory.setpoint[-LAST:], trajectory.output[-LAST:]
+    within = np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint)
+    return np.asarray(within.all(axis=0))
+
+
+def split(trajectory: Trajectory, sample: int) -> tuple[Trajectory, Trajectory]:
+    """Return the trajectory before a sample, and the rest from that sample on."""
+    arrays = vars(trajectory).values()
+    return Trajectory(*(a[:sample] for a in arrays)), Trajectory(*(a[sample:] for a in arrays))
+
+
+def join(trajectories: Sequence[Trajectory]) -> Trajectory:
+    """Join the runs of several batches into one trajectory."""
+    arrays = zip(*(vars(trajectory).values() for trajectory in trajectories), strict=True)
+    return Trajectory(*(np.hstack(parts) for parts in arrays))

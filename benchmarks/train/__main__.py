@@ -11,8 +11,7 @@ import numpy as np
 from cyclopts import Parameter
 
 from agents.networks import PRETRAINED
-from benchmarks.lib.command import Count, Folder, command, options
-from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.command import Count, FanOut, Folder, command, options
 from benchmarks.lib.storage import Kept, commit, out_folder, replacing
 
 SEED = 10_000  # of the first network; the others follow
