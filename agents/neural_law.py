@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any, Final
@@ -297,16 +297,13 @@ class NeuralSmithPredictor(ModelBasedController):
     the measured output that the model does not explain, and the model's numbers; see `Law`. It
     was trained once, on many plants, and does not learn online. All its inputs are scaled by
     the flow's authority and by the sampling interval, so one set of weights serves plants of
-    either sign, with any limits and any sampling interval. With a first-order model and a time
-    constant of at least 90 samples, it acts every second sample or less often.
+    either sign, with any limits and any sampling interval. With a time constant of at least 90
+    samples, it acts every second sample or less often.
 
     The other parameters are those of `ModelBasedController`.
 
     Parameters
     ----------
-    coefficients
-        A and B of the stable plant, if more than a first-order model is known: `a[0]` is 1, and
-        `b` begins with z^-1. Their gain replaces `gain`.
     uncertainty
         Standard deviation of the gain, as a share of it; 0 where the numbers are exact. It also
         stands for the time constant, which may be wrong by half as much again, and for the
@@ -319,7 +316,6 @@ class NeuralSmithPredictor(ModelBasedController):
         The weights; by default those that come with the project.
     """
 
-    coefficients: tuple[Sequence[float], Sequence[float]] | None = None
     uncertainty: NotNegative = 0.0
     setpoint_index: Index = 0
     error_index: Index = 3
@@ -330,24 +326,17 @@ class NeuralSmithPredictor(ModelBasedController):
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
         self._edge = self.dead_zone
         constant = self.time_constant / self.sampling_interval
-        first_order = self.coefficients is None
         # A slow plant is seen as the network knows plants, by longer sampling.
-        self._every = max(1, int(constant / SLOWEST)) if first_order else 1
+        self._every = max(1, int(constant / SLOWEST))
         constant /= self._every
-        pole = math.exp(-1.0 / constant)
-        if self.coefficients is None:
-            a, b = np.array([1.0, -pole]), np.array([self.gain * (1.0 - pole)])
-        else:
-            a, b = _checked(self.coefficients)
-        gain = b.sum() / a.sum()
+        self._pole = math.exp(-1.0 / constant)
         half = (self.u_max - self.u_min) / 2.0
-        self._flow = math.copysign(half, gain)  # t/h at a flow of 1
-        self._authority = abs(gain) * half  # degC
-        self._a, self._b = a, b / gain
+        self._flow = math.copysign(half, self.gain)  # t/h at a flow of 1
+        self._authority = abs(self.gain) * half  # degC
         self._delay = max(round(self._delay_samples / self._every) - 1, 0)
         self._about = Prior(
-            unit=a.sum(),
-            fading=pole ** (self._delay + (1.5 if first_order else 1.0)),
+            unit=1.0 - self._pole,
+            fading=self._pole ** (self._delay + 1.5),
             time_constant=min(max(constant / NOMINAL, 0.3), 3.3),
             delay=min(self._delay, 44),
             dead_zone=self.dead_zone / half,
@@ -372,12 +361,11 @@ class NeuralSmithPredictor(ModelBasedController):
 
     def _start(self, loops: int) -> Law:
         """Set the model to rest, and return the law."""
-        # Undelayed outputs of the model, what it misses, residuals and flows that passed, each
-        # of shape (samples, loops), newest first.
-        self._model = np.zeros((self._delay + len(self._a) + 1, loops))
-        self._off = np.zeros((2, loops))
-        self._residual = np.zeros((len(self._a), loops))
-        self._flows = np.zeros((len(self._b), loops))
+        # Undelayed outputs of the model, what it misses, residuals, newest first, and the flow
+        # that passed last.
+        self._model = np.zeros((self._delay + 3, loops))
+        self._off, self._residual = np.zeros((2, 2, loops))
+        self._passed = np.zeros(loops)
         self._k = 0
         return Law(Prior(**{name: np.full(loops, x) for name, x in vars(self._about).items()}))
 
@@ -388,13 +376,11 @@ class NeuralSmithPredictor(ModelBasedController):
         model = self._model
         off = self._off = _shifted(self._off, output - model[self._delay])
         # First-order models miss fast dynamics, which the average of two samples reduces.
-        unexplained = (off[0] + off[1]) / 2.0 if self.coefficients is None else off[0]
-        residual = self._residual = _shifted(self._residual, unexplained)
-        state = model[0], model[1], self._flows[0]
-        wanted = law.flow(self.network, setpoint, residual[0], self._a @ residual, state)
-        wanted, passed = law.applied(wanted)
-        flows = self._flows = _shifted(self._flows, passed)
-        new = self._b @ flows - self._a[1:] @ model[: len(self._a) - 1]
+        residual = self._residual = _shifted(self._residual, (off[0] + off[1]) / 2.0)
+        state, load = (model[0], model[1], self._passed), residual[0] - self._pole * residual[1]
+        wanted = law.flow(self.network, setpoint, residual[0], load, state)
+        wanted, self._passed = law.applied(wanted)
+        new = (1.0 - self._pole) * self._passed + self._pole * model[0]
         self._model = _shifted(model, new)
         command: Array = self._flow * wanted
         return command
@@ -403,15 +389,3 @@ class NeuralSmithPredictor(ModelBasedController):
 def _shifted(past: Array, newest: Array) -> Array:
     """Return the last samples, newest first, after one more."""
     return np.concatenate([newest[np.newaxis], past[:-1]])
-
-
-def _checked(coefficients: tuple[Sequence[float], Sequence[float]]) -> tuple[Array, Array]:
-    """Return A and B if they describe a stable plant with a gain other than 0."""
-    a, b = (np.array(each, dtype=np.float64) for each in coefficients)
-    stable = a.ndim == b.ndim == 1 and len(a) and a[0] == 1.0 and np.isfinite([*a, *b]).all()
-    if not (stable and np.all(np.abs(np.roots(a)) < 1.0) and b.sum() != 0.0):
-        raise ValueError(
-            "coefficients must be A and B of a stable plant with a gain, A beginning with 1, "
-            f"got {coefficients!r}"
-        )
-    return a, b

@@ -495,10 +495,6 @@ BAD = {
     partial(SmithPredictor, **TOLD): [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)],
     partial(NeuralSmithPredictor, **PLANT): [
         ("gain", 0.0), ("time_constant", 0.0), ("delay", 1e12), ("uncertainty", np.nan),
-        *(("coefficients", each) for each in (
-            ([1.0, -1.0], [0.1]), ([1.0, 0.0], [0.1, -0.1]), ([2.0, -0.5], [0.1]),
-            ([[1.0]], [0.1]), ([1.0, np.nan], [0.1]),
-        )),
     ],
     partial(SelfTuningController, **PLANT): [
         ("shortest_delay_samples", 0), ("longest_delay_samples", 6),
