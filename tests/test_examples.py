@@ -10,8 +10,6 @@ from types import SimpleNamespace
 import gymnasium
 import matplotlib.pyplot as plt
 import numpy as np
-import pytest
-import torch
 from stable_baselines3 import PPO
 
 import mptc_gym.sb3
@@ -46,25 +44,15 @@ def test_stable_baselines3_learns_with_the_lines_of_the_page():
         assert model.learn(1).num_timesteps == 8 * model.n_envs
 
 
-def test_offline_transitions_follow_one_another_within_an_episode():
-    episodes = (SimpleNamespace(**episode) for episode in record("paper", "smith", 2))
-    observations, actions, rewards, following = offline.transitions_of(episodes).tensors
-    assert observations.shape == following.shape == (2400, 26)
-    assert torch.equal(following[:1199], observations[1:1200])
-    assert not torch.equal(following[1199], observations[1200])
-    # The reward is minus the error that the step leads to, and the action is seen after it.
-    torch.testing.assert_close(rewards[:, 0], -following[:, 3].abs())
-    assert torch.equal(following[:, offline.LAST_ACTION], actions[:, 0])
-
-
-def test_an_offline_actor_that_changes_nothing_leaves_the_valve_alone():
-    actor = offline.Actor(np.repeat([50.0, 100.0, 1.0], [3, 3, 20]).astype(np.float32))
-    torch.nn.init.zeros_(actor.layers[-1].weight)
-    torch.nn.init.zeros_(actor.layers[-1].bias)
-    # 5 degC, and nothing done: the square wave's error is 5 all the time.
-    arguments = {**arguments_of("paper"), "setpoint": "square"}
-    found = evaluate(offline.policy_of(actor), episodes=2, **arguments)
-    assert found.mean_error == pytest.approx(5.0)
+def test_an_offline_clone_does_what_was_logged():
+    logged = [SimpleNamespace(**episode) for episode in record("paper", "smith", 8)]
+    high = np.repeat([50.0, 100.0, 1.0], [3, 3, 20]).astype(np.float32)
+    arguments = arguments_of("paper")
+    still, cloned = (
+        evaluate(offline.clone(logged, high, steps=n, seed=0), episodes=4, **arguments)
+        for n in (1, 400)
+    )
+    assert cloned.mean_error < 0.6 * still.mean_error
 
 
 def test_the_notebook_runs_and_shows_what_it_showed(capsys):

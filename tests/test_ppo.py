@@ -104,7 +104,7 @@ class TestPolicy:
         plants = make_plants(3, 80, setpoint=5.0, noise_variance=0.5, **recipe.windows)
         run = rollout(plants, network, 80, seed=1)
         wrapped = IncrementalAction(
-            plants, max_move=recipe.max_move, compensate_dead_zone=recipe.dead_zone
+            plants, max_move=ppo.MAX_MOVE, compensate_dead_zone=recipe.dead_zone
         )
         observations, info = wrapped.reset(seed=1)
         moves = []

@@ -7,12 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from cyclopts import Parameter
 
-from agents.networks import PRETRAINED
 from benchmarks.lib.command import Count, FanOut, Folder, command, options
-from benchmarks.lib.storage import Kept, commit, out_folder, replacing
+from benchmarks.lib.storage import Kept, out_folder, replacing
 
 SEED = 10_000  # of the first network; the others follow
 NETWORKS = {"nn-smith": 1, "ppo": 5, "ppo-hard": 5}  # and how many are trained by default
@@ -34,8 +32,6 @@ class Options:
     validation chooses the best of several; 5 for PPO, which are all compared)."""
     steps: Count | None = None
     """Optimiser steps or, for PPO, samples of experience (default: as published)."""
-    keep: bool = False
-    """Save the result to agents/pretrained."""
     out: Folder = Path("results/networks")
     fan_out: FanOut = field(default_factory=FanOut)
 
@@ -46,56 +42,39 @@ def work(options: Options) -> str:
 
     from benchmarks.lib.report import on_screen
 
-    out = out_folder(options.out)
-    seeds = range(SEED, SEED + (options.networks or NETWORKS[options.network]))
+    out, name = out_folder(options.out), options.network
+    seeds = range(SEED, SEED + (options.networks or NETWORKS[name]))
     tasks = {f"seed {seed}": task_of(options, seed) for seed in seeds}
     trained = options.fan_out.run(tasks, "training", Kept(out / "tasks"))
     networks = dict(zip(seeds, trained.values(), strict=True))
-    rows = {seed: _validated(network) for seed, network in networks.items()}
+    rows = {seed: dict(network.provenance["validation"]) for seed, network in networks.items()}
+    for seed, network in networks.items():
+        rows[seed]["CPU (s)"] = network.provenance["cpu_seconds"]
     shown = pd.DataFrame.from_dict(rows, "index").map("{:.4g}".format)
     print(on_screen(shown.reset_index(names="seed")))
-    target, said = PRETRAINED if options.keep else out, "The policies are"
-    if options.network == "nn-smith":
+    files = {f"{name}-{seed}": network for seed, network in networks.items()}
+    if name == "nn-smith":
         best = min(rows, key=lambda seed: rows[seed]["all"])
-        networks = {best: networks[best]}
-        said = f"Validation chooses seed {best}: it is nn-smith.npz"
-    for seed, network in networks.items():
-        name = options.network if options.network == "nn-smith" else f"{options.network}-{seed}"
-        with replacing(target / f"{name}.npz") as file:
+        files = {name: networks[best]}
+        print(f"Validation chooses seed {best}")
+    for stem, network in files.items():
+        with replacing(out / f"{stem}.npz") as file:
             network.save(file)
-    return f"{said} in {target}"
+    return f"Written to {out}: {', '.join(files)}"
 
 
 def task_of(options: Options, seed: int) -> Any:
     """Return the training of one network, a function without arguments."""
     if options.network == "nn-smith":
-        from benchmarks.train.through_plant import Training, train
+        from benchmarks.train import through_plant
 
-        training = Training(seed=seed)
-        return partial(
-            train, replace(training, steps=options.steps or training.steps), commit()
-        )
+        training = replace(through_plant.TRAINING, seed=seed)
+        steps = options.steps or training.steps
+        return partial(through_plant.train, replace(training, steps=steps))
     from benchmarks.train import ppo
 
     recipe = ppo.RECIPES[options.network]
     return partial(ppo.train, replace(recipe, steps=options.steps or recipe.steps), seed)
-
-
-def _validated(network: Any) -> dict[str, float]:
-    """Return the results of a network in validation.
-
-    For the law these are geometric means of |e| as shares of the authority, and their mean;
-    for PPO mean |e| of each case, degC.
-    """
-    about = network.provenance
-    found = dict(about["validation"])
-    if found.pop("seed", None) is not None:
-        from benchmarks.train.through_plant import KINDS
-
-        logarithms = {kind: found[kind] for kind in KINDS}
-        logarithms["all"] = float(np.mean([*logarithms.values()]))
-        found = {kind: float(np.exp(value)) for kind, value in logarithms.items()}
-    return {**found, "CPU (s)": about["cpu_seconds"]}
 
 
 main = command("train", Options, work)

@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 
 TRAINING_SEEDS = 1 << 32  # seeds from here on are those of the training plants alone
 VALIDATION_SEED = 9_000_000  # no published result uses the seeds from here on
+MAX_MOVE = 2.0  # change of the flow at an action of 1, as a share of half its range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +55,6 @@ class Recipe:
     """Past temperatures and past flows in the observation."""
     steps: int
     """Samples of experience, summed over all plants."""
-    max_move: float = 2.0
-    """Change of the flow at an action of 1, as a share of half its range."""
     log_std: tuple[float, float] = (-1.2, -3.5)
     """Logarithm of the action's standard deviation, at the start and at the end."""
 
@@ -69,17 +68,14 @@ class Recipe:
 # An error scale of 50 degC brings returns to a size of about 1, which are learnt quickly.
 _COST = {"reward": "absolute", "error_scale": 50.0}
 _RANDOM = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
+_SLOWER = {"setpoint_amplitude": 5.4, "setpoint_period": 500}
 
 RECIPES = {
     "ppo": Recipe(
         plants=((152, _RANDOM), (360, {**_RANDOM, "noise_variance": 0.6})),
         cases={
-            "calm": {"setpoint_amplitude": 5.4, "setpoint_period": 500},
-            "noise": {
-                "noise_variance": 0.4,
-                "setpoint_amplitude": 5.4,
-                "setpoint_period": 500,
-            },
+            "calm": _SLOWER,
+            "noise": {**_SLOWER, "noise_variance": 0.4},
         },
         dead_zone=5.0,
         levels=False,
@@ -142,7 +138,7 @@ class Plants(GymnasiumVecEnv):
     """
 
     def __init__(self, recipe: Recipe) -> None:
-        moves = {"max_move": recipe.max_move, "compensate_dead_zone": recipe.dead_zone}
+        moves = {"max_move": MAX_MOVE, "compensate_dead_zone": recipe.dead_zone}
         given = {**recipe.windows, "autoreset_mode": "SameStep"}
         super().__init__(
             *(
@@ -200,5 +196,5 @@ def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
         observation=recipe.windows,
         input_scale=np.ones(sum(recipe.windows.values())),
         activation="tanh",
-        increments=Increments(recipe.max_move, recipe.dead_zone),
+        increments=Increments(MAX_MOVE, recipe.dead_zone),
     )
