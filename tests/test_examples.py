@@ -47,12 +47,9 @@ def test_stable_baselines3_learns_with_the_lines_of_the_page():
 def test_an_offline_clone_does_what_was_logged():
     logged = [SimpleNamespace(**episode) for episode in record("paper", "smith", 8)]
     high = np.repeat([50.0, 100.0, 1.0], [3, 3, 20]).astype(np.float32)
-    arguments = arguments_of("paper")
-    still, cloned = (
-        evaluate(offline.clone(logged, high, steps=n, seed=0), episodes=4, **arguments)
-        for n in (1, 400)
-    )
-    assert cloned.mean_error < 0.6 * still.mean_error
+    actor = offline.clone(logged, high, steps=400, seed=0)
+    # 0.6 degC is the error of the controller that was logged; no control has 2.4.
+    assert evaluate(actor, episodes=4, **arguments_of("paper")).mean_error < 0.95
 
 
 def test_the_notebook_runs_and_shows_what_it_showed(capsys):
