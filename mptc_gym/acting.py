@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from typing import Any, Final, cast
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from mptc_gym.checks import reject, shorten
 from mptc_gym.env import MiddlePointEnv
-from mptc_gym.parameters import Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
@@ -24,48 +23,41 @@ from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalActio
 
 _INCREMENTS: Final = IncrementalAction, VectorIncrementalAction
 _SB3: Final = "stable_baselines3.common"
-_TOLERANCE: Final = 1e-6  # of infos, degC or t/h
+_TOLERANCE: Final = 1e-6  # of infos, degC or t/h, and relative to them
 Act = Callable[[Any], Any]  # observations, one row a plant, to actions
 Infos = Mapping[str, Any]  # arrays, one element per plant
+Steps = Iterator[tuple[Infos, Infos, NDArray[np.bool_]]]
 
 
-def rollout(
-    plants: Any, act: Act, samples: int, seed: int | list[int]
-) -> Iterator[tuple[Infos, Infos, NDArray[np.bool_]]]:
+def rollout(plants: Any, act: Act, samples: int, seeds: list[int]) -> Steps:
     """Reset a batch of plants, and step it through samples k = 0, 1, ...
 
     Yield the infos at sample k, those at k + 1, and whether the episodes have ended.
 
     This is the one loop, for scores, benchmarks and tests. `plants` are a vector environment of
-    Gymnasium, and `act` is a function of their observations. In place of the first seed, a list
-    may give all. Actions of the wrong shape, or not finite, are a ValueError.
+    Gymnasium or `Given` ones, and `act` is a function of their observations. Actions of the
+    wrong shape, or not finite, are a ValueError.
     """
-    observations, infos = plants.reset(seed=seed)
+    observations, infos = plants.reset(seed=seeds)
     shape = plants.num_envs, *plants.single_action_space.shape
-    for k in range(samples):
-        actions = _checked(act(observations), shape, k)
+    for _ in range(samples):
+        actions = _checked(act(observations), shape)
         before = infos
         observations, _, terminated, truncated, infos = plants.step(actions)
         # Where the same step resets a plant, the last sample's infos are apart.
         yield before, infos.get("final_info", infos), terminated | truncated
 
 
-def _checked(actions: Any, shape: tuple[int, ...], k: int) -> NDArray[Any]:
-    """Return a policy's actions at sample k as an array, if the environments can take them."""
+def _checked(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return the actions of a policy as an array, if the environments can take them."""
     try:
         checked = np.asarray(actions)
-        finite = np.isfinite(checked)
+        if checked.shape == shape and np.isfinite(checked).all():
+            return checked
+        found = f"{shorten(checked)}, shape {checked.shape}"
     except (TypeError, ValueError, RuntimeError) as error:  # the last: from tensors
-        hint = "its first element" if isinstance(actions, tuple) else f"an array ({error})"
-        raise ValueError(
-            f"policy must return an array of numbers, got {shorten(actions)}: return {hint}"
-        ) from error
-    if checked.shape != shape:
-        raise ValueError(f"policy must return actions of shape {shape}, got {checked.shape}")
-    if not finite.all():
-        wrong = checked[~finite][0]
-        raise ValueError(f"policy must return finite actions, got {wrong} at sample {k}")
-    return checked
+        found = f"{shorten(actions)} ({error})"
+    raise ValueError(f"policy must return finite actions, shape {shape}, got {found}")
 
 
 def loaded(module: str, name: str) -> Any:
@@ -73,16 +65,12 @@ def loaded(module: str, name: str) -> Any:
     return getattr(sys.modules.get(module), name, ())
 
 
-def behind(policy: Any) -> tuple[Any, Any, Mapping[str, inspect.Parameter]]:
-    """Return the function that a policy calls in the end, its object, and its arguments."""
+def behind(policy: Any) -> tuple[Any, Any]:
+    """Return the function that a policy is, out of its partials, and that function's object."""
     while isinstance(policy, partial):
         policy = policy.func
     owner = getattr(policy, "__self__", policy)
-    owner = None if isinstance(owner, type) else owner
-    try:
-        return policy, owner, inspect.signature(getattr(policy, "forward", policy)).parameters
-    except (TypeError, ValueError):  # of what is not written in Python
-        return policy, owner, {}
+    return policy, None if isinstance(owner, type) else owner
 
 
 def start(policy: Any, n: int) -> Act:
@@ -91,38 +79,40 @@ def start(policy: Any, n: int) -> Act:
     act: Any = getattr(policy, forms[0]) if forms else policy
     if isinstance(policy, type) or not callable(act):
         reject("policy", policy, "a function, or an object with predict or act, not a class")
-    function, owner, named = behind(act)
+    function, owner = behind(act)
     owner = policy if forms else owner
     if callable(getattr(owner, "reset", None)):
         owner.reset()
-    chosen = act.keywords if isinstance(act, partial) else {}
+    is_module = isinstance(owner, loaded("torch.nn", "Module"))
+    # Methods have a name, and modules none.
+    forward = is_module and getattr(function, "__name__", "forward") == "forward"
+    named: Mapping[str, inspect.Parameter] = {}
+    with suppress(TypeError, ValueError):  # of what is not written in Python
+        named = inspect.signature(owner.forward if forward else function).parameters
     if forms[:1] == ["predict"]:
         act = _predicting(act, named, n)
-    elif "deterministic" in named and "deterministic" not in chosen:
+    elif "deterministic" in {*named} - {*getattr(act, "keywords", ())}:
         act = partial(act, deterministic=True)
-    if isinstance(owner, loaded("torch.nn", "Module")):
-        # Methods have a name, and modules none.
-        forward = not forms and getattr(function, "__name__", "forward") == "forward"
-        act = _evaluating(owner, act, tensors=forward)
-    return cast("Act", act)
+    return cast("Act", _evaluating(owner, act, forward) if is_module else act)
 
 
 def _predicting(predict: Any, named: Mapping[str, inspect.Parameter], n: int) -> Act:
     """Return the function of observations of a policy in the form of Stable-Baselines3."""
-    if "action_masks" in named:
-        raise ValueError("policy.predict must need no action_masks: give a function")
-    offered: dict[str, Any] = {"state": None, "episode_start": None, "deterministic": True}
-    takes_all = any(each.kind is each.VAR_KEYWORD for each in named.values())
-    accepted = [name for name in offered if takes_all or name in named]
-    offered["episode_start"] = np.ones(n, np.bool_)
+    first = np.ones(n, np.bool_)
+    offered: dict[str, Any] = {"state": None, "episode_start": first, "deterministic": True}
+    if not any(each.kind is each.VAR_KEYWORD for each in named.values()):
+        offered = {name: value for name, value in offered.items() if name in named}
 
     def act(observations: Any) -> Any:
-        actions = predict(observations, **{name: offered[name] for name in accepted})
-        offered["episode_start"] = np.zeros(n, np.bool_)
+        actions = predict(observations, **offered)
         if isinstance(actions, tuple):
-            actions, offered["state"] = actions
-        if offered["state"] is not None and "state" not in accepted:
-            raise ValueError("policy.predict must take the state that it returns: state=None")
+            actions, state = actions
+            if state is not None and "state" not in offered:
+                raise ValueError("policy.predict must take the state that it returns")
+            if "state" in offered:
+                offered["state"] = state
+        if "episode_start" in offered:
+            offered["episode_start"] = np.zeros(n, np.bool_)
         return actions
 
     return act
@@ -158,7 +148,7 @@ def is_vec_env(env: Any) -> bool:
     return isinstance(env, loaded(f"{_SB3}.vec_env", "VecEnv"))
 
 
-def layers(env: Any) -> Iterator[Any]:
+def _layers(env: Any) -> Iterator[Any]:
     """Yield environments and all that is in them, the outermost first.
 
     Those in other processes are not among them, but copies of their plants, while they run.
@@ -168,73 +158,62 @@ def layers(env: Any) -> Iterator[Any]:
         inside = vars(env).get(name, ())
         for each in inside if isinstance(inside, list | tuple) else (inside,):
             if isinstance(each, gymnasium.Env | VectorEnv) or is_vec_env(each):
-                yield from layers(each)
-    with suppress(Exception):  # whatever closed or foreign ones raise
-        yield from _asked(env, "unwrapped")
+                yield from _layers(each)
+    yield from _asked(env, "unwrapped")
 
 
 def _asked(env: Any, name: str) -> list[Any]:
-    """Return an attribute of environments in other processes, if they have it."""
-    if "processes" not in vars(env):
-        return []
-    ask = getattr(env, "env_method", None) or env.call
-    return [*env.get_attr(name)] if any(ask("has_wrapper_attr", name)) else []
-
-
-def shared(one: Any, other: Any) -> bool:
-    """Whether environments have a layer in common."""
-    return not set(map(id, layers(one))).isdisjoint([id(each) for each in layers(other)])
-
-
-def plants_of(env: Any) -> list[Any]:
-    """Return the plants at the heart of environments."""
-    kinds = MiddlePointEnv, MiddlePointVectorEnv
-    found = [each for each in layers(env) if isinstance(each, kinds)]
-    number = sum(getattr(each, "num_envs", 1) for each in found)
-    if number != getattr(env, "num_envs", 1):
-        reject("env", env, "an open environment of MiddlePointEnv in NumPy, wrapped or not")
-    return found
-
-
-def described(env: Any) -> dict[str, Any]:
-    """Return what changes observations and actions, as far as it can be known, by kind."""
-    inside = [*layers(env)]
-    found: dict[str, Any] = {
-        "wrappers": {
-            name
-            for name in ("VecNormalize", "VecFrameStack")
-            for each in inside
-            if isinstance(each, loaded(f"{_SB3}.vec_env", name))
-            if getattr(each, "norm_obs", True)
-        }
-    }
-    with suppress(Exception):  # closed processes cannot be asked, what is around them can
-        found["windows"] = {plant.parameters.windows for plant in plants_of(env)}
-        moves = [each._arguments for each in inside if isinstance(each, _INCREMENTS)]
-        moves += [each for layer in inside for each in _asked(layer, "_arguments")]
-        found["action_wrappers"] = {f"IncrementalAction{each}" for each in moves}
-    return found
+    """Return an attribute of environments in other processes, if these run and have it."""
+    with suppress(Exception):  # whatever closed ones raise
+        if "processes" in vars(env):
+            ask = getattr(env, "env_method", None) or env.call
+            return [*env.get_attr(name)] if any(ask("has_wrapper_attr", name)) else []
+    return []
 
 
 class Given:
     """Environments as one batch: each gets a seed of its own, and infos are arrays."""
 
     def __init__(self, env: Any) -> None:
-        self.env, self.num_envs, self._vec_env = env, env.num_envs, is_vec_env(env)
-        self.inner = plants_of(env)
-        of_one = "" if self._vec_env else "single_"
+        self.env, self.num_envs = env, getattr(env, "num_envs", 1)
+        of_one = "single_" if isinstance(env, VectorEnv) else ""
         self.single_observation_space = getattr(env, f"{of_one}observation_space")
         self.single_action_space = getattr(env, f"{of_one}action_space")
+        self.layers = [*_layers(env)]
+        kinds = MiddlePointEnv, MiddlePointVectorEnv
+        self.plants = [each for each in self.layers if isinstance(each, kinds)]
 
-    def reset(self, *, seed: int | list[int]) -> tuple[Any, Infos]:
-        """Reset all, with a seed each or with those that they draw from one."""
+    def shares(self, other: Given) -> bool:
+        """Whether both have a layer in common."""
+        return not {*map(id, self.layers)}.isdisjoint(map(id, other.layers))
+
+    def traits(self) -> dict[str, Any]:
+        """Return what changes observations and actions, as far as it can be known, by kind."""
+        found: dict[str, Any] = {
+            "observation space": self.single_observation_space,
+            "action space": self.single_action_space,
+            "wrappers": {
+                name
+                for name in ("VecNormalize", "VecFrameStack")
+                for each in self.layers
+                if isinstance(each, loaded(f"{_SB3}.vec_env", name))
+                if getattr(each, "norm_obs", True)
+            },
+        }
+        if self.plants:  # unlike closed processes, which cannot be asked
+            moves = [each._arguments for each in self.layers if isinstance(each, _INCREMENTS)]
+            moves += [each for layer in self.layers for each in _asked(layer, "_arguments")]
+            found["action wrappers"] = {f"IncrementalAction{each}" for each in moves}
+            found["windows"] = {plant.parameters.windows for plant in self.plants}
+        return found
+
+    def reset(self, *, seed: list[int]) -> tuple[Any, Infos]:
+        """Reset all, with a seed each."""
         try:
-            if not self._vec_env:
+            if not is_vec_env(self.env):
                 observations, infos = self.env.reset(seed=seed)
                 return observations, _columns(infos)
-            self.env.seed(seed if isinstance(seed, int) else seed[0])
-            if isinstance(seed, list):  # a batch may repeat seeds by its own `seed`
-                self.env.unwrapped._seeds = [*seed]
+            self.env.unwrapped._seeds = [*seed]  # its own `seed` may repeat them
             return self.env.reset(), _columns(self.env.unwrapped.reset_infos)
         except RuntimeError as error:
             if "before done" not in str(error):
@@ -246,21 +225,41 @@ class Given:
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Infos]:
         """Step all."""
-        if not self._vec_env:
+        if not is_vec_env(self.env):
             *others, infos = self.env.step(actions)
             return (*others, _columns(infos))
         observations, rewards, ended, infos = self.env.step(actions)
-        inner, ours = self.env.unwrapped, loaded("mptc_gym.sb3", "GymnasiumVecEnv")
-        if isinstance(inner, ours) and not ended.any():  # then its list is empty
-            infos = inner.infos
+        if not infos[0]:  # a `GymnasiumVecEnv` fills its list where episodes end
+            infos = getattr(self.env.unwrapped, "infos", infos)
         return observations, rewards, ended, np.zeros_like(ended), _columns(infos)
+
+    def frozen(self) -> Iterator[tuple[Any, str]]:
+        """Yield all that normalises, with the name of the flag that freezes its statistics."""
+        for layer in self.layers:
+            if _asked(layer, "update_running_mean"):
+                raise ValueError(
+                    "env must not normalise in other processes, where its statistics cannot be "
+                    "frozen: make it in this one, by DummyVecEnv or SyncVectorEnv"
+                )
+            of_sb3 = isinstance(layer, loaded(f"{_SB3}.vec_env", "VecNormalize"))
+            flag = "training" if of_sb3 else "update_running_mean"
+            if not (of_sb3 or hasattr(type(layer), flag)):
+                continue
+            yield layer, flag
+            found = getattr(layer, "obs_rms", {})
+            for each in found.values() if isinstance(found, dict) else [found]:
+                if not each.mean.any() and (each.var == 1.0).all():
+                    raise ValueError(
+                        "env must have the statistics of the training in its "
+                        f"{type(layer).__name__}, which has seen nothing: load or copy them"
+                    )
 
     def restart(self, policy: Any) -> None:
         """Reset all with fresh seeds, so that training never meets the episodes of a score."""
         with suppress(Exception):  # a Monitor may not allow it; what is broken raised its own
-            self.reset(seed=int(np.random.SeedSequence().generate_state(1)[0]))
+            self.reset(seed=np.random.SeedSequence().generate_state(self.num_envs).tolist())
         algorithm = loaded(f"{_SB3}.base_class", "BaseAlgorithm")
-        if isinstance(policy, algorithm) and policy.env and shared(policy.env, self.env):
+        if isinstance(policy, algorithm) and policy.env and self.shares(Given(policy.env)):
             policy._last_obs = None  # its training begins anew
 
 
@@ -283,7 +282,9 @@ def opened(env: Any, n: int, policy: Any = None) -> Iterator[Given]:
         if batch is not env:
             stack.callback(batch.close)
         given = Given(batch)
-        for layer, flag in _normalisers(batch):
+        if sum(getattr(each, "num_envs", 1) for each in given.plants) != given.num_envs:
+            reject("env", env, "an open environment of MiddlePointEnv in NumPy, wrapped or not")
+        for layer, flag in given.frozen():
             stack.callback(setattr, layer, flag, getattr(layer, flag))
             setattr(layer, flag, False)
         stack.callback(given.restart, policy)
@@ -297,91 +298,69 @@ def _batch(env: Any, n: int) -> Any:
     exists = isinstance(env, gymnasium.Env)
     if not (exists or callable(env)):
         reject("env", env, "an id, an EnvSpec, environments, or a function that makes one")
-    envs = [env] if exists else []
-    while len(envs) < (1 if exists else n):
-        envs.append(env())
-        if not isinstance(envs[-1], gymnasium.Env):
+
+    def one() -> Any:
+        made = env if exists else env()
+        if not isinstance(made, gymnasium.Env):
             allowed = "a function that makes one environment; where it makes many, call it"
-            reject("env", envs[-1], allowed)
-    following = iter(envs)
-    batch = SyncVectorEnv([lambda: next(following)] * len(envs))
+            reject("env", made, allowed)
+        return made
+
+    batch = SyncVectorEnv([one] * (1 if exists else n))
     batch.closed = exists  # then it is not ours to close
     return batch
 
 
-def _normalisers(env: Any) -> Iterator[tuple[Any, str]]:
-    """Yield all that normalises, with the name of the flag that lets its statistics change."""
-    for layer in layers(env):
-        if _asked(layer, "update_running_mean"):
-            raise ValueError(
-                "env must not normalise in other processes, where its statistics cannot be "
-                "frozen: make it in this one, by DummyVecEnv or SyncVectorEnv"
-            )
-        of_sb3 = isinstance(layer, loaded(f"{_SB3}.vec_env", "VecNormalize"))
-        flag = "training" if of_sb3 else "update_running_mean"
-        if not (of_sb3 or hasattr(type(layer), flag)):
-            continue
-        yield layer, flag
-        found = getattr(layer, "obs_rms", {})
-        for each in found.values() if isinstance(found, dict) else [found]:
-            if not each.mean.any() and (each.var == 1.0).all():
-                raise ValueError(
-                    f"env must have the statistics of the training in its "
-                    f"{type(layer).__name__}, which has seen nothing: load or copy them"
-                )
-
-
-def check_fit(policy: Any, parameters: Parameters, plants: Any) -> None:
+def check_fit(policy: Any, plants: Any) -> None:
     """Refuse environments that a policy was not made for, if it is one that can tell."""
-    env = plants.env if isinstance(plants, Given) else plants
-    here, (_, owner, _) = described(env), behind(policy)
-    if hasattr(owner, "check_environment"):
-        wrapped = ", ".join(here["wrappers"] | here["action_wrappers"])
-        owner.check_environment(parameters, wrapped, plants.num_envs)
+    _, owner = behind(policy)
     kinds = ("base_class", "BaseAlgorithm"), ("policies", "BaseModel")
-    if not any(isinstance(policy, loaded(f"{_SB3}.{file}", kind)) for file, kind in kinds):
+    is_model = any(isinstance(policy, loaded(f"{_SB3}.{file}", name)) for file, name in kinds)
+    if not is_model and not hasattr(owner, "check_environment"):
         return
-    names = "observation_space", "action_space"
-    trained = {name: getattr(policy, name) for name in names}
-    here |= {name: getattr(plants, f"single_{name}") for name in names}
-    if getattr(policy, "env", None) is not None and not is_vec_env(env):
-        trained |= described(policy.env)
+    given = plants if isinstance(plants, Given) else Given(plants)
+    here = given.traits()
+    if not is_model:
+        wrapped = ", ".join(here["wrappers"] | here["action wrappers"])
+        owner.check_environment(given.plants[0].parameters, wrapped, given.num_envs)
+        return
+    trained = {
+        "observation space": policy.observation_space,
+        "action space": policy.action_space,
+    }
+    if getattr(policy, "env", None) is not None and not is_vec_env(given.env):
+        trained = {**Given(policy.env).traits(), **trained}
     for name, its in trained.items():
-        if its != here.get(name):
+        if its != here[name]:
             raise ValueError(
-                f"env must have the {name.replace('_', ' ')} of policy's training, "
-                f"{its or 'none'}, got {here[name] or 'none'}: act where it was trained, by "
-                "evaluate(model, model.get_env()), or in others like that, see "
-                "mptc_gym.sb3.spec_of(model, id)"
+                f"env must have the {name} of policy's training, {its or 'none'}, got "
+                f"{here[name] or 'none'}: act where it was trained, by evaluate(model, "
+                "model.get_env()), or in others like that, see mptc_gym.sb3.spec_of(model, id)"
             )
 
 
-def replayed(steps: Iterable[tuple[Infos, Infos, Any]], plants: Any, seeds: list[int]) -> Any:
+def replayed(steps: Steps, plants: Any, seeds: list[int]) -> Steps:
     """Yield steps, as long as `plants`, given the same seeds and commands, show the same."""
-    expected = plants.reset(seed=seeds)[1]
-    limits = [
-        expected.get(each, getattr(plants.parameters, each)) for each in ("u_min", "u_max")
-    ]
+    _, shown = plants.reset(seed=seeds)
+    limits = [shown.get(name, getattr(plants.parameters, name)) for name in ("u_min", "u_max")]
     for k, (before, after, ended) in enumerate(steps):
         if k == 0:
-            before = before or expected  # where it does not keep the infos of a reset
-            _check_infos(before, expected, k)
+            before = before or shown  # where it does not keep the infos of a reset
+            _check_infos(before, shown, k)
         flows = np.asarray(after.get("command", np.zeros(plants.num_envs)))
-        expected = plants.step(action_from_command(flows, *limits)[:, np.newaxis])[-1]
-        _check_infos(after, expected, k + 1)
+        *_, shown = plants.step(action_from_command(flows, *limits)[:, np.newaxis])
+        _check_infos(after, shown, k + 1)
         yield before, after, ended
 
 
-def _check_infos(infos: Infos, expected: Infos, k: int) -> None:
-    """Refuse infos at sample k that are not those expected, but for rounding."""
+def _check_infos(infos: Infos, shown: Infos, k: int) -> None:
+    """Refuse infos at sample k that are not those shown by the native plants."""
     # The last names first: what is drawn tells more than what follows from it.
-    names = [name for name in reversed([*expected]) if not name.startswith("_")]
-    values = np.array([expected[name] for name in names])
-    found = np.array([infos.get(name, np.full_like(values[0], np.nan)) for name in names])
-    right = np.isclose(found, values, _TOLERANCE, _TOLERANCE, equal_nan=True).all(axis=1)
-    for name in np.array(names)[~right]:
-        raise ValueError(
-            f"env must run the episodes of its seeds, whose {name} by sample {k} is "
-            f"{shorten(expected[name])}, got {shorten(infos.get(name))}: it must not reset "
-            "with another seed, skip or repeat samples, or change the plant or info"
-        )
+    for name in reversed([name for name in shown if not name.startswith("_")]):
+        found, right = infos.get(name, np.nan), shown[name]
+        if not (np.abs(found - right) <= _TOLERANCE * (1.0 + np.abs(right))).all():
+            raise ValueError(
+                f"env must run the episodes of its seeds, whose {name} by sample {k} is "
+                f"{shorten(right)}, got {shorten(infos.get(name))}: it must not reset with "
+                "another seed, skip or repeat samples, or change the plant or info"
+            )

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import itertools
 import json
-import shlex
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from importlib import resources
-from types import FunctionType
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import gymnasium
 import numpy as np
@@ -24,20 +21,16 @@ from mptc_gym.checks import MOST_PLANTS, count, reject
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
-from mptc_gym.presets import IDS, PRESETS
+from mptc_gym.presets import IDS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
 Env = gymnasium.Env[Any, Any]
 Values = NDArray[np.float64]  # one per episode, shape (episodes,)
 
-SEED: Final = 7_000_000
-"""Seed of the first fixed episode; episode i has the seed `SEED + i`. Train on other seeds."""
+SEED: Final = 7_000_000  # of the first fixed episode, as the next one has the next seed
 EPISODES: Final = 100
-"""Default number of episodes per score."""
-SAMPLES: Final = 1200
-"""Length of an episode if its environment has no time limit, samples."""
-
+SAMPLES: Final = 1200  # of an episode, unless its environment ends it earlier
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
 # Arguments that change observations or rewards, but not the least possible error.
 _NO_MATTER: Final = *WINDOWS, "reward", "error_scale", "move_weight"
@@ -46,7 +39,7 @@ _RESAMPLES: Final = 2000  # bootstrap resamples
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
-    """Result of `evaluate`; `str` gives a one-line summary.
+    """Result of `evaluate`, shown in one line.
 
     Attributes
     ----------
@@ -65,7 +58,7 @@ class Evaluation:
     least_possible : float or None
         Least possible mean error of these episodes, degC: see `benchmarks/bounds`. This and all
         that follows from it are None where the package has no bound, as for arguments of no
-        preset.
+        preset; `python -m benchmarks.bounds` computes others.
     multiple : float or None
         `mean_error / least_possible`.
     score : float or None
@@ -77,8 +70,6 @@ class Evaluation:
         elements equal its expectation over these.
     scores : ndarray or None, shape (episodes,)
         Score of each episode against its own bound.
-    missing : str
-        How to compute the bound if there is none; otherwise empty.
     """
 
     env: str
@@ -93,9 +84,8 @@ class Evaluation:
     interval: tuple[float, float] | None = None
     least: Values | None = None
     scores: Values | None = None
-    missing: str = ""
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         parts = [f"{self.env}: mean error {self.mean_error:.3f} degC"]
         if self.interval is not None:
             low, high = self.interval
@@ -104,11 +94,9 @@ class Evaluation:
             parts.append(f"score {self.score:.3f}{drawn}")
         alike = ", all alike" if np.ptp(self.errors) == 0.0 else ""
         parts += [f"valve travel {self.travel:.0f} t/h", f"{len(self.errors)} episodes{alike}"]
-        return "; ".join([*parts, self.missing] if self.missing else parts)
-
-    def __repr__(self) -> str:
-        score = "None" if self.score is None else f"{self.score:.3f}"
-        return f"Evaluation({self.env!r}, mean_error={self.mean_error:.3f}, score={score})"
+        if self.score is None:
+            parts.append("no bound is kept: see python -m benchmarks.bounds --help")
+        return "; ".join(parts)
 
 
 def evaluate(
@@ -150,16 +138,13 @@ def evaluate(
     Returns
     -------
     Evaluation
-        Mean error, score with its interval, and valve travel; arrays of shape (episodes,) hold
-        those of each episode.
+        Mean error, score and valve travel, also of each episode in arrays, shape (episodes,).
 
     Raises
     ------
     ValueError
         If the environment does not exist, is not one of this package or runs other episodes
         than those of its seeds; or if the policy or its actions do not fit it.
-    TypeError
-        If an argument of the environment is unknown.
 
     Examples
     --------
@@ -180,31 +165,35 @@ valve travel 0 t/h; 100 episodes, all alike
     first = count("seed", seed, 0, 2**63)
     seeds, most, native = range(first, first + episodes), SAMPLES, None
     if isinstance(env, str | EnvSpec):
-        env = partial(make_one, env, arguments)
-        single: Any = env()
-        most = single.spec.max_episode_steps or SAMPLES
+        single = make_one(env, arguments)
+        most = cast("EnvSpec", single.spec).max_episode_steps or SAMPLES
         native = native_batch(single, episodes)
+        env = partial(make_one, env, arguments)
     elif arguments:
         raise ValueError(f"{', '.join(arguments)} must be given where env is made")
-    given = closing(native) if native else None
-    with given or acting.opened(env, episodes, policy) as plants:
-        one, *others = [native.unwrapped] if native else plants.inner
-        if any(case_of(each.parameters) != case_of(one.parameters) for each in others):
+    given = nullcontext(native) if native else acting.opened(env, episodes, policy)
+    with given as plants:
+        one, *others = [native.unwrapped] if native else plants.plants
+        case = case_of(one.parameters)
+        if any(case_of(each.parameters) != case for each in others):
             raise ValueError("env must have the same plants, but for windows and rewards")
-        if not isinstance(policy, FunctionType):  # which cannot tell what it was made for
-            acting.check_fit(policy, one.parameters, plants)
+        acting.check_fit(policy, plants)
         expected = None if native else one.parameters
         errors, travels, samples = _run(policy, plants, seeds, most, expected)
-    name = one.spec.id if one.spec else type(one).__name__
     found = Evaluation(
-        name, float(errors.mean()), float(travels.mean()), errors, travels, seeds
+        env=one.spec.id if one.spec else type(one).__name__,
+        mean_error=float(errors.mean()),
+        travel=float(travels.mean()),
+        errors=errors,
+        travels=travels,
+        seeds=seeds,
     )
-    least = least_errors(one.parameters, samples, seeds)
+    least = least_errors(case, samples, seeds)
     if least is None:
-        return replace(found, missing=_missing(one.parameters, samples, seeds))
-    rest = action_from_command(0.0, one.parameters.u_min, one.parameters.u_max)
-    plants = MiddlePointVectorEnv(episodes, **asdict(one.parameters))
-    idle, *_ = _run(lambda seen: np.full((len(seen), 1), rest), plants, seeds, samples)
+        return found
+    rest = action_from_command(0.0, case.u_min, case.u_max)
+    idle_plants = MiddlePointVectorEnv(episodes, **asdict(case))
+    idle, *_ = _run(lambda seen: np.full((len(seen), 1), rest), idle_plants, seeds, samples)
     gained, possible = idle - errors, idle - least
     return replace(
         found,
@@ -254,24 +243,23 @@ def _run(
     Episodes are refused unless they are those of plants with the arguments `expected`, if any.
     Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each; and N.
     """
-    rounds, samples, n = [], 0, plants.num_envs
-    for first in range(seeds.start, seeds.stop, n):
+    rounds, lengths, n = [], set(), plants.num_envs
+    for first in seeds[::n]:
         own = [*range(first, first + n)]
         steps = acting.rollout(plants, acting.start(policy, n), most, own)
         if expected:
-            native = MiddlePointVectorEnv(n, **asdict(expected))
-            steps = acting.replayed(steps, native, own)
+            steps = acting.replayed(steps, MiddlePointVectorEnv(n, **asdict(expected)), own)
         totals = np.zeros((2, n))
         for k, (before, after, ended) in enumerate(steps, 1):  # noqa: B007 (used below)
             totals += np.abs((after["error"], after["applied"] - before["applied"]))
             if ended.any():
                 break
-        samples = samples or k
-        if samples != k or ended.any() != ended.all():
+        lengths.add(k)
+        if len(lengths) > 1 or ended.any() != ended.all():
             raise ValueError(f"env must end all episodes at once, got an end after {k} samples")
         rounds.append(totals)
     errors, travels = np.hstack(rounds)[:, : len(seeds)]
-    return errors / samples, travels, samples
+    return errors / k, travels, k
 
 
 def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values | None:
@@ -300,25 +288,6 @@ def _kept() -> dict[Parameters, Values]:
 def case_of(parameters: Parameters) -> Parameters:
     """Return the arguments, with those that do not affect the bound at their defaults."""
     return replace(parameters, **{name: ARGUMENTS[name].default for name in _NO_MATTER})
-
-
-def _missing(parameters: Parameters, samples: int, seeds: range) -> str:
-    """Return a message with the command that computes a missing bound."""
-    case = case_of(parameters)
-    presets = {case_of(Parameters(**given)): name for name, given in PRESETS.items()}
-    as_json = partial(json.dumps, separators=(",", ":"))
-    pairs = [
-        ("--set", name + "=" + as_json(value).strip('"'))
-        for name, value in asdict(case).items()
-        if value != ARGUMENTS[name].default
-    ]
-    if case in presets:
-        pairs = [("--preset", presets[case])]
-    usual = {"samples": SAMPLES, "episodes": EPISODES, "seed": SEED}
-    asked = {"samples": samples, "episodes": len(seeds), "seed": seeds.start}
-    pairs += [(f"--{name}", str(n)) for name, n in asked.items() if n != usual[name]]
-    words = ["python", "-m", "benchmarks.bounds", *itertools.chain(*pairs)]
-    return f"no bound is kept for this case: {shlex.join(words)}"
 
 
 def _interval(gained: Values, possible: Values) -> tuple[float, float]:

@@ -1,8 +1,5 @@
 """Train with Stable-Baselines3 on a batch of plants, and save models with their spec.
 
-    from stable_baselines3 import PPO
-    from mptc_gym.sb3 import ScoreCallback, make_vec_env
-
     plants = make_vec_env("MiddlePoint-v0", 64, seed=0, wrapper={"compensate_dead_zone": True},
                           action_window=20, setpoint="random")
     model = PPO("MlpPolicy", plants, n_steps=64).learn(200_000, ScoreCallback(path="best.zip"))
@@ -17,20 +14,23 @@ import json
 import pkgutil
 import tempfile
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import gymnasium
+import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env import sync_envs_normalization as synchronise
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from mptc_gym import acting
+from mptc_gym.acting import Given
 from mptc_gym.checks import MOST_PLANTS, count, reject
 from mptc_gym.evaluation import (
     EPISODES,
@@ -41,12 +41,131 @@ from mptc_gym.evaluation import (
     make_one,
     native_batch,
 )
-from mptc_gym.sb3_vec_env import GymnasiumVecEnv
 from mptc_gym.wrappers import IncrementalAction
 
 __all__ = ["GymnasiumVecEnv", "ScoreCallback", "load", "make_vec_env", "save", "spec_of"]
 
 MEMBER = "mptc_gym.json"  # of a zip
+
+
+class GymnasiumVecEnv(VecEnv):
+    """Step whole batches at once, where `DummyVecEnv` steps one environment after another.
+
+    All that it returns is bit for bit that of `DummyVecEnv` with the same environments, but for
+    infos: `step` lists those of last samples only, as dicts would take longer than the step,
+    and `infos` holds the latest of all in Gymnasium's form, as arrays.
+
+    Parameters
+    ----------
+    batches
+        One or more vector environments of autoreset mode "SameStep" and with the same spaces;
+        their environments are numbered one batch after another.
+    spec
+        Spec of one environment with its wrappers, if all are alike.
+    group
+        Number of neighbouring environments that share a seed, and thus what is drawn.
+    """
+
+    def __init__(
+        self, *batches: VectorEnv, spec: EnvSpec | None = None, group: int = 1
+    ) -> None:
+        for batch in batches:
+            if (mode := batch.metadata.get("autoreset_mode")) is not AutoresetMode.SAME_STEP:
+                raise ValueError(f"batches must have autoreset_mode 'SameStep', got {mode}")
+        self.batches, self.spec, self.group = batches, spec, group
+        self.infos: dict[str, Any] = {}
+        # Of each environment, the number of its batch and its own number there.
+        self._places = [(i, j) for i, each in enumerate(batches) for j in range(each.num_envs)]
+        self._edges = np.cumsum([batch.num_envs for batch in batches])[:-1]
+        spaces = batches[0].single_observation_space, batches[0].single_action_space
+        super().__init__(len(self._places), *spaces)
+        self._returns = np.zeros(self.num_envs)
+        self._lengths = np.zeros(self.num_envs, np.int64)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seeds of the next reset: environment i has `seed + i // group`."""
+        first, *_ = super().seed(seed)
+        self._seeds = [cast("int", first) + i // self.group for i in range(self.num_envs)]
+        return self._seeds
+
+    def reset(self) -> NDArray[Any]:
+        """Reset all environments, with the seeds set by `seed`."""
+        seeds: Any = np.split(np.array(self._seeds, object), self._edges)
+        pairs = zip(self.batches, seeds, strict=True)
+        resets = [batch.reset(seed=own.tolist()) for batch, own in pairs]
+        self._reset_seeds()
+        self._returns[:], self._lengths[:] = 0.0, 0
+        self.reset_infos = [_alone(resets[i][-1], j) for i, j in self._places]
+        return self._joined(resets)[0]
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Store the actions, shape (num_envs, action size)."""
+        self._actions = np.split(actions, self._edges)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step with the stored actions."""
+        pairs = zip(self.batches, self._actions, strict=True)
+        steps = [batch.step(actions) for batch, actions in pairs]
+        observations, rewards, terminated, truncated = self._joined(steps)
+        ended = terminated | truncated
+        self._returns += rewards
+        self._lengths += 1
+        infos: list[dict[str, Any]] = [{} for _ in ended]
+        for place in np.flatnonzero(ended).tolist():
+            i, j = self._places[place]
+            *_, found = steps[i]
+            self.reset_infos[place] = _alone(found, j)
+            infos[place] = {
+                **_alone(found["final_info"], j),
+                "terminal_observation": found["final_obs"][j],
+                "TimeLimit.truncated": bool(truncated[place] and not terminated[place]),
+                "episode": {"r": float(self._returns[place]), "l": int(self._lengths[place])},
+            }
+        self._returns[ended], self._lengths[ended] = 0.0, 0
+        return observations, rewards.astype(np.float32), ended, infos
+
+    def _joined(self, returned: list[tuple[Any, ...]]) -> list[NDArray[Any]]:
+        """Concatenate what the batches returned, and store the infos in `infos`."""
+        *arrays, infos = zip(*returned, strict=True)
+        self.infos = {
+            name: np.concatenate([each[name] for each in infos])
+            for name in set.intersection(*map(set, infos))
+            if isinstance(infos[0][name], np.ndarray)
+        }
+        return [np.concatenate(each) for each in arrays]
+
+    def get_images(self) -> list[NDArray[np.uint8]]:
+        """Return a picture of each environment, if the batch has the mode "rgb_array"."""
+        return [image for batch in self.batches for image in cast("Any", batch.render() or ())]
+
+    def close(self) -> None:
+        """Close the batches."""
+        for batch in self.batches:
+            batch.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return an attribute of each environment's batch, but its own `spec`."""
+        chosen = [self.batches[self._places[i][0]] for i in self._get_indices(indices)]
+        return [self.spec if attr_name == "spec" else getattr(b, attr_name) for b in chosen]
+
+    def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
+        """Refuse: an environment of a batch has no methods or attributes of its own."""
+        raise NotImplementedError(f"use `batches`, for all at once, got {args or kwargs}")
+
+    set_attr = env_method
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
+        """Return False for each index: a batch holds no wrapped environments."""
+        return [False for _ in self._get_indices(indices)]
+
+
+def _alone(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
+    """Return the infos of environment i of a batch, as it would give them alone."""
+    return {
+        name: values[i].item() if isinstance(values[i], np.generic) else values[i]
+        for name, values in infos.items()
+        if f"_{name}" in infos and infos[f"_{name}"][i] and not name.startswith("final_")
+    }
 
 
 def make_vec_env(
@@ -76,11 +195,6 @@ def make_vec_env(
     wrapper
         Adds `IncrementalAction`: its arguments, or the class itself for its defaults. Others
         cannot take a batch: use `stable_baselines3.common.env_util.make_vec_env`.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range, or the wrapper is another.
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)
@@ -88,14 +202,12 @@ def make_vec_env(
     single = make_one(env, arguments)
     if isinstance(wrapper, Mapping):
         single = IncrementalAction(single, **wrapper)
-    elif callable(wrapper):
-        single = wrapper(single)
     elif wrapper is not None:
-        reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
+        single = wrapper(single)
     mode = AutoresetMode.SAME_STEP
     batch = native_batch(single, n_envs, autoreset_mode=mode, render_mode=render_mode)
     if batch is None:
-        raise ValueError(f"wrapper must be IncrementalAction, got {single}")
+        reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
     plants = GymnasiumVecEnv(batch, spec=single.spec, group=group)
     plants.seed(seed)
     return plants
@@ -106,30 +218,13 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
 
         evaluate(model, spec_of(model, "MiddlePointHard-v0"))
 
-    Those of Stable-Baselines3, such as `VecNormalize`, are not among them.
-
-    Parameters
-    ----------
-    policy
-        A model that has its environments.
-    env, **arguments
-        An id or an `EnvSpec`, whose own windows and wrappers are replaced, and further
-        arguments for it.
-
-    Raises
-    ------
-    ValueError
-        If the model's environments cannot be made from a spec, or have other windows than
-        `arguments`.
+    `env` is an id or an `EnvSpec`, and `arguments` are further arguments for it. Wrappers of
+    Stable-Baselines3, such as `VecNormalize`, are not in a spec. ValueError if the model's
+    environments cannot be made from theirs.
     """
-    own, (plant, *_) = _spec(policy), acting.plants_of(policy.get_env())
+    own, (plant, *_) = _spec(policy), Given(policy.get_env()).plants
     windows = dict(zip(WINDOWS, plant.parameters.windows, strict=True))
-    for name, value in windows.items():
-        if arguments.get(name, value) != value:
-            raise ValueError(
-                f"{name} must be that of policy's training, {value}, got {arguments[name]}"
-            )
-    spec = cast("EnvSpec", make_one(env, {**arguments, **windows}).spec)
+    spec = cast("EnvSpec", make_one(env, {**windows, **arguments}).spec)
     return dataclasses.replace(spec, additional_wrappers=own.additional_wrappers)
 
 
@@ -159,21 +254,11 @@ def _spec(model: Any) -> EnvSpec:
 def save(model: BaseAlgorithm, path: str | Path) -> None:
     """Save a model atomically, with the spec of its environments.
 
-    The zip is that of `model.save` with one more member, `mptc_gym.json`. A `VecEnvWrapper`,
-    such as `VecNormalize` or `VecFrameStack`, is no part of a spec: a model in one is saved as
-    Stable-Baselines3 does, by `model.save` and `VecNormalize.save`.
-
-    Parameters
-    ----------
-    model
-        A model with its environments.
-    path
-        Path of the zip; `.zip` is added to a name without an ending.
-
-    Raises
-    ------
-    ValueError
-        If the environments cannot be made from their spec, or the file cannot be written.
+    The zip is that of `model.save` with one more member, `mptc_gym.json`; `.zip` is added to a
+    name without an ending. A `VecEnvWrapper`, such as `VecNormalize` or `VecFrameStack`, is no
+    part of a spec: a model in one is saved as Stable-Baselines3 does, by `model.save` and
+    `VecNormalize.save`. ValueError if the environments cannot be made from their spec, or the
+    file cannot be written.
     """
     record, path = _record(model), _zip_path(path)
     try:
@@ -273,7 +358,7 @@ class ScoreCallback(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         self.every = count("every", every, 1, 10**12)
-        self.episodes = count("episodes", episodes, 2, MOST_PLANTS)
+        self.episodes = episodes
         self.path = None if path is None else _zip_path(path)
         if path and (Path(path).is_dir() or not Path(path).parent.is_dir()):
             reject("path", path, "the name of a zip in a folder that exists, not a folder")
@@ -285,7 +370,7 @@ class ScoreCallback(BaseCallback):
         env, arguments = self._env, self._arguments
         if isinstance(env, str | EnvSpec):
             env, arguments = spec_of(self.model, env, **arguments), {}
-        elif not callable(env) and acting.shared(env, self.training_env):
+        elif not callable(env) and Given(env).shares(Given(self.training_env)):
             raise ValueError("env must not be the environments of the training: make others")
         # Not kept in place of the id: the next model may have other windows.
         self._score_in: Any = partial(evaluate, env=env, **arguments)
@@ -295,14 +380,12 @@ class ScoreCallback(BaseCallback):
 
     def _hand_over(self) -> None:
         """Give the statistics of the training to the environments of the scores."""
-        if self.model.get_vec_normalize_env() is None or not isinstance(self._env, VecEnv):
-            return
+        normalised = self.model.get_vec_normalize_env() is not None
         try:
-            synchronise(self.training_env, self._env)
+            if normalised and isinstance(self._env, VecEnv):
+                synchronise(self.training_env, self._env)
         except (AssertionError, AttributeError) as error:
-            raise ValueError(
-                f"env must be wrapped like that of the training: {error}"
-            ) from error
+            raise ValueError(f"env must be wrapped as in training: {error}") from error
 
     def _on_training_start(self) -> None:
         self._latest = self.num_timesteps

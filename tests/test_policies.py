@@ -12,7 +12,7 @@ import torch
 from gymnasium import wrappers
 from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
-from sb3_contrib import TQC, MaskablePPO, RecurrentPPO
+from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
@@ -483,13 +483,13 @@ def unlike(first, second):
 # Each gives a policy and where it acts.
 REFUSED = {
     "actions of another shape": (
-        lambda: (lambda seen: np.zeros(len(seen)), NOISY), r"of shape \(3, 1\)"),
+        lambda: (lambda seen: np.zeros(len(seen)), NOISY), r"shape \(3, 1\), .*\(3,\)"),
     "actions that are not finite": (
-        lambda: (lambda seen: np.full((len(seen), 1), np.nan), NOISY), "finite act.* got nan"),
+        lambda: (lambda seen: np.full((len(seen), 1), np.nan), NOISY), "(?s)finite .*nan"),
     "actions that are text": (
-        lambda: (lambda seen: [["open"]] * len(seen), NOISY), "array of numbers"),
+        lambda: (lambda seen: [["open"]] * len(seen), NOISY), "finite.*open"),
     "actions and state": (
-        lambda: (lambda seen: (law(seen), None), NOISY), r"(?s)numbers.*first element"),
+        lambda: (lambda seen: (law(seen), None), NOISY), "(?s)finite.*None"),
     "tensors with gradients": (
         lambda: (lambda seen: torch.zeros(len(seen), 1, requires_grad=True), NOISY),
         r"tensor\.detach\("),
@@ -497,8 +497,6 @@ REFUSED = {
     "a class": (lambda: (PIController, NOISY), "predict or act, not a class"),
     "predict that keeps its state": (
         lambda: (SimpleNamespace(predict=lambda seen: (law(seen), 1)), NOISY), "take the st"),
-    "masked actions": (
-        lambda: (MaskablePPO("MlpPolicy", levels()), levels()), "need no action_masks"),
     "controller of another actuator": (
         lambda: (PIController(u_max=6.0), NOISY), "limits of env, u_min=-10.0, u_max=10.0"),
     "controller in a wrapper": (
@@ -681,4 +679,4 @@ class TestRounds:
         assert evaluate(law, plants, episodes=2).score is not None
         # Its spec says 1200.
         short = gymnasium.make_vec("MiddlePoint-v0", N, max_episode_steps=50)
-        assert "--samples 50" in evaluate(law, short, episodes=2).missing
+        assert evaluate(law, short, episodes=2).score is None

@@ -172,7 +172,7 @@ class Policy:
                 yield IncrementalAction(plants, **self.env) if self.env else plants
             return
         with opened(self.env, self.runs) as given:
-            if {case_of(each.parameters) for each in given.inner} != {case_of(self.plant)}:
+            if {case_of(each.parameters) for each in given.plants} != {case_of(self.plant)}:
                 raise ValueError("the environment must have the parameters that it is made for")
             yield given
 
