@@ -167,7 +167,7 @@ class TestOwnControllers:
             ),
             (
                 "class Mine: reset = dict; act = lambda self, o: 0.0",
-                r"policy must return actions of shape \(2, 1\), got \(\)",
+                r"policy must return finite actions, shape \(2, 1\), got .*, shape \(\)",
             ),
             ("class Mine: __init__ = lambda self, gain: None", "argument: 'gain'"),
         ],
