@@ -2,10 +2,10 @@
 
 from agents.controller import Controller
 from agents.direct_nn import DirectNNController, Weights
+from agents.networks import Increments, PolicyNetwork
 from agents.neural_law import LawNetwork, NeuralSmithPredictor
 from agents.neural_self_tuning import NeuralSelfTuningController
 from agents.pi import PIController, SmithPredictor
-from agents.policy_network import Increments, PolicyNetwork
 from agents.self_tuning import SelfTuningController
 
 __all__ = [

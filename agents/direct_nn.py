@@ -97,11 +97,6 @@ class DirectNNController(Controller):
         The weights are updated at every `update_interval`-th sample, starting with the first of
         an episode.
 
-    Raises
-    ------
-    ValueError
-        If an argument is out of range; the message names it.
-
     Examples
     --------
     >>> import gymnasium, mptc_gym
@@ -134,8 +129,6 @@ class DirectNNController(Controller):
         self.n_obs = max(self.n_inputs, self.error_index + 1)
         if abs(self.direction) != 1.0:
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
-        if not np.isfinite(2.0 * self.weight_scale):  # width of the initial range
-            raise ValueError(f"weight_scale must be at most 8.9e307, got {self.weight_scale!r}")
         if self.num_envs is not None:
             check_count("num_envs", self.num_envs, 1, MOST)
         self._batch = () if self.num_envs is None else (self.num_envs,)  # the leading axis

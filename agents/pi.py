@@ -88,11 +88,6 @@ class PIController(Controller):
             Sampling interval, s.
         arguments
             Other arguments of the controller.
-
-        Raises
-        ------
-        ValueError
-            If an argument is out of range; the message names it.
         """
         k = check_gain("gain", gain)
         tau_1 = check_number("time_constant", time_constant, above=0)

