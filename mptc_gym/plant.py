@@ -6,7 +6,6 @@ There are two implementations, side by side: `Plant` in plain floats, fastest fo
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from operator import mul
 from typing import Any, Final, cast
@@ -120,7 +119,6 @@ class Plant:
         self._actuator = edge, u_min, u_max, (u_max - u_min) / 2.0
         self._numbers = numbers
         self._drifts = parameters.drifts
-        self._may_overflow = not parameters.is_stable
         self._age = 0
         self._dynamics = Dynamics(parameters)
         self._update_dynamics()
@@ -171,8 +169,6 @@ class Plant:
         output = noise + self._scale * response
         for lag, alpha in self._alpha:
             output += alpha * outputs[lag]  # A of (28)
-        if self._may_overflow and output != output:
-            output = math.nan  # processors differ in the sign of inf - inf
         outputs.appendleft(output)
         return command, applied, output
 
@@ -202,7 +198,6 @@ class PlantBatch:
 
         self._dynamics = Dynamics(parameters)
         self._drifts = parameters.drifts
-        self._may_overflow = not parameters.is_stable
         self._changes_dynamics = parameters.changes_dynamics
         self._clock = self._next_update = 0
         self._starts = np.zeros(num_envs if self._drifts else (), np.int64)
@@ -285,8 +280,6 @@ class PlantBatch:
         output: Values = noise + response
         for term in map(mul, self._alpha, self._outputs):  # A of (28)
             output += term
-        if self._may_overflow:
-            output[np.isnan(output)] = math.nan
         self._outputs.appendleft(output)
         return command, applied, output
 

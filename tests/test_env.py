@@ -115,16 +115,6 @@ def test_noise_and_set_point_come_from_the_seed_alone_in_separate_streams(others
         np.testing.assert_array_equal(first[key], second[key])
 
 
-def test_a_generator_of_the_user_is_used():
-    env = MiddlePointEnv(noise_variance=0.5)
-    noises = []
-    for seed in (4, 4, 5):
-        env.np_random = np.random.default_rng(seed)
-        noises.append(run(env, np.zeros(5), seed=None)["noise"])
-    np.testing.assert_array_equal(noises[0], noises[1])
-    assert not np.array_equal(noises[0], noises[2])
-
-
 def test_info_is_made_of_floats_and_counts_of_ints():
     env = MiddlePointEnv(noise_variance=[0.5, 0.7], delay=[3, 9])
     _, info = env.reset(seed=0)

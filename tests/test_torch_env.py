@@ -13,8 +13,7 @@ from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from agents.actuator import applied_flow  # noqa: E402
-from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters  # noqa: E402
+from mptc_gym import PRESETS, MiddlePointVectorEnv  # noqa: E402
 from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
 from mptc_gym.signals import Ranges, Signals, Streams  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv  # noqa: E402
@@ -146,27 +145,6 @@ def test_a_command_on_the_edge_of_the_dead_zone_passes(rng, dtype, action_of, at
         np.testing.assert_allclose(applied[-1]["applied"], commands, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize(
-    "numbers",
-    [
-        {}, {"dead_zone": 0.0}, {"dead_zone": 5.0, "u_min": -3.0},  # this limit lies inside
-        {"dead_zone": 2.0, "u_min": 6.0, "u_max": 8.0},
-        {"dead_zone": 10.0, "u_min": -8.62},  # the way to an action and back is not exact
-    ],
-)  # fmt: skip
-def test_the_actuator_is_one_for_plants_and_controllers(numbers):
-    sizes = np.r_[0.0, 1e-9, 1.0, 2.0, 3.0, 3.999, 4.0, 5.0, 6.0, 10.0, 12.0, 1e3]
-    commands = np.r_[-sizes, sizes]
-    n, parameters = len(commands), Parameters(**numbers)
-    limits = parameters.dead_zone, parameters.u_min, parameters.u_max
-    actions = action_from_command(commands, *limits[1:])[:, np.newaxis]
-    for env in (MiddlePointVectorEnv(n, **numbers), make(n, **numbers)):
-        env.reset(seed=0)
-        found = env.step(torch.tensor(actions))[-1]["applied"]
-        expected = applied_flow(commands, *limits)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-
-
 class TestGradients:
     @pytest.mark.parametrize("plant", [
         {"dead_zone": 0.0, "action_window": 2}, {"delay": [2, 4], "gain_factor": [0.5, 2]},
@@ -225,15 +203,6 @@ class TestGradients:
         assert not cut[:25].any()
         # The last move before the cut is one of an action after it, too.
         torch.testing.assert_close(cut[25:], whole[25:])
-
-    def test_an_episode_knows_nothing_of_the_one_before(self):
-        env = make(2, differentiable=True, max_episode_steps=30, autoreset_mode="SameStep")
-        env.reset(seed=0)
-        actions = torch.full((60, 2, 1), 0.8, dtype=torch.float64, requires_grad=True)
-        rewards = [env.step(a)[1] for a in actions]
-        torch.stack(rewards[30:]).sum().backward()
-        assert not actions.grad[:30].any()
-        assert actions.grad[30:40].abs().min() > 0
 
     @pytest.mark.parametrize("differentiable", [False, True])
     def test_memory_does_not_grow_and_a_graph_is_kept_only_if_wanted(self, differentiable):

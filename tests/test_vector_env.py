@@ -101,24 +101,6 @@ def test_it_equals_them_over_long_times_and_at_the_edge(mode, limit, steps, argu
     compare(native, sync, steps=steps, rng=rng, partial_resets=0.005)
 
 
-@pytest.mark.parametrize("a", [[1.0, -3.0, 4.0], [1.0, 1.5], [1.0, -3.0, 3.0, 2.0]])
-def test_a_plant_beyond_all_floats_equals_the_one_alone(a):
-    native, sync = native_and_sync(
-        2, "NextStep", None, a=a, reward="quadratic" if len(a) == 3 else "absolute",
-        output_window=1, move_weight=0.1, noise_variance=0.1, delay=[0, 3],
-    )  # fmt: skip
-    native.reset(seed=0), sync.reset(seed=0)
-    with np.errstate(all="ignore"):
-        for action in 1500 * [1.0] + 500 * [-1.0]:
-            ours, theirs = (envs.step(np.full((2, 1), action)) for envs in (native, sync))
-            np.testing.assert_array_equal(ours[0], theirs[0])
-            for name in ("output", "error"):
-                # Of NaN the sign, too.
-                assert ours[4][name].tobytes() == theirs[4][name].tobytes()
-            assert ours[1].tobytes() == theirs[1].tobytes()
-    assert not np.isfinite(ours[4]["output"]).any()
-
-
 def used(made):
     """Return what was made, and the memory that it takes."""
     tracemalloc.start()
