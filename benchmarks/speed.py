@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -12,23 +12,21 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from agents import DirectNNController
 from benchmarks.lib.command import Runs, blame, command, options
 from mptc_gym import PRESETS
 
 if TYPE_CHECKING:
     import pandas as pd
 
-EPISODE = 1200  # steps of a call
+EPISODE = 1200  # steps
 BATCHES = (8, 64, 1024, 16384)
 ON_DEVICE = tuple(4**power for power in range(5, 12))  # 1,024 to 4,194,304 plants
-LEARNERS = 1000
 REFERENCE, PLANT = "CartPole-v1", "MiddlePoint-v0"
-# Arguments of the plants, by the suffix of their names.
-NOISE: dict[str, Any] = {"noise_variance": 0.5}
-PLANTS: dict[str, dict[str, Any]] = {"": {}, ", R = 0.5": NOISE, ", hard": PRESETS["hard"]}
+# By what follows the name.
+PLANTS: dict[str, Any] = {"": {}, ", R = 0.5": PRESETS["noisy"], ", hard": PRESETS["hard"]}
 
-Cases = dict[str, tuple[Callable[[], object], int]]  # by name: a function, and its steps
+Case = tuple[Callable[[], object], int]  # a function, and its steps
+Cases = dict[str, Case]  # by name
 
 
 @options
@@ -49,31 +47,81 @@ def work(options: Options) -> str:
     """Measure, print the tables and return the closing line."""
     from benchmarks.lib.report import on_screen
 
+    sizes = ON_DEVICE if options.device else BATCHES
+    tables: dict[str, Callable[[], Cases]] = {}
+    if options.device is None:
+        tables["One environment, from gymnasium.make"] = one_by_one
+    tables |= {
+        f"Vector environments, n = {n:,}": partial(in_batch, n, options.device) for n in sizes
+    }
     with blame("--device"):
-        for title, cases in tables(options.device):
-            print(f"\n{title}\n{on_screen(compare(cases, options.rounds))}", flush=True)
+        for title, cases in tables.items():
+            print(f"\n{title}\n{on_screen(compare(cases(), options.rounds))}", flush=True)
     return f"Medians of {options.rounds} rounds; in parentheses, 10th to 90th percentile."
 
 
-def tables(device: str | None) -> Iterator[tuple[str, Cases]]:
-    """Yield the title and the cases of each table; those of a device are PyTorch's alone."""
-    from benchmarks.loop.rollout import make_plants, rollout
+def one_by_one() -> Cases:
+    """Return the cases of one environment, reset whenever an episode ends."""
 
-    if device is not None:
-        for n in ON_DEVICE:
-            yield f"In PyTorch on {device}, n = {n:,}", in_torch(n, device, steps=200)
-        return
-    yield "One environment, from gymnasium.make", single(REFERENCE) | single(PLANT)
-    has_torch = importlib.util.find_spec("torch") is not None
-    for n in BATCHES:
-        cases = in_batch(REFERENCE, n, {"": {}}) | in_batch(PLANT, n, PLANTS)
-        yield f"Vector environments, n = {n:,}", cases | (in_torch(n) if has_torch else {})
-    plants = make_plants(LEARNERS, EPISODE, **NOISE)
-    networks = DirectNNController(num_envs=LEARNERS)
-    cases = in_batch(REFERENCE, LEARNERS, {"": {}})
-    episode = partial(rollout, plants, networks, EPISODE, seed=0)
-    cases["plants and networks"] = episode, LEARNERS * EPISODE
-    yield f"Noisy plants and their networks, which learn, n = {LEARNERS:,}", cases
+    def run(env: Any, actions: list[Any]) -> None:
+        env.reset(seed=0)
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+
+    cases: Cases = {}
+    for name in (REFERENCE, PLANT):
+        env = gymnasium.make(name)
+        env.action_space.seed(0)
+        actions = [env.action_space.sample() for _ in range(10 * EPISODE)]
+        cases[name] = partial(run, env, actions), len(actions)
+    return cases
+
+
+def in_batch(n: int, device: str | None) -> Cases:
+    """Return the cases of `n` environments; those of a device are PyTorch's alone."""
+    cases: Cases = {}
+    if device is None:
+        make = partial(gymnasium.make_vec, vectorization_mode="vector_entry_point")
+        cases = {REFERENCE: stepping(make(REFERENCE, n))}
+        cases |= {
+            PLANT + name: stepping(make(PLANT, n, **each)) for name, each in PLANTS.items()
+        }
+        if importlib.util.find_spec("torch") is None:
+            return cases
+    import torch
+
+    from mptc_gym.torch_env import MiddlePointTorchEnv
+
+    torch.set_num_threads(1)  # one core, as for the others
+    for name, each in PLANTS.items():
+        envs = MiddlePointTorchEnv(n, device=device or "cpu", **each)
+        cases[f"in PyTorch{name}"] = stepping(
+            envs,
+            partial(torch.as_tensor, device=device),
+            torch.accelerator.synchronize if device else lambda: None,
+        )
+    return cases
+
+
+def stepping(
+    envs: Any,
+    convert: Callable[[Any], Any] = np.asarray,
+    wait: Callable[[], object] = lambda: None,
+) -> Case:
+    """Return the case of a vector environment: an episode and its reset, `wait` at the end."""
+    envs.reset(seed=0)
+    envs.action_space.seed(0)
+    actions = [convert(envs.action_space.sample()) for _ in range(20)]
+
+    def run() -> None:
+        for k in range(EPISODE + 1):
+            envs.step(actions[k % len(actions)])
+        wait()
+
+    envs.step(actions[0])  # the first is slow on a device
+    return run, envs.num_envs * (EPISODE + 1)
 
 
 def compare(cases: Cases, rounds: int) -> pd.DataFrame:
@@ -102,65 +150,6 @@ def compare(cases: Cases, rounds: int) -> pd.DataFrame:
             f"ratio to {next(iter(cases))}": ratio + " (" + low + " to " + high + ")",
         }
     )
-
-
-def single(name: str) -> Cases:
-    """Return the case of one environment, reset whenever an episode ends."""
-    env = gymnasium.make(name)
-    env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(10 * EPISODE)]
-
-    def run() -> None:
-        env.reset(seed=0)
-        for action in actions:
-            _, _, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
-                env.reset()
-
-    return {name: (run, len(actions))}
-
-
-def in_batch(name: str, n: int, plants: dict[str, dict[str, Any]]) -> Cases:
-    """Return cases of NumPy's vector environment; a call is an episode and its reset."""
-    cases: Cases = {}
-    for special, arguments in plants.items():
-        envs = gymnasium.make_vec(name, n, vectorization_mode="vector_entry_point", **arguments)
-        envs.reset(seed=0)
-        envs.action_space.seed(0)
-        actions = [envs.action_space.sample() for _ in range(20)]
-        run = partial(_cycle, envs.step, actions, EPISODE + 1)
-        cases[name + special] = run, n * (EPISODE + 1)
-    return cases
-
-
-def in_torch(n: int, device: str = "cpu", steps: int = EPISODE + 1) -> Cases:
-    """Return the cases of the PyTorch environment; a call waits for the device to finish."""
-    import torch
-
-    from mptc_gym.torch_env import MiddlePointTorchEnv
-
-    torch.set_num_threads(1)  # one core, as for the others
-    wait = torch.accelerator.synchronize if device != "cpu" else lambda: None
-    cases: Cases = {}
-    for special, arguments in PLANTS.items():
-        envs = MiddlePointTorchEnv(n, device=device, **arguments)
-        envs.reset(seed=0)
-        actions = [2.0 * torch.rand(n, 1, device=device) - 1.0 for _ in range(20)]
-        run = partial(_cycle, envs.step, actions, steps, wait)
-        run()  # the first call on a device is slow
-        cases[f"in PyTorch{special}"] = run, n * steps
-    return cases
-
-
-def _cycle(
-    step: Callable[[Any], object],
-    actions: list[Any],
-    steps: int,
-    wait: Callable[[], object] = lambda: None,
-) -> None:
-    for k in range(steps):
-        step(actions[k % len(actions)])
-    wait()
 
 
 main = command("speed", Options, work, interrupted="nothing is kept.")

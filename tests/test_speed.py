@@ -18,12 +18,12 @@ def test_ratios_compare_rounds_with_each_other(monkeypatch):
 def test_it_runs_with_and_without_pytorch(torch, monkeypatch, capsys):
     if torch:
         pytest.importorskip("torch")
-    small = {"EPISODE": 3, "BATCHES": (2,), "ON_DEVICE": (3,), "LEARNERS": 2}
+    small = {"EPISODE": 3, "BATCHES": (2,), "ON_DEVICE": (3,)}
     for name, value in small.items():
         monkeypatch.setattr(speed, name, value)
     monkeypatch.setattr(speed.importlib.util, "find_spec", lambda _: torch or None)
     assert speed.main(["--rounds", "1"]) == 0
     shown = capsys.readouterr().out
-    for words in ("CartPole-v1", "n = 2", "MiddlePoint-v0, hard", "networks"):
+    for words in ("CartPole-v1", "n = 2", "MiddlePoint-v0, hard"):
         assert words in shown
     assert ("in PyTorch" in shown) is torch

@@ -21,7 +21,7 @@ class TestScore:
         assert tune.FIRST_RUN < tune.FINAL_FIRST_RUN < comparison.SEED - 1_000_000
 
     def test_no_control_pays_for_not_settling(self):
-        found = tune.score("pi", {}, 2, 0, {"kp": 0.0, "ki": 0.0})
+        found = tune.score("pi", 2, 0, {"kp": 0.0, "ki": 0.0})
         assert found["constant"] == pytest.approx(4.8)  # all of the set point, all the time
         assert found["learnt"] == pytest.approx(5.2)
         assert found["not converged"] == 1.0
@@ -42,7 +42,7 @@ def short(monkeypatch):
 
 def search(out, runs=2, status=0):
     """Run a search, and return its trials."""
-    given = f"pi --trials 6 --runs {runs} --jobs 1 --out {out}"
+    given = f"pi --trials 6 --runs {runs} --out {out}"
     assert tune.main(given.split()) == status
     return pd.read_csv(out / "pi/trials.csv")
 
@@ -59,7 +59,7 @@ class TestSearch:
         rows = [[*map(float, line.split("|")[1:-1])] for line in table[2:]]
         assert len(rows) == 2
         for kp, ki, *_, objective, in_search in rows:
-            again = tune.score("pi", {}, 3, tune.FINAL_FIRST_RUN, {"kp": kp, "ki": ki})
+            again = tune.score("pi", 3, tune.FINAL_FIRST_RUN, {"kp": kp, "ki": ki})
             assert objective == pytest.approx(again["objective"], rel=1e-3)
             assert np.isclose(trials["objective"], in_search, rtol=1e-3).any()
 
