@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -53,21 +52,23 @@ class Options:
     runs: Runs = RUNS
     """Runs of each controller in each case."""
     out: Folder | None = None
-    """Folder to write to (default: results/compare, or for other controllers or cases a folder
-    beside it that is named after them)."""
+    """Folder to write to (default: results/compare, with --presets results/compare-presets, and
+    where another option chooses what is run, results/compare-other)."""
 
 
 def work(options: Options) -> str:
     """Run the comparison and write its results, also after an error: of what has finished."""
-    from benchmarks.compare import report
-    from benchmarks.compare.comparison import Case, run_case, scale_of
+    from benchmarks.compare.comparison import Case, run_case, scale_of, write
     from benchmarks.lib.report import show
 
     controllers = chosen(options.agents, options.controllers.agent)
     fan_out = options.controllers.fan_out
     scenarios = _scenarios(options)
-    out = options.out or _folder(options, [*scenarios])
-    folder, made = out_folder(out), origin()
+    place = "results/compare-presets" if options.presets else "results/compare"
+    whole = Options(presets=options.presets, controllers=ControllerOptions(fan_out=fan_out))
+    if options != whole:
+        place = "results/compare-other"
+    folder, made = out_folder(options.out or Path(place)), origin()
     # Short tasks last, so that no core waits long at the end; the bounds of drawn plants are
     # the longest of all.
     by_length = sorted(scenarios.values(), key=lambda each: -each.samples)
@@ -105,8 +106,8 @@ def work(options: Options) -> str:
                 "policies": {each.agent: each.policies for each in finished if each.policies},
             }
             write_json(folder / "provenance.json", about)
-            show(report.write(finished, scenarios, scales, controllers, folder, made)[:2])
-    return f"The report, tables, data and plots are in {out}/"
+            show(write(finished, scenarios, scales, controllers, folder, made)[:2])
+    return f"The report, tables, data and plots are in {folder}/"
 
 
 def _scenarios(options: Options) -> dict[str, Scenario]:
@@ -114,22 +115,12 @@ def _scenarios(options: Options) -> dict[str, Scenario]:
     there = options.plant.cases(PRESET_SCENARIOS if options.presets else SCENARIOS)
     if options.presets and options.plant.name:
         raise UsageError("--presets cannot be combined with --plant, --preset and --set")
-    given = [*there] if options.scenarios is None else options.scenarios
-    names = known("--scenarios", given, [*there])
+    names = known(
+        "--scenarios", [*there] if options.scenarios is None else options.scenarios, there
+    )
     if not names:
         raise UsageError("--scenarios: none to run")
     return {name: there[name] for name in names}
-
-
-def _folder(options: Options, names: list[str]) -> Path:
-    """Return a folder named after the differences from the default comparison."""
-    own = dict.fromkeys(text.partition("=")[0] for text in options.controllers.agent)
-    parts = ["compare", *(options.agents if options.agents != COMPARED else ()), *own]
-    parts += names if options.scenarios is not None else []
-    parts += [options.plant.name] * bool(options.plant.name) + ["presets"] * options.presets
-    parts += [f"{options.runs}-runs"] * (options.runs != RUNS)
-    # Names of files may have 255 bytes; where this is cut, an older result may be replaced.
-    return Path("results", re.sub(r"[^\w.-]", "-", "-".join(parts))[:200])
 
 
 main = command("compare", Options, work)

@@ -1,20 +1,31 @@
-"""Run controllers on cases, and estimate how far they are from the least possible error."""
+"""Run controllers on cases, estimate how far they are from the least possible error, report."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.controllers.roster import Controller
-from benchmarks.lib.statistics import Estimate, bootstrap, groups, improvement, percentiles
-from benchmarks.loop.rollout import Trajectory, is_random, join, measure
+from benchmarks.controllers.roster import Controller, label
+from benchmarks.lib.report import Best, Section, provenance_line, write_report
+from benchmarks.lib.statistics import (
+    Estimate,
+    bootstrap,
+    groups,
+    improvement,
+    percentiles,
+    written,
+)
+from benchmarks.lib.storage import write_csv
+from benchmarks.loop.rollout import CHANGE, START, Trajectory, is_random, join, measure
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES, SEED
 
@@ -22,6 +33,22 @@ Array = NDArray[np.float64]
 Score = tuple[Estimate, dict[str, float]]  # overall, and by case
 
 BOOTSTRAP = 0  # seed of the bootstraps
+SCORE = "Mean over the cases, 95 % interval; travel of the valve in the median run."
+BOUND = (
+    "Least possible without foresight; where marked *, if each change of the set point finds "
+    "the plant settled: a controller that knows the timetable can do better, but none comes "
+    "below the least with foresight."
+)
+PAIRED = "Below 0 a controller is better; in % the share of runs in which it is."
+COSTS = (
+    "What it is told; what was searched or trained beforehand; the processor time of its runs."
+)
+PARTS = {
+    "mae_start": f"first {START} samples",
+    "mae_changes": f"{CHANGE} samples after later changes",
+    "mae_steady": "the rest",
+    "mae": "together",
+}
 
 
 @dataclass(frozen=True)
@@ -181,3 +208,181 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 def _errors(runs: pd.DataFrame) -> Array:
     """Return the errors of a controller's runs, shape (policies, seeds)."""
     return runs.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
+
+
+def write(
+    cases: Sequence[Case],
+    scenarios: Mapping[str, Scenario],
+    scales: Mapping[str, Scale],
+    controllers: Mapping[str, Controller],
+    folder: Path,
+    made: Mapping[str, Any],
+) -> list[Section]:
+    """Write the numbers, pictures and report of finished cases, and return the sections.
+
+    A case without a scale is in the numbers only.
+    """
+    from benchmarks.compare import plots  # here: it draws what is defined above
+
+    runs = pd.concat([case.runs for case in cases], ignore_index=True)
+    summary = summarise(runs)
+    write_numbers(folder / "runs.csv", runs)
+    write_numbers(folder / "summary.csv", summary)
+    for name in scenarios:
+        if found := [case.responses for case in cases if case.scenario == name]:
+            write_numbers(folder / f"{name}.csv", pd.concat(found, ignore_index=True))
+    scales = {name: scales[name] for name in scenarios if name in scales}
+    runs = runs[runs["scenario"].isin([*scales])]
+    if runs.empty:
+        return []
+    reference = str(runs["agent"].iloc[0])
+    by_case = [
+        estimate(rows, scales[name], reference) for name, rows in groups(runs, "scenario")
+    ]
+    estimates = pd.concat(by_case, ignore_index=True)
+    write_numbers(folder / "estimates.csv", estimates)
+    scores = ranked(runs, scales)
+    titles = {name: scenarios[name].title for name in scales}
+    sections = [
+        Section(
+            "Score: 0 without control, 1 at the least possible error",
+            [SCORE],
+            score_table(runs, scores, [*scales]),
+            {"scores.png": "The score of each controller, and a tick for each case"},
+        ),
+        Section(
+            "Mean error as a multiple of the least possible, with its 95 % interval",
+            [BOUND],
+            ratio_table(estimates, scales, [*scores]),
+            {"bounds.png": "The mean error of each controller in each case"},
+        ),
+        Section(
+            "Error against valve travel",
+            ["Down and left is better."],
+            pictures={"travel.png": "The mean error over valve travel, a panel for each case"},
+        ),
+        Section(
+            f"Difference to {label(reference)} (°C), 95 % interval",
+            [PAIRED],
+            paired_table(estimates),
+        ),
+        Section(
+            "Where the error arises: `hard`",
+            ["Contributions to the mean error, °C: means of all runs."],
+            parts_table(runs[runs["scenario"] == "hard"]),
+        ),
+        Section("What each controller costs", [COSTS], costs_table(cases, controllers)),
+        Section(
+            "Cases",
+            table=pd.DataFrame(titles.items(), columns=["case", "what it is"]),
+            pictures={f"{name}.png": f"Responses: {title}" for name, title in titles.items()},
+        ),
+    ]
+    sections = [each for each in sections if each.table is None or len(each.table)]
+    for picture in itertools.chain.from_iterable(each.pictures for each in sections):
+        (folder / picture).unlink(missing_ok=True)  # of an earlier run
+    try:
+        plots.draw(folder, cases, scenarios, scales, controllers, summary, estimates, scores)
+    finally:  # with the pictures that there are
+        made_by = provenance_line("compare", made)
+        write_report(folder, "Comparison of controllers", sections, made_by)
+    return sections
+
+
+def write_numbers(path: Path, table: pd.DataFrame) -> None:
+    """Write a table of numbers, texts and estimates as CSV.
+
+    An estimate becomes three columns: its value and the ends of its interval. Infinite values,
+    which apart from these ends are settling times, are written in words.
+    """
+    columns: dict[Any, Any] = {}
+    for name, cells in table.items():
+        columns[name] = cells
+        if any(isinstance(cell, Estimate) for cell in cells):
+            for end, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
+                columns[f"{name}{suffix}"] = [getattr(cell, end, math.nan) for cell in cells]
+    flat = pd.DataFrame(columns)
+    write_csv(path, flat.astype(object).where(flat != math.inf, "not settled"))
+
+
+def score_table(
+    runs: pd.DataFrame, scores: Mapping[str, Score], names: Sequence[str]
+) -> pd.DataFrame:
+    """Return the scores and the mean travel of the median runs, the best in bold."""
+    travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
+    rows = [
+        {
+            "controller": label(agent),
+            "score": f"{overall:.3f}",
+            "travel (t/h)": f"{travels[agent].mean():,.0f}",
+            **{name: written(by_case[name], ".2f") for name in names if name in by_case},
+        }
+        for agent, (overall, by_case) in scores.items()
+    ]
+    table = pd.DataFrame(rows).fillna("")  # after an interruption, with gaps
+    table.iloc[0] = table.iloc[0].map(Best)
+    return table
+
+
+def ratio_table(
+    estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
+) -> pd.DataFrame:
+    """Return the least possible and the mean errors as multiples; the least are in bold."""
+    bounds = [{"controller": "least possible (°C)"}, {"controller": "with foresight (°C)"}]
+    for name, scale in scales.items():
+        mark = "*" * (scale.least.kind == "reference")
+        bounds[0][name] = f"{scale.least.value:.3f}{mark}"
+        bounds[1][name] = f"{scale.preview.value:.3f}"
+    values = estimates["ratio"].map(lambda ratio: ratio.value)
+    least = values == values.groupby(estimates["scenario"]).transform("min")
+    cells = estimates["ratio"].map("{:.2f}".format).where(~least, lambda all_: all_.map(Best))
+    table = _by_agent(estimates, cells, agents)
+    return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
+
+
+def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
+    """Return differences from the reference, one row for each other agent."""
+    if "difference" not in estimates:
+        return pd.DataFrame()
+    others = estimates.dropna(subset=["difference"])
+    pairs = zip(others["difference"], others["improvement"], strict=True)
+    cells = [f"{mean:+.3f}; {100 * better.value:.0f} %" for mean, better in pairs]
+    return _by_agent(others, cells, [*others["agent"].unique()])
+
+
+def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
+    table = rows.assign(cell=cells).pivot_table(
+        index="agent", columns="scenario", values="cell", aggfunc="first", sort=False
+    )
+    table = table.loc[[*agents]].fillna("").rename(index=label)
+    return table.rename_axis(index="controller", columns=None).reset_index()
+
+
+def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean error of a case and its parts, the least first."""
+    means = runs.groupby("agent")[[*PARTS]].mean().sort_values("mae").map("{:.3f}".format)
+    return means.rename(index=label, columns=PARTS).rename_axis("controller").reset_index()
+
+
+def costs_table(cases: Sequence[Case], controllers: Mapping[str, Controller]) -> pd.DataFrame:
+    """Return what each controller is told, what it took before, and its runs."""
+    rows = []
+    for name, controller in controllers.items():
+        own = [case for case in cases if case.agent == name]
+        about = [dict(each) for each in own[0].policies] if own else []
+        training = [each["cpu_seconds"] for each in about if "cpu_seconds" in each]
+        # The roster says it in a record, a user's own controller itself.
+        said = {"knows": controller.knows, "searched": controller.searched}
+        knows, searched = (
+            text or (about[0].get(each, "") if about else "") for each, text in said.items()
+        )
+        rows.append(
+            {
+                "controller": label(name),
+                "prior knowledge": knows,
+                "searched or trained": searched,
+                "training (s)": f"{np.median(training):.0f}" if training else "",
+                "runs (s)": f"{sum(case.seconds for case in own):.1f}",
+            }
+        )
+    return pd.DataFrame(rows)
