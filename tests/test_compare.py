@@ -8,7 +8,6 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from unittest.mock import Mock
 
 import matplotlib.image
 import numpy as np
@@ -17,7 +16,7 @@ import pytest
 
 from agents import PIController
 from benchmarks.bounds.least import least_possible
-from benchmarks.compare import comparison, plots, report
+from benchmarks.compare import comparison, plots
 from benchmarks.compare.__main__ import main
 from benchmarks.compare.comparison import estimate, ranked, scale_of
 from benchmarks.controllers.roster import ROSTER, looks
@@ -136,7 +135,7 @@ class TestEstimates:
         overall, by_scenario = scores["b"]
         assert overall.value == pytest.approx(0.75)
         assert by_scenario == pytest.approx({"constant": 0.75, "square": 0.75})
-        best, other = report.score_table(runs, scores, [*scales]).to_dict("records")
+        best, other = comparison.score_table(runs, scores, [*scales]).to_dict("records")
         assert (best["controller"], best["travel (t/h)"], best["square"]) == ("b", "12", "0.75")
         assert (other["controller"], other["constant"]) == ("a", "0.25")
 
@@ -185,28 +184,13 @@ class TestReport:
             "s": [1.5, np.inf],
             "e": [Estimate(2.0, 1.0, 3.0, 4), np.nan],
         }
-        report.write_numbers(tmp_path / "table.csv", pd.DataFrame(columns))
+        comparison.write_numbers(tmp_path / "table.csv", pd.DataFrame(columns))
         written = (tmp_path / "table.csv").read_bytes()
         assert written == b"a,s,e,e_low,e_high\nx,1.5,2.0,1.0,3.0\ny,not settled,,,\n"
 
     def test_percentiles_where_some_do_not_settle(self):
         found = percentiles(np.array([1.0, 2.0, 3.0, np.inf]))
         assert found == {"median": 3.0, "p10": 2.0, "p90": np.inf}
-
-    def test_titles_say_what_the_numbers_say(self):
-        def scores(**values):
-            return {name: (Estimate(x, x, x, 1), {}) for name, x in values.items()}
-
-        found = scores(mpc=0.998, smith=0.997, pi=0.5)
-        closest = "Closest to the least possible error is Smith: 0.997"
-        assert plots.closest(found, ["mpc"]) == f"{closest} (MPC: 0.998, told the plant)"
-        assert plots.closest(scores(mpc=0.9), ["mpc"]) == "Score of MPC: 0.900, told the plant"
-        travels = pd.Series({"smith": 300.0, "mpc": 100.0, "pi": 50.0})
-        assert "MPC moves the valve least: 100" in plots.calmest(travels, found)
-        alone = scores(smith=0.997, pi=0.5)
-        assert "Smith alone is near the best score: 300" in plots.calmest(
-            travels[["smith", "pi"]], alone
-        )
 
 
 @pytest.mark.parametrize(
@@ -254,7 +238,7 @@ def compared(tmp_path):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Leave out the pictures, which take most of the time."""
-    monkeypatch.setattr(report, "_pictures", lambda *_: {})
+    monkeypatch.setattr(plots, "draw", lambda *_: None)
 
 
 def assert_golden(found, name):
@@ -297,16 +281,6 @@ class TestCompare:
         for name in ("runs.csv", "summary.csv", "estimates.csv", "constant-noise.csv"):
             assert (one / name).read_bytes() == (two / name).read_bytes()
         assert sorted(pd.read_csv(one / "runs.csv")["policy"].unique()) == [*range(5)]
-
-    def test_a_picture_that_cannot_be_drawn_costs_no_other(self, compared, monkeypatch, capsys):
-        error = ValueError("Axis limits cannot be NaN or Inf")
-        monkeypatch.setattr(plots, "plot_scores", Mock(side_effect=error))
-        out = compared("--agents nothing --scenarios constant-noise --runs 1", status=1)
-        assert "scores.png: ValueError: Axis limits cannot be" in capsys.readouterr().out
-        page = (out / "report.md").read_text()
-        assert "(bounds.png)" in page
-        assert "(scores.png)" not in page
-        assert "(one run)" in page
 
     @pytest.mark.usefixtures("undrawn")
     def test_a_row_of_the_presets_is_what_evaluate_says(self, compared):
@@ -364,5 +338,5 @@ class TestCompare:
         monkeypatch.chdir(tmp_path)
         assert main(["--preset", "hard", "--agents", "pi", "--runs", "2", "--jobs", "1"]) == 0
         (folder,) = (tmp_path / "results").iterdir()  # of its own, as it is a part
-        assert folder.name == "compare-pi-hard-2-runs"
+        assert folder.name == "compare-other"
         assert pd.read_csv(folder / "runs.csv")["saturation_share"].isna().all()

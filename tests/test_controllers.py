@@ -187,11 +187,10 @@ class TestOwnControllers:
 def zips(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     velocity = {"max_move": 0.3, "compensate_dead_zone": True}
-    for seed in (0, 1):
-        windows = {"action_window": 20, "error_window": 2}
-        plants = make_vec_env("MiddlePoint-v0", 2, wrapper=velocity, **windows)
-        model = PPO("MlpPolicy", plants, n_steps=8, batch_size=16, seed=seed, device="cpu")
-        save(model, folder / f"velocity-{seed}.zip")
+    windows = {"action_window": 20, "error_window": 2}
+    plants = make_vec_env("MiddlePoint-v0", 2, wrapper=velocity, **windows)
+    model = PPO("MlpPolicy", plants, n_steps=8, batch_size=16, seed=0, device="cpu")
+    save(model, folder / "velocity.zip")
     bare = PPO("MlpPolicy", gymnasium.make("MiddlePoint-v0"), device="cpu")
     bare.save(folder / "bare.zip")
     model.save(folder / "wide.zip")  # of other windows, which it does not say
@@ -207,9 +206,11 @@ def zips(tmp_path_factory):
 class TestSavedPolicies:
     """Zips of Stable-Baselines3: they act as their file says, or in the plain environment."""
 
-    @pytest.mark.parametrize("preset", ["noisy", "hard"])
-    def test_it_does_what_it_was_trained_to(self, preset, zips):
-        file = zips / "velocity-0.zip"
+    @pytest.mark.parametrize(
+        ("name", "preset"), [("velocity", "noisy"), ("velocity", "hard"), ("delayed", "noisy")]
+    )
+    def test_it_does_what_it_was_trained_to(self, name, preset, zips):
+        file = zips / f"{name}.zip"
         (member,) = members_of(f"PPO:{file}")
         assert "weights: 0 M samples a policy" in member.provenance["searched"]
         controller = member(PRESETS[preset], 3, SEED)
@@ -257,22 +258,17 @@ class TestSavedPolicies:
         with pytest.raises(ValueError, match="the parameters that it is made for"):
             other.run({"delay": 3}, 2, 2, 0)
 
-    def test_a_pattern_names_several_trainings(self, zips):
-        found = members_of(f"PPO:{zips / 'velocity-*.zip'}")
-        about = [each.provenance for each in found]
-        assert [each["file"] for each in about] == ["velocity-0.zip", "velocity-1.zip"]
-        assert about[0]["sha256"] != about[1]["sha256"]
-
     @pytest.mark.parametrize(
         ("location", "complaint"),
         [
-            ("PPO:{}/wide.zip", "not act in the plain environment: write a function that ret"),
-            ("PPO:{}/delayed.zip", "acts in DelayObservation, not in IncrementalAction alone"),
-            ("No:{}/bare.zip", "No must be an algorithm of Stable-Baselines3, such as PPO"),
+            ("PPO:{}/wide.zip", "env must have the observation space of policy's training"),
+            ("No:{}/bare.zip", "must be such as PPO:model.zip"),
             ("PPO:{}/nan.zip", "Expected parameter loc"),
-            ("{}/velocity-0.zip", "must be such as PPO:.*velocity-0.zip"),
-            ("PPO:{}/none.zip", "there is no file .*none.zip"),
-            ("SAC:{}/velocity-0.zip", "holds a model of PPO, not of SAC"),
+            ("{}/velocity.zip", "must be such as PPO:model.zip"),
+            (
+                "PPO:{}/none.zip",
+                "none.zip' must be such as PPO:model.zip, a file",
+            ),
         ],
     )
     def test_what_is_refused(self, location, complaint, zips):

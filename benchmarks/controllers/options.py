@@ -5,15 +5,10 @@ The code of a user's own runs in the tasks that need it: what is wrong with it c
 
 from __future__ import annotations
 
-import glob
-import hashlib
-import importlib
 import inspect
 import pkgutil
-import sys
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -24,19 +19,13 @@ from cyclopts import Parameter
 from agents.controller import PAPER_WINDOWS
 from agents.networks import WINDOWS
 from benchmarks.controllers.roster import OWN, ROSTER, Controller, limits
-from benchmarks.lib.command import FanOut, Names, Repeated, blame, options
+from benchmarks.lib.command import FanOut, Names, blame, options
 from benchmarks.lib.storage import UsageError
-from benchmarks.loop.rollout import make_plants
-from mptc_gym import MiddlePointEnv, Parameters
-from mptc_gym.acting import opened, start
-from mptc_gym.evaluation import case_of
-from mptc_gym.wrappers.vector import IncrementalAction
+from mptc_gym import IDS, Parameters
+from mptc_gym.acting import check_fit, opened, start
+from mptc_gym.evaluation import case_of, make_one, native_batch
 
 AgentNames = Annotated[Names, Parameter(help="Controllers to run.", choices=ROSTER)]
-_ADVICE = (
-    "write a function that returns the policy, or the policy and the environment that it acts "
-    "in, and give --agent NAME=MODULE:FUNCTION"
-)
 
 
 @options
@@ -44,10 +33,10 @@ _ADVICE = (
 class ControllerOptions:
     """A user's own controllers, and where controllers run."""
 
-    agent: Repeated = ()
+    agent: Names = ()
     """A controller of your own in addition to those of --agents, NAME=MODULE:FACTORY or
     NAME=PPO:FILE.zip, of Stable-Baselines3; loading a zip runs the code in it. The same name
-    again adds another training of it (repeatable)."""
+    again adds another training of it."""
     fan_out: FanOut = field(default_factory=FanOut)
 
 
@@ -71,12 +60,14 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
 
 
 def own_entry(name: str, locations: Sequence[str]) -> Controller:
-    """Return the record of a user's own controller, with a member or more for each location.
+    """Return the record of a user's own controller, with a member for each location.
 
     Its `members` raises a `UsageError` that says what is wrong with a location.
     """
-    read = partial(_read, tuple(locations))
-    return Controller(name, name, OWN[0], _make, networks=read, random=True, drawn=True)
+    return Controller(
+        name, name, OWN[0], _make, networks=partial(_found, tuple(locations)), random=True,
+        drawn=True,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -86,25 +77,16 @@ class Own:
     make: Callable[..., Any]
     """Function of the arguments that `_make` offers, as far as it takes them by name; it
     returns a policy, or a policy and the environment that it acts in."""
-    observation: Mapping[str, int]
-    provenance: Mapping[str, Any]
+    observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
 
-def _read(locations: Sequence[str]) -> dict[str, Own]:
-    found: dict[str, Own] = {}
-    for location in locations:
-        with blame("--agent"):
-            if location.endswith(".zip"):
-                algorithm, _, pattern = location.partition(":")
-                if not pattern:
-                    raise ValueError(f"{location!r} must be such as PPO:{location}")
-                files = sorted(glob.glob(pattern))  # noqa: PTH207 (patterns of absolute paths, too)
-                if not files:
-                    raise ValueError(f"{location!r}: there is no file {pattern}")
-                found |= {file: _saved(algorithm, Path(file).resolve()) for file in files}
-            else:
-                found[location] = _function(location)
-    return found
+def _found(locations: Sequence[str]) -> dict[str, Own]:
+    with blame("--agent"):
+        return {
+            each: _saved(each) if each.endswith(".zip") else _function(each)
+            for each in locations
+        }
 
 
 def _function(location: str) -> Own:
@@ -126,10 +108,26 @@ def _function(location: str) -> Own:
             f"{', '.join(WINDOWS)}, got {observation!r}"
         )
     about = {name: str(getattr(made_by, name, "")) for name in ("knows", "searched")}
-    source = getattr(sys.modules[made_by.__module__], "__file__", None)
-    if source:
-        about["sha256"] = hashlib.sha256(Path(source).read_bytes()).hexdigest()
     return Own(made_by, dict(observation), about)
+
+
+def _saved(location: str) -> Own:
+    """Load a model, which acts as its file says, or else in the plain environment."""
+    import stable_baselines3  # here: PyTorch takes seconds to load
+
+    from mptc_gym.sb3 import load
+
+    algorithm, _, file = location.partition(":")
+    kind = getattr(stable_baselines3, algorithm, None)
+    if not (kind and Path(file).is_file()):
+        raise ValueError(f"{location!r} must be such as PPO:model.zip, a file that is there")
+    try:
+        model = load(file, device="cpu")
+    except ValueError:  # not of `mptc_gym.sb3.save`
+        model = kind.load(file, device="cpu")
+    weights = sum(weight.numel() for weight in model.policy.parameters())
+    samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
+    return Own(lambda: model, provenance={"searched": f"{weights:,} weights: {samples}"})
 
 
 def _make(plant: Parameters, runs: int, seed: int, *, network: Own) -> Any:
@@ -151,8 +149,8 @@ class Policy:
 
     policy: Any
     env: Any
-    """None for the plain environment, arguments of `IncrementalAction` for it in that wrapper,
-    or an environment, or a function that makes one."""
+    """An environment, or a function that makes one. None for that of the model, if it was saved
+    with one, or else for the plain one."""
     plant: Parameters
     runs: int
 
@@ -167,53 +165,21 @@ class Policy:
     @contextmanager
     def opened(self, samples: int, **arguments: Any) -> Iterator[Any]:
         """Yield the plants that it acts in, with these arguments or refused."""
-        if self.env is None or isinstance(self.env, Mapping):
-            with closing(make_plants(self.runs, samples, **arguments)) as plants:
-                yield IncrementalAction(plants, **self.env) if self.env else plants
-            return
-        with opened(self.env, self.runs) as given:
+        env = self._own(samples, arguments) if self.env is None else self.env
+        with opened(env, self.runs) as given:
             if {case_of(each.parameters) for each in given.plants} != {case_of(self.plant)}:
                 raise ValueError("the environment must have the parameters that it is made for")
+            check_fit(self.policy, given)
             yield given
 
+    def _own(self, samples: int, arguments: Mapping[str, Any]) -> Any:
+        """Return the environments of a saved model, or plain ones, for these arguments."""
+        make = partial(make_one, IDS["paper"], {**arguments, "max_episode_steps": samples})
+        with suppress(AttributeError, ImportError):
+            if self.policy.get_env() is not None:
+                from mptc_gym.sb3 import spec_of
 
-def _saved(algorithm: str, file: Path) -> Own:
-    """Return a model, which acts as its file says, or else in the plain environment."""
-    from mptc_gym.sb3 import MEMBER, load, spec_of  # here: PyTorch takes seconds to load
-
-    says, windows, moves = True, dict(PAPER_WINDOWS), None
-    with suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
-        says = MEMBER in archive.namelist()
-    model = load(file, device="cpu") if says else _plain(algorithm, file)
-    if type(model).__name__ != algorithm:
-        raise ValueError(f"{file} holds a model of {type(model).__name__}, not of {algorithm}")
-    if says:
-        spec = spec_of(model)
-        names = [each.name for each in spec.additional_wrappers]
-        if names not in ([], ["IncrementalAction"]):
-            acts_in = f"{', '.join(names)}, not in IncrementalAction alone"
-            raise ValueError(f"{file} acts in {acts_in}: {_ADVICE}")
-        moves = spec.additional_wrappers[0].kwargs if names else None
-        plant = Parameters.of_environment(spec.kwargs)
-        windows = {name: getattr(plant, name) for name in WINDOWS}
-    weights = sum(weight.numel() for weight in model.policy.parameters())
-    samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
-    about = {
-        "file": file.name,
-        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-        "searched": f"{weights:,} weights: {samples}",
-    }
-    return Own(lambda: (model, moves), windows, about)
-
-
-def _plain(algorithm: str, file: Path) -> Any:
-    """Return a model that does not say where it acts, if it may be in the plain environment."""
-    for package in ("stable_baselines3", "sb3_contrib"):
-        with suppress(ImportError):
-            if kind := getattr(importlib.import_module(package), algorithm, None):
-                model, plain = kind.load(file, device="cpu"), MiddlePointEnv()
-                spaces = plain.observation_space, plain.action_space
-                if (model.observation_space, model.action_space) != spaces:
-                    raise ValueError(f"{file} does not act in the plain environment: {_ADVICE}")
-                return model
-    raise ValueError(f"{algorithm} must be an algorithm of Stable-Baselines3, such as PPO")
+                plant = {each: arguments[each] for each in {*arguments} - {*WINDOWS}}
+                spec = spec_of(self.policy, max_episode_steps=samples, **plant)
+                make = partial(make_one, spec, {})
+        return native_batch(make(), self.runs) or make
