@@ -11,24 +11,18 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 
+from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Seed, command, known, options
 from benchmarks.lib.storage import UsageError, out_folder, replacing
 from benchmarks.loop.rollout import Trajectory, held
-from benchmarks.loop.scenarios import SCENARIOS, SETPOINTS, PlantOptions
+from benchmarks.loop.scenarios import SCENARIOS, PlantOptions
 
 REFERENCE = ROSTER["nn-smith"]  # whose errors those of the film are multiples of
-PICTURES = 60  # of a film
-SIZE = 7.5, 5.0  # inches, of 100 pixels
-SHADES = 24  # colours
-_AGENTS = (
-    f"Who controls: {', '.join(ROSTER)}, or a controller of your own, NAME=MODULE:FACTORY or "
-    "NAME=PPO:FILE.zip."
-)
-_CASES = (
-    f"Case to run: {', '.join(SCENARIOS)}; on a plant of your own "
-    f"{', '.join(name for name, *_ in SETPOINTS)}, or run if it has a set point of its own."
-)
+PICTURES = 60  # of a film, after the first
+STYLE: Any = {"font.size": 15, "axes.spines.top": False, "axes.spines.right": False}
+_AGENT = f"Who controls: {', '.join(ROSTER)}, or your own as in `compare`, NAME=MODULE:FACTORY."
+_CASE = f"Case to run: {', '.join(SCENARIOS)}, or a plant of your own: square, constant, run."
 
 
 @options
@@ -36,8 +30,8 @@ _CASES = (
 class Options:
     """Make a film of a controller at work."""
 
-    agent: Annotated[str, Parameter(help=_AGENTS)] = "nn"
-    scenario: Annotated[str, Parameter(help=_CASES)] = "square"
+    agent: Annotated[str, Parameter(help=_AGENT)] = "nn"
+    scenario: Annotated[str, Parameter(help=_CASE)] = "square"
     plant: PlantOptions = field(default_factory=PlantOptions)
     seed: Seed = 0
     """Seed of noise and initial weights."""
@@ -47,16 +41,13 @@ class Options:
 
 def work(options: Options) -> str:
     """Run a controller on a case and write a film of it."""
-    from benchmarks.controllers.options import own_entry
-
     cases = options.plant.cases(SCENARIOS)
     case = cases[known("--scenario", [options.scenario], cases)[0]]
-    name, equals, location = options.agent.partition("=")
-    if ":" in options.agent:
-        controller = own_entry(name, [location if equals else name])
-    else:
-        controller = ROSTER[known("--agent", [options.agent], ROSTER)[0]]
-    path = options.video or Path("results/watch", f"{name.replace(':', '.')}-{case.name}.gif")
+    own = [options.agent] if "=" in options.agent else []
+    (controller,) = chosen(
+        [] if own else known("--agent", [options.agent], ROSTER), own
+    ).values()
+    path = options.video or Path("results/watch", f"{controller.name}-{case.name}.gif")
     if path.suffix != ".gif":
         raise UsageError(f"--video: must end in .gif, got {path}")
     out_folder(path.absolute().parent, "--video")
@@ -98,45 +89,40 @@ def write_film(
 
     steps = equal_steps(run.setpoint[:, 0])
     minutes = np.arange(steps[0][1] - steps[0][0]) * interval / 60.0
-    multiples, lines = [], []
-    with rc_context({"font.size": 15, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(SIZE, dpi=100, layout="constrained")
+    lines, multiples, pictures = [], [], []
+    with rc_context(STYLE):
+        figure = Figure((7.5, 5.0), dpi=100, layout="constrained")
         panels = figure.subplots(2, len(steps), sharex=True, sharey="row", squeeze=False)
-        for column, (start, stop) in zip(panels.T, steps, strict=True):
-            ours, theirs, setpoint = (
-                values[start:stop, 0]
-                for values in (run.next_error, reference.next_error, run.setpoint)
-            )
-            multiples.append(np.abs(ours).mean() / np.abs(theirs).mean())
-            column[0].set_title(f"from {start * interval / 60:.0f} min on: {multiples[-1]:.2f}")
-            column[0].plot(minutes, setpoint, "--", color="0.3", label="set point")
-            for panel, name in zip(column, ("output", "applied"), strict=True):
-                for each, colour, who in (
-                    (reference, "#E69F00", REFERENCE.label),
-                    (run, "#0072B2", label),
-                ):
-                    values = getattr(each, name)[start:stop, 0]
-                    lines += panel.plot(minutes, values, color=colour, lw=2, label=who)
-            column[1].set_xlabel("min")
+        for (upper, lower), (start, stop) in zip(panels.T, steps, strict=True):
+            step = slice(start, stop)
+            ours, theirs = (np.abs(each.next_error[step]).mean() for each in (run, reference))
+            multiples.append(f"{ours / theirs:.2f}")
+            upper.set_title(f"from {start * interval / 60:.0f} min on: {multiples[-1]}")
+            upper.plot(minutes, run.setpoint[step], "--", color="0.3", label="set point")
+            lower.set_xlabel("min")
+            for each, colour, name in (
+                (reference, "#E69F00", REFERENCE.label),
+                (run, "#0072B2", label),
+            ):
+                lines += upper.plot(minutes, each.output[step], color=colour, lw=2, label=name)
+                lines += lower.plot(minutes, each.applied[step], color=colour, lw=2)
         panels[0, 0].set_ylabel("°C")
         panels[1, 0].set_ylabel("t/h")
         handles, names = panels[0, 0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False)
-        change = " and ".join(f"{multiple:.2f}" for multiple in multiples)
-        title = f"{label}: error {change} times that of the {REFERENCE.label} predictor"
-        title += " on the same step"
-        figure.suptitle(textwrap.fill(title, 62), x=0.01, ha="left", weight="bold", size=15)
+        title = f"{label}: error {' and '.join(multiples)} times that of the {REFERENCE.label} "
+        title = textwrap.fill(title + "predictor on the same step", 62)
+        figure.suptitle(title, x=0.01, ha="left", weight="bold", size=15)
         canvas: Any = FigureCanvasAgg(figure)
         drawn = [line.get_data() for line in lines]
-        pictures = []
         for share in (1.0, *np.arange(1, PICTURES + 1) / PICTURES):
+            shown = max(1, round(share * len(minutes)))
             for line, (x, y) in zip(lines, drawn, strict=True):
-                shown = max(1, round(share * len(x)))
                 line.set_data(x[:shown], y[:shown])
             canvas.draw()
             figure.set_layout_engine("none")  # done once, by the first picture
             pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-    palette = pictures[0].quantize(SHADES)
+    palette = pictures[0].quantize(24)  # few colours make it small
     first, *others = (
         each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures
     )

@@ -90,7 +90,7 @@ REFUSED = {
     ],
     "train": [([], "NETWORK is missing: one of nn-smith, ppo, ppo-hard")],
     "watch": [
-        (["--agent", "pi=none"], "--agent: no 'pi=none'; there are"),
+        (["--agent", "pi=none"], "--agent must be .*, and .pi. is taken"),
         (["--agent", "lqr"], "--agent: no 'lqr'; there are nothing, nn"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
         (["--scenario", "triangle"], "--scenario.*constant-noise"),
