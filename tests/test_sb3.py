@@ -1,4 +1,4 @@
-"""Tests of `mptc_gym.sb3`: the batch against DummyVecEnv, and the callback."""
+"""Tests of `mptc_gym.sb3`: the batch against DummyVecEnv, zips, and the callback."""
 
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import data_equivalence
-from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import DelayObservation, TransformObservation
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
@@ -17,116 +16,27 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from mptc_gym import MiddlePointEnv, evaluate
+from mptc_gym import sb3 as ours
 from mptc_gym.evaluation import SEED
-from mptc_gym.sb3 import (
-    MEMBER,
-    GymnasiumVecEnv,
-    ScoreCallback,
-    load,
-    make_vec_env,
-    save,
-    spec_of,
-)  # fmt: skip
+from mptc_gym.sb3 import ScoreCallback, load, make_vec_env, save, spec_of
 from mptc_gym.wrappers import IncrementalAction
 
-N = 4
 HARD = "MiddlePointHard-v0"
-ARGUMENTS = {
-    "max_episode_steps": 30, "noise_variance": 0.5, "setpoint": "random", "setpoint_period": 20,
-}  # fmt: skip
-TWO = [(3, ARGUMENTS), (1, {**ARGUMENTS, "noise_variance": 0.0})]
 VELOCITY = {"max_move": 0.3, "compensate_dead_zone": True}
 TRAINING = {"action_window": 20, "setpoint": "random", "reward": "absolute"}
+SHORT = {"setpoint": "random", "setpoint_period": 20, "max_episode_steps": 30}
+TWO = [(3, {"noise_variance": 0.5, **SHORT}), (1, SHORT)]
 
 
-def two_batches():
-    return GymnasiumVecEnv(*(
-        gymnasium.make_vec("MiddlePoint-v0", n, autoreset_mode="SameStep", **given)
+def two_batches(mode="SameStep"):
+    return ours.GymnasiumVecEnv(*(
+        gymnasium.make_vec("MiddlePoint-v0", n, autoreset_mode=mode, **given)
         for n, given in TWO
     ))  # fmt: skip
 
 
-def make_both(kind):
-    """Return a batch, and the same in Stable-Baselines3's own way, both with the seed 3."""
-    given = {**TRAINING, "max_episode_steps": 7}
-    cart_pole = [partial(gymnasium.make, "CartPole-v1", max_episode_steps=15)] * N
-    ours, made = {
-        "wrapped": (
-            lambda: make_vec_env(HARD, N, wrapper=VELOCITY, **given),
-            [lambda: IncrementalAction(gymnasium.make(HARD, **given), **VELOCITY)] * N,
-        ),
-        "two": (
-            two_batches,
-            [partial(gymnasium.make, "MiddlePoint-v0", **x) for n, x in TWO for _ in range(n)],
-        ),
-        "terminate": (
-            lambda: GymnasiumVecEnv(SyncVectorEnv(cart_pole, autoreset_mode="SameStep")),
-            cart_pole,
-        ),
-    }[kind]
-    both = ours(), DummyVecEnv([lambda one=one: Monitor(one()) for one in made])
-    for each in both:
-        each.seed(3)
-    return both
-
-
-def test_a_group_draws_the_same_and_no_other_does(rng):
-    plants = make_vec_env(HARD, 6, seed=3, group=3)
-    apart = make_vec_env(HARD, 2, seed=3)
-    for _ in range(2):  # of the seed, and of what follows it
-        seen = plants.reset()
-        np.testing.assert_array_equal(seen, np.repeat(apart.reset(), 3, axis=0))
-        assert not np.array_equal(seen[0], seen[3])
-        seen = plants.step(rng.normal(0, 1, (6, 1)))[0]
-        assert len(np.unique(plants.infos["noise"])) == 2
-
-
-@pytest.mark.parametrize("kind", ["wrapped", "two", "terminate"])
-def test_trajectories_equal_those_of_dummy_vec_env(kind, rng):
-    ours, theirs = make_both(kind)
-    assert ours.num_envs == theirs.num_envs
-    assert ours.observation_space == theirs.observation_space
-    assert ours.action_space == theirs.action_space
-    truncated = []
-    for _ in range(2):
-        np.testing.assert_array_equal(ours.reset(), theirs.reset())
-        for _ in range(70):
-            actions = rng.normal(0, 1, (N, 1)).astype(np.float32)
-            if ours.action_space.shape == ():
-                actions = (actions[:, 0] > 0).astype(int)
-            *arrays, infos = ours.step(actions)
-            *expected, expected_infos = theirs.step(actions)
-            for array, other in zip(arrays, expected, strict=True):
-                np.testing.assert_array_equal(array, other)
-                assert array.dtype == other.dtype
-            for info, other, done in zip(infos, expected_infos, arrays[2], strict=True):
-                assert bool(info) == done
-                if done:
-                    own, its = info.pop("episode"), other.pop("episode")
-                    assert own["r"] == pytest.approx(its["r"], abs=2e-6)
-                    assert own["l"] == its["l"]
-                    truncated.append(info["TimeLimit.truncated"])
-                    assert data_equivalence(info, other, exact=True)
-            assert ours.reset_infos == theirs.reset_infos
-    assert set(truncated) == ({True, False} if kind == "terminate" else {True})
-
-
-def test_what_is_shown_is_of_the_batches_and_what_they_cannot_do_is_refused():
-    pictured = make_vec_env("MiddlePoint-v0", 2, render_mode="rgb_array")
-    pictured.reset()
-    np.testing.assert_array_equal(pictured.get_images(), pictured.batches[0].render())
-    ours = two_batches()
-    ours.reset()
-    ours.step(np.ones((N, 1), np.float32))
-    assert list(ours.infos["command"]) == [10.0] * N
-    assert list(ours.infos["noise"] != 0.0) == [True, True, True, False]
-    assert [p.noise_variance for p in ours.get_attr("parameters", [0, 3])] == [0.5, 0.0]
-    assert ours.env_is_wrapped(Monitor) == [False] * N
-    for refuse in (ours.set_attr, ours.env_method):
-        with pytest.raises(NotImplementedError, match=r"use `batches`, .*parameters"):
-            refuse("parameters", None)
-    with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
-        GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", N))
+def one(**arguments):
+    return gymnasium.make("MiddlePoint-v0", **arguments)
 
 
 def model_of(plants, **arguments):
@@ -134,49 +44,105 @@ def model_of(plants, **arguments):
     return PPO("MlpPolicy", plants, **small, **arguments)
 
 
-class TestMakeVecEnv:
-    def test_the_spec_makes_the_same_environment(self):
-        by_class = partial(IncrementalAction, **VELOCITY)
-        for wrapper in (VELOCITY, by_class, lambda env: by_class(env)):
-            spec = make_vec_env("MiddlePoint-v0", 2, wrapper=wrapper, **TRAINING).spec
-            env = gymnasium.make(EnvSpec.from_json(spec.to_json()))
-            assert isinstance(env, IncrementalAction)
-            assert spec.additional_wrappers[0].kwargs == VELOCITY
-            assert env.unwrapped.parameters.action_window == 20
+class TestBatches:
+    @pytest.mark.parametrize("kind", ["wrapped", "two"])
+    def test_they_equal_dummy_vec_env(self, kind, rng):
+        if kind == "two":
+            batch = two_batches()
+            made = [partial(one, **given) for n, given in TWO for _ in range(n)]
+        else:
+            given = {**TRAINING, "max_episode_steps": 7}
+            batch = make_vec_env(HARD, 4, wrapper=VELOCITY, **given)
+            made = [lambda: IncrementalAction(gymnasium.make(HARD, **given), **VELOCITY)] * 4
+        theirs = DummyVecEnv([lambda make=make: Monitor(make()) for make in made])
+        for each in (batch, theirs):
+            each.seed(3)
+        for name in ("num_envs", "observation_space", "action_space"):
+            assert getattr(batch, name) == getattr(theirs, name)
+        ends = 0
+        for _ in range(2):
+            np.testing.assert_array_equal(batch.reset(), theirs.reset())
+            for _ in range(70):
+                actions = rng.normal(0, 1, (4, 1)).astype(np.float32)
+                *arrays, infos = batch.step(actions)
+                *expected, expected_infos = theirs.step(actions)
+                for array, other in zip(arrays, expected, strict=True):
+                    np.testing.assert_array_equal(array, other)
+                    assert array.dtype == other.dtype
+                for info, other, done in zip(infos, expected_infos, arrays[2], strict=True):
+                    assert bool(info) == done
+                    if done:
+                        own, its = info.pop("episode"), other.pop("episode")
+                        assert own == {"r": pytest.approx(its["r"], abs=2e-6), "l": its["l"]}
+                        assert data_equivalence(info, other, exact=True)
+                        ends += 1
+                assert batch.reset_infos == theirs.reset_infos
+        assert ends >= 16
+
+    def test_a_group_draws_the_same_and_no_other_does(self, rng):
+        plants = make_vec_env(HARD, 6, seed=3, group=3)
+        apart = make_vec_env(HARD, 2, seed=3)
+        for _ in range(2):  # of the seed, and of what follows it
+            seen = plants.reset()
+            np.testing.assert_array_equal(seen, np.repeat(apart.reset(), 3, axis=0))
+            assert not np.array_equal(seen[0], seen[3])
+            plants.step(rng.normal(0, 1, (6, 1)))
+            assert len(np.unique(plants.infos["noise"])) == 2
+
+    def test_what_they_show_and_what_they_refuse(self):
+        pictured = make_vec_env("MiddlePoint-v0", 2, render_mode="rgb_array")
+        pictured.reset()
+        np.testing.assert_array_equal(pictured.get_images(), pictured.batches[0].render())
+        batch = two_batches()
+        batch.reset()
+        batch.step(np.ones((4, 1), np.float32))
+        assert list(batch.infos["command"]) == [10.0] * 4
+        assert list(batch.infos["noise"] != 0.0) == [True, True, True, False]
+        assert [p.noise_variance for p in batch.get_attr("parameters", [0, 3])] == [0.5, 0.0]
+        assert batch.env_is_wrapped(Monitor) == [False] * 4
+        for refuse in (batch.set_attr, batch.env_method):
+            with pytest.raises(NotImplementedError, match=r"use `batches`, .*parameters"):
+                refuse("parameters", None)
+        with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
+            two_batches("NextStep")
+
+    @pytest.mark.parametrize("wrapper", [VELOCITY, partial(IncrementalAction, **VELOCITY)])
+    def test_the_spec_makes_the_same_environment(self, wrapper):
+        spec = make_vec_env("MiddlePoint-v0", 2, wrapper=wrapper, **TRAINING).spec
+        env = gymnasium.make(EnvSpec.from_json(spec.to_json()))
+        assert isinstance(env, IncrementalAction)
+        assert spec.additional_wrappers[0].kwargs == VELOCITY
+        assert env.unwrapped.parameters.action_window == 20
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
             ({"n_envs": 0}, "n_envs must be an integer from 1"),
+            ({"group": 2}, "group must be an integer from 1"),
             ({"wrapper": partial(DelayObservation, delay=2)}, "wrapper must be the argum"),
             ({"wrapper": {"max_move": 7}}, "max_move must be"),
             ({"env": "Point-v0"}, "env must be the id of an environment"),
-            ({"delay": -2}, "delay must be"),
         ],
     )
-    def test_what_is_refused(self, arguments, message):
+    def test_bad_arguments_are_named(self, arguments, message):
         with pytest.raises(ValueError, match=message):
             make_vec_env(**arguments)
 
 
-class TestSave:
+class TestZips:
     def test_a_model_comes_back_with_environments_like_its_own(self, tmp_path):
         plants = make_vec_env(HARD, 3, wrapper=VELOCITY, action_window=4, max_episode_steps=9)
         model = model_of(plants)
         save(model, tmp_path / "model")
         assert [each.name for each in tmp_path.iterdir()] == ["model.zip"]
         loaded = load(tmp_path / "model", device="cpu")
-        assert type(loaded) is PPO
         assert loaded.get_env().num_envs == 3
-        assert spec_of(loaded, HARD) == spec_of(model, HARD)
         assert loaded.get_env().get_attr("spec")[0].max_episode_steps == 9
+        assert spec_of(loaded, HARD) == spec_of(model, HARD)
         # It is a zip of Stable-Baselines3 all the same.
-        bare = PPO.load(tmp_path / "model.zip", device="cpu")
-        seen = np.ones((1, 10), np.float32)
-        for each in (loaded, bare):
-            assert each.predict(seen, deterministic=True)[0] == pytest.approx(
-                model.predict(seen, deterministic=True)[0]
-            )
+        bare, seen = PPO.load(tmp_path / "model.zip", device="cpu"), np.ones((1, 10), "f4")
+        actions = [m.predict(seen, deterministic=True)[0] for m in (loaded, bare, model)]
+        assert actions[0] == actions[1] == actions[2]
         loaded.learn(64)
 
     def test_long_names_threads_and_steps_in_a_name(self, tmp_path):
@@ -200,14 +166,8 @@ class TestSave:
             (lambda: VecFrameStack(make_vec_env(), 2), "in VecFrameStack to be saved here"),
             (MiddlePointEnv, "must come from gymnasium.make or make_vec_env, .* got None"),
             (two_batches, "must come from gymnasium.make or make_vec_env"),
-            (
-                lambda: TransformObservation(law_env(), abs, None),
-                "that can be imported and rec",
-            ),
-            (
-                lambda: type("Local", (DelayObservation,), {})(law_env(), 2),
-                "that can be imported",
-            ),
+            (lambda: TransformObservation(one(), abs, None), "can be imported and rec"),
+            (lambda: type("Local", (DelayObservation,), {})(one(), 2), "can be imported"),
         ],
     )
     def test_what_cannot_be_saved_is_said_also_before_training(self, make, message, tmp_path):
@@ -215,7 +175,7 @@ class TestSave:
         with pytest.raises(ValueError, match=message):
             save(model, tmp_path / "model.zip")
         with pytest.raises(ValueError, match=message):
-            model.learn(64, ScoreCallback(law_env, path=tmp_path / "best.zip"))
+            model.learn(64, ScoreCallback(one, path=tmp_path / "best.zip"))
         assert model.num_timesteps == 0
         assert not [*tmp_path.iterdir()]
 
@@ -223,18 +183,17 @@ class TestSave:
         model, file = model_of(make_vec_env(wrapper=VELOCITY)), tmp_path / "model.zip"
         save(model, file)
         with zipfile.ZipFile(file) as archive:
-            record = archive.read(MEMBER).decode()
+            record = archive.read(ours.MEMBER).decode()
         for edited, message in (
             ("[" * 100_000, "RecursionError"),
             ("{}", "KeyError"),
             (record.replace("PPO", "PPOO"), "AttributeError"),
-            (record.replace("wrappers:Incr", "wrappers:In"), "must be a zip of mptc_gym"),
             (None, "must be a zip of mptc_gym.sb3.save; others are loaded by"),
         ):
             model.save(file)
             if edited:
                 with zipfile.ZipFile(file, "a") as archive:
-                    archive.writestr(MEMBER, edited)
+                    archive.writestr(ours.MEMBER, edited)
             with pytest.raises(ValueError, match=message):
                 load(file)
         file.write_bytes(file.read_bytes()[:500])
@@ -243,33 +202,26 @@ class TestSave:
                 load(path)
 
 
-def law_env():
-    return gymnasium.make("MiddlePoint-v0")
-
-
-class TestSpecOf:
-    def test_windows_and_wrappers_are_those_of_the_model(self):
-        model = model_of(make_vec_env("MiddlePoint-v0", 2, wrapper=VELOCITY, **TRAINING))
-        other = DelayObservation(gymnasium.make(HARD, output_window=2), 3).spec
-        for env in (HARD, other):
-            env = gymnasium.make(spec_of(model, env, delay=3))
-            assert isinstance(env, IncrementalAction)
-            parameters = env.unwrapped.parameters
-            assert (parameters.action_window, parameters.output_window) == (20, 0)
-            assert (parameters.delay, parameters.setpoint) == (3, "random")
-        other = spec_of(model, HARD, action_window=3)
-        with pytest.raises(ValueError, match="observation space of policy's training"):
-            evaluate(model, other)
-        with pytest.raises(ValueError, match="must be a model with its env"):
-            spec_of(model.policy)
+def test_spec_of_a_model_has_its_windows_and_wrappers():
+    model = model_of(make_vec_env("MiddlePoint-v0", 2, wrapper=VELOCITY, **TRAINING))
+    other = DelayObservation(gymnasium.make(HARD, output_window=2), 3).spec
+    for env in (HARD, other):
+        env = gymnasium.make(spec_of(model, env, delay=3))
+        assert isinstance(env, IncrementalAction)
+        parameters = env.unwrapped.parameters
+        assert (parameters.action_window, parameters.output_window) == (20, 0)
+        assert (parameters.delay, parameters.setpoint) == (3, "random")
+    with pytest.raises(ValueError, match="observation space of policy's training"):
+        evaluate(model, spec_of(model, HARD, action_window=3))
+    with pytest.raises(ValueError, match="must be a model with its env"):
+        spec_of(model.policy)
 
 
 class TestScoreCallback:
     def test_it_scores_keeps_the_best_and_tells(self, tmp_path, capsys):
         plants = make_vec_env("MiddlePoint-v0", 2, seed=0, wrapper=VELOCITY, **TRAINING)
-        callback = ScoreCallback(
-            "MiddlePointNoisy-v0", every=128, episodes=3, path=tmp_path / "best.zip"
-        )
+        noisy, best = "MiddlePointNoisy-v0", tmp_path / "best.zip"
+        callback = ScoreCallback(noisy, every=128, episodes=3, path=best)
         model = model_of(plants, seed=2, learning_rate=0.01)  # gets worse
         model.set_logger(configure(str(tmp_path / "log"), ["csv"]))
         model.learn(192, callback=callback)
@@ -277,12 +229,11 @@ class TestScoreCallback:
         assert [samples for samples, _ in callback.scores] == [128, 192]
         errors = [found.mean_error for _, found in callback.scores]
         assert callback.best.mean_error == min(errors)
-        kept = load(tmp_path / "best.zip", device="cpu")
-        spec = spec_of(kept, "MiddlePointNoisy-v0")
-        found = evaluate(kept, spec, episodes=3, seed=SEED + 100)
+        kept = load(best, device="cpu")
+        found = evaluate(kept, spec_of(kept, noisy), episodes=3, seed=SEED + 100)
         assert found.mean_error == min(errors)
         shown = capsys.readouterr().out.splitlines()
-        assert shown[0].startswith("128 of 192 samples: MiddlePointNoisy-v0: mean error ")
+        assert shown[0].startswith(f"128 of 192 samples: {noisy}: mean error ")
         least = np.minimum.accumulate([np.inf, *errors])[:-1]
         assert [line.endswith("; best") for line in shown] == list(errors < least)
         logged = (tmp_path / "log" / "progress.csv").read_text()
@@ -317,7 +268,7 @@ class TestScoreCallback:
             (model.get_env().venv, "must not be the environments of the training"),
             (make_vec_env(), "must be wrapped as in training"),
             ("MiddlePoint-v0", "wrappers of policy's training, {'VecNormalize'}"),
-            (law_env, "wrappers of policy's training, {'VecNormalize'}"),
+            (one, "wrappers of policy's training, {'VecNormalize'}"),
         ):
             with pytest.raises(ValueError, match=message):
                 model.learn(64, ScoreCallback(env, every=1))
