@@ -76,9 +76,7 @@ class PlantNumbers(Generic[Value]):
     gain_drift: Value = _arg(
         1.0, checks.positive, "1", "factor by which the gain changes in `drift_samples`"
     )
-    time_constant_drift: Value = _arg(
-        1.0, checks.positive, "1", "the same of the time constant"
-    )
+    time_constant_drift: Value = _arg(1.0, checks.positive, "1", "that of the time constant")
 
     def chosen(self, names: Sequence[str]) -> dict[str, Value]:
         """Return some of the numbers by name."""
@@ -253,23 +251,24 @@ class Parameters(PlantNumbers[Number]):
         names = "disturbance_amplitude", "disturbance_walk_variance"
         return any(self.range_of(name)[1] > 0.0 for name in names)
 
+    def _scales(self, *names: str) -> bool:
+        """Whether factors differ, or may come to differ, from 1."""
+        return any(self.range_of(name) != (1.0, 1.0) for name in names)
+
     @property
     def drifts(self) -> bool:
         """Whether the dynamics change within an episode."""
-        names = "gain_drift", "time_constant_drift"
-        return any(self.range_of(name) != (1.0, 1.0) for name in names)
+        return self._scales("gain_drift", "time_constant_drift")
 
     @property
     def changes_time_constant(self) -> bool:
         """Whether the time constant differs, or may come to differ, from that of A."""
-        names = "time_constant_factor", "time_constant_drift"
-        return any(self.range_of(name) != (1.0, 1.0) for name in names)
+        return self._scales("time_constant_factor", "time_constant_drift")
 
     @property
     def changes_dynamics(self) -> bool:
         """Whether the coefficients of (28) differ, or may come to differ, from A and B."""
-        gain_changes = self.range_of("gain_factor") != (1.0, 1.0)
-        return self.drifts or self.changes_time_constant or gain_changes
+        return self.drifts or self._scales("gain_factor", "time_constant_factor")
 
     @property
     def windows(self) -> tuple[int, int, int, int]:

@@ -37,20 +37,8 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
         "setpoint": "random",
     },
 }
-"""The environment's arguments in each preset. Each preset has its own id, see `IDS`.
-
-| Name | Id | Description |
-|---|---|---|
-| `paper` | `MiddlePoint-v0` | the paper's first case: dead zone 5 t/h, no noise; the default |
-| `dead-zone-7` | `MiddlePointDeadZone7-v0` | its second case: dead zone 7 t/h |
-| `noisy` | `MiddlePointNoisy-v0` | its third case: R = 0.5 degC^2 |
-| `disturbed` | `MiddlePointDisturbed-v0` | a noisy boiler and transmitter; the load changes |
-| `fouling` | `MiddlePointFouling-v0` | as `disturbed`, and gain and time constant drift |
-| `randomised` | `MiddlePointRandomised-v0` | a plant drawn at each reset |
-| `hard` | `MiddlePointHard-v0` | everything on, and random set points |
-
-`time_constant_drift` above 1 makes the plant slower, and `gain_drift` below 1 weaker.
-"""
+"""The environment's arguments in each preset: "paper" is the paper's first case, "dead-zone-7"
+its second, "noisy" its third; the others are described in the package's README."""
 
 IDS: Final[dict[str, str]] = {
     name: f"MiddlePoint{name.title().replace('-', '')}-v0" for name in PRESETS
