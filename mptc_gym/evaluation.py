@@ -180,29 +180,14 @@ valve travel 0 t/h; 100 episodes, all alike
         acting.check_fit(policy, plants)
         expected = None if native else one.parameters
         errors, travels, samples = _run(policy, plants, seeds, most, expected)
-    found = Evaluation(
+    return Evaluation(
         env=one.spec.id if one.spec else type(one).__name__,
         mean_error=float(errors.mean()),
         travel=float(travels.mean()),
         errors=errors,
         travels=travels,
         seeds=seeds,
-    )
-    least = least_errors(case, samples, seeds)
-    if least is None:
-        return found
-    rest = action_from_command(0.0, case.u_min, case.u_max)
-    idle_plants = MiddlePointVectorEnv(episodes, **asdict(case))
-    idle, *_ = _run(lambda seen: np.full((len(seen), 1), rest), idle_plants, seeds, samples)
-    gained, possible = idle - errors, idle - least
-    return replace(
-        found,
-        least_possible=float(least.mean()),
-        multiple=float(errors.mean() / least.mean()),
-        score=float(gained.mean() / possible.mean()),
-        interval=_interval(gained, possible),
-        least=least,
-        scores=gained / possible,
+        **_judged(errors, case, samples, seeds),
     )
 
 
@@ -290,10 +275,26 @@ def case_of(parameters: Parameters) -> Parameters:
     return replace(parameters, **{name: ARGUMENTS[name].default for name in _NO_MATTER})
 
 
-def _interval(gained: Values, possible: Values) -> tuple[float, float]:
-    """Return the 95 % bootstrap interval of a quotient of means over episodes."""
-    generator, n = np.random.default_rng(0), len(gained)
+def _judged(
+    errors: Values, parameters: Parameters, samples: int, seeds: range
+) -> dict[str, Any]:
+    """Return what an `Evaluation` says of errors beside the bound, if there is one."""
+    least = least_errors(parameters, samples, seeds)
+    if least is None:
+        return {}
+    rest, n = action_from_command(0.0, parameters.u_min, parameters.u_max), len(seeds)
+    plants = MiddlePointVectorEnv(n, **asdict(parameters))
+    idle, *_ = _run(lambda _: np.full((n, 1), rest), plants, seeds, samples)
+    gained, possible = idle - errors, idle - least
+    generator = np.random.default_rng(0)
     drawn = (generator.integers(n, size=n) for _ in range(_RESAMPLES))
     quotients = [gained[which].mean() / possible[which].mean() for which in drawn]
-    low, high = np.quantile(quotients, (0.025, 0.975))
-    return float(low), float(high)
+    low, high = np.quantile(quotients, (0.025, 0.975)).tolist()
+    return {
+        "least_possible": float(least.mean()),
+        "multiple": float(errors.mean() / least.mean()),
+        "score": float(gained.mean() / possible.mean()),
+        "interval": (low, high),
+        "least": least,
+        "scores": gained / possible,
+    }

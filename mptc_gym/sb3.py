@@ -260,29 +260,24 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     `VecNormalize.save`. ValueError if the environments cannot be made from their spec, or the
     file cannot be written.
     """
-    record, path = _record(model), _zip_path(path)
-    try:
-        # A folder of its own: whatever the name, nobody else writes there.
-        with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
-            partial_zip = Path(folder, "model.zip")
-            model.save(partial_zip)
-            with zipfile.ZipFile(partial_zip, "a") as archive:
-                archive.writestr(MEMBER, record)
-            partial_zip.replace(path)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be written: {error.strerror}") from error
-
-
-def _record(model: BaseAlgorithm) -> str:
-    """Return what `save` adds to a model's zip."""
-    spec = _spec(model)
+    path, spec = _zip_path(path), _spec(model)
     if isinstance(outermost := model.get_env(), VecEnvWrapper):
         raise ValueError(
             f"policy must not be in {type(outermost).__name__} to be saved here: save it by "
             "model.save(path), and the statistics by model.get_vec_normalize_env().save(path)"
         )
     algorithm = f"{type(model).__module__}:{type(model).__name__}"
-    return json.dumps({"algorithm": algorithm, "spec": spec.to_json()})
+    try:
+        # A folder of its own: whatever the name, nobody else writes there.
+        with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
+            partial_zip = Path(folder, "model.zip")
+            model.save(partial_zip)
+            with zipfile.ZipFile(partial_zip, "a") as archive:
+                record = {"algorithm": algorithm, "spec": spec.to_json()}
+                archive.writestr(MEMBER, json.dumps(record))
+            partial_zip.replace(path)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
@@ -318,10 +313,9 @@ def _zip_path(path: str | Path) -> Path:
 class ScoreCallback(BaseCallback):
     """Score the policy during training, without exploration, and keep the best.
 
-    The default episodes of `mptc_gym.evaluate` are not used, so they stay free for the final
-    score. Where nothing is drawn, as in `MiddlePoint-v0`, all episodes are the same: select by
-    another set point, such as `setpoint_period=500`. The log gets `score/mean_error` and, where
-    there is a bound, `score/score`.
+    The default episodes of `mptc_gym.evaluate` stay free for the final score. Where nothing is
+    drawn, as in `MiddlePoint-v0`, all episodes are the same: select by another set point, such
+    as `setpoint_period=500`. The log gets `score/mean_error` and, with a bound, `score/score`.
 
     Parameters
     ----------
@@ -375,8 +369,9 @@ class ScoreCallback(BaseCallback):
         # Not kept in place of the id: the next model may have other windows.
         self._score_in: Any = partial(evaluate, env=env, **arguments)
         self._hand_over()
-        if self.path is not None:
-            _record(self.model)  # now, rather than when it is to be saved
+        with tempfile.TemporaryDirectory() as folder:
+            if self.path is not None:  # what cannot be saved is said now
+                save(self.model, Path(folder, "model"))
 
     def _hand_over(self) -> None:
         """Give the statistics of the training to the environments of the scores."""
