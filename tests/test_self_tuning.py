@@ -92,18 +92,6 @@ def test_it_finds_the_dead_zone_that_it_was_not_told(monkeypatch):
     assert ours < theirs
 
 
-def test_it_reckons_with_the_dead_zone_that_it_is_told():
-    controller = tuning(dead_zone=7.3)
-    control(controller, dead_zone=7.3, noise_variance=0.05)
-    assert controller.estimates["dead_zone"] == [7.3]
-    assert SelfTuningController(**SHOWN).dead_zone == 0.0  # none is assumed
-    plant = {"dead_zone": 0.0, "noise_variance": 0.1, "setpoint": 1.0}
-    unaware, aware = (
-        control(make(**SHOWN), **plant) for make in (SelfTuningController, tuning)
-    )
-    assert travel(unaware)[0] < 0.5 * travel(aware)[0]
-
-
 @pytest.mark.parametrize(
     ("shown", "dead_zone", "setpoint"),
     [(7.0, 7.0, 5.2), (5.0, 5.8, 4.4), (5.0, 6.0, 4.4), (5.0, 7.5, 5.2)],
