@@ -80,16 +80,14 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         max_move: float = 0.4,
         compensate_dead_zone: bool | float = False,
     ) -> None:
-        if isinstance(env, VectorEnv):
-            allowed = "one environment; mptc_gym.wrappers.vector.IncrementalAction takes many"
+        parameters = getattr(env.unwrapped, "parameters", None)
+        if isinstance(env, VectorEnv) or not isinstance(parameters, Parameters):
+            allowed = "a MiddlePointEnv, wrapped or not; mptc_gym.wrappers.vector takes many"
             reject("env", env, allowed)
         RecordConstructorArgs.__init__(
             self, max_move=max_move, compensate_dead_zone=compensate_dead_zone
         )
         gymnasium.ActionWrapper.__init__(self, env)
-        parameters = getattr(env.unwrapped, "parameters", None)
-        if not isinstance(parameters, Parameters):
-            reject("env", env, "a MiddlePointEnv, in wrappers or not")
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self._arguments = max_move, compensate_dead_zone
         self._numbers = {name: parameters.range_of(name)[0] for name in NUMBERS}

@@ -39,14 +39,11 @@ class IncrementalAction(VectorActionWrapper):
         max_move: float = 0.4,
         compensate_dead_zone: bool | float = False,
     ) -> None:
-        if not isinstance(env, VectorEnv):
-            allowed = "a vector environment; mptc_gym.wrappers.IncrementalAction takes one"
-            reject("env", env, allowed)
+        plants = _parameters(env)
         super().__init__(env)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._arguments = max_move, compensate_dead_zone
-        plants = _parameters(env)
         self._numbers = {
             name: np.array([plant.range_of(name)[0] for plant in plants]) for name in NUMBERS
         }
@@ -98,5 +95,6 @@ def _parameters(env: VectorEnv[Any, Any, Any]) -> list[Parameters]:
     with suppress(AttributeError):  # from environments that are not plants
         plants = list(inner.get_attr("parameters"))
     if not plants or not all(isinstance(plant, Parameters) for plant in plants):
-        reject("env", env, "a vector environment of MiddlePointEnv in NumPy")
+        allowed = "a vector environment of MiddlePointEnv in NumPy; mptc_gym.wrappers takes one"
+        reject("env", env, allowed)
     return plants
