@@ -8,7 +8,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property, partial
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, Generic, TypeVar
 
@@ -174,7 +174,7 @@ class Parameters(PlantNumbers[Number]):
         self._check_actuator()
         if self.changes_time_constant:
             self._check_time_constant()
-        if self.is_disturbed and not self.is_stable:
+        if self.is_disturbed and not np.all(np.abs(np.roots(self.a)) < 1.0):
             reject(
                 "disturbance_amplitude, disturbance_walk_variance",
                 (self.disturbance_amplitude, self.disturbance_walk_variance),
@@ -239,11 +239,6 @@ class Parameters(PlantNumbers[Number]):
     def ranges(self) -> tuple[str, ...]:
         """Names of the plant numbers that are drawn at each reset."""
         return tuple(name for name in PLANT_NUMBERS if isinstance(getattr(self, name), tuple))
-
-    @cached_property
-    def is_stable(self) -> bool:
-        """Whether all poles of 1 / A lie within the unit circle."""
-        return bool(np.all(np.abs(np.roots(self.a)) < 1.0))
 
     @property
     def is_disturbed(self) -> bool:
