@@ -19,7 +19,7 @@ from mptc_gym.checks import one_action, one_of, plain
 from mptc_gym.parameters import Parameters, insert_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.record import Record
-from mptc_gym.signals import ONE, Ranges, Signals, Streams, numbers_of_plant
+from mptc_gym.signals import ONE, Ranges, Signals, Streams, plant_numbers
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys, see `reset`
 _FLOAT32 = np.dtype(np.float32)  # faster to pass than the type
@@ -255,7 +255,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         parameters = self.parameters
         drawn = self._ranges.draw([self._streams])
         setpoint = self._signals.reset(ONE, [self._streams], drawn).item()
-        numbers = numbers_of_plant(drawn, 0)
+        numbers = plant_numbers(drawn, 0)
         self._plant = Plant(parameters, numbers)
 
         # At rest u is 0, whichever action that is.

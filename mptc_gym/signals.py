@@ -125,7 +125,7 @@ class Ranges:
         return replace(self.given, **drawn)
 
 
-def numbers_of_plant(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
+def plant_numbers(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
     """Return the numbers of plant i of many."""
     arrays = numbers.chosen(tuple(PLANT_NUMBERS))
     return PlantNumbers(

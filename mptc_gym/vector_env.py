@@ -19,15 +19,7 @@ from mptc_gym.env import NO_MODE, Frame, MiddlePointEnv
 from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.record import Record
-from mptc_gym.signals import (
-    BLOCK,
-    Indices,
-    Ranges,
-    Signals,
-    Streams,
-    Values,
-    numbers_of_plant,
-)
+from mptc_gym.signals import BLOCK, Indices, Ranges, Signals, Streams, Values, plant_numbers
 
 Observations = NDArray[np.float32]  # shape (num_envs, observation_size)
 
@@ -213,7 +205,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._shown.reset(which, setpoint, rest_action)
         if self.render_mode is not None:
             for j, i in enumerate(which.tolist()):
-                own, interval = numbers_of_plant(numbers, j), parameters.sampling_interval
+                own, interval = plant_numbers(numbers, j), parameters.sampling_interval
                 self._records[i] = Record(own, interval, float(setpoint[j]))
 
         first = {"setpoint": setpoint, "error": setpoint}

@@ -59,17 +59,6 @@ def test_flows_by_hand(arguments, wrapper, moves, flows):
     assert [info["applied"] for info in infos] == pytest.approx(flows, abs=5e-5)
 
 
-@pytest.mark.parametrize("dead_zone", [0.1, 5.0, 7.0, 10.0])
-def test_every_flow_passes_the_dead_zone_that_is_compensated(dead_zone):
-    env = make({"dead_zone": dead_zone}, max_move=2.0, compensate_dead_zone=True)
-    for wanted in (1e-12, 1e-3, 0.5, 1.0, -1e-12, -0.3, -1.0):
-        # 2 is the whole range, from -1 to 1, and so a move of w / 2 wants w.
-        env.reset(seed=0)
-        info = env.step(np.array([wanted / 2.0]))[4]
-        expected = np.sign(wanted) * (dead_zone + (10.0 - dead_zone) * abs(wanted))
-        assert info["applied"] == pytest.approx(expected, abs=5e-5)
-
-
 def test_drawn_numbers_are_those_of_the_episode():
     env = make(RANGES, max_move=2.0, compensate_dead_zone=True)
     drawn = set()

@@ -18,7 +18,7 @@ from benchmarks.loop.linear import (
 )
 from benchmarks.loop.scenarios import PlantOptions
 from mptc_gym import MiddlePointEnv, Parameters
-from mptc_gym.signals import Ranges, numbers_of_plant
+from mptc_gym.signals import Ranges, plant_numbers
 from tests.conftest import run
 
 OTHER = {"delay": 7, "gain_factor": 1.3, "time_constant_factor": 2.0, "dead_zone": 0.0}
@@ -47,7 +47,7 @@ def test_a_course_is_the_environment_while_it_drifts(rng):
     flow, output = outputs(rng, **arguments)
     parameters = Parameters(**arguments)
     of_plant = time_varying_model(
-        parameters, numbers_of_plant(Ranges(parameters).given, 0), len(flow)
+        parameters, plant_numbers(Ranges(parameters).given, 0), len(flow)
     )
     np.testing.assert_allclose(of_plant.flow_response() @ flow, output, rtol=0, atol=1e-12)
     assert np.abs(nominal(parameters).response(flow) - output).max() > 0.1

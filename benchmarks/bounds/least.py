@@ -35,7 +35,7 @@ from benchmarks.loop.rollout import (
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
 from mptc_gym.parameters import PlantNumbers
-from mptc_gym.signals import numbers_of_plant
+from mptc_gym.signals import plant_numbers
 
 Array = NDArray[np.float64]
 
@@ -149,7 +149,7 @@ def _least_possible(
     drawn = parameters.ranges or parameters.setpoint == "random"
     # Rounded to be the same on every machine, as solvers differ in later digits.
     values = tuple(
-        round(_least(parameters, kind, numbers_of_plant(numbers, i), setpoint) / samples, 6)
+        round(_least(parameters, kind, plant_numbers(numbers, i), setpoint) / samples, 6)
         for i, setpoint in enumerate(trajectory.setpoint.T[: episodes if drawn else 1])
     )
     idle = student(np.abs(trajectory.setpoint - trajectory.output)[1:].mean(axis=0))
