@@ -274,7 +274,7 @@ def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
 
     centre = [sum(nominal.range_of(name)) / 2.0 for name in ("delay", "gain_factor")]
     scale, names = LogNorm(0.01, 3.0), list(runs["agent"].unique())
-    with panels(path, [*map(label, names)], 2.3, 3, PICTURE) as (figure, axes, free):
+    with panels(path, [*map(label, names)], 2.3, 3, PICTURE) as (figure, axes):
         for panel, name in zip(axes, names, strict=True):
             plants = runs[runs["agent"] == name].groupby("plant")
             delay, gain = plants["delay"].first(), plants["gain_factor"].first()
@@ -294,7 +294,7 @@ def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
         bar = figure.colorbar(image, ax=axes, label=MULTIPLE, **place)
         scale_by_excess(bar.ax, "x", 0.013, 3.0 / 1.3)
         handles, texts = panel.get_legend_handles_labels()
-        draw_legend(figure, free, dict(zip(texts, handles, strict=True)))
+        draw_legend(figure, dict(zip(texts, handles, strict=True)))
 
 
 main = command("sweep", Options, work)

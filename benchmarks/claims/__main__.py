@@ -143,7 +143,6 @@ def plot_figures(curves: pd.DataFrame, path: Path) -> None:
     with panels(path, [each[0] for each in signals], 1.7, 2, *PICTURE.values()) as (
         sheet,
         found,
-        free,
     ):
         entries: dict[str, Any] = {}
         for axes, (_, signal, case) in zip(found, signals, strict=True):
@@ -153,7 +152,7 @@ def plot_figures(curves: pd.DataFrame, path: Path) -> None:
             entries = dict(zip(names, handles, strict=True)) | entries
         for axes in found[-2:]:  # the lowest of each column
             axes.set_xlabel("time (min)")
-        draw_legend(sheet, free, entries)
+        draw_legend(sheet, entries)
 
 
 def _draw_signal(axes: Axes, signal: str, curves: pd.DataFrame, plant: Parameters) -> None:

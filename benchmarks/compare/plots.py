@@ -107,7 +107,7 @@ def plot_bounds(
     """Draw mean errors as multiples of the least possible, with intervals and worst runs."""
     style, cases = looks(agents), dict(groups(estimates, "scenario"))
     height, title = 0.8 + 0.17 * len(agents), "Mean errors, the best score first"
-    with panels(path, [*cases], height, 2, title) as (figure, found, free):
+    with panels(path, [*cases], height, 2, title) as (figure, found):
         for i, (axes, (case, rows)) in enumerate(zip(found, cases.items(), strict=True)):
             farthest = NEAREST
             for row in rows.to_dict("records"):
@@ -131,7 +131,7 @@ def plot_bounds(
             "95 % interval of the mean": Line2D([], [], linewidth=3, **GREY),
             "to the worst run": Line2D([], [], linewidth=1, alpha=0.4, **GREY),
         }
-        draw_legend(figure, free, entries)
+        draw_legend(figure, entries)
 
 
 def plot_travel(
@@ -148,7 +148,7 @@ def plot_travel(
     if medians.empty:
         return
     style, cases = looks(agents), dict(groups(medians, "scenario"))
-    with panels(path, [*cases], 2.4, 2, "Mean error and valve travel") as (figure, found, free):
+    with panels(path, [*cases], 2.4, 2, "Mean error and valve travel") as (figure, found):
         for axes, (case, rows) in zip(found, cases.items(), strict=True):
             travel = rows["total_variation"]
             excess = rows["mae"] / scales[case].least.value - 1.0
@@ -168,7 +168,7 @@ def plot_travel(
             label(agent): Line2D([], [], color=colour, marker=marker, linestyle="")
             for agent, (colour, marker) in style.items()
         }
-        draw_legend(figure, free, entries)
+        draw_legend(figure, entries)
 
 
 def plot_responses(

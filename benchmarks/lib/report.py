@@ -73,13 +73,18 @@ def write_report(folder: Path, title: str, sections: Sequence[Section], made: st
     write_text(folder / "report.md", page)
     body = markdown.markdown(page, extensions=["tables", "toc"])
     body = _INTERVAL.sub(r" <small>\1</small></td>", body)
-    body = _PICTURE.sub(lambda found: f'src="{_embedded(folder / found[1])}"', body)
+    body = _PICTURE.sub(lambda found: _embedded(folder / found[1]), body)
     head = (
         '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style>"
     )
     page = f'<!doctype html><html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
     write_text(folder / "report.html", page)
+
+
+def _embedded(picture: Path) -> str:
+    data = base64.b64encode(picture.read_bytes()).decode()
+    return f'src="data:image/png;base64,{data}"'
 
 
 def provenance_line(command: str, origin: Mapping[str, Any]) -> str:
@@ -106,40 +111,24 @@ def on_screen(table: pd.DataFrame) -> str:
     Nothing is cut: columns that find no room follow below, beside the first column again.
     """
     width = shutil.get_terminal_size((150, 24)).columns
-    cells = table.astype(str).set_index(table.columns[0])
-    cells.index.name = None
+    cells = table.astype(str).set_index(table.columns[0]).rename_axis(None)
     with pd.option_context("display.max_colwidth", None):
-        shown = cells.to_string(line_width=width + 2, max_rows=None)
-    return re.sub(r"[ \\]+$", "", shown, flags=re.MULTILINE)  # pandas marks what goes on below
+        return cells.to_string(line_width=width - 2, max_rows=None)
 
 
 def _markdown(folder: Path, title: str, sections: Sequence[Section], made: str) -> str:
-    parts = [f"# {_plain(title)}"]
+    parts = [f"# {title}"]
     for section in sections:
-        parts += [f"## {_plain(section.title)}"] * bool(section.title)
-        parts += map(_plain, section.text)
+        parts += [f"## {section.title}"] * bool(section.title)
+        parts += section.text
         if section.table is not None:
-            table = section.table.map(_cell).rename(columns=_cell)
-            parts.append(table.to_markdown(index=False, disable_numparse=True))
-        there = {
-            name: shown for name, shown in section.pictures.items() if (folder / name).exists()
-        }
-        parts += [f"![{_plain(shown)}]({name})" for name, shown in there.items()]
-    return "\n\n".join([*parts, _plain(made)]) + "\n"
-
-
-def _plain(text: str) -> str:
-    """Escape text that Markdown would read as HTML."""
-    return text.replace("&", "&amp;").replace("<", "&lt;")
-
-
-def _cell(text: str) -> str:
-    plain = _plain(text).replace("|", r"\|")
-    return f"**{plain}**" if isinstance(text, Best) else plain
-
-
-def _embedded(picture: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(picture.read_bytes()).decode()
+            cells = section.table.map(
+                lambda each: f"**{each}**" if type(each) is Best else each
+            )
+            parts.append(cells.to_markdown(index=False, disable_numparse=True))
+        there = [name for name in section.pictures if (folder / name).exists()]
+        parts += [f"![{section.pictures[name]}]({name})" for name in there]
+    return "\n\n".join([*parts, made]) + "\n"
 
 
 # Okabe and Ito's palette for colour-blind readers, for lines that stand for no controller.
@@ -167,12 +156,12 @@ STYLE: Any = {
 
 
 @contextmanager
-def drawn(path: Path, height: float, title: str = "", *, grid: bool = True) -> Iterator[Figure]:
+def drawn(path: Path, height: float, title: str = "") -> Iterator[Figure]:
     """Yield a figure of a height in inches, and save it, completely or not at all.
 
     The title says what the figure shows.
     """
-    with mpl.rc_context(STYLE | {"axes.grid": grid}):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, height))
         if title:
             lines = textwrap.fill(title[0].upper() + title[1:], 86)
@@ -183,43 +172,29 @@ def drawn(path: Path, height: float, title: str = "", *, grid: bool = True) -> I
         picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         with replacing(path) as partial:
             # Without dithering, areas stay even and the file small.
-            few = picture.quantize(SHADES, dither=Image.Dither.NONE)
+            few = picture.quantize(SHADES, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
             few.save(partial, optimize=True)
 
 
 @contextmanager
 def panels(
-    path: Path,
-    names: Sequence[str],
-    height: float,
-    columns: int,
-    title: str = "",
-    *,
-    grid: bool = True,
-) -> Iterator[tuple[Figure, list[Axes], list[Axes]]]:
-    """Yield a figure with a panel of a height in inches for each name, and save it.
-
-    Then come the panels, and places in the last row that are free for a legend.
-    """
+    path: Path, names: Sequence[str], height: float, columns: int, title: str = ""
+) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Yield a figure with a panel of a height in inches for each name, and save it."""
     columns = min(columns, len(names))
     rows = math.ceil(len(names) / columns)
-    with drawn(path, height * rows + 0.9, title, grid=grid) as figure:
+    with drawn(path, height * rows + 1.2, title) as figure:
         axes = list(figure.subplots(rows, columns, squeeze=False).flat)
         for panel, name in zip(axes, names, strict=False):
             panel.set_title(name)
         for panel in axes[len(names) :]:
             panel.set_axis_off()
-        yield figure, axes[: len(names)], axes[len(names) :]
+        yield figure, axes[: len(names)]
 
 
-def draw_legend(figure: Figure, free: Sequence[Axes], entries: dict[str, Any]) -> None:
-    """Put a legend of handles by label in a free place, or else below the panels."""
-    if free:
-        columns = 1 + (len(entries) > 7)
-        legend = free[0].legend(entries.values(), entries, loc="center left", ncols=columns)
-        legend.set_in_layout(len(free) < 2)  # with room beside it, it may be wider than a panel
-    elif entries:
-        figure.legend(entries.values(), entries, loc="outside lower center", ncols=4)
+def draw_legend(figure: Figure, entries: dict[str, Any]) -> None:
+    """Put a legend of handles by label below the panels."""
+    figure.legend(entries.values(), entries, loc="outside lower center", ncols=4)
 
 
 def scale_by_excess(axes: Axes, name: str, low: float, high: float) -> None:
