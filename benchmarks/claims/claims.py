@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
+from numpy.polynomial.polynomial import polyadd
 
 from agents import PIController
 from agents.pi import SEARCHED_GAINS
@@ -166,8 +167,16 @@ def pi_gains(batch: Batch, claim: Claim) -> None:
 
 
 def largest_pole(kp: float, ki: float) -> float:
-    """Return the largest pole modulus of the loop of a PI controller and the linear plant."""
-    return linear.largest_pole(PIController(kp, ki), linear.nominal(Parameters()))
+    """Return the modulus of the largest pole of the loop of a PI and the plant (28).
+
+    The actuator is left out. The loop is stable if this is below 1.
+    """
+    (up, down), (b, a) = (
+        PIController(kp, ki).transfer(),
+        linear.nominal(Parameters()).transfer(),
+    )
+    closed = polyadd(np.convolve(down, a), np.convolve(up, b))
+    return float(np.abs(np.roots(closed)).max())
 
 
 def versus_pi(gains: tuple[float, float], batch: Batch, claim: Claim) -> None:

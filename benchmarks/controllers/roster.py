@@ -66,8 +66,6 @@ class Controller:
     compared: bool = True
     swept: bool = True
     """Whether `compare` (`compared`) and `sweep` (`swept`) run it by default."""
-    told: bool = False
-    """Whether it is told the whole plant, as no controller of a real one is."""
     drawn: bool = False
     """Whether its responses are drawn in a comparison."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
@@ -255,7 +253,7 @@ _CONTROLLERS = (
     ),
     Controller(
         "mpc", "MPC", ("#000000", "*"), PredictiveController,
-        knows="everything but the future", searched="nothing", told=True, swept=False,
+        knows="everything but the future", searched="nothing", swept=False,
     ),
     Controller(
         "ppo", "PPO", ("#E69F00", "D"), with_policy, knows="dead zone", drawn=True,

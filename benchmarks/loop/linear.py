@@ -1,4 +1,4 @@
-"""Describe the plant as a linear system: its step response, step test and closed loop.
+"""Describe the plant as a linear system: its step test and time-varying course.
 
 Between the limits of the actuator (29) the plant is
 
@@ -15,10 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.polynomial.polynomial import polyadd
 from numpy.typing import ArrayLike, NDArray
 
-from agents import PIController
 from mptc_gym import Parameters
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
@@ -49,11 +47,6 @@ class LinearModel:
         a, b = sum(self.a), sum(self.b)
         return b / a if a else math.copysign(math.inf, b)
 
-    @property
-    def poles(self) -> NDArray[np.complex128]:
-        """Roots of A."""
-        return np.asarray(np.roots(self.a), np.complex128)
-
     def transfer(self) -> tuple[Array, Array]:
         """Return the numerator and denominator from u_a to y, in powers of z^-1."""
         return np.array([*[0.0] * (self.delay + 1), *self.b]), np.array(self.a)
@@ -68,24 +61,6 @@ class LinearModel:
             found.append(value)
             past = [value, *past[:-1]] if past else past
         return np.array(found)
-
-    def step_response(self, samples: int | None = None) -> Array:
-        """Return y(0), y(1), ... after a step of u_a from 0 to 1 t/h at k = 0, degC per t/h.
-
-        By default, it is as long as the response takes to settle. A ValueError is then raised
-        if it never settles, or settles at 0.
-        """
-        if samples is None:
-            slowest = float(np.max(np.abs(self.poles), initial=0.0))
-            if sum(self.b) == 0.0:
-                raise ValueError(f"b must have a sum other than 0 for a gain, got {self.b}")
-            # Until 1e-5 of a transient remains.
-            settling = math.log(1e-5) / math.log(slowest) if 0.0 < slowest < 1.0 else 0.0
-            if slowest >= 1.0 or settling > LONGEST:
-                raise ValueError(f"a must be of a stable plant for a step test, got {self.a}")
-            # Twice as long, since the transients of repeated poles last longer.
-            samples = self.delay + len(self.b) + 2 * math.ceil(settling) + 2
-        return self.response(np.ones(samples))
 
 
 @dataclass(frozen=True)
@@ -175,7 +150,15 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     delay includes the one sample that any input takes to show.
     """
     plant = nominal(parameters)
-    response, interval = plant.step_response(), plant.sampling_interval
+    slowest = float(np.abs(np.roots(plant.a)).max(initial=0.0))
+    # Until 1e-5 of a transient remains; and twice as long, as those of repeated poles are.
+    settling = math.log(1e-5) / math.log(slowest) if 0.0 < slowest < 1.0 else 0.0
+    if slowest >= 1.0 or settling > LONGEST:
+        raise ValueError(f"a must be of a stable plant for a step test, got {plant.a}")
+    if sum(plant.b) == 0.0:
+        raise ValueError(f"b must have a sum other than 0 for a gain, got {plant.b}")
+    samples = plant.delay + len(plant.b) + 2 * math.ceil(settling) + 2
+    response, interval = plant.response(np.ones(samples)), plant.sampling_interval
     early, late = (_first_reached(response / response[-1], level) for level in (0.283, 0.632))
     time_constant = 1.5 * (late - early)
     # In samples, u(k) shows at y(k + 1) at the earliest.
@@ -244,13 +227,3 @@ def time_varying_model(
         high=max(flows),
         numbers=numbers,
     )
-
-
-def largest_pole(controller: PIController, plant: LinearModel) -> float:
-    """Return the modulus of the closed loop's largest pole: it is stable if this is below 1.
-
-    The plant is (28) without the actuator; the controller is linear, as its `transfer` says.
-    """
-    (up, down), (b, a) = controller.transfer(), plant.transfer()
-    closed = polyadd(np.convolve(down, a), np.convolve(up, b))
-    return float(np.abs(np.roots(closed)).max())

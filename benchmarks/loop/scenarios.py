@@ -126,32 +126,26 @@ class PlantOptions:
             except (ValueError, RecursionError):
                 arguments[name] = value  # a bare word, such as random
         given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
-        try:
+        with blame(", ".join(given)):
             a = Parameters.of_environment(arguments).a
             if abs(slowest_pole(a) or 0.0) > 1.0:
                 raise ValueError(
                     "a must not have a root beyond the unit circle, as nothing holds such a "
                     f"plant, got {list(a)}"
                 )
-        except (TypeError, ValueError) as error:
-            raise UsageError(f"{', '.join(given)}: {error}") from error
         return arguments
 
 
 def _read(path: Path) -> dict[str, Any]:
     """Return the arguments in a JSON file such as `plant.json`."""
     try:
-        arguments = json.loads(path.read_text(encoding="utf-8"))
+        return dict(json.loads(path.read_text(encoding="utf-8")).items())
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:  # not JSON, not text, or too deep
-        raise ValueError(f"{path} must be a JSON file: {error}") from error
-    if not isinstance(arguments, dict):
+    except (AttributeError, ValueError, RecursionError) as error:  # not JSON, or no object
         raise ValueError(
-            f'{path} must hold one object of arguments, such as {{"delay": 20}}, got '
-            f"{type(arguments).__name__}"
-        )
-    return arguments
+            f'{path} must be a JSON file of arguments, such as {{"delay": 20}}: {error}'
+        ) from error
 
 
 # Ranges of the plants drawn for sweeps and for training. With a gain factor below 0.74, 5 degC
@@ -175,10 +169,8 @@ def grid() -> list[Arguments]:
     ]
 
 
-def random_design(
-    count: int, seed: int, samples: int, spans: Mapping[str, tuple[float, float]] = SPANS
-) -> list[Arguments]:
-    """Return `count` plants from a Latin hypercube over `spans`.
+def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
+    """Return `count` plants from a Latin hypercube over `SPANS`.
 
     The second half of them drift: over `samples` samples, their gain and time constant move to
     other values within the spans.
@@ -186,15 +178,15 @@ def random_design(
     from scipy.stats.qmc import LatinHypercube  # here: slow to import
 
     generator = np.random.default_rng(seed)
-    drawn = LatinHypercube(len(spans) + 2, rng=generator).random(count)
+    drawn = LatinHypercube(len(SPANS) + 2, rng=generator).random(count)
     drifting = ("gain_factor", "time_constant_factor")
-    ends = np.array([*spans.values(), *(spans[name] for name in drifting)])
+    ends = np.array([*SPANS.values(), *(SPANS[name] for name in drifting)])
     rows = ends[:, 0] + drawn * (ends[:, 1] - ends[:, 0])
     plants = []
     for i, row in enumerate(rows.round(4).tolist()):
-        plant = dict(zip(spans, row, strict=False)) | {"delay": round(row[0])}
+        plant = dict(zip(SPANS, row, strict=False)) | {"delay": round(row[0])}
         if i >= count // 2:
-            gain, time_constant = row[len(spans) :]
+            gain, time_constant = row[len(SPANS) :]
             plant |= {
                 "gain_drift": gain / plant["gain_factor"],
                 "time_constant_drift": time_constant / plant["time_constant_factor"],
