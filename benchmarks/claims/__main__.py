@@ -15,7 +15,6 @@ from mptc_gym import Parameters
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.axes import Axes
 
     from benchmarks.claims.runs import Claim
     from benchmarks.lib.report import Section
@@ -132,48 +131,35 @@ def _three_digits(value: float) -> str:
 def plot_figures(curves: pd.DataFrame, path: Path) -> None:
     """Draw counterparts of Figs 5 to 12: a typical run, and the spread of all runs."""
     from benchmarks.claims.runs import FIGURES
-    from benchmarks.lib.report import draw_legend, panels
+    from benchmarks.lib.report import draw_actuator, draw_legend, panels
 
-    signals = [
-        (f"Fig. {number}: {case.title}", signal, case)
-        for case in FIGURES
-        for number, signals in case.figures.items()
-        for signal in signals
+    found = [
+        (f"Fig. {number}: {title}", curves[curves["case"] == title], arguments, signal)
+        for title, arguments, _, figures in FIGURES
+        for signal, number in figures.items()
     ]
-    with panels(path, [each[0] for each in signals], 1.7, 2, *PICTURE.values()) as (
+    with panels(path, [title for title, *_ in found], 1.7, 2, *PICTURE.values()) as (
         sheet,
-        found,
+        all_axes,
     ):
         entries: dict[str, Any] = {}
-        for axes, (_, signal, case) in zip(found, signals, strict=True):
-            of_case = curves[curves["case"] == case.title]
-            _draw_signal(axes, signal, of_case, Parameters(**case.arguments))
+        for axes, (_, case, arguments, signal) in zip(all_axes, found, strict=True):
+            minutes, (name, colour) = case["time_s"] / 60, SIGNALS[signal]
+            low, high = (case[f"{signal}_{end}"] for end in ("p10", "p90"))
+            look: Any = {"color": colour, "alpha": 0.25, "linewidth": 0}
+            axes.fill_between(minutes, low, high, label="10th to 90th percentile", **look)
+            typical = case[f"{signal}_typical"]
+            axes.plot(minutes, typical, color=colour, linewidth=1, label="a typical run")
+            if signal == "output":
+                axes.plot(minutes, case["setpoint"], "k--", linewidth=1, label="set point")
+            if signal == "command":
+                draw_actuator(axes, Parameters(**arguments))
+            axes.set(xlim=(0, minutes.max()), ylabel=name)
             handles, names = axes.get_legend_handles_labels()
             entries = dict(zip(names, handles, strict=True)) | entries
-        for axes in found[-2:]:  # the lowest of each column
+        for axes in all_axes[-2:]:  # the lowest of each column
             axes.set_xlabel("time (min)")
         draw_legend(sheet, entries)
-
-
-def _draw_signal(axes: Axes, signal: str, curves: pd.DataFrame, plant: Parameters) -> None:
-    from benchmarks.lib.report import draw_actuator
-
-    minutes = curves["time_s"] / 60
-    name, colour = SIGNALS[signal]
-    axes.fill_between(
-        minutes, curves[f"{signal}_p10"], curves[f"{signal}_p90"], color=colour, alpha=0.25,
-        linewidth=0, label="10th to 90th percentile",
-    )  # fmt: skip
-    typical = curves[f"{signal}_typical"]
-    axes.plot(minutes, typical, color=colour, linewidth=1, label="a typical run")
-    if signal == "output":
-        axes.step(
-            minutes, curves["setpoint"], "k--", linewidth=1, where="post", label="set point"
-        )
-    if signal == "command":
-        draw_actuator(axes, plant)
-    axes.set_xlim(0, minutes.max())
-    axes.set_ylabel(name)
 
 
 main = command("claims", Options, work)

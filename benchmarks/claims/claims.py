@@ -349,37 +349,33 @@ def direction_only(batch: Batch, claim: Claim) -> None:
         "set point 5 °C": (0.75, 1.0, 1.25, 1.4),
         "set point 5 °C times the gain": (0.7, 1.0, 1.25, 1.5),
     }
-    settles: dict[tuple[str, float, float, int], Any] = {}
+    settles: dict[str, dict[tuple[float, float, int], Any]] = {}
     for family, gains in families.items():
-        for case in itertools.product((0.5, 1.0, 2.0), gains, (9, 18, 27, 36)):
-            constant, gain, delay = case
+        settles[family] = {}
+        for constant, gain, delay in itertools.product((0.5, 1.0, 2.0), gains, (9, 18, 27, 36)):
             setpoint = 5.0 * gain if "times" in family else 5.0
-            plant = {"gain_factor": gain, "time_constant_factor": constant}
-            runs = batch.run_nn(1200, setpoint=setpoint, delay=delay, **plant)
-            settles[family, constant, gain, delay] = settled(runs)
+            plant = {"gain_factor": gain, "time_constant_factor": constant, "delay": delay}
+            runs = batch.run_nn(1200, setpoint=setpoint, **plant)
+            settles[family][constant, gain, delay] = settled(runs)
 
-    def ask(text: str, of: list[tuple[str, float, float, int]]) -> None:
-        worst = min(of, key=lambda case: settles[case].mean())
-        _, constant, gain, delay = worst
+    def ask(text: str, family: str, alone: Callable[..., bool] = lambda *_: True) -> None:
+        found = {case: runs for case, runs in settles[family].items() if alone(*case)}
+        constant, gain, delay = worst = min(found, key=lambda case: found[case].mean())
         where = f"delay {delay:g}, gain {gain:g}, time constant {constant:g}"
-        quantity = f"settled within 1,200 samples, the worst of {text} ({where})"
-        claim.ask_share(quantity, settles[worst], often=True)
+        quantity = f"settled within 1,200 samples, the worst of {text}, {family} ({where})"
+        claim.ask_share(quantity, found[worst], often=True)
 
-    paper = (1.0, 1.0, 18)  # time constant, gain, delay
-    for place, text, family in (
-        (2, "delays from 9 to 36", "set point 5 °C"),
-        (0, "time constants from 0.5 to 2 times the paper's", "set point 5 °C"),
-        *((1, "gains from 0.7 to 1.5 times the paper's", family) for family in families),
-    ):
-        others = {*range(3)} - {place}
-        of_family = [each for each in settles if each[0] == family]
-        alone = [each for each in of_family if all(each[1 + i] == paper[i] for i in others)]
-        ask(f"{text}, {family}", alone)
-    for family in families:
-        those = [each for each in settles if each[0] == family]
-        ask(f"all {len(those)} combinations, {family}", those)
+    five, _ = settles
+    ask("delays from 9 to 36", five, lambda constant, gain, _: constant == gain == 1.0)
+    constants = "time constants from 0.5 to 2 times the paper's"
+    ask(constants, five, lambda _, gain, delay: (gain, delay) == (1.0, 18))
+    for family in settles:
+        text = "gains from 0.7 to 1.5 times the paper's"
+        ask(text, family, lambda constant, _, delay: (constant, delay) == (1.0, 18))
+    for family, found in settles.items():
+        ask(f"all {len(found)} combinations", family)
+        often = np.mean([runs.mean() >= OFTEN for runs in found.values()])
         quantity = f"combinations in which at least {OFTEN:.0%} of runs settle, {family}"
-        often = np.mean([settles[each].mean() >= OFTEN for each in those])
         claim.ask(quantity, 100 * often, "%")
 
 
@@ -391,7 +387,7 @@ def direction_only(batch: Batch, claim: Claim) -> None:
 )
 def figures(batch: Batch, claim: Claim) -> pd.DataFrame:
     curves = []
-    for case in FIGURES:
-        agent = PIController() if case.nodes is None else batch.networks(nodes=case.nodes)
-        curves.append(typical(batch.run(agent, 1200, **case.arguments)).assign(case=case.title))
+    for title, arguments, nodes, _ in FIGURES:
+        agent = batch.networks(nodes=nodes) if nodes else PIController()
+        curves.append(typical(batch.run(agent, 1200, **arguments)).assign(case=title))
     return pd.concat(curves, ignore_index=True)
