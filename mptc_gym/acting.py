@@ -98,21 +98,15 @@ def start(policy: Any, n: int) -> Act:
 
 def _predicting(predict: Any, named: Mapping[str, inspect.Parameter], n: int) -> Act:
     """Return the function of observations of a policy in the form of Stable-Baselines3."""
-    first = np.ones(n, np.bool_)
-    offered: dict[str, Any] = {"state": None, "episode_start": first, "deterministic": True}
-    if not any(each.kind is each.VAR_KEYWORD for each in named.values()):
-        offered = {name: value for name, value in offered.items() if name in named}
+    latest = {"state": None, "episode_start": np.ones(n, np.bool_), "deterministic": True}
+    takes_all = any(each.kind is each.VAR_KEYWORD for each in named.values())
+    accepted = [name for name in latest if takes_all or name in named]
 
     def act(observations: Any) -> Any:
-        actions = predict(observations, **offered)
+        actions = predict(observations, **{name: latest[name] for name in accepted})
+        latest["episode_start"] = np.zeros(n, np.bool_)
         if isinstance(actions, tuple):
-            actions, state = actions
-            if state is not None and "state" not in offered:
-                raise ValueError("policy.predict must take the state that it returns")
-            if "state" in offered:
-                offered["state"] = state
-        if "episode_start" in offered:
-            offered["episode_start"] = np.zeros(n, np.bool_)
+            actions, latest["state"] = actions
         return actions
 
     return act
@@ -207,12 +201,11 @@ class Given:
             found["windows"] = {plant.parameters.windows for plant in self.plants}
         return found
 
-    def reset(self, *, seed: list[int]) -> tuple[Any, Infos]:
+    def reset(self, *, seed: list[int]) -> Any:
         """Reset all, with a seed each."""
         try:
             if not is_vec_env(self.env):
-                observations, infos = self.env.reset(seed=seed)
-                return observations, _columns(infos)
+                return self.env.reset(seed=seed)
             self.env.unwrapped._seeds = [*seed]  # its own `seed` may repeat them
             return self.env.reset(), _columns(self.env.unwrapped.reset_infos)
         except RuntimeError as error:
@@ -223,11 +216,10 @@ class Given:
                 "wrap it in Monitor(env, allow_early_resets=True)"
             ) from error
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Infos]:
+    def step(self, actions: Any) -> Any:
         """Step all."""
         if not is_vec_env(self.env):
-            *others, infos = self.env.step(actions)
-            return (*others, _columns(infos))
+            return self.env.step(actions)
         observations, rewards, ended, infos = self.env.step(actions)
         if not infos[0]:  # a `GymnasiumVecEnv` fills its list where episodes end
             infos = getattr(self.env.unwrapped, "infos", infos)
