@@ -55,9 +55,9 @@ def work(options: Options) -> str:
         each.members()[0].run(case.arguments, case.samples, 1, options.seed)
         for each in (controller, REFERENCE)
     )
-    write_film(path, controller.label, case.parameters.sampling_interval, run, reference)
-    error = f"mean absolute error {np.abs(run.next_error).mean():.3f} °C"
-    return f"{controller.label} on {case.title}: {error}\nThe film is {path}"
+    interval = case.parameters.sampling_interval
+    found = write_film(path, controller.label, interval, run, reference)
+    return f"On {case.title}:\n{found}\nThe film is {path}"
 
 
 def equal_steps(setpoint: NDArray[np.float64]) -> list[tuple[int, int]]:
@@ -76,8 +76,8 @@ def equal_steps(setpoint: NDArray[np.float64]) -> list[tuple[int, int]]:
 
 def write_film(
     path: Path, label: str, interval: float, run: Trajectory, reference: Trajectory
-) -> None:
-    """Write a film of the first and the last of equal steps of a run, side by side.
+) -> str:
+    """Write a film of the first and the last of equal steps of a run, and return its title.
 
     Errors are multiples of the reference's on the same step; samples are `interval` seconds
     apart. The first picture shows all. Then the run goes on from sample to sample.
@@ -111,8 +111,8 @@ def write_film(
         handles, names = panels[0, 0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False)
         title = f"{label}: error {' and '.join(multiples)} times that of the {REFERENCE.label} "
-        title = textwrap.fill(title + "predictor on the same step", 62)
-        figure.suptitle(title, x=0.01, ha="left", weight="bold", size=15)
+        title += "predictor on the same step"
+        figure.suptitle(textwrap.fill(title, 62), x=0.01, ha="left", weight="bold", size=15)
         canvas: Any = FigureCanvasAgg(figure)
         drawn = [line.get_data() for line in lines]
         for share in (1.0, *np.arange(1, PICTURES + 1) / PICTURES):
@@ -129,6 +129,7 @@ def write_film(
     durations = [2500, *[100] * (PICTURES - 1), 1000]  # ms
     with replacing(path) as partial:
         first.save(partial, save_all=True, append_images=others, duration=durations, loop=0)
+    return title
 
 
 main = command("watch", Options, work, interrupted="nothing is kept.")
