@@ -24,17 +24,17 @@ def commands() -> dict[str, str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that is named, or print the questions in README.md in this folder."""
-    name, *given = [*(sys.argv[1:] if arguments is None else arguments), ""]
-    modules = commands()
+    given = [*(sys.argv[1:] if arguments is None else arguments)]
+    modules, name = commands(), given[0] if given else "--help"
     if name in modules:
         run = importlib.import_module(modules[name]).main
-        if arguments is None:  # the command is the program, as its report says
-            sys.argv = [f"benchmarks.{name}", *given[:-1]]
-        return int(run(None if arguments is None else given[:-1]))
-    if name not in ("", "-h", "--help", "help"):
-        close = difflib.get_close_matches(name, modules, n=1)
-        meant = f"did you mean {close[0]}?" if close else f"there are {', '.join(modules)}"
-        stop(ValueError(f"no command {name!r}; {meant}"))
+        if arguments is not None:
+            return int(run(given[1:]))
+        sys.argv = [f"benchmarks.{name}", *given[1:]]  # the command is the program
+        return int(run())
+    if name not in ("-h", "--help"):
+        close = difflib.get_close_matches(name, modules, n=1) or modules
+        stop(ValueError(f"no command {name!r}; there is {', '.join(close)}"))
     page = FOLDER.joinpath("README.md").read_text(encoding="utf-8")
     try:
         for row in page[page.index("|") :].partition("\n\n")[0].splitlines()[2:]:

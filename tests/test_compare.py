@@ -22,7 +22,7 @@ from benchmarks.compare.comparison import estimate, ranked, scale_of
 from benchmarks.controllers.roster import ROSTER, looks
 from benchmarks.lib import storage
 from benchmarks.lib.report import Best, Section, on_screen, write_report
-from benchmarks.lib.statistics import Estimate, percentiles
+from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.rollout import make_plants, measure, rollout
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
@@ -169,7 +169,7 @@ class TestReport:
             assert part in html
         assert "http" not in html  # nothing is fetched
 
-    @pytest.mark.parametrize("width", [40, 60, 200])
+    @pytest.mark.parametrize("width", [60, 200])
     def test_on_screen_nothing_is_cut(self, width, monkeypatch):
         monkeypatch.setenv("COLUMNS", str(width))
         cells = {f"square-dead-zone-{i}": ["1.00 (0.99 to 1.01)", "11.5"] for i in range(7)}
@@ -187,10 +187,6 @@ class TestReport:
         comparison.write_numbers(tmp_path / "table.csv", pd.DataFrame(columns))
         written = (tmp_path / "table.csv").read_bytes()
         assert written == b"a,s,e,e_low,e_high\nx,1.5,2.0,1.0,3.0\ny,not settled,,,\n"
-
-    def test_percentiles_where_some_do_not_settle(self):
-        found = percentiles(np.array([1.0, 2.0, 3.0, np.inf]))
-        assert found == {"median": 3.0, "p10": 2.0, "p90": np.inf}
 
 
 @pytest.mark.parametrize(
@@ -225,8 +221,8 @@ def test_a_controller_has_one_look_wherever_it_is_listed():
 def compared(tmp_path):
     """Return a function that compares, and returns the folder of the results."""
 
-    def compared(options, *more, status=0, into="out"):
-        out = tmp_path / into
+    def compared(options, *more, status=0):
+        out = tmp_path / "out"
         # In this process, unless an option says otherwise.
         given = ["--out", out, "--jobs", 1, *options.split(), *more]
         assert main([str(each) for each in given]) == status
@@ -270,17 +266,6 @@ class TestCompare:
         for name in ("constant", "constant-noise", "bounds", "scores", "travel"):
             picture = matplotlib.image.imread(out / f"{name}.png")
             assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
-
-    @pytest.mark.usefixtures("undrawn")
-    def test_the_count_of_cores_changes_no_number(self, compared):
-        for jobs in ("1", "2"):
-            compared(
-                f"--agents nn ppo --scenarios constant-noise --runs 2 --jobs {jobs}", into=jobs
-            )
-        one, two = (Path(compared.__closure__[0].cell_contents) / jobs for jobs in ("1", "2"))
-        for name in ("runs.csv", "summary.csv", "estimates.csv", "constant-noise.csv"):
-            assert (one / name).read_bytes() == (two / name).read_bytes()
-        assert sorted(pd.read_csv(one / "runs.csv")["policy"].unique()) == [*range(5)]
 
     @pytest.mark.usefixtures("undrawn")
     def test_a_row_of_the_presets_is_what_evaluate_says(self, compared):

@@ -2,31 +2,48 @@
 
 import os
 import secrets
+import signal
 import sys
 import tempfile
+import time
 from collections import Counter
 from functools import partial
 
+import numpy as np
 import pytest
 
 from benchmarks.lib import storage
 from benchmarks.lib.command import FanOut
 from benchmarks.lib.storage import Kept, UnfinishedError, UsageError
-from tests import tasks
 from tests.conftest import ROOT, python
 
-# Of two processes: how many hear Ctrl-C, however the program itself was started.
-CTRL_C = """
-import os, signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-from benchmarks.lib.command import FanOut
-from tests.tasks import hears_ctrl_c
-print([*FanOut(jobs=2).run({"a": hears_ctrl_c, "b": hears_ctrl_c}).values(), hears_ctrl_c()])
-"""
+
+def draw(seed, calls=None, seconds=0.0):
+    """Return random numbers of a seed, and leave a file for each call."""
+    if calls is not None:
+        (calls / f"{seed} {time.time_ns()} {os.getpid()}").touch()
+    time.sleep(seconds)
+    rng = np.random.default_rng(seed)
+    product = rng.normal(size=(9, 9)) @ rng.normal(size=9)
+    return [{"seed": seed, "sum": float(product.sum())}]
+
+
+def die_of_memory():
+    """Kill the own process as the system does if memory runs out."""
+    os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # as Windows has it
+
+
+def fail(seed):
+    """Raise an exception that cannot be pickled."""
+
+    class LocalError(Exception):
+        pass
+
+    raise LocalError(f"no such plant as {seed}")
 
 
 def work(n, calls=None, seconds=0.0):
-    return {f"plant {seed}": partial(tasks.draw, seed, calls, seconds) for seed in range(n)}
+    return {f"plant {seed}": partial(draw, seed, calls, seconds) for seed in range(n)}
 
 
 def run(given, folder=None, jobs=2):
@@ -55,36 +72,30 @@ def commit(monkeypatch):
 
 def test_jobs_and_order_do_not_matter():
     there = work(5)
-    there["plant 0"] = partial(tasks.draw, 0, None, 0.3)  # the first is not ready first
+    there["plant 0"] = partial(draw, 0, None, 0.3)  # the first is not ready first
     back = dict(reversed(there.items()))
     for given, jobs in ((there, 1), (there, 2), (back, 2)):
         results = run(given, jobs=jobs)
-        assert results == {f"plant {seed}": tasks.draw(seed) for seed in range(5)}
+        assert results == {f"plant {seed}": draw(seed) for seed in range(5)}
         assert list(results) == list(given)
     assert run({"pid": os.getpid}, jobs=1) == {"pid": os.getpid()}
     assert os.getpid() not in run({"one": os.getpid, "two": os.getpid}).values()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT to another process")
-def test_ctrl_c_is_heard_by_one_process():
-    # The others would show tracebacks of their own.
-    assert python("-c", CTRL_C, check=True).stdout == "[False, False, True]\n"
-
-
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_exception_names_its_task_and_spares_the_others(calls, jobs):
-    faulty = {"the fault": partial(tasks.fail, 3), "left": partial(sys.exit, 3)}
+    faulty = {"the fault": partial(fail, 3), "left": partial(sys.exit, 3)}
     done = {}
     with pytest.raises(UnfinishedError, match="no such plant as 3") as error:
         done.update(FanOut(jobs=jobs).stream({**faulty, **work(4, calls)}))
     assert "2 of 6 tasks failed" in str(error.value)
     assert "left: A controller called sys.exit(3)" in str(error.value)
-    assert done == {f"plant {seed}": tasks.draw(seed) for seed in range(4)}
+    assert done == {f"plant {seed}": draw(seed) for seed in range(4)}
 
 
 def test_a_killed_process_is_a_sentence():
     with pytest.raises(UnfinishedError, match="killed, perhaps for lack of memory: try fewer"):
-        run({**work(2), "the killer": partial(tasks.die_of_memory, 0)})
+        run({**work(2), "the killer": die_of_memory})
     assert run(work(2))  # with new processes
 
 
@@ -138,7 +149,7 @@ node = {"num_cpus": 1, "object_store_memory": 80_000_000}
 cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
 cluster.add_node(**node)
 os.environ["RAY_ADDRESS"] = cluster.address
-from tests.test_fan_out import FanOut, tasks, work
+from tests.test_fan_out import FanOut, work
 there = dict(FanOut(backend="ray").stream(work(3)))
 assert there == FanOut(jobs=1).run(work(3)), there
 print("the same numbers")

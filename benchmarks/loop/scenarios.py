@@ -126,13 +126,15 @@ class PlantOptions:
             except (ValueError, RecursionError):
                 arguments[name] = value  # a bare word, such as random
         given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
-        with blame(", ".join(given)):
+        try:
             a = Parameters.of_environment(arguments).a
             if abs(slowest_pole(a) or 0.0) > 1.0:
                 raise ValueError(
                     "a must not have a root beyond the unit circle, as nothing holds such a "
                     f"plant, got {list(a)}"
                 )
+        except (TypeError, ValueError) as error:  # the first: of an unknown argument
+            raise UsageError(f"{', '.join(given)}: {error}") from error
         return arguments
 
 
