@@ -216,12 +216,9 @@ class Parameters(PlantNumbers[Number]):
         """Refuse changes of the time constant that are undefined for A."""
         pole, least = slowest_pole(self.a), self.range_of("time_constant_factor")[0]
         least *= min(self.range_of("time_constant_drift")[0], 1.0)
-        if pole is None:
-            allowed = "1 for this a, which has no pole"
-        elif pole.imag != 0.0:
-            allowed = "1 for this a, whose slowest poles are complex"
-        elif not 0.0 < pole.real < 1.0:
-            allowed = f"1 for this a, whose slowest pole, {pole.real:g}, is not between 0 and 1"
+        if pole is None or pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
+            found = "no pole" if pole is None else f"the slowest pole {pole:g}"
+            allowed = f"1 for this a, which has {found}, not one between 0 and 1"
         elif least < 1.0 - pole.real:
             rate = f"{1.0 - pole.real:g}"
             allowed = f"such that the factor is never below {rate}, where that pole comes to 0"

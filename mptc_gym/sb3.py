@@ -352,7 +352,7 @@ class ScoreCallback(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         self.every = count("every", every, 1, 10**12)
-        self.episodes = episodes
+        self.episodes = count("episodes", episodes, 2, MOST_PLANTS)
         self.path = None if path is None else _zip_path(path)
         if path and (Path(path).is_dir() or not Path(path).parent.is_dir()):
             reject("path", path, "the name of a zip in a folder that exists, not a folder")

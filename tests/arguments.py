@@ -4,6 +4,7 @@ from gymnasium.vector import AutoresetMode
 from hypothesis import strategies as st
 
 from mptc_gym import checks
+from mptc_gym.evaluation import WINDOWS
 from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS
 
 few = st.floats(-0.3, 0.3)
@@ -42,7 +43,6 @@ def _strategy(name, argument):
 STRATEGIES = {name: _strategy(name, argument) for name, argument in ARGUMENTS.items()}
 MODES = [mode.value for mode in AutoresetMode]
 NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
-WINDOWS = ("setpoint_window", "error_window", "output_window", "action_window")
 
 
 def _without(*names):

@@ -14,8 +14,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mptc_gym import MiddlePointEnv, Parameters
+from mptc_gym.evaluation import WINDOWS
 from mptc_gym.parameters import argument_table
-from tests.arguments import WINDOWS, valid_arguments
+from tests.arguments import valid_arguments
 from tests.conftest import run
 
 INFO = {"output", "setpoint", "error", "command", "applied", "noise"}

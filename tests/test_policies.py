@@ -546,39 +546,18 @@ class TestEnvironmentsAreLeftAsTheyWere:
         assert model._last_obs is kept  # of others it forgets nothing
 
 
-class TestRounds:
-    def test_each_begins_anew_and_has_the_next_seeds(self):
-        begun = []
+@pytest.mark.parametrize("learns", [False, True])
+def test_what_is_learnt_carries_over_to_the_next_round(learns):
+    network = DirectNNController(num_envs=N, learning=learns)
+    plants = gymnasium.make_vec("MiddlePoint-v0", N)
+    errors = evaluate(network, plants, episodes=2 * N).errors
+    assert np.array_equal(errors[:N], errors[N:]) is not learns
 
-        class Noting(Integrator):
-            def reset(self):
-                begun.append("reset")
-                super().reset()
 
-            def __call__(self, observations):
-                assert observations.shape == (N, 6)
-                return super().__call__(observations)
-
-        policy = Noting()
-        begun.clear()
-        few = evaluate(policy, many(), episodes=5)
-        assert begun == ["reset"] * 3
-        whole = evaluate(Integrator(), NOISY, episodes=5, **SHORT)
-        np.testing.assert_allclose(few.errors, whole.errors, atol=1e-12)
-        np.testing.assert_allclose(few.travels, whole.travels, atol=1e-9)
-
-    def test_what_is_learnt_carries_over(self):
-        for learns in (True, False):
-            network = DirectNNController(num_envs=N, learning=learns)
-            errors = evaluate(
-                network, gymnasium.make_vec("MiddlePoint-v0", N), episodes=4
-            ).errors
-            assert np.array_equal(errors[:N], errors[N:]) is not learns
-
-    @pytest.mark.parametrize("limit", [None, 2000])
-    def test_without_an_end_of_its_own_it_has_1200_samples(self, limit):
-        plants = MiddlePointVectorEnv(N, max_episode_steps=limit)
-        assert evaluate(law, plants, episodes=2).score is not None
-        # Its spec says 1200.
-        short = gymnasium.make_vec("MiddlePoint-v0", N, max_episode_steps=50)
-        assert evaluate(law, short, episodes=2).score is None
+@pytest.mark.parametrize("limit", [None, 2000])
+def test_without_an_end_of_its_own_it_has_1200_samples(limit):
+    plants = MiddlePointVectorEnv(N, max_episode_steps=limit)
+    assert evaluate(law, plants, episodes=2).score is not None
+    # Its spec says 1200.
+    short = gymnasium.make_vec("MiddlePoint-v0", N, max_episode_steps=50)
+    assert evaluate(law, short, episodes=2).score is None
