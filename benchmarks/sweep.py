@@ -7,14 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER, Controller, label
-from benchmarks.lib.command import Runs, Seed, blame, command, options
+from benchmarks.lib.command import Folder, Runs, Seed, blame, command, options
 from benchmarks.lib.storage import Kept, UsageError, origin, out_folder, write_csv, write_json
 from benchmarks.loop.rollout import Trajectory, held, measure
 from benchmarks.loop.scenarios import SPANS, PlantOptions, around, grid, random_design
@@ -94,8 +95,9 @@ class Options:
     agents: AgentNames = tuple(name for name, each in ROSTER.items() if each.swept)
     controllers: ControllerOptions = field(default_factory=ControllerOptions)
     plant: PlantOptions = field(default_factory=PlantOptions)
-    out: Path | None = None
-    """Folder to write to (default: results/sweep-DESIGN)."""
+    out: Annotated[
+        Folder | None, Parameter(help="Folder to write to (default: results/sweep-DESIGN).")
+    ] = None
 
 
 def work(options: Options) -> str:

@@ -222,6 +222,14 @@ class TestEnds:
         assert err == ""
         assert [path.name for path in tmp_path.iterdir()] == ["report.md"]
 
+    def test_a_signal_after_the_end_is_ignored(self, tmp_path):
+        late = (
+            "import atexit, os, signal\natexit.register(os.kill, os.getpid(), signal.SIGTERM)"
+        )
+        program = late + TOY.replace("60)", "0)")
+        done = python("-c", program, str(tmp_path), "--jobs", "1")
+        assert (done.returncode, done.stderr) == (0, "")
+
     def test_on_a_full_disk(self, tmp_path):
         small = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))"
         done = python("-c", small + TOY.replace("60)", "0)"), str(tmp_path), "--jobs", "1")
@@ -253,7 +261,8 @@ class TestEnds:
 )
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the words are Linux's")
 def test_a_folder_that_cannot_be_written_to(out, complaint, refused):
-    assert complaint in refused(main_of("compare"), ["--out", out])
+    for name in ("compare", "sweep"):
+        assert complaint in refused(main_of(name), ["--out", out])
 
 
 def test_of_a_repeated_option_the_last_counts_and_lists_add_up():

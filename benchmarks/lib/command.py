@@ -183,7 +183,10 @@ def command(
         try:
             given = sys.argv[1:] if arguments is None else arguments
             if (chosen := read(declared, program, given)) is not None:
-                print(work(chosen), flush=True)
+                said = work(chosen)
+                if arguments is None:  # the process ends: nothing is left to be interrupted
+                    _ignore_signals()
+                print(said, flush=True)
         except KeyboardInterrupt as stopped:
             print(f"\nInterrupted: {interrupted}", flush=True)
             return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
@@ -199,10 +202,14 @@ def command(
     return main
 
 
-def _interrupt(number: int, _frame: object) -> NoReturn:
-    """Raise KeyboardInterrupt; later signals are ignored while what has finished is written."""
+def _ignore_signals() -> None:
     for each in (signal.SIGINT, signal.SIGTERM):
         signal.signal(each, signal.SIG_IGN)
+
+
+def _interrupt(number: int, _frame: object) -> NoReturn:
+    """Raise KeyboardInterrupt; later signals are ignored while what has finished is written."""
+    _ignore_signals()
     threading.excepthook = lambda _: None  # of joblib's threads, as its processes end
     warnings.simplefilter("ignore")
     raise KeyboardInterrupt(number)
