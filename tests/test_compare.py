@@ -115,7 +115,7 @@ class TestEstimates:
         runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
         nn, ppo_ = estimate(runs, scale, "nn").to_dict("records")
         assert (nn["mean"].value, nn["limit"]) == (2.0, limit)
-        assert nn["ratio"].value == 2.0 / limit
+        assert nn["ratio"].value == pytest.approx(2.0 / limit)
         assert ppo_["mean"].value == pytest.approx(1.5)
         assert ppo_["difference"].value == pytest.approx(-0.5)
         assert ppo_["improvement"].value == pytest.approx((1 + 0.5 + 1 + 0 + 0.5 + 1) / 6)

@@ -88,7 +88,7 @@ def work(options: Options) -> str:
             if isinstance(result, Case):
                 cases[result.agent, result.scenario] = result
             else:
-                scales[result.scenario] = result
+                scales[result.scenario.name] = result
         complete = True
     finally:
         if cases:

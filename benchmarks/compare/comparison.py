@@ -120,13 +120,11 @@ def _responses(trajectory: Trajectory, scenario: Scenario, agent: str) -> pd.Dat
 class Scale:
     """The bounds that the errors of a case are measured against."""
 
-    scenario: str
+    scenario: Scenario
     least: Any
     """`LeastPossible`, of the kind "causal", "reference" or "preview" that applies."""
-    preview: Any
-    """The least possible error of any controller, even with foresight."""
-    drawn: bool
-    """Whether anything is random, so that runs differ."""
+    preview: float
+    """The least possible error of any controller, even with foresight, degC."""
 
 
 def scale_of(scenario: Scenario, runs: int) -> Scale:
@@ -137,7 +135,7 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
     least = least_possible(**episodes, **scenario.arguments)
     least.score(0.0)  # raises an error if nothing is better than no control
     preview = least_possible(kind="preview", **episodes, **scenario.arguments)
-    return Scale(scenario.name, least, preview, is_random(scenario.parameters))
+    return Scale(scenario, least, preview.value)
 
 
 def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
@@ -149,27 +147,20 @@ def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
     least possible error of any controller. Ends are infinite if runs differ but there is only
     one.
     """
-    rows = []
-    limit = scale.least.value
     errors = {agent: _errors(group) for agent, group in groups(runs, "agent")}
     base = errors[reference].mean(axis=0) if reference in errors else None
+    about = {"scenario": scale.scenario.name}
+    limits = {"limit": scale.least.value, "preview": scale.preview}
+    rows: list[dict[str, Any]] = []
     for agent, values in errors.items():
         mean = bootstrap(values, seed=BOOTSTRAP)
-        if scale.drawn and values.size == 1:
+        if values.size == 1 and is_random(scale.scenario.parameters):
             mean = replace(mean, low=-math.inf, high=math.inf)
-        ends = {end: getattr(mean, end) / limit for end in ("value", "low", "high")}
-        row: dict[str, Any] = {
-            "scenario": scale.scenario,
-            "agent": agent,
-            "limit": limit,
-            "preview": scale.preview.value,
-            "mean": mean,
-            "ratio": replace(mean, **ends),
-        }
+        ratio = mean.scaled(1 / scale.least.value)
+        rows.append({**about, "agent": agent, **limits, "mean": mean, "ratio": ratio})
         if base is not None and agent != reference:
-            row["difference"] = bootstrap(values - base, seed=BOOTSTRAP)
-            row["improvement"] = improvement(values, base, BOOTSTRAP)
-        rows.append(row)
+            rows[-1]["difference"] = bootstrap(values - base, seed=BOOTSTRAP)
+            rows[-1]["improvement"] = improvement(values, base, BOOTSTRAP)
     return pd.DataFrame(rows)
 
 
@@ -282,7 +273,7 @@ def write(
     for picture in itertools.chain.from_iterable(each.pictures for each in sections):
         (folder / picture).unlink(missing_ok=True)  # of an earlier run
     try:
-        plots.draw(folder, cases, scenarios, scales, controllers, summary, estimates, scores)
+        plots.draw(folder, cases, scales, controllers, summary, estimates, scores)
     finally:  # with the pictures that there are
         made_by = provenance_line("compare", made)
         write_report(folder, "Comparison of controllers", sections, made_by)
@@ -332,7 +323,7 @@ def ratio_table(
     for name, scale in scales.items():
         mark = "*" * (scale.least.kind == "reference")
         bounds[0][name] = f"{scale.least.value:.3f}{mark}"
-        bounds[1][name] = f"{scale.preview.value:.3f}"
+        bounds[1][name] = f"{scale.preview:.3f}"
     values = estimates["ratio"].map(lambda ratio: ratio.value)
     least = values == values.groupby(estimates["scenario"]).transform("min")
     cells = estimates["ratio"].map("{:.2f}".format).where(~least, lambda all_: all_.map(Best))

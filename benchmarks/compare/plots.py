@@ -36,7 +36,6 @@ EDGE = "at the edge or beyond"
 def draw(
     folder: Path,
     cases: Sequence[Case],
-    scenarios: Mapping[str, Scenario],
     scales: Mapping[str, Scale],
     controllers: Mapping[str, Controller],
     summary: pd.DataFrame,
@@ -49,11 +48,11 @@ def draw(
     plot_bounds(estimates, worst, [*scores], folder / "bounds.png")
     plot_travel(summary, scales, [*scores], folder / "travel.png")
     shown = [name for name, each in controllers.items() if each.drawn] or [*controllers]
-    for name in scales:
+    for name, scale in scales.items():
         if own := [each for each in cases if each.scenario == name and each.agent in shown]:
             errors = {each.agent: float(each.runs["mae"].mean()) for each in own}
             rows = pd.concat([each.responses for each in own], ignore_index=True)
-            plot_responses(rows, errors, scenarios[name], folder / f"{name}.png")
+            plot_responses(rows, errors, scale.scenario, folder / f"{name}.png")
 
 
 def plot_scores(scores: Mapping[str, Score], path: Path) -> None:

@@ -45,14 +45,14 @@ def replacing(path: Path) -> Iterator[Path]:
     partial = path.with_name(f".{os.getpid()}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            yield partial
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+        yield partial
+        partial.replace(path)
     except OSError as error:
         reason = error.strerror or error
         raise UnfinishedError(f"{path} could not be written: {reason}") from error
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -99,10 +99,11 @@ class Kept:
         import joblib  # here: slow to import
 
         name = commit()
-        if not name.isalnum():  # no commit, or a dirty one
-            return None
-        with suppress(Exception):  # what cannot be pickled has no name, and is not kept
-            return self.folder / name[:12] / f"{joblib.hash(task)}.pkl"
+        # None without a commit, at one that is dirty, and of what cannot be pickled.
+        with suppress(Exception):
+            return (
+                self.folder / name[:12] / f"{joblib.hash(task)}.pkl" if name.isalnum() else None
+            )
         return None
 
     def load(self, task: Callable[[], Any]) -> Any:
@@ -118,8 +119,7 @@ class Kept:
         """Write the result of a task, completely or not at all."""
         import joblib
 
-        path = self.path(task)
-        if path:
+        if path := self.path(task):
             with replacing(path) as partial:
                 joblib.dump(result, partial)
 
@@ -138,8 +138,8 @@ def versions() -> dict[str, str]:
 
 def origin() -> dict[str, Any]:
     """Return the provenance of results made now: time, versions and commit."""
-    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    return {"started": started, "versions": versions(), "commit": commit()}
+    now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return {"started": now, "versions": versions(), "commit": commit()}
 
 
 @cache
