@@ -100,7 +100,7 @@ def in_batch(n: int, device: str | None) -> Cases:
         cases[f"in PyTorch{name}"] = stepping(
             envs,
             partial(torch.as_tensor, device=device),
-            torch.accelerator.synchronize if device else lambda: None,
+            torch.accelerator.synchronize if device not in (None, "cpu") else lambda: None,
         )
     return cases
 

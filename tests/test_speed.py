@@ -27,3 +27,6 @@ def test_it_runs_with_and_without_pytorch(torch, monkeypatch, capsys):
     for words in ("CartPole-v1", "n = 2", "MiddlePoint-v0, hard"):
         assert words in shown
     assert ("in PyTorch" in shown) is torch
+    if torch:
+        assert speed.main(["--rounds", "1", "--device", "cpu"]) == 0
+        assert "n = 3\n" in capsys.readouterr().out
