@@ -89,6 +89,7 @@ def write_film(
 
     steps = equal_steps(run.setpoint[:, 0])
     minutes = np.arange(steps[0][1] - steps[0][0]) * interval / 60.0
+    runs = (reference, "#E69F00", REFERENCE.label), (run, "#0072B2", label)
     lines, multiples, pictures = [], [], []
     with rc_context(STYLE):
         figure = Figure((7.5, 5.0), dpi=100, layout="constrained")
@@ -100,16 +101,13 @@ def write_film(
             upper.set_title(f"from {start * interval / 60:.0f} min on: {multiples[-1]}")
             upper.plot(minutes, run.setpoint[step], "--", color="0.3", label="set point")
             lower.set_xlabel("min")
-            for each, colour, name in (
-                (reference, "#E69F00", REFERENCE.label),
-                (run, "#0072B2", label),
-            ):
+            for each, colour, name in runs:
                 lines += upper.plot(minutes, each.output[step], color=colour, lw=2, label=name)
                 lines += lower.plot(minutes, each.applied[step], color=colour, lw=2)
         panels[0, 0].set_ylabel("°C")
         panels[1, 0].set_ylabel("t/h")
-        handles, names = panels[0, 0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False)
+        named = panels[0, 0].get_legend_handles_labels()
+        figure.legend(*named, loc="outside lower center", ncols=3, frameon=False)
         title = f"{label}: error {' and '.join(multiples)} times that of the {REFERENCE.label} "
         title += "predictor on the same step"
         figure.suptitle(textwrap.fill(title, 62), x=0.01, ha="left", weight="bold", size=15)
