@@ -41,8 +41,12 @@ class ControllerOptions:
 
 
 def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controller]:
-    """Return controllers of the roster by name, then a user's own, as given to `--agent`."""
-    locations: dict[str, list[str]] = {}
+    """Return controllers of the roster by name, then a user's own, as given to `--agent`.
+
+    These have a member for each location. Their `members` raises a `UsageError` that says what
+    is wrong with one.
+    """
+    locations: dict[str, tuple[str, ...]] = {}
     for text in own:
         name, equals, location = text.partition("=")
         taken = f", and {name!r} is taken" if name.lower() in ROSTER else ""
@@ -51,23 +55,15 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
                 "--agent must be NEW_NAME=MODULE:FACTORY or NEW_NAME=PPO:FILE.zip"
                 f"{taken}, got {text!r}"
             )
-        locations.setdefault(name, []).append(location)
-    found = {name: ROSTER[name] for name in names}
-    found |= {name: own_entry(name, each) for name, each in locations.items()}
-    if not found:
+        locations[name] = *locations.get(name, ()), location
+    if not (names or own):
         raise UsageError("--agents, --agent: no controller to run")
-    return found
-
-
-def own_entry(name: str, locations: Sequence[str]) -> Controller:
-    """Return the record of a user's own controller, with a member for each location.
-
-    Its `members` raises a `UsageError` that says what is wrong with a location.
-    """
-    return Controller(
-        name, name, OWN[0], _make, networks=partial(_found, tuple(locations)), random=True,
-        drawn=True,
-    )  # fmt: skip
+    return {name: ROSTER[name] for name in names} | {
+        name: Controller(
+            name, name, OWN[0], _make, networks=partial(_found, each), random=True, drawn=True
+        )
+        for name, each in locations.items()
+    }
 
 
 @dataclass(frozen=True)

@@ -32,13 +32,10 @@ class Estimate:
         return Estimate(factor * self.value, factor * self.low, factor * self.high, self.runs)
 
     def __format__(self, form: str) -> str:
-        """Return `value (low to high)`; the value alone if nothing was random.
-
-        If the interval extends to infinity, the reason takes its place.
-        """
+        """Return `value (low to high)`; the value alone if nothing was random."""
         value, low, high = (written(end, form) for end in (self.value, self.low, self.high))
         if math.isinf(self.high):
-            return f"{value} ({'one run' if self.runs == 1 else 'too few runs'})"
+            return f"{value} (one run)"
         return value if low == high else f"{value} ({low} to {high})"
 
 
