@@ -137,7 +137,7 @@ def draw(record: Record) -> pygame.Surface:
     if plant.dead_zone > 0.0:
         last = record.first + record.span
         panel.shade(DEAD_ZONE, record.first, last, -plant.dead_zone, plant.dead_zone)
-    panel.shade(IN_TRANSIT, record.k - record.in_transit, record.k, low, high)
+    panel.shade(IN_TRANSIT, record.k - int(plant.delay), record.k, low, high)
     for limit in (plant.u_min, plant.u_max):
         panel.level(LIMIT, limit)
     # An input is held from its sample to the next. The first entry is from before the episode.

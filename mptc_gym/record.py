@@ -43,11 +43,6 @@ class Record:
         return max(0, self.k - self.span)
 
     @property
-    def in_transit(self) -> int:
-        """Number of latest inputs that do not yet show in the temperature."""
-        return min(int(self.plant.delay), self.k)
-
-    @property
     def temperatures(self) -> tuple[float, float]:
         """The ends of the temperature axis, degC: it covers the episode so far."""
         margin = max(0.05 * (self._highest - self._lowest), 0.5)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from itertools import islice, pairwise
@@ -24,8 +23,8 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     """Return the flow u_a that the actuator applies, (29), t/h.
 
     Its gradient with respect to the command is 1 within the limits, straight through the dead
-    zone as if there were none, and 0 beyond them. `edge` is the largest magnitude of a command
-    without effect. The limits are both floats, or both of shape (n,).
+    zone as if there were none, and 0 beyond them. Commands of a magnitude above `edge` have an
+    effect. The limits are both floats, or both of shape (n,).
     """
     alike = isinstance(edge, float) and isinstance(u_min, float) and isinstance(u_max, float)
     if alike and not command.requires_grad and u_min <= 0.0 <= u_max:
@@ -38,17 +37,6 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
         return limited.mul_(command.abs().gt_(edge))
     passes = command.detach().abs().gt_(edge)
     return torch.addcmul(limited, limited.detach(), passes.sub_(1.0))
-
-
-def _largest_dead(dead_zone: Number, u_min: Number, u_max: Number, like: Tensor) -> Number:
-    """Return the largest magnitude of a command without effect, in the precision of `like`."""
-    if like.dtype == torch.float32:
-        edge: Number = least_effective(dead_zone, u_min, u_max, rounding=2.0**-21)
-        return edge
-    edge = least_effective(dead_zone, u_min, u_max)
-    if isinstance(edge, Tensor):
-        return edge.nextafter(torch.full_like(edge, -math.inf))
-    return math.nextafter(edge, -math.inf)
 
 
 class TorchPlants:
@@ -95,7 +83,8 @@ class TorchPlants:
         self._limits = u_min, u_max = numbers["u_min"], numbers["u_max"]
         self._middle = zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
-        self._edge = _largest_dead(numbers["dead_zone"], u_min, u_max, zeros)
+        rounding = 2.0**-21 if zeros.dtype == torch.float32 else 2.0**-50
+        self._edge = least_effective(numbers["dead_zone"], u_min, u_max, rounding)
         delay, n = numbers["delay"], len(zeros)
         self._places = None  # of each plant's delayed flows, where delays differ
         if isinstance(delay, Tensor):

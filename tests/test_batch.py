@@ -354,3 +354,4 @@ class TestDraws:
             return [plain(env.step(np.zeros((5, 1)))[0]) for _ in range(120)]
 
         assert_the_seed_is_all_that_differs(trajectory)
+        assert not np.array_equal(trajectory(None), trajectory(None))

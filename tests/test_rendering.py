@@ -176,8 +176,8 @@ def test_a_window_shows_what_a_frame_does_in_time_and_nothing_else_changes(monke
         returned = [each.step(action) for each in envs]
     assert clock().tick.mock_calls == [call(30)] * 7
     assert envs[0].render() is None
-    for mode in modes:
-        MiddlePointEnv(render_mode=mode).close()  # has no window
+    for other in (envs[1], *(MiddlePointEnv(render_mode=mode) for mode in modes)):
+        other.close()  # has no window
     assert pygame.display.get_init()
     envs[0].close()
     assert not pygame.display.get_init()

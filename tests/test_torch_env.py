@@ -281,6 +281,7 @@ def test_what_is_refused_is_named(given, named):
     if given.keys() & {"seed", "options"}:
         env = make(delay=[5, 9])
         env.reset(seed=(1 << 63) - 1)  # the largest
+        assert env.np_random_seed == (1 << 63) - 1
         with pytest.raises(ValueError, match=named):
             env.reset(**given)
     else:

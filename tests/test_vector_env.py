@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, VectorEnv
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mptc_gym import MiddlePointVectorEnv
@@ -59,6 +59,7 @@ def compare(native, sync, *, steps, rng, partial_resets):
     compensated=st.sampled_from(["no wrapper", False, True, 4.0]),
     of_sync=st.booleans(),
 )
+@example({}, 3, "NextStep", 4, 0.3, 0, 0, True, False)  # wrapped plants, reset when ended
 def test_it_equals_one_environment_after_the_other(
     arguments, num_envs, mode, limit, partial_resets, seed, randomness, compensated, of_sync
 ):
