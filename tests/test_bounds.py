@@ -272,13 +272,6 @@ class TestCausal:
 
 
 class TestLeastPossible:
-    def test_they_hold_for_those_who_read_the_transmitter(self):
-        noisy = {"setpoint": 5.0, "noise_variance": 0.5, "delay": 2}
-        reads = {**noisy, "measurement_noise_variance": 100.0}
-        least = least_possible(samples=300, folder=None, **reads)
-        # One that reads the true output does better.
-        assert beats(errors(MPC, 15, 300, **noisy), least)
-
     def test_drawn_episodes_are_those_of_the_environment(self):
         # Without noise, a run and the bound of its plant and set point can be compared.
         arguments = {"delay": [5, 30], "gain_factor": [0.8, 1.4], "setpoint": 4.0}

@@ -27,10 +27,6 @@ def small(monkeypatch):
     monkeypatch.setattr(through_plant, "VALIDATION_SAMPLES", 40)
 
 
-def weights(network):
-    return np.concatenate([W.ravel() for W, _ in (*network.choosing, *network.adding)])
-
-
 def lively(training, seed=0):
     """Return a network whose outputs matter."""
     torch.manual_seed(seed)
@@ -84,19 +80,6 @@ class TestLaw:
         assert (numbers["setpoint"].abs().amax(0) <= reach).all()
         assert (numbers["dead_zone"] < room).all()
         assert 0.1 < (numbers["noise_variance"] == 0.0).float().mean() < 0.7
-
-    def test_a_wrong_model_is_said_to_be_uncertain(self):
-        draw = Draw(4000, 1, 0.3, 0)
-        numbers = draw.plants()
-        models = draw.models(numbers)
-        off = (models["gain_factor"] / numbers["gain_factor"]).log()
-        sure, unsure = (
-            off[mask] for mask in (models["uncertainty"] < 0.05, models["uncertainty"] > 0.2)
-        )
-        assert unsure.std() > 1.5 * sure.std()
-        assert models["first"].float().mean() == pytest.approx(0.6, abs=0.03)
-        exact = draw.models(numbers, exact=True)
-        assert torch.allclose(exact["gain_factor"], numbers["gain_factor"])
 
 
 class TestGradient:
