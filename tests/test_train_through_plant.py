@@ -74,12 +74,16 @@ class TestLaw:
         np.testing.assert_allclose(error, errors.numpy() * reach, atol=0.02)
 
     def test_plants_can_be_made_and_their_set_points_held(self):
-        numbers = Draw(500, 60, SMALL.spread, 0).plants()
+        draw = Draw(500, 60, SMALL.spread, 0)
+        numbers = draw.plants()
         room = torch.minimum(-numbers["u_min"], numbers["u_max"])
         reach = room * numbers["gain_factor"] * loops.GAIN
         assert (numbers["setpoint"].abs().amax(0) <= reach).all()
         assert (numbers["dead_zone"] < room).all()
         assert 0.1 < (numbers["noise_variance"] == 0.0).float().mean() < 0.7
+        wrong, exact = (draw.models(numbers, exact=told)["gain_factor"] for told in (0, 1))
+        assert torch.equal(exact, numbers["gain_factor"])
+        assert 0.4 < (wrong != exact).float().mean() < 0.7
 
 
 class TestGradient:
