@@ -242,19 +242,24 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) 
     sections = [Section("Errors on other plants", text, overview, {"map.png": PICTURE})]
     for title, pairs in QUESTIONS.items():
         asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
-        if asked and "gain_drift" in runs:
-            sections.append(Section(title, [DIFFERENCES], differences(runs, asked)))
+        if asked and "gain_drift" in runs and len(compared := differences(runs, asked)):
+            sections.append(Section(title, [DIFFERENCES], compared))
     write_report(out, "Controllers on other plants", sections, provenance_line("sweep", made))
     show(sections)
 
 
 def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:
-    """Return differences: a row for each group of two plants and more, a column a pair."""
+    """Return differences: a row for each group of two plants and more, a column a pair.
+
+    Plants on which one of the controllers has failed do not count.
+    """
     import pandas as pd
 
     from benchmarks.lib.statistics import bootstrap
 
-    rows = []
+    rows, agents = [], {agent for pair in pairs for agent in pair}
+    runs = runs[runs["agent"].isin(agents)]
+    runs = runs[runs.groupby("plant")["agent"].transform("nunique") == len(agents)]
     for name, which in GROUPS.items():
         group = runs.query(which)
         errors = group.pivot_table(index="plant", columns=["agent", "run"], values="mae")

@@ -112,3 +112,8 @@ def test_differences_of_runs_made_up_so_that_the_answer_is_known():
         "delay above 22 samples": "-0.500",
     }
     assert table["number"].tolist() == ["10", "20", "10", "10"]
+    # Plants where one of them has failed do not count, and one plant is no group.
+    failed = (runs["agent"] == "nn") & (runs["plant"] > 1)
+    found = sweep.differences(runs[~failed], [("nn", "pi-simc")])
+    assert found["number"].tolist() == ["2"]
+    assert sweep.differences(runs[runs["plant"] == 0], [("nn", "pi-simc")]).empty
