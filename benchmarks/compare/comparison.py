@@ -356,23 +356,17 @@ def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def costs_table(cases: Sequence[Case], controllers: Mapping[str, Controller]) -> pd.DataFrame:
-    """Return what each controller is told, what it took before, and its runs."""
+    """Return what each controller is told, what it took before, and the time of its runs."""
     rows = []
     for name, controller in controllers.items():
         own = [case for case in cases if case.agent == name]
-        about = [dict(each) for each in own[0].policies] if own else []
-        training = [each["cpu_seconds"] for each in about if "cpu_seconds" in each]
         # The roster says it in a record, a user's own controller itself.
-        said = {"knows": controller.knows, "searched": controller.searched}
-        knows, searched = (
-            text or (about[0].get(each, "") if about else "") for each, text in said.items()
-        )
+        said = dict(own[0].policies[0]) if own and own[0].policies else {}
         rows.append(
             {
                 "controller": label(name),
-                "prior knowledge": knows,
-                "searched or trained": searched,
-                "training (s)": f"{np.median(training):.0f}" if training else "",
+                "prior knowledge": controller.knows or said.get("knows", ""),
+                "searched or trained": controller.searched or said.get("searched", ""),
                 "runs (s)": f"{sum(case.seconds for case in own):.1f}",
             }
         )
