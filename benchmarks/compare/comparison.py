@@ -14,6 +14,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from benchmarks.compare import plots
+from benchmarks.compare.plots import Score
 from benchmarks.controllers.roster import Controller, label
 from benchmarks.lib.report import Best, Section, provenance_line, write_report
 from benchmarks.lib.statistics import (
@@ -30,8 +32,6 @@ from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES, SEED
 
 Array = NDArray[np.float64]
-Score = tuple[Estimate, dict[str, float]]  # overall, and by case
-
 BOOTSTRAP = 0  # seed of the bootstraps
 SCORE = "Mean over the cases, 95 % interval; travel of the valve in the median run."
 BOUND = (
@@ -213,15 +213,16 @@ def write(
 
     A case without a scale is in the numbers only.
     """
-    from benchmarks.compare import plots  # here: it draws what is defined above
-
     runs = pd.concat([case.runs for case in cases], ignore_index=True)
     summary = summarise(runs)
     write_numbers(folder / "runs.csv", runs)
     write_numbers(folder / "summary.csv", summary)
-    for name in scenarios:
-        if found := [case.responses for case in cases if case.scenario == name]:
-            write_numbers(folder / f"{name}.csv", pd.concat(found, ignore_index=True))
+    responses = {
+        name: pd.concat([each.responses for each in cases if each.scenario == name])
+        for name in summary["scenario"].unique()
+    }
+    for name, rows in responses.items():
+        write_numbers(folder / f"{name}.csv", rows)
     scales = {name: scales[name] for name in scenarios if name in scales}
     runs = runs[runs["scenario"].isin([*scales])]
     if runs.empty:
@@ -272,8 +273,13 @@ def write(
     sections = [each for each in sections if each.table is None or len(each.table)]
     for picture in itertools.chain.from_iterable(each.pictures for each in sections):
         (folder / picture).unlink(missing_ok=True)  # of an earlier run
+    drawn = [name for name, each in controllers.items() if each.drawn]
+    shown = {name: responses[name] for name in scales}
+    for name, rows in shown.items():
+        few = rows[rows["agent"].isin(drawn)]
+        shown[name] = rows if few.empty else few
     try:
-        plots.draw(folder, cases, scales, controllers, summary, estimates, scores)
+        plots.draw(folder, scenarios, runs, shown, summary, estimates, scores)
     finally:  # with the pictures that there are
         made_by = provenance_line("compare", made)
         write_report(folder, "Comparison of controllers", sections, made_by)

@@ -13,8 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
-from benchmarks.compare.comparison import Case, Scale, Score
-from benchmarks.controllers.roster import Controller, label, looks
+from benchmarks.controllers.roster import label, looks
 from benchmarks.lib.report import (
     MULTIPLE,
     NEAREST,
@@ -24,8 +23,10 @@ from benchmarks.lib.report import (
     panels,
     scale_by_excess,
 )
-from benchmarks.lib.statistics import groups, written
+from benchmarks.lib.statistics import Estimate, groups, written
 from benchmarks.loop.scenarios import Scenario
+
+Score = tuple[Estimate, dict[str, float]]  # overall, and by case
 
 FARTHEST = 1.5  # distance of a score from 1 at which the axis ends
 HELD = 15  # minutes that are shown of a held set point without load
@@ -35,24 +36,20 @@ EDGE = "at the edge or beyond"
 
 def draw(
     folder: Path,
-    cases: Sequence[Case],
-    scales: Mapping[str, Scale],
-    controllers: Mapping[str, Controller],
+    scenarios: Mapping[str, Scenario],
+    runs: pd.DataFrame,
+    responses: Mapping[str, pd.DataFrame],
     summary: pd.DataFrame,
     estimates: pd.DataFrame,
     scores: Mapping[str, Score],
 ) -> None:
     """Draw all pictures: of scores, errors and travel, and of the responses in each case."""
+    errors = runs.groupby(["scenario", "agent"])["mae"]
     plot_scores(scores, folder / "scores.png")
-    worst = {(each.scenario, each.agent): float(each.runs["mae"].max()) for each in cases}
-    plot_bounds(estimates, worst, [*scores], folder / "bounds.png")
-    plot_travel(summary, scales, [*scores], folder / "travel.png")
-    shown = [name for name, each in controllers.items() if each.drawn] or [*controllers]
-    for name, scale in scales.items():
-        if own := [each for each in cases if each.scenario == name and each.agent in shown]:
-            errors = {each.agent: float(each.runs["mae"].mean()) for each in own}
-            rows = pd.concat([each.responses for each in own], ignore_index=True)
-            plot_responses(rows, errors, scale.scenario, folder / f"{name}.png")
+    plot_bounds(estimates, errors.max(), [*scores], folder / "bounds.png")
+    plot_travel(summary, estimates, [*scores], folder / "travel.png")
+    for name, rows in responses.items():
+        plot_responses(rows, errors.mean()[name], scenarios[name], folder / f"{name}.png")
 
 
 def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
@@ -99,7 +96,7 @@ def _list_controllers(axes: Axes, agents: Sequence[str]) -> None:
 
 def plot_bounds(
     estimates: pd.DataFrame,
-    worst: Mapping[tuple[str, str], float],
+    worst: pd.Series[float],
     agents: Sequence[str],
     path: Path,
 ) -> None:
@@ -134,7 +131,7 @@ def plot_bounds(
 
 
 def plot_travel(
-    summary: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str], path: Path
+    summary: pd.DataFrame, estimates: pd.DataFrame, agents: Sequence[str], path: Path
 ) -> None:
     """Draw the error of every controller against its valve travel, a panel for each case.
 
@@ -143,14 +140,17 @@ def plot_travel(
     medians = summary.pivot_table(
         index=["scenario", "agent"], columns="metric", values="median", sort=False
     ).reset_index()
-    medians = medians[(medians["total_variation"] > 0.0) & medians["scenario"].isin([*scales])]
+    limits = estimates.groupby("scenario")["limit"].first()
+    medians = medians[
+        (medians["total_variation"] > 0.0) & medians["scenario"].isin(limits.index)
+    ]
     if medians.empty:
         return
     style, cases = looks(agents), dict(groups(medians, "scenario"))
     with panels(path, [*cases], 2.4, 2, "Mean error and valve travel") as (figure, found):
         for axes, (case, rows) in zip(found, cases.items(), strict=True):
             travel = rows["total_variation"]
-            excess = rows["mae"] / scales[case].least.value - 1.0
+            excess = rows["mae"] / limits[case] - 1.0
             for agent, x, y in zip(rows["agent"], travel, excess, strict=True):
                 _mark(axes, x, y, style[agent], up=(NEAREST, math.inf))
             scale_by_excess(axes, "y", *excess.clip(NEAREST).agg(["min", "max"]))
@@ -171,7 +171,7 @@ def plot_travel(
 
 
 def plot_responses(
-    responses: pd.DataFrame, errors: Mapping[str, float], scenario: Scenario, path: Path
+    responses: pd.DataFrame, errors: pd.Series[float], scenario: Scenario, path: Path
 ) -> None:
     """Draw output and applied input over time, a row for every controller, the best first.
 
@@ -179,13 +179,14 @@ def plot_responses(
     load only the beginning. `responses` holds the rows of all controllers, `errors` their mean
     errors.
     """
-    agents, plant = sorted(errors, key=errors.__getitem__), scenario.parameters
+    shown, plant = responses["agent"].unique(), scenario.parameters
+    agents = [*errors[shown].sort_values(kind="stable").index]
     held = responses["setpoint"].nunique() == 1
     if held:
         if not plant.is_disturbed:
             responses = responses[responses["time_s"] <= 60 * HELD]
-        shown = [f"output_{name}" for name in ("median", "p10", "p90")]
-        below = responses[shown].rsub(responses["setpoint"], axis="index")
+        outputs = [f"output_{name}" for name in ("median", "p10", "p90")]
+        below = responses[outputs].rsub(responses["setpoint"], axis="index")
         responses = responses.assign(setpoint=0.0, **below)
     height = 1.0 + 1.05 * len(agents)
     with drawn(path, height, scenario.title) as figure:
