@@ -171,8 +171,10 @@ def drawn(path: Path, height: float, title: str = "") -> Iterator[Figure]:
         canvas.draw()
         picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         with replacing(path) as partial:
-            # Without dithering, areas stay even and the file small.
-            few = picture.quantize(SHADES, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+            # Without dithering, areas stay even and the file small. The clustering keeps the
+            # colours of small marks, which the usual way mixes, and that of the dead zone.
+            most = Image.Quantize.MAXCOVERAGE
+            few = picture.quantize(SHADES, most, kmeans=3, dither=Image.Dither.NONE)
             few.save(partial, optimize=True)
 
 
