@@ -128,6 +128,7 @@ def test_a_missing_package_is_named_with_its_extra(
     for name in [*sys.modules]:  # those that import it are imported anew
         if re.fullmatch(r"benchmarks\.train\.(?!__main__).*", name):
             monkeypatch.delitem(sys.modules, name)
+            monkeypatch.delattr(sys.modules["benchmarks.train"], name.rpartition(".")[2], False)
     name, *options = given.split()
     said = refused(main_of(name), options)
     assert f'{package} is not installed: pip install -e ".[{extra}]"' in said
