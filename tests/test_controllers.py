@@ -54,49 +54,36 @@ def test_it_is_told_the_plant_that_it_is_made_for(entry, member):
         assert mean_error(learnt).mean() < 0.9 * found.mean()
 
 
-@pytest.fixture
-def run(member):
-    """Run plants with a limit that is nearer on one side, and set points beyond it."""
-
-    def run(runs, seed, sign=1.0, again=False):
+def test_a_batch_is_its_members_again_and_mirrored(entry, member):
+    def run(runs, seed, sign=1.0, controller=None):
+        # Plants with a limit that is nearer on one side, and set points beyond it.
         limits = {"u_min": -6.0, "u_max": 10.0} if sign > 0 else {"u_min": -10.0, "u_max": 6.0}
         plant = {**limits, "b": [sign * b for b in Parameters().b], "noise_variance": 0.1}
-        controller = member(plant, runs, seed)
+        controller = controller or member(plant, runs, seed)
         plant["setpoint_amplitude"] = 6.0
-        if again:
-            member.run(plant, 700, runs, seed + 50, controller)
-        return member.run(plant, 700, runs, seed, controller)
+        return controller, member.run(plant, 500, runs, seed, controller)
 
-    return run
-
-
-def test_a_batch_does_what_its_members_do_alone(entry, run):
-    batch = run(3, 5)
+    controller, batch = run(3, 5)
     # Where a network has learnt, its noise then was that of its place in the batch.
-    for i in range(1 if entry.name == "nn-frozen" else 3):
-        # Matrix products differ in their last digit by the number of rows.
-        np.testing.assert_allclose(run(1, 5 + i).command[:, 0], batch.command[:, i], atol=1e-3)
-
-
-def test_an_episode_leaves_nothing_behind_but_what_is_learnt(member, run):
-    same = np.array_equal(run(2, 5).command, run(2, 5, again=True).command)
-    assert same is not member.learns
-
-
-def test_a_mirrored_plant_gets_the_mirrored_flow(entry, run):
+    i = 0 if entry.name == "nn-frozen" else 2
+    # Matrix products differ in their last digit by the number of rows.
+    alone = run(1, 5 + i)[1].command[:, 0]
+    np.testing.assert_allclose(alone, batch.command[:, i], atol=1e-3)
+    # An episode leaves nothing behind but what is learnt.
+    again = run(3, 5, controller=controller)[1]
+    assert np.array_equal(again.command, batch.command) is not member.learns
     # Policies trained on the paper's plant are not told another; initial weights are random.
     if entry.name in UNTOLD or entry.random:
         return
-    ours, theirs = run(2, 3), run(2, 3, sign=-1.0)
+    _, mirrored = run(3, 5, sign=-1.0)
     # Actions have 24 bits, which limits the agreement.
-    np.testing.assert_allclose(theirs.command, -ours.command, atol=1e-2)
-    np.testing.assert_allclose(theirs.output, ours.output, atol=1e-3)
+    np.testing.assert_allclose(mirrored.command, -batch.command, atol=1e-2)
     if entry.name != "nothing":
-        assert (ours.command > 9.99).any()  # the limits, and anti-windup, had a part
+        assert (batch.command > 9.99).any()  # the limits, and anti-windup, had a part
 
 
-@pytest.mark.parametrize("windows", [{"setpoint_window": 7}, {"error_window": 0}], ids=str)
-def test_it_asks_for_its_own_windows(member, windows):
+def test_it_asks_for_its_own_windows(member):
+    windows = {"setpoint_window": 7, "error_window": 0}
     assert errors(member, 1, 60, **windows) == errors(member, 1, 60)
 
 
@@ -208,7 +195,7 @@ class TestSavedPolicies:
 
     @pytest.mark.parametrize(
         ("name", "preset"),
-        [("velocity", "noisy"), ("velocity", "hard"), ("delayed", "noisy"), ("bare", "noisy")],
+        [("velocity", "hard"), ("delayed", "noisy"), ("bare", "noisy")],
     )
     def test_it_does_what_it_was_trained_to(self, name, preset, zips):
         file = zips / f"{name}.zip"

@@ -23,6 +23,8 @@ from tests.conftest import ROOT
 def test_ppo_runs_as_one_file_of_its_own(tmp_path, monkeypatch, capsys):
     for package in ("benchmarks", "agents"):
         monkeypatch.setitem(sys.modules, package, None)  # an import is an error
+    monkeypatch.setattr(PPO, "train", lambda _: None)  # it takes most of the time
+    monkeypatch.setitem(evaluate.__kwdefaults__, "episodes", 3)
     given = ["page", "--steps", "1", "--seed", "3", "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", given)
     runpy.run_path(str(ROOT / "benchmarks/examples/sb3.py"), run_name="__main__")
@@ -52,7 +54,8 @@ def test_an_offline_clone_does_what_was_logged():
     assert evaluate(actor, episodes=4, **arguments_of("paper")).mean_error < 0.95
 
 
-def test_the_notebook_runs_and_shows_what_it_showed(capsys):
+def test_the_notebook_runs_and_shows_what_it_showed(capsys, monkeypatch):
+    monkeypatch.setattr(PPO, "train", lambda _: None)
     text = (ROOT / "benchmarks/examples/quickstart.ipynb").read_text(encoding="utf-8")
     cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
     names: dict[str, object] = {}

@@ -144,14 +144,15 @@ def test_the_commit_says_whether_files_differ(tmp_path, monkeypatch):
 
 RAY = """
 import os
+from functools import partial
 from ray.cluster_utils import Cluster
-node = {"num_cpus": 1, "object_store_memory": 80_000_000}
-cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
-cluster.add_node(**node)
+from benchmarks.lib.command import FanOut
+node = {"num_cpus": 2, "object_store_memory": 80_000_000, "include_dashboard": False}
+cluster = Cluster(initialize_head=True, head_node_args=node)
 os.environ["RAY_ADDRESS"] = cluster.address
-from tests.test_fan_out import FanOut, work
-there = dict(FanOut(backend="ray").stream(work(3)))
-assert there == FanOut(jobs=1).run(work(3)), there
+work = {f"plant {seed}": partial(pow, 0.1, seed) for seed in range(3)} | {"where": os.getpid}
+there, here = dict(FanOut(backend="ray").stream(work)), FanOut(jobs=1).run(work)
+assert there.pop("where") != here.pop("where") and there == here, there
 print("the same numbers")
 cluster.shutdown()
 """

@@ -536,7 +536,7 @@ class TestEnvironmentsAreLeftAsTheyWere:
         with pytest.raises(ZeroDivisionError):
             evaluate(law, odd(step=lambda *_: 1 / 0), episodes=EPISODES)
 
-    @pytest.mark.parametrize("algorithm", [PPO, SAC, RecurrentPPO])
+    @pytest.mark.parametrize("algorithm", [SAC, RecurrentPPO])
     def test_training_goes_on_after_a_score_in_its_own_environments(self, algorithm):
         model = model_of(algorithm, VecNormalize(dummy(n=1))).learn(64)
         evaluate(model, model.get_env(), episodes=EPISODES)

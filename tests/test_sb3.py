@@ -248,8 +248,9 @@ class TestScoreCallback:
         assert [samples for samples, _ in callback.scores] == [128, 192, 64, 128]
 
     def test_statistics_of_the_training_are_handed_over(self):
-        model = model_of(VecNormalize(make_vec_env(HARD, 2, seed=0)))
-        own = VecNormalize(make_vec_env(HARD, 2), training=False)
+        made = partial(make_vec_env, HARD, 2, max_episode_steps=40)
+        model = model_of(VecNormalize(made(seed=0)))
+        own = VecNormalize(made(), training=False)
         callback = ScoreCallback(own, every=64, episodes=2, verbose=0)
         model.learn(64, callback)
         assert own.obs_rms.count == model.get_env().obs_rms.count

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from benchmarks import sweep
+from benchmarks.bounds import least
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib import storage
 from benchmarks.lib.storage import Kept
@@ -50,6 +51,12 @@ class TestCommand:
     def short(self, monkeypatch):
         monkeypatch.setattr(sweep, "SAMPLES", 700)
 
+    @pytest.fixture
+    def quick(self, monkeypatch):
+        """Leave out what takes most of the time."""
+        monkeypatch.setattr(sweep, "report", Mock())
+        monkeypatch.setattr(least, "least_possible", lambda **_: Mock(value=1.0))
+
     def test_random_design(self, tmp_path, capsys, monkeypatch):
         monkeypatch.setattr(storage, "commit", lambda: "abc")
         given = "--design-seed 2026 --agents nn nn-frozen pi-simc"
@@ -68,8 +75,8 @@ class TestCommand:
         monkeypatch.setattr(sweep, "report", Mock())
         assert run_sweep(tmp_path, given).equals(runs)
 
-    def test_what_the_options_change(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(sweep, "report", Mock())  # which takes its time to draw
+    @pytest.mark.usefixtures("quick")
+    def test_what_the_options_change(self, tmp_path):
         first = run_sweep(tmp_path, "--agents smith")
         for more in ("--design-seed 1", "--set dead_zone=4"):
             other = run_sweep(tmp_path, f"--agents smith {more}")
@@ -78,6 +85,7 @@ class TestCommand:
         told = run_sweep(tmp_path, "--agents smith --told each")
         assert told["mae"].mean() < first["mae"].mean() - 0.05
 
+    @pytest.mark.usefixtures("quick")
     @pytest.mark.parametrize(
         ("error", "status", "rows"), [(ArithmeticError, 1, 12), (KeyboardInterrupt, 130, 8)]
     )
