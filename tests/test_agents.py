@@ -223,19 +223,6 @@ class TestDirectNN:
             moved = getattr(nn.weights, field) - getattr(before, field)
             np.testing.assert_allclose(moved, -gain * leaf.grad.numpy(), atol=1e-12)
 
-    @pytest.mark.parametrize(("n_inputs", "n_hidden"), [(6, 3), (6, 1), (1, 1), (12, 9)])
-    @pytest.mark.parametrize("num_envs", [1, 2, 7, 64])
-    def test_batch_is_its_members_to_the_bit(self, n_inputs, n_hidden, num_envs, rng):
-        shape = {"n_inputs": n_inputs, "n_hidden": n_hidden, "error_index": 0}
-        batch = DirectNNController(seed=5, num_envs=num_envs, **shape)
-        singles = [DirectNNController(seed=5 + i, **shape) for i in range(num_envs)]
-        for _ in range(20):
-            observation = rng.normal(0, 4, (num_envs, n_inputs))
-            batch.act(observation)
-            for nn, row in zip(singles, observation, strict=True):
-                nn.act(row)
-            assert np.array_equal(batch.command, [nn.command for nn in singles])
-
     def test_initial_weights_are_uniform_and_of_the_seed_alone(self):
         weights = DirectNNController(num_envs=2000, weight_scale=0.5).weights
         for field in FIELDS:

@@ -194,6 +194,7 @@ def work(options):
 out = pathlib.Path(sys.argv.pop(1))
 sys.exit(command("toy", Options, work)())
 """
+SHORT = TOY.replace("60)", "0)").replace("sleep(2)", "sleep(0)")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no signals to other processes")
@@ -225,15 +226,14 @@ class TestEnds:
 
     def test_a_signal_after_the_end_is_ignored(self, tmp_path):
         late = (
-            "import atexit, os, signal\natexit.register(os.kill, os.getpid(), signal.SIGTERM)"
+            "import atexit, os, signal; atexit.register(os.kill, os.getpid(), signal.SIGTERM)"
         )
-        program = late + TOY.replace("60)", "0)")
-        done = python("-c", program, str(tmp_path), "--jobs", "1")
+        done = python("-c", f"{late}\n{SHORT}", str(tmp_path), "--jobs", "1")
         assert (done.returncode, done.stderr) == (0, "")
 
     def test_on_a_full_disk(self, tmp_path):
         small = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))"
-        done = python("-c", small + TOY.replace("60)", "0)"), str(tmp_path), "--jobs", "1")
+        done = python("-c", small + SHORT, str(tmp_path), "--jobs", "1")
         assert done.returncode == 1
         assert "report.md could not be written: File too large" in done.stdout
         assert not list(tmp_path.iterdir())

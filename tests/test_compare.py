@@ -139,7 +139,7 @@ class TestEstimates:
         assert (best["controller"], best["travel (t/h)"], best["square"]) == ("b", "12", "0.75")
         assert (other["controller"], other["constant"]) == ("a", "0.25")
 
-    @pytest.mark.parametrize("agent", ["mpc", "self-tuning", "smith"])
+    @pytest.mark.parametrize("agent", ["self-tuning", "smith"])
     def test_runs_that_are_alike_are_what_each_of_them_is(self, agent, monkeypatch):
         once = comparison.run_case(SCENARIOS["constant"], ROSTER[agent], 3)
         monkeypatch.setattr(comparison, "is_random", lambda _: True)

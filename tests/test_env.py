@@ -94,15 +94,6 @@ def test_timeline_by_hand():
     assert list(record["observation"][4]) == [1, 1, 1, -2.5, 2, 3, 3.5, -1, 0, -1]
 
 
-def test_measurement_saturates_and_truth_does_not():
-    env = MiddlePointEnv(temperature_span=2.0, output_window=1)
-    record = run(env, -np.ones(200))
-    assert record["output"][-1] > 6.8
-    assert record["error"][-1] == 5.0 - record["output"][-1]
-    assert record["reward"][-1] == pytest.approx(-((record["error"][-1] / 5.0) ** 2) / 2)
-    assert list(record["observation"][-1]) == [5, 5, 5, 3, 3, 3, 2]
-
-
 @pytest.mark.parametrize(("others", "alone"), [
     ({"setpoint": 0.0}, ["noise"]), ({"noise_variance": 0.0}, ["setpoint"]),
     ({"disturbance_amplitude": 4.0}, ["noise", "setpoint"]),

@@ -24,7 +24,8 @@ def test_ppo_runs_as_one_file_of_its_own(tmp_path, monkeypatch, capsys):
     for package in ("benchmarks", "agents"):
         monkeypatch.setitem(sys.modules, package, None)  # an import is an error
     monkeypatch.setattr(PPO, "train", lambda _: None)  # it takes most of the time
-    monkeypatch.setitem(evaluate.__kwdefaults__, "episodes", 3)
+    for name in ("MiddlePoint-v0", "MiddlePointNoisy-v0"):
+        monkeypatch.setattr(gymnasium.spec(name), "max_episode_steps", 60)
     given = ["page", "--steps", "1", "--seed", "3", "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", given)
     runpy.run_path(str(ROOT / "benchmarks/examples/sb3.py"), run_name="__main__")

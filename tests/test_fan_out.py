@@ -101,13 +101,6 @@ def test_a_killed_process_is_a_sentence():
 
 class TestKept:
     @pytest.mark.usefixtures("commit")
-    def test_only_what_is_missing_runs(self, tmp_path, calls):
-        first = run(work(3, calls), tmp_path / "out")
-        again = run(work(5, calls), tmp_path / "out")
-        assert counted(calls) == Counter(range(5))
-        assert {name: again[name] for name in first} == first
-
-    @pytest.mark.usefixtures("commit")
     def test_a_damaged_result_is_made_again(self, tmp_path):
         whole = run(work(3), tmp_path, jobs=1)
         file = sorted(tmp_path.rglob("*.pkl"))[1]

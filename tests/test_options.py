@@ -63,11 +63,12 @@ class TestTransmitter:
             seen["observation"][:, 3], seen["setpoint"] - seen["observation"][:, -1], atol=1e-5
         )
 
-    def test_the_reading_saturates(self):
+    def test_the_reading_saturates_and_the_truth_does_not(self):
         noisy = {"measurement_noise_variance": 100.0, "temperature_span": 5.0}
-        env = MiddlePointEnv(output_window=1, **noisy)
-        reading = run(env, np.zeros(300))["observation"][:, -1]
-        assert np.abs(reading).max() == 5.0
+        record = run(MiddlePointEnv(output_window=1, **noisy), -np.ones(300))
+        assert np.abs(record["observation"][:, -1]).max() == 5.0
+        assert record["output"][-1] > 6.8
+        np.testing.assert_array_equal(record["error"], record["setpoint"] - record["output"])
 
 
 class TestDisturbance:
@@ -84,17 +85,6 @@ class TestDisturbance:
 
 
 class TestDynamics:
-    @pytest.mark.parametrize("gain", [0.5, 1.0, 2.0])
-    @pytest.mark.parametrize("time_constant", [0.5, 1.0, 3.0])
-    def test_gain_and_time_constant(self, gain, time_constant):
-        env = MiddlePointEnv(gain_factor=gain, time_constant_factor=time_constant)
-        output = run(env, np.ones(3000))["output"]
-        assert output[-1] == pytest.approx(10 * gain * GAIN, rel=1e-9)
-        # What is left decays by the slow pole, the other one (-0.5) having died out long ago.
-        left = output[-1] - output[60:90]
-        pole = (left[1:] / left[:-1]).mean()
-        assert 1 / (1 - pole) == pytest.approx(time_constant / (1 - POLE), rel=1e-4)
-
     def test_drift_ends_at_the_plant_that_factors_give(self):
         drifting = MiddlePointEnv(
             gain_factor=0.8, gain_drift=1.5, time_constant_drift=2.0, drift_samples=200
@@ -144,15 +134,12 @@ class TestRanges:
         ({"dead_zone": [0, 11]}, "dead_zone must be small enough"),
         ({"dead_zone": 8, "u_min": [-9, -7], "u_max": [7, 9]}, "dead_zone must be small"),
         ({"u_min": [-10, 10]}, "u_min must be below"),
-        ({"disturbance_interval": 0}, "disturbance_interval must be a number from 1"),
         ({"disturbance_walk_variance": [0, float("nan")]}, "disturbance_walk_variance must"),
-        ({"gain_factor": 0}, "gain_factor must be a number above 0"),
         ({"time_constant_factor": 0.01}, "time_constant_factor, .* never below 0.048"),
         ({"time_constant_factor": 2, "a": [1.0]}, "which has no pole, not one"),
         ({"time_constant_factor": 2, "a": [1.0, 0.0, 0.5]}, r"slowest pole .*0\.7.*j, not one"),
         ({"time_constant_factor": 2, "a": [1.0, -1.0]}, r"slowest pole 1\+0j, not one between"),
         ({"disturbance_amplitude": 1, "a": [1.0, -1.0]}, "not stable"),
-        ({"drift_samples": 0}, "drift_samples must be an integer from 1 to 1,000,000,000"),
         ({"setpoint_window": 0, "error_window": 0}, "error_window"),
     ],
 )  # fmt: skip

@@ -63,12 +63,6 @@ def test_actuator_whose_edge_passes(command, arguments, expected):
     assert found == pytest.approx(expected, abs=1e-12)
 
 
-def test_scaling_by_hand():
-    for action, command in [(-1.0, -4.0), (0.0, 2.0), (1.0, 8.0), (2.0, 14.0)]:
-        assert step(action, u_min=-4.0, u_max=8.0)[0] == command
-        assert action_from_command(command, -4.0, 8.0) == action
-
-
 def exact(command, u_min, u_max, dead_zone):
     return action_from_command(command, u_min, u_max)
 

@@ -12,7 +12,7 @@ import torch
 from gymnasium import wrappers
 from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
-from sb3_contrib import TQC, RecurrentPPO
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
@@ -355,7 +355,6 @@ RIGHT = {
     "PPO in IncrementalAction": lambda _: live(
         PPO, make_vec_env(NOISY, N, wrapper=VELOCITY, **SHORT), lambda: moved(made())),
     "SAC": lambda _: live(SAC, made()),
-    "TQC": lambda _: live(TQC, made()),
     "DQN": lambda _: live(DQN, levels(), levels),
     "RecurrentPPO": lambda _: live(RecurrentPPO, dummy()),
     "policy of a model": lambda _: ((m := model_of(PPO, made())).policy, NOISY, predicting(m)),

@@ -1,7 +1,6 @@
 """Tests of `mptc_gym.sb3`: the batch against DummyVecEnv, zips, and the callback."""
 
 import zipfile
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import gymnasium
@@ -145,17 +144,13 @@ class TestZips:
         assert actions[0] == actions[1] == actions[2]
         loaded.learn(64)
 
-    def test_long_names_threads_and_steps_in_a_name(self, tmp_path):
-        model, long = model_of(make_vec_env()), "m" * 250 + ".zip"
-        names = [long] * 4 + [f"model.step{i}" for i in range(4)]
-        with ThreadPoolExecutor(8) as threads:
-            saved = [threads.submit(save, model, tmp_path / name) for name in names * 3]
-        assert [each.result() for each in saved] == [None] * len(saved)
-        assert {each.name for each in tmp_path.iterdir()} == set(names)
-        assert load(tmp_path / long, device="cpu").num_timesteps == 0
-        mode = (tmp_path / long).stat().st_mode
+    def test_long_names_and_steps_in_a_name(self, tmp_path):
+        model, names = model_of(make_vec_env()), {"m" * 250 + ".zip", "model.step8"}
+        for name in names:
+            save(model, tmp_path / name)
+        assert {each.name for each in tmp_path.iterdir()} == names
         (tmp_path / "other").touch()
-        assert mode == (tmp_path / "other").stat().st_mode
+        assert len({each.stat().st_mode for each in tmp_path.iterdir()}) == 1
         with pytest.raises(ValueError, match="cannot be written: File name too long"):
             save(model, tmp_path / ("m" * 300))
 

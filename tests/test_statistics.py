@@ -112,10 +112,6 @@ class TestBootstrap:
         assert estimate.value == pytest.approx(1028.0 / 16.0)
         assert estimate.high > 100 > estimate.low
 
-    def test_no_width_where_nothing_is_random(self):
-        estimate = bootstrap(np.full((3, 4), 2.5), seed=0)
-        assert vars(estimate) == {"value": 2.5, "low": 2.5, "high": 2.5, "runs": 12}
-
 
 @pytest.mark.parametrize(
     ("errors", "expected"),

@@ -110,15 +110,11 @@ def test_it_equals_the_environment_in_numpy(
 # float32 has 24 bits. Errors of rounding grow with the slowest pole's time constant of some 20
 # samples, and temperatures are some 10 degC: 10 * 20 * 2^-24 = 1e-5.
 @pytest.mark.parametrize(
-    ("mode", "dtype", "rtol", "atol"),
-    [
-        *((mode, torch.float64, 1e-9, 1e-9) for mode in MODES),
-        ("SameStep", torch.float32, 1e-5, 1e-4),
-    ],
+    ("dtype", "rtol", "atol"), [(torch.float64, 1e-9, 1e-9), (torch.float32, 1e-5, 1e-4)]
 )
-def test_it_equals_it_over_long_episodes_in_both_types(mode, dtype, rtol, atol, rng):
+def test_it_equals_it_over_long_episodes_in_both_types(dtype, rtol, atol, rng):
     shown = {"action_window": 20, "output_window": 2, "move_weight": 0.1, **PRESETS["hard"]}
-    arguments = {"max_episode_steps": 400, "autoreset_mode": mode, **shown}
+    arguments = {"max_episode_steps": 400, "autoreset_mode": "SameStep", **shown}
     env, envs = make(3, dtype=dtype, **arguments), MiddlePointVectorEnv(3, **arguments)
     of = {"rtol": rtol, "atol": atol}
     compare(env, envs, steps=600, rng=rng, partial_resets=0.002, limit=400, **of)
