@@ -223,6 +223,16 @@ class TestDirectNN:
             moved = getattr(nn.weights, field) - getattr(before, field)
             np.testing.assert_allclose(moved, -gain * leaf.grad.numpy(), atol=1e-12)
 
+    @pytest.mark.parametrize("n_hidden", [1, 9])
+    def test_a_batch_with_many_inputs_is_its_members_to_the_bit(self, n_hidden, rng):
+        shape = {"n_inputs": 12, "n_hidden": n_hidden, "error_index": 0}
+        batch = DirectNNController(seed=5, num_envs=7, **shape)
+        singles = [DirectNNController(seed=5 + i, **shape) for i in range(7)]
+        for observation in rng.normal(0, 4, (20, 7, 12)):
+            batch.act(observation)
+            [nn.act(row) for nn, row in zip(singles, observation, strict=True)]
+            assert np.array_equal(batch.command, [nn.command for nn in singles])
+
     def test_initial_weights_are_uniform_and_of_the_seed_alone(self):
         weights = DirectNNController(num_envs=2000, weight_scale=0.5).weights
         for field in FIELDS:
