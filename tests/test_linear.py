@@ -1,15 +1,12 @@
 """The linear model against the environment, its step test, and the poles of loops."""
 
-import control
 import numpy as np
 import pytest
 from scipy import signal
 
 from agents import PIController, SmithPredictor
-from benchmarks.claims.claims import largest_pole
 from benchmarks.lib.storage import UsageError
 from benchmarks.loop.linear import (
-    Coefficients,
     LinearModel,
     nominal,
     step_test,
@@ -59,22 +56,6 @@ def test_ranges_stand_for_their_middle_and_what_is_added_does_not_show():
 
 def test_an_integrating_plant_has_a_gain_of_one_sign():
     assert LinearModel([1.0, -1.0], [-0.1]).gain == -np.inf
-
-
-@pytest.mark.parametrize("a", [(1.0,), (1.0, -0.9), (1.0, -1.2, 0.5)])
-def test_responses_of_many_plants_at_once(a):
-    b, c = [0.3, -0.1, 0.2], (1.0, 0.4, 0.1)
-    ones = np.ones((2, 1))
-    many = Coefficients(-np.array(a[1:]) * ones, np.array(b) * ones, np.ones(2))
-    alone = LinearModel(a, b).response(np.eye(1, 30)[0])
-    np.testing.assert_allclose(many.impulse_response(29), [alone[1:]] * 2, atol=1e-12)
-
-    F, g = many.state_space(c)
-    state, noise = g, []
-    for _ in range(30):
-        noise.append(state[0])
-        state = F[0] @ state
-    np.testing.assert_allclose(noise, signal.lfilter(c, a, np.eye(1, 30)[0]), atol=1e-12)
 
 
 def first_order(gain, time_constant, delay):
@@ -141,15 +122,6 @@ def test_bad_plant_file_is_named(tmp_path, text, complaint):
 
 
 STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of the paper's plant
-
-
-@pytest.mark.parametrize(("kp", "ki"), [(2.2, 0.3), (4.4, 0.3), (0.5, 0.01)])
-def test_the_largest_pole_of_the_loop_is_that_of_python_control(kp, ki):
-    b, a = nominal(Parameters()).transfer()
-    plant = control.tf(b, np.pad(a, (0, len(b) - len(a))), True)
-    pi = control.tf([kp + ki, -kp], [1.0, -1.0], True)
-    poles = control.feedback(-pi * plant, 1).poles()
-    assert largest_pole(kp, ki) == pytest.approx(np.abs(poles).max(), rel=1e-6)
 
 
 @pytest.mark.parametrize(

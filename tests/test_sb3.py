@@ -6,7 +6,6 @@ from functools import partial
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.wrappers import DelayObservation, TransformObservation
 from stable_baselines3 import PPO
@@ -51,7 +50,9 @@ class TestBatches:
             made = [partial(one, **given) for n, given in TWO for _ in range(n)]
         else:
             given = {**TRAINING, "max_episode_steps": 7}
-            batch = make_vec_env(HARD, 4, wrapper=VELOCITY, **given)
+            batch = make_vec_env(
+                HARD, 4, wrapper=partial(IncrementalAction, **VELOCITY), **given
+            )
             made = [lambda: IncrementalAction(gymnasium.make(HARD, **given), **VELOCITY)] * 4
         theirs = DummyVecEnv([lambda make=make: Monitor(make()) for make in made])
         for each in (batch, theirs):
@@ -104,14 +105,6 @@ class TestBatches:
                 refuse("parameters", None)
         with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
             two_batches("NextStep")
-
-    @pytest.mark.parametrize("wrapper", [VELOCITY, partial(IncrementalAction, **VELOCITY)])
-    def test_the_spec_makes_the_same_environment(self, wrapper):
-        spec = make_vec_env("MiddlePoint-v0", 2, wrapper=wrapper, **TRAINING).spec
-        env = gymnasium.make(EnvSpec.from_json(spec.to_json()))
-        assert isinstance(env, IncrementalAction)
-        assert spec.additional_wrappers[0].kwargs == VELOCITY
-        assert env.unwrapped.parameters.action_window == 20
 
     @pytest.mark.parametrize(
         ("arguments", "message"),

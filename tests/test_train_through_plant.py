@@ -13,7 +13,7 @@ from agents.networks import PRETRAINED  # noqa: E402
 from benchmarks.controllers.roster import ROSTER  # noqa: E402
 from benchmarks.loop.rollout import make_plants, rollout  # noqa: E402
 from benchmarks.train import __main__ as program  # noqa: E402
-from benchmarks.train import loops, through_plant  # noqa: E402
+from benchmarks.train import loops, ppo, through_plant  # noqa: E402
 from benchmarks.train.loops import Draw, Loops, environment  # noqa: E402
 from benchmarks.train.through_plant import Net, Training, loss_of, train, validate  # noqa: E402
 from mptc_gym import Parameters  # noqa: E402
@@ -144,6 +144,8 @@ def test_the_command_lists_trainings_by_their_seeds(
     network, steps, files, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(through_plant, "TRAINING", SMALL)
+    short = {"plants": ((64, {}),), "cases": {"short": {"max_episode_steps": 20}}}
+    monkeypatch.setitem(ppo.RECIPES, "ppo", replace(ppo.RECIPES["ppo"], **short))
     arguments = [network, "--networks", "2", "--steps", str(steps), "--jobs", "1"]
     assert program.main([*arguments, "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
