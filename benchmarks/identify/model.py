@@ -10,11 +10,12 @@ import numpy as np
 from benchmarks.identify.fit import Array, Plant, Problem
 from benchmarks.identify.log import Log
 from benchmarks.identify.options import Knowledge
-from benchmarks.identify.search import FAULT, FAVOUR, Found, draws, possible_zones, search
-from benchmarks.identify.valve import SOUND, VALVES
+from benchmarks.identify.search import FAULT, Found, draws, possible_zones, search
+from benchmarks.identify.valve import HYSTERESES, SOUND, VALVES
 
 LAGS = 30  # of the autocorrelation of the errors, blocks
 COMMANDS = 5  # distinct ones, at least, that test a valve
+FAVOUR = 6.0  # deviance by which valves may differ that explain a log alike
 RIVAL = 1.3  # largest ratio of the gains behind valves that explain a log alike
 TEST = (
     "The test that tells: move the flow up and down in small steps, twice in each direction, "
@@ -230,7 +231,7 @@ def _warnings(
     alike = np.correlate(errors, errors, "full")[len(errors) :][:LAGS] / (errors @ errors)
     large = float(np.mean(np.abs(alike) > max(0.1, 2.5 / np.sqrt(len(errors)))))
     bar = max(found.valve.drop - FAVOUR, FAULT)
-    rivals = [abs(each.gain) for each in found.rivals if each.harmless and each.drop > bar]
+    rivals = [abs(each.gain) for each in found.rivals if each.drop > bar]
     doubts = {
         fault_sentence(found, log.flow_unit): found.fault is not None,
         "Valves of two kinds explain the log alike, and the plants behind them differ. "
@@ -253,12 +254,12 @@ def _warnings(
 def fault_sentence(found: Found, unit: str) -> str:
     """Return what seems to be wrong with the valve or the plant, and the test that tells."""
     fault = found.fault or found.valve
-    if fault not in found.rivals:
+    if fault in found.faults and fault.name not in HYSTERESES:
         return (
             f"The plant seems to change: {fault.name}. Identify each level, time or direction "
             "from a log of its own."
         )
-    others = [each.drop for each in found.rivals if each.name != fault.name]
+    others = [each.drop for each in found.faults[1:] if each.name in HYSTERESES]
     alone = max(others, default=0.0) < fault.drop - FAULT
     return (
         f"The valve does not seem to pass what it is told: {fault.name} of {fault.size:.2g} "

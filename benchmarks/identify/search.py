@@ -9,11 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.identify.fit import BLOCKS, SHAPES, Array, Plant, Problem, Solution
-from benchmarks.identify.valve import VALVES, Hypothesis, with_change, with_valve
+from benchmarks.identify.valve import (
+    VALVES,
+    Hypothesis,
+    with_change,
+    with_hysteresis,
+    with_valve,
+)
 
 LOAD, MOST_LOADS = 25.0, 4  # deviance that a load must explain, and how many there may be
 FAULT = 12.0  # deviance from which a valve or a change is evident
-FAVOUR = 6.0  # by which a dead zone or a limit is preferred to other faults
 DRAWS, THIN = 200, 3  # plants that are drawn, and steps of the walk between them
 SPREAD = 1.4  # draws are that much wider than the likelihood says, as no model is right
 
@@ -71,10 +76,16 @@ class Found(Fits):
 
     valve: Hypothesis
     """A sound valve, a dead zone or a limit, which the fits take into account."""
-    fault: Hypothesis | None
-    """What no controller should be tuned for, if it is evident."""
     rivals: list[Hypothesis]
-    """All valves that were tried, the likeliest first."""
+    """All such valves that were tried, the likeliest first."""
+    faults: list[Hypothesis]
+    """What no controller should be tuned for, the likeliest first: what each explains beyond
+    the valve that was found."""
+
+    @property
+    def fault(self) -> Hypothesis | None:
+        """The likeliest fault, if it is evident."""
+        return self.faults[0] if self.faults[0].drop > FAULT else None
 
 
 def search(problem: Problem, command: Array, *, applied: bool) -> Found:
@@ -90,21 +101,15 @@ def search(problem: Problem, command: Array, *, applied: bool) -> Found:
     found = fits(problem.reweighted("one lag", starts["one lag"][0]), starts)
     for _ in range(2):
         found = found.again(found.problem, found.p)
-    harmless = {name: kind for name, kind in VALVES.items() if kind.harmless}
-    for kinds in ({}, {}) if applied else (harmless, VALVES):
+    for kinds in ({}, {}) if applied else (VALVES, VALVES):
         rivals = with_valve(found.problem, found.shape, found.p, command, kinds)
-        sound = [each for each in rivals if each.harmless]
         # Of those that differ by rounding alone, the first.
-        valve = max(sound, key=lambda each: round(each.drop) - FAULT * (each.name != "none"))
+        valve = max(rivals, key=lambda each: round(each.drop) - FAULT * (each.name != "none"))
         found = found.again(_with_loads(valve.problem, found.shape, valve.p), valve.p)
-    # Faults, by what they explain beyond the valve that was found.
-    bar = max(valve.drop, 0.0)
-    others = [(each.drop - bar - FAVOUR, each) for each in rivals if not each.harmless]
-    changes = with_change(found.problem, found.shape, found.p)
-    others += [(each.drop, each) for each in changes]
-    drop, fault = max(others, key=lambda each: each[0])
-    evident = fault if drop > FAULT else None
-    return Found(found.problem, found.places, found.prices, valve, evident, rivals)
+    where = found.problem, found.shape, found.p
+    faults = with_change(*where) + ([] if applied else with_hysteresis(*where, command))
+    faults.sort(key=lambda each: -each.drop)
+    return Found(found.problem, found.places, found.prices, valve, rivals, faults)
 
 
 def _coarse(

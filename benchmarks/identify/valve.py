@@ -35,26 +35,26 @@ class Kind:
     """Sizes to try, as shares of the largest flow; of a rate, in a delay and a lag."""
     delays: tuple[float, ...] = (1.0,)
     """Shares of the delay to try: some valves look like a part of it."""
-    harmless: bool = False
-    """Whether a linear controller can be tuned for the plant behind it."""
 
 
-SOUND = Kind(lambda u, _: u, (0.0,), harmless=True)
+SOUND = Kind(lambda u, _: u, (0.0,))
+# A linear controller can be tuned for the plant behind these.
 VALVES = {
-    "dead zone": Kind(lambda u, size: np.where(np.abs(u) < size, 0.0, u), harmless=True),
+    "dead zone": Kind(lambda u, size: np.where(np.abs(u) < size, 0.0, u)),
     "subtractive dead zone": Kind(
-        lambda u, size: np.sign(u) * np.maximum(np.abs(u) - size, 0.0), harmless=True
+        lambda u, size: np.sign(u) * np.maximum(np.abs(u) - size, 0.0)
     ),
-    "saturation": Kind(
-        lambda u, size: np.clip(u, -size, size), (0.4, 0.55, 0.7, 0.85), harmless=True
-    ),
+    "saturation": Kind(lambda u, size: np.clip(u, -size, size), (0.4, 0.55, 0.7, 0.85)),
     "rate limit": Kind(
         following(lambda p, u, size: p + min(max(u - p, -size), size)),
-        (10.0, 3.3, 1.6, 1.0, 0.6), (1.0, 0.7, 0.4), harmless=True,
+        (10.0, 3.3, 1.6, 1.0, 0.6), (1.0, 0.7, 0.4),
     ),
+}  # fmt: skip
+# With these a loop cycles.
+HYSTERESES = {
     "backlash": Kind(
         following(lambda p, u, size: min(max(p, u - size / 2), u + size / 2)),
-        (0.1, 0.2, 0.35, 0.5, 0.8), (1.0, 0.7),
+        (0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.1), (1.0, 0.7),
     ),
     "stiction": Kind(
         following(lambda p, u, size: u if abs(u - p) > size else p),
@@ -77,7 +77,6 @@ class Hypothesis:
     p: Array
     gain: float
     """Of the plant behind it."""
-    harmless: bool = False
 
 
 def with_valve(
@@ -102,8 +101,33 @@ def with_valve(
         plain = plain if found else deviance
         gain = behind.plant(shape, q, behind.solve(shape, q).c).gain
         drop = plain - deviance
-        found.append(Hypothesis(name, size, drop, behind, q, gain, kind.harmless))
+        found.append(Hypothesis(name, size, drop, behind, q, gain))
     return sorted(found, key=lambda each: -round(each.drop))
+
+
+def with_hysteresis(problem: Problem, shape: str, p: Array, command: Array) -> list[Hypothesis]:
+    """Return backlash and stiction, each with its best size, plant and noise."""
+    own, found = problem.reweighted(shape, p), []
+    plain = own.refined(shape, p, 12)[0]
+    for name, kind in HYSTERESES.items():
+        places = [np.r_[share * p[0], p[1:]] for share in kind.delays]
+        sizes = [float(np.abs(command).max()) * share for share in kind.sizes]
+        # The plant that was found without hysteresis is too slow: each size has its own.
+        for finer in FINER:
+            tried = []
+            for size in sizes:
+                behind = problem.behind(kind.passed(command, size))
+                prices = [behind.solve(shape, q).deviance for q in places]
+                nearest = places[int(np.argmin(prices))]
+                tried.append((*behind.refined(shape, nearest, 8), size, behind))
+            _, q, size, behind = min(tried, key=lambda each: each[0])
+            sizes, places = [size * factor for factor in finer], [q]
+        # Nor is the noise what that plant left.
+        behind = behind.reweighted(shape, q)
+        deviance, q = behind.refined(shape, q, 12)
+        gain = behind.plant(shape, q, behind.solve(shape, q).c).gain
+        found.append(Hypothesis(name, size, plain - deviance, behind, q, gain))
+    return found
 
 
 def with_change(problem: Problem, shape: str, p: Array) -> list[Hypothesis]:
