@@ -1,6 +1,5 @@
 """Identification: known plants are found again, and what a log cannot tell is refused."""
 
-import contextlib
 import json
 import re
 from dataclasses import replace
@@ -164,8 +163,7 @@ class TestValves:
             assert any(said in note for note in model.notes)
             assert model.plant.gain == pytest.approx(-0.6825, rel=0.05)
         else:
-            assert said in model.warnings[0]
-            assert "The test that tells" in model.warnings[0]
+            assert re.search(rf"{said} of [\d.]+ .*The test that tells", model.warnings[0])
             assert recommended(model) == []
 
     @pytest.mark.parametrize("seed", [91_010, 91_011])
@@ -177,24 +175,30 @@ class TestValves:
         assert found["Ms, delay a fifth off"] < 2.5
 
     @pytest.mark.parametrize(
-        "fault",
-        ["stiction with a slip", "rate limit", "gain by level", "two levels, saturation"],
+        ("seed", "fault", "recommended"),
+        [
+            (92_000, "stiction with a slip", 0),
+            (92_000, "rate limit", 1),
+            (92_000, "gain by level", 0),
+            (92_000, "two levels, saturation", 0),
+            # Without it, the plant seems slow: the true Ms of a loop for that one is 3.
+            (90_062, "backlash", 0),
+        ],
     )
-    def test_faulty_plants_are_refused_or_safe(self, fault):
-        found = study.tried(92_000, fault)
+    def test_faulty_plants_are_refused_or_safe(self, seed, fault, recommended):
+        found = study.tried(seed, fault)
+        assert found["recommended"] == recommended
         assert not found["unsafe"]
-        assert not (found["recommended"] and fault.startswith("two levels"))
 
 
 class TestTuning:
     def test_ms_is_that_of_the_loop(self):
         # A plant of first order, and the stability limit of pure integration with a delay.
         plant = Plant(40.0, np.array([100.0 + 0j]), np.array([2.0 + 0j]))
-        loops = Loops([plant], 1.0)
-        calm, margin = loops.judged(PIController(-0.1, -0.001))
+        calm, margin = Loops([plant], 1.0).judged(PIController(-0.1, -0.001))
         assert 1.0 < calm[0] < 1.3
         assert margin > 100.0
-        wild, _ = loops.judged(PIController(-3.0, -0.03))
+        wild, _ = Loops([plant], 1.0).judged(PIController(-3.0, -0.03))
         assert wild[0] == np.inf
 
     @pytest.mark.parametrize("direction", [-1.0, 1.0])
@@ -207,9 +211,8 @@ class TestTuning:
         assert listed["warnings"] == []
         assert [each["controller"] for each in listed["recommended"]] == ["pi-simc", "smith"]
         env = gymnasium.make("MiddlePoint-v0", b=b, dead_zone=0.0, setpoint=3.0)
-        for each, made in zip(
-            listed["recommended"], [PIController, SmithPredictor], strict=True
-        ):
+        makers = [PIController, SmithPredictor]
+        for each, made in zip(listed["recommended"], makers, strict=True):
             assert np.sign(each["kp"]) == -direction  # the gain of the paper's B is negative
             assert each["action"] == ("reverse" if direction < 0.0 else "direct")
             assert max(each["sensitivity"]) <= 1.8
@@ -226,12 +229,9 @@ class TestTuning:
         assert pi["arguments"]["ki"] == pytest.approx(-pi["kp"] * 8.0 / pi["ti"])
         assert pi["ti"] == pytest.approx(161.0, rel=0.1)  # SIMC's: the time constant
         assert pi["model"]["delay"] == pytest.approx(19 * 8.0, rel=0.1)
-        assert pi["units"] == {
-            "kp": "t/h per °C",
-            "ti": "s",
-            "flow": "t/h",
-            "temperature": "°C",
-        }
+        flow, degree = "t/h", "°C"
+        units = {"kp": f"{flow} per {degree}", "ti": "s", "flow": flow, "temperature": degree}
+        assert pi["units"] == units
         assert pi["limits"]["low"] == pytest.approx(model.operating_flow + model.u_min)
         assert set(pi["operating_point"]) == {"flow", "temperature"}
 
@@ -348,11 +348,6 @@ def dated(form):
     return csv(table(time=dates.strftime(form)))
 
 
-def in_unit(unit, seconds):
-    log = table().assign(time=table()["time"] / seconds)
-    return csv(log.rename(columns={"time": f"Time ({unit})", "flow": "Flow [kg/s]"}))
-
-
 def with_line(line):
     """Return a log whose line 4 is this one."""
     good = [f"{8 * k},1.0,1.0" for k in range(120)]
@@ -369,28 +364,25 @@ WAYS = {
     "commas at the ends": (csv(lineterminator=",\n").replace(",\n", "\n", 1), {}),
     "ISO dates": (dated("%Y-%m-%dT%H:%M:%S"), {}),
     "dates with points": (dated("%d.%m.%Y %H:%M:%S"), {}),
-    "minutes": (in_unit("min", 60.0), {"time": "Time (min)", "flow": "Flow [kg/s]"}),
-    "hours, without the units": (in_unit("h", 3600.0), {"time": "Time", "flow": "Flow"}),
+    "minutes": (csv(table(time=np.arange(400) / 7.5)), {"time_unit": "min"}),
+    "other headings": (csv().replace("flow", "Flow [kg/s]"), {"flow": "Flow [kg/s]"}),
     "days": (csv(table(time=46053.5 + np.arange(400) / 10800)), {"time_unit": "D"}),
 }  # fmt: skip
 # Text and options of what is no log, by what is said.
 FAULTS = {
-    "is not a table: No columns": ("", {}),
     "too short: 0 rows": ("time,flow,temperature\n", {}),
     "is not a table: .* With decimal commas": (with_line("16,1,0,1,5"), {}),
     "line 4: flow must be a number, got 'broken'": (with_line("16,broken,1.0"), {}),
-    "line 4: temperature must be a number, got 'inf'": (with_line("16,1.0,inf"), {}),
-    "line 4: temperature must be a number, got '4e.300'": (with_line("16,1.0,4e300"), {}),
-    "line 4: time must be a number, got 'soon'": (with_line("soon,1.0,1.0"), {}),
-    "line 4: there is no time": (with_line(",1.0,1.0"), {}),
+    "line 4: temperature must be a number, got '4e300'": (with_line("16,1.0,4e300"), {}),
+    "line 4: time must be a number or a date, got 'soon'": (with_line("soon,1.0,1.0"), {}),
+    "line 4: time must be a number or a date, got 'nan'": (with_line(",1.0,1.0"), {}),
+    "line 4: time must be a date": (dated("%Y-%m-%dT%H:%M:%S").replace("50:16", "50:6x"), {}),
     "line 4: a time step of -4 s: times must increase": (with_line("4,1.0,1.0"), {}),
-    "line 4: a time step of 0 s": (with_line("8,1.0,1.0"), {}),
     "line 4: a time step of 11.5 s: most steps are 8": (with_line("19.5,1.0,1.0"), {}),
     "line 202: a time step of 808 s: rows are missing": (
         csv(table(time=8.0 * np.arange(400) + np.repeat([0.0, 800.0], 200))), {},
     ),
     "if the times are days, say --time-unit D": (csv(table(time=np.arange(400) / 1e4)), {}),
-    "unit of the times must be .* got 'furlongs'": (csv(), {"time_unit": "furlongs"}),
     "no column 'flow'; it has 'time', 'flown', 'temp": (csv().replace("flow", "flown"), {}),
     "one thing only": (csv(), {"temperature": "flow"}),
     "250 of 400 values .* missing": (csv(table(flow=[np.nan] * 250 + [1.0] * 150)), {}),
@@ -402,7 +394,7 @@ def read(tmp_path):
     """Return a function that reads the text of a log."""
 
     def of_text(text, **columns):
-        (tmp_path / "log.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
+        (tmp_path / "log.csv").write_text(text)
         return read_log(tmp_path / "log.csv", Columns(**columns))
 
     return of_text
@@ -416,12 +408,11 @@ class TestLog:
         np.testing.assert_allclose(log.flow, expected.flow, rtol=1e-9)
         np.testing.assert_allclose(log.temperature, expected.temperature, 1e-9, 1e-9)
         assert log.sampling_interval == pytest.approx(8.0)
-        assert log.flow_unit == ("kg/s" if "Flow [kg/s]" in text else "t/h")
         assert not any("missing" in note for note in log.notes)
 
     def test_units_are_those_of_the_log(self):
-        log = replace(good().log, flow_unit="%", temperature_unit="K")
-        model = replace(good(), log=log)
+        columns = Columns(flow_unit="%", temperature_unit="K")
+        model = replace(good(), log=replace(good().log, columns=columns))
         text = str([section.text for section in report(model, recommended(model))])
         assert "t/h" not in text
         assert "°C" not in text
@@ -441,16 +432,6 @@ class TestLog:
         assert np.flatnonzero(np.isnan(log.temperature)).tolist() == [50, 100, 101, 102]
         assert any("4 values of 'temperature'" in note for note in log.notes)
         np.testing.assert_array_equal(log.flow[100:103], log.flow[99])
-
-    def test_corrupted_file_is_read_or_refused(self, read):
-        generator = np.random.default_rng(0)
-        for _ in range(30):
-            data = bytearray(csv().encode())
-            for at in generator.integers(len(data), size=int(generator.integers(1, 30))):
-                junk = generator.bytes(int(generator.integers(1, 20)))
-                data[at : at + int(generator.integers(0, 40))] = junk
-            with contextlib.suppress(ValueError):  # refused
-                assert len(read(bytes(data)).flow) > 0
 
     @pytest.mark.parametrize("complaint", FAULTS)
     def test_what_cannot_be_read_is_named(self, read, complaint):

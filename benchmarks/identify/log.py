@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,33 +19,32 @@ Array = NDArray[np.float64]
 FEWEST, MOST = 100, 20_000  # rows; of a longer log, the last ones are used
 LONGEST_GAP = 20  # rows
 SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}
-_UNIT = re.compile(r"\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")  # in brackets, at the end of a heading
 
 
 @dataclass(frozen=True)
 class Log:
-    """A recorded log with one row a sample."""
+    """A recorded log with one row a sample.
+
+    - `flow`: the flow from the time of its row on;
+    - `temperature`: the temperature at the time of its row; NaN where it is unknown;
+    - `sampling_interval`: in s;
+    - `disturbances`: other measured inputs, by column;
+    - `columns`: where it was read, and the units;
+    - `notes`: what was read, and what was done about numbers that are missing.
+    """
 
     flow: Array
-    """From the time of its row on."""
     temperature: Array
-    """At the time of its row; NaN where it is unknown."""
     sampling_interval: float
-    """s."""
     disturbances: dict[str, Array] = field(default_factory=dict)
-    """Other measured inputs, by column."""
-    flow_unit: str = "t/h"
-    """Of the flow, for reports."""
-    temperature_unit: str = "°C"
-    """Of the temperature."""
+    columns: Columns = field(default_factory=Columns)
     notes: tuple[str, ...] = ()
-    """What was read, and what was done about numbers that are missing."""
 
 
 def read_log(path: Path, columns: Columns | None = None) -> Log:
     """Read a table with a heading.
 
-    The separator (comma, semicolon or tab) and the decimal mark are detected.
+    The separator may be a comma, a semicolon or a tab, the decimal mark a point or a comma.
 
     Raises
     ------
@@ -54,48 +52,49 @@ def read_log(path: Path, columns: Columns | None = None) -> Log:
         If the table cannot be read; the message names the column, and the line if there is one.
     """
     columns = columns or Columns()
-    table, decimal = _table(path)
-    options = "time", "flow", "temperature"
-    names = [_heading(table, option, getattr(columns, option)) for option in options]
-    time, flow, temperature = names
-    names += [_heading(table, "disturbance", each) for each in columns.disturbance]
+    table = _table(path)
+    flow, temperature = columns.flow, columns.temperature
+    names = [columns.time, flow, temperature, *columns.disturbance]
     if len(set(names)) < len(names):
         raise ValueError(f"each column can be one thing only, got {', '.join(names)}")
-    interval, places = _sampled(_times(table[time], decimal, columns.time_unit))
-    kept = pd.DataFrame({name: _numbers(table[name], decimal) for name in names[1:]})
-    kept = kept.set_index(places).reindex(range(places[-1] + 1))[-MOST:]
+    for name in names:
+        if name not in table:
+            raise ValueError(
+                f"the log has no column {name!r}; it has {', '.join(map(repr, table))}. Name "
+                "the right ones with --time, --flow, --temperature and --disturbance"
+            )
+    interval, places = _sampled(_times(table[columns.time], SECONDS[columns.time_unit]))
+    numbers = table[names[1:]].apply(_numbers)
+    kept = numbers.set_index(places).reindex(range(places[-1] + 1))[-MOST:]
     notes = [f"Read {len(table):,} rows, one every {interval:g} s; {len(kept):,} are used."]
-    for name, count in kept.isna().sum().items():
-        done = "are left out of the fit" if name == temperature else "are the values before"
-        notes += [f"{count} values of {name!r} are missing, and {done}."] * bool(count)
+    for column, count in kept.isna().sum().items():
+        done = "are left out of the fit" if column == temperature else "are the values before"
+        notes += [f"{count} values of {column!r} are missing, and {done}."] * bool(count)
         if len(kept) - count < max(FEWEST, len(kept) / 2):
-            raise ValueError(f"{count} of {len(kept)} values of {name!r} are missing: too many")
+            raise ValueError(
+                f"{count} of {len(kept)} values of {column!r} are missing: too many"
+            )
     held = kept.ffill().bfill()
-    return Log(
-        held[flow].to_numpy(np.float64), kept[temperature].to_numpy(np.float64), interval,
-        {name: held[name].to_numpy(np.float64) for name in names[3:]},
-        columns.flow_unit or _unit(flow, "t/h"),
-        columns.temperature_unit or _unit(temperature, "°C"), tuple(notes),
-    )  # fmt: skip
+    others = {name: held[name].to_numpy() for name in columns.disturbance}
+    temperatures = kept[temperature].to_numpy()
+    return Log(held[flow].to_numpy(), temperatures, interval, others, columns, tuple(notes))
 
 
-def _table(path: Path) -> tuple[pd.DataFrame, str]:
-    """Return a file's table and its decimal mark."""
+def _table(path: Path) -> pd.DataFrame:
+    """Return a file's table of texts."""
     try:
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    heading, *lines = text[:10_000].splitlines() or [""]
+    heading = text.partition("\n")[0]
     separator = next((mark for mark in ";\t" if mark in heading), ",")
-    # With commas between the columns, a number with a decimal comma stands in quotes.
-    comma = r'"-?\d+,\d+"' if separator == "," else r"\d,\d"
-    decimal = "," if any(re.search(comma, line) for line in lines) else "."
     try:
         with warnings.catch_warnings():
+            # Of more cells than headings.
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = pd.read_csv(
-                io.StringIO(text), sep=separator, decimal=decimal, skipinitialspace=True,
-                skip_blank_lines=False, index_col=False, low_memory=False,
+                io.StringIO(text), sep=separator, dtype=str, skipinitialspace=True,
+                skip_blank_lines=False, index_col=False,
             )  # fmt: skip
     except (pd.errors.EmptyDataError, pd.errors.ParserError, pd.errors.ParserWarning) as error:
         raise ValueError(
@@ -104,61 +103,39 @@ def _table(path: Path) -> tuple[pd.DataFrame, str]:
         ) from error
     if len(table) < FEWEST:
         raise ValueError(f"the log is too short: {len(table)} rows, and hundreds are needed")
-    return table.set_axis([str(name) for name in table.columns], axis=1), decimal
+    return table
 
 
-def _heading(table: pd.DataFrame, option: str, name: str) -> str:
-    """Return the heading that a user names, with its unit or without."""
-    for each in map(str, table):
-        if name in (each, _UNIT.sub("", each)):
-            return each
-    raise ValueError(
-        f"the log has no column {name!r}; it has {', '.join(map(repr, table))}. Name the right "
-        f"one with --{option}"
-    )
-
-
-def _unit(name: str, default: str) -> str:
-    """Return the unit that stands in a heading, if any."""
-    bracket = _UNIT.search(name)
-    return bracket.group(1) if bracket else default
-
-
-def _numbers(column: pd.Series[Any], decimal: str) -> pd.Series[Any]:
-    """Return a column as numbers; a ValueError names the line of what is none."""
-    texts = column
-    if not pd.api.types.is_numeric_dtype(column) and decimal == ",":
-        texts = column.astype(str).str.replace(",", ".")  # pandas has left it all as text
-    values = pd.to_numeric(texts, errors="coerce").astype(np.float64)
-    bad = ~(values.abs() < 1e30) & column.notna()  # so that squares are finite
-    if bad.any():
-        raise ValueError(
-            f"line {bad.to_numpy().argmax() + 2}: {column.name} must be a number, got "
-            f"{str(column[bad].iloc[0])!r}. Leave the cell empty where it is not known"
-        )
+def _numbers(column: pd.Series[str]) -> pd.Series[float]:
+    """Return texts as numbers; a ValueError names the line of what is none."""
+    values = pd.to_numeric(column.str.replace(",", "."), errors="coerce").astype(np.float64)
+    _check(column, ~(values.abs() < 1e30) & column.notna(), "a number")  # its square is finite
     return values
 
 
-def _times(column: pd.Series[Any], decimal: str, unit: str | None) -> Array:
+def _times(column: pd.Series[str], unit: float) -> Array:
     """Return times in seconds, of numbers or dates."""
-    if column.isna().any():
-        raise ValueError(f"line {column.isna().to_numpy().argmax() + 2}: there is no time")
-    if not pd.api.types.is_numeric_dtype(column):
-        # In the one form the year comes first, in the other the day.
-        first = str(column.iloc[0])[:4].isdigit()
-        form: dict[str, Any] = {"format": "ISO8601"} if first else {"dayfirst": True}
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a form that is not known
-            dates = pd.to_datetime(column, errors="coerce", utc=True, **form)
-        if dates.notna().all():
-            seconds = (dates - dates.iloc[0]) / pd.Timedelta(seconds=1)
-            return np.asarray(seconds, np.float64)
-    unit = unit or _unit(str(column.name), "s")
-    if unit not in SECONDS:
+    numbers = pd.to_numeric(column.str.replace(",", "."), errors="coerce")
+    if numbers.count() > len(column) / 2:
+        _check(column, numbers.isna(), "a number or a date")
+        return unit * numbers.to_numpy(np.float64)
+    # In the one form of dates the year comes first, in the other the day.
+    first = str(column.iloc[0])[:4].isdigit()
+    form: dict[str, Any] = {"format": "ISO8601"} if first else {"dayfirst": True}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of a form that is not known
+        dates = pd.to_datetime(column, errors="coerce", utc=True, **form)
+    _check(column, dates.isna(), "a date")
+    return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), np.float64)
+
+
+def _check(column: pd.Series[str], bad: pd.Series[bool], needed: str) -> None:
+    """Raise a ValueError that names the first line that is bad."""
+    if bad.any():
         raise ValueError(
-            f"the unit of the times must be {', '.join(SECONDS)}, got {unit!r}: say --time-unit"
+            f"line {bad.to_numpy().argmax() + 2}: {column.name} must be {needed}, got "
+            f"{str(column[bad].iloc[0])!r}. Leave other cells empty where nothing is known"
         )
-    return SECONDS[unit] * _numbers(column, decimal).to_numpy()
 
 
 def _sampled(times: Array) -> tuple[float, NDArray[np.intp]]:

@@ -196,7 +196,7 @@ def held_out(found: Found) -> tuple[float, float]:
 
 def _notes(found: Found, log: Log) -> list[str]:
     """Return what a user should know of the fit."""
-    problem, size, unit = found.problem, found.valve.size, log.flow_unit
+    problem, size, unit = found.problem, found.valve.size, log.columns.flow_unit
     of_valve = {
         "rate limit": f"The valve seems to move by {size / problem.h:.3g} {unit} a second at "
         "most, which plant.json cannot hold.",
@@ -217,8 +217,8 @@ def _notes(found: Found, log: Log) -> list[str]:
     for i, name in enumerate(log.disturbances):
         gain = found.solution.c[first + 3 * i : first + 3 * i + 3].sum()
         notes.append(
-            f"{name} is a known disturbance with a gain of {gain:.4g} {log.temperature_unit} a "
-            "unit, which plant.json cannot hold."
+            f"{name} is a known disturbance with a gain of {gain:.4g} "
+            f"{log.columns.temperature_unit} a unit, which plant.json cannot hold."
         )
     return notes
 
@@ -233,7 +233,7 @@ def _warnings(
     bar = max(found.valve.drop - FAVOUR, FAULT)
     rivals = [abs(each.gain) for each in found.rivals if each.drop > bar]
     doubts = {
-        fault_sentence(found, log.flow_unit): found.fault is not None,
+        fault_sentence(found, log.columns.flow_unit): found.fault is not None,
         "Valves of two kinds explain the log alike, and the plants behind them differ. "
         + TEST: max(rivals, default=1.0) > RIVAL * min(rivals, default=1.0),
         "Not even the direction is known in which the temperature answers the flow. Move the "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from benchmarks.lib.command import Finite, Folder, Repeated, options
 
@@ -11,7 +12,7 @@ from benchmarks.lib.command import Finite, Folder, Repeated, options
 @options
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """The columns of a log. Their units may also stand in the heading, in brackets."""
+    """The columns of a log, and their units."""
 
     time: str = "time"
     """Column of the times, numbers or dates."""
@@ -21,12 +22,12 @@ class Columns:
     """Column of the temperature."""
     disturbance: Repeated = ()
     """Column of a measured disturbance (repeatable)."""
-    time_unit: str | None = None
-    """Unit of the times: ms, s, min, h or D, days (default: s)."""
-    flow_unit: str | None = None
-    """Unit of the flow, for the report (default: t/h)."""
-    temperature_unit: str | None = None
-    """Unit of the temperature, for the report (default: °C)."""
+    time_unit: Literal["ms", "s", "min", "h", "D"] = "s"
+    """Unit of the times, unless these are dates; D are days."""
+    flow_unit: str = "t/h"
+    """Unit of the flow, for the report."""
+    temperature_unit: str = "°C"
+    """Unit of the temperature, for the report."""
 
 
 @options

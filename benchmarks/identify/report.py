@@ -36,11 +36,9 @@ HOW = (
 
 def execute(options: Options) -> str:
     """Identify a plant from a log and write the results."""
-    made, began = origin(), time.process_time()
-    out = out_folder(options.out)
+    made, began, out = origin(), time.process_time(), out_folder(options.out)
     try:
-        log = read_log(options.log, options.columns)
-        model = identify(log, options.knowledge)
+        model = identify(read_log(options.log, options.columns), options.knowledge)
         plant, ranges = plant_arguments(model), plant_ranges(model)
     except ValueError as error:
         raise UsageError(str(error)) from error
@@ -64,84 +62,81 @@ def execute(options: Options) -> str:
 
 def controllers(model: Model, found: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the content of `controllers.json`."""
-    flow, temperature, rest = _units(model)
+    flow, degree = model.log.columns.flow_unit, model.log.columns.temperature_unit
+    rest = model.operating_flow
     shared = {
-        "units": {
-            "kp": f"{flow} per {temperature}", "ti": "s",
-            "flow": flow, "temperature": temperature,
-        },
+        "units": {"kp": f"{flow} per {degree}", "ti": "s", "flow": flow, "temperature": degree},
         "operating_point": {"flow": rest, "temperature": model.operating_temperature},
         "limits": {"low": rest + model.u_min, "high": rest + model.u_max},
-    }  # fmt: skip
-    listed = [each | shared for each in found]
-    return {"recommended": listed, "warnings": model.warnings}
-
-
-def _units(model: Model) -> tuple[str, str, float]:
-    return model.log.flow_unit, model.log.temperature_unit, model.operating_flow
+    }
+    return {"recommended": [each | shared for each in found], "warnings": model.warnings}
 
 
 def report(model: Model, found: list[dict[str, Any]]) -> list[Section]:
     """Return the sections of the report."""
-    flow, temperature, rest = _units(model)
-    units = {"delay": "samples", "dead_zone": flow, "gain": f"{temperature} per {flow}"}
+    flow, degree = model.log.columns.flow_unit, model.log.columns.temperature_unit
+    rest = model.operating_flow
+    units = {"delay": "samples", "dead_zone": flow, "gain": f"{degree} per {flow}"}
     rows = [
         (name.replace("_", " "), f"{at:.4g}", f"[{low:.4g}, {high:.4g}]", units.get(name, "s"))
         for name, (at, low, high) in model.estimates.items()
     ]
-    warned = [f"**Nothing is recommended.** {' '.join(model.warnings)}"] * bool(model.warnings)
+    warned = [f"**Nothing is recommended.** {' '.join(model.warnings)}"]
+    advised = [
+        f"Recommended: {LABELS[each['controller']]} with Kp = {each['kp']:.4g} {flow} per "
+        f"{degree} and Ti = {each['ti']:.3g} s, {each['action']} acting."
+        for each in found
+    ]
     text = [
-        *warned,
-        f"Fitted to the first two thirds of the log, the model explains "
+        *(warned if model.warnings else []),
+        "Fitted to the first two thirds of the log, the model explains "
         f"{100 * max(model.explained[0], 0.0):.1f} % of the temperature's variance in the "
         "last, by simulation from the flow, but for a straight line.",
-        *(
-            f"Recommended: {LABELS[each['controller']]} with Kp = {each['kp']:.4g} {flow} per "
-            f"{temperature} and Ti = {each['ti']:.3g} s, {each['action']} acting."
-            for each in found
-        ),
+        *advised,
         *model.notes,
         f"All numbers are deviations from the operating point: a flow of {rest:g} {flow}, at "
-        f"which the temperature is {model.operating_temperature:.4g} {temperature}. The flow "
-        f"can be between {rest + model.u_min:g} and {rest + model.u_max:g} {flow}. Brackets "
-        "are 95 % intervals.",
+        f"which the temperature is {model.operating_temperature:.4g} {degree}. The flow can be "
+        f"between {rest + model.u_min:g} and {rest + model.u_max:g} {flow}. Brackets are 95 % "
+        "intervals.",
     ]
-    loops = [
-        (LABELS[each["controller"]], "{:.2f} to {:.2f}".format(*each["sensitivity"]),
-         f"{each['delay_margin']:.0f}", f"{each['slowed']:.2f} times")
-        for each in found
-    ]  # fmt: skip
-    columns = ["controller", "Ms", "delay margin (s)", "slower than by the rule"]
-    advice = Section("Recommended controllers", HOW, pd.DataFrame(loops, columns=columns))
+    loops = {
+        "controller": [LABELS[each["controller"]] for each in found],
+        "Ms": ["{:.2f} to {:.2f}".format(*each["sensitivity"]) for each in found],
+        "delay margin (s)": [f"{each['delay_margin']:.0f}" for each in found],
+        "slower than by the rule": [f"{each['slowed']:.2f} times" for each in found],
+    }
     table = pd.DataFrame(rows, columns=["", "value", "95 %", "unit"])
     shown = {"identify.png": "The log, the model and the response to a step"}
-    picture = Section("The log and the model", pictures=shown)
-    return [Section("What the log shows", text, table), picture, *([advice] if found else [])]
+    sections = [
+        Section("What the log shows", text, table),
+        Section("The log and the model", pictures=shown),
+        Section("Recommended controllers", HOW, pd.DataFrame(loops)),
+    ]
+    return sections if found else sections[:2]
 
 
 def draw(model: Model, path: Path) -> None:
     """Draw the log with the model's simulation of it, and the step response with its band."""
     log, shown, h = model.log, slice(-SHOWN, None), model.log.sampling_interval
+    flow, degree = log.columns.flow_unit, log.columns.temperature_unit
     minutes = (np.arange(len(log.flow)) * h / 60.0)[shown]
-    flow, temperature, rest = _units(model)
     title = "The log as recorded and as the model simulates it, and its response to a step"
     with drawn(path, 5, title) as figure:
         places = figure.subplot_mosaic([["y", "y"], ["u", "step"]], height_ratios=[3, 2])
         above, below, step = (places[name] for name in ("y", "u", "step"))
         above.plot(minutes, log.temperature[shown], color="0.5", lw=1, label="recorded")
         above.plot(minutes, model.simulated[shown], color=COLOURS[1], label="model")
-        above.set(xlabel="time (min)", ylabel=f"temperature ({temperature})")
+        above.set(xlabel="time (min)", ylabel=f"temperature ({degree})")
         above.legend(loc="upper left", ncols=2)
         above.margins(y=0.2)  # room for the legend
         below.step(minutes, log.flow[shown], where="post", color=COLOURS[0], lw=1)
-        zone = model.estimates["dead_zone"].value
-        ends = rest - zone, rest + zone
-        below.axhspan(*ends, color="0.5", alpha=0.15, lw=0, label="dead zone")
+        zone = model.estimates["dead_zone"].value * np.array([-1.0, 1.0])
+        below.axhspan(*(model.operating_flow + zone), color="0.9", label="dead zone")
         below.legend(loc="upper left")
         below.set(xlabel="time (min)", ylabel=f"flow ({flow})")
-        samples = int((model.plant.delay + 5.0 * model.plant.slowest) / h) + 2
-        after, ones = np.arange(samples) * h / 60.0, np.ones(samples)
+        ones = np.ones(int((model.plant.delay + 5.0 * model.plant.slowest) / h) + 2)
+        after = np.arange(len(ones)) * h / 60.0
         band = np.quantile([each.simulated(ones, h) for each in model.possible], ENDS, axis=0)
         step.fill_between(after, *band, color=COLOURS[0], alpha=0.25, lw=0)
         step.plot(after, model.plant.simulated(ones, h), color=COLOURS[0])
-        step.set(xlabel="time after the step (min)", ylabel=f"{temperature} per {flow}")
+        step.set(xlabel="time after the step (min)", ylabel=f"{degree} per {flow}")
