@@ -16,7 +16,6 @@ pytest.importorskip("cyclopts", reason="the commands need the extra compare")
 
 from benchmarks.__main__ import commands
 from benchmarks.__main__ import main as show_map
-from benchmarks.compare.__main__ import Options
 from benchmarks.lib.command import read
 from tests.conftest import ROOT, python
 
@@ -206,8 +205,7 @@ class TestEnds:
         assert main_of(name).__module__ == "benchmarks.lib.command"
 
     @pytest.mark.parametrize(
-        ("jobs", "sent"),
-        [("1", [signal.SIGINT]), ("2", [signal.SIGTERM]), ("2", [signal.SIGINT] * 2)],
+        ("jobs", "sent"), [("1", [signal.SIGTERM]), ("2", [signal.SIGINT] * 2)]
     )
     def test_after_signals(self, jobs, sent, tmp_path):
         run = subprocess.Popen(
@@ -264,13 +262,3 @@ class TestEnds:
 def test_a_folder_that_cannot_be_written_to(out, complaint, refused):
     for name in ("compare", "sweep"):
         assert complaint in refused(main_of(name), ["--out", out])
-
-
-def test_of_a_repeated_option_the_last_counts_and_lists_add_up():
-    given = [
-        "--agents", "nn", "pi", "--agents", "mpc", "--runs", "3", "--runs", "4",
-        "--set", "delay=3", "--set", "a=[1,-0.5]",
-    ]  # fmt: skip
-    options = read(Options, "program", given)
-    assert (options.agents, options.runs) == (("nn", "pi", "mpc"), 4)
-    assert options.plant.set == ("delay=3", "a=[1,-0.5]")

@@ -202,11 +202,13 @@ class TestSavedPolicies:
         (member,) = members_of(f"PPO:{file}")
         assert "weights: 0 M samples a policy" in member.provenance["searched"]
         controller = member(PRESETS[preset], 3, SEED)
-        found = errors(member, 3, 1200, **PRESETS[preset])
-        model, env = PPO.load(file, device="cpu"), IDS[preset]
+        found = errors(member, 3, 350, **PRESETS[preset])
+        model = PPO.load(file, device="cpu")
+        env = copy.deepcopy(gymnasium.spec(IDS[preset]))
         if name != "bare":  # the others say where they act
             model = load(file, device="cpu")
             env = spec_of(model, env)
+        env.max_episode_steps = 350
         expected = evaluate(model, env, episodes=3)
         np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-12)
         # What it remembers, the flow, is forgotten at the beginning of an episode.

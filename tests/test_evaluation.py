@@ -49,12 +49,12 @@ class TestEvaluate:
 
     @pytest.mark.parametrize("name", IDS)
     def test_a_valve_that_is_left_alone_scores_0_and_the_bound_1(self, name):
-        found = evaluate(idle, IDS[name], episodes=10)
+        found = evaluate(idle, IDS[name], episodes=5)
         assert found.score == pytest.approx(0.0, abs=1e-12)
-        assert found.scores == pytest.approx(np.zeros(10), abs=1e-12)
+        assert found.scores == pytest.approx(np.zeros(5), abs=1e-12)
         assert found.travel == 0.0
         # The same line through both, at the error of a better policy.
-        better = evaluate(PIController(1.0, 0.05), IDS[name], episodes=10)
+        better = evaluate(PIController(1.0, 0.05), IDS[name], episodes=5)
         share = (found.mean_error - better.mean_error) / (
             found.mean_error - found.least_possible
         )
