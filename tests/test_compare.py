@@ -305,18 +305,6 @@ class TestCompare:
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
 
     @pytest.mark.usefixtures("undrawn")
-    def test_controllers_are_told_about_the_plant_that_is_run(self, compared, tmp_path):
-        plant = {"b": [0.04560, 0.00404], "delay": 9, "a": [1, -0.9]}
-        (tmp_path / "plant.json").write_text(json.dumps(plant))
-        given = "--agents pi-simc smith --scenarios square --runs 1 --plant"
-        out = compared(given, tmp_path / "plant.json")
-        errors = pd.read_csv(out / "runs.csv").set_index("agent")["mae"]
-        # Its gain has the other sign: who is told about the paper's plant drives it to a limit.
-        assert (errors < 3.0).all()
-        provenance = json.loads((out / "provenance.json").read_text())
-        assert provenance["scenarios"]["square"]["arguments"] == plant
-
-    @pytest.mark.usefixtures("undrawn")
     def test_where_limits_are_drawn_shares_are_not_measured(
         self, compared, monkeypatch, tmp_path
     ):
