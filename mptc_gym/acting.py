@@ -50,6 +50,8 @@ def rollout(plants: Any, act: Act, samples: int, seeds: list[int]) -> Steps:
 
 def _checked(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     """Return the actions of a policy as an array, if the environments can take them."""
+    if isinstance(actions, tuple):
+        reject("policy", actions, "what returns actions alone: a model, not its predict")
     try:
         checked = np.asarray(actions)
         if checked.shape == shape and np.isfinite(checked).all():
@@ -86,6 +88,10 @@ def start(policy: Any, n: int) -> Act:
     is_module = isinstance(owner, loaded("torch.nn", "Module"))
     # Methods have a name, and modules none.
     forward = is_module and getattr(function, "__name__", "forward") == "forward"
+    if forward and owner.forward.__name__ == "_forward_unimplemented":
+        reject(
+            "policy", owner, "a module with forward: its part that acts, as agent.actor_mean"
+        )
     named: Mapping[str, inspect.Parameter] = {}
     with suppress(TypeError, ValueError):  # of what is not written in Python
         named = inspect.signature(owner.forward if forward else function).parameters
@@ -289,7 +295,8 @@ def _batch(env: Any, n: int) -> Any:
         return env
     exists = isinstance(env, gymnasium.Env)
     if not (exists or callable(env)):
-        reject("env", env, "an id, an EnvSpec, environments, or a function that makes one")
+        allowed = "an id, an EnvSpec, environments, or a function that makes one"
+        reject("env", env, f"{allowed} (a model that was loaded has no environments)")
 
     def one() -> Any:
         made = env if exists else env()
@@ -327,7 +334,8 @@ def check_fit(policy: Any, plants: Any) -> None:
             raise ValueError(
                 f"env must have the {name} of policy's training, {its or 'none'}, got "
                 f"{here[name] or 'none'}: act where it was trained, by evaluate(model, "
-                "model.get_env()), or in others like that, see mptc_gym.sb3.spec_of(model, id)"
+                "model.get_env()), or in others like that: of mptc_gym.sb3.spec_of(model, id), "
+                "in the same VecNormalize and VecFrameStack"
             )
 
 

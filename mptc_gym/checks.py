@@ -117,7 +117,7 @@ def _number_that(holds: Callable[[float], bool], allowed: str) -> Callable[[str,
 
 number = _number_that(lambda value: True, "a number within +-1e9")
 not_negative = _number_that(lambda value: value >= 0, "a number from 0 to 1e9")
-positive = _number_that(lambda value: value > 0, "a number above 0, up to 1e9")
+positive = _number_that(lambda value: value >= 1e-9, "a number from 1e-9 to 1e9")
 at_least_1 = _number_that(lambda value: value >= 1, "a number from 1 to 1e9")
 
 

@@ -168,6 +168,8 @@ valve travel 0 t/h; 100 episodes, all alike
         single = make_one(env, arguments)
         most = cast("EnvSpec", single.spec).max_episode_steps or SAMPLES
         native = native_batch(single, episodes)
+        if not isinstance(single.unwrapped, MiddlePointEnv):
+            reject("env", env, "the id of an environment of this package")
         env = partial(make_one, env, arguments)
     elif arguments:
         raise ValueError(f"{', '.join(arguments)} must be given where env is made")

@@ -202,11 +202,13 @@ def make_vec_env(
     single = make_one(env, arguments)
     if isinstance(wrapper, Mapping):
         single = IncrementalAction(single, **wrapper)
-    elif wrapper is not None:
+    elif callable(wrapper):
         single = wrapper(single)
     mode = AutoresetMode.SAME_STEP
     batch = native_batch(single, n_envs, autoreset_mode=mode, render_mode=render_mode)
-    if batch is None:
+    if batch is None or not (
+        wrapper is None or callable(wrapper) or isinstance(wrapper, Mapping)
+    ):
         reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
     plants = GymnasiumVecEnv(batch, spec=single.spec, group=group)
     plants.seed(seed)

@@ -292,7 +292,7 @@ class TestCompare:
         (option,) = re.findall(r"--agent (\w+=my_\S+)`", readme)
         (tmp_path / "my_controllers.py").write_text(example)
         monkeypatch.syspath_prepend(tmp_path)
-        bad = "--agent bad=nowhere:Mine --agent worse=my_controllers:PIController.x"
+        bad = "--agent bad=my_controllers:Mine --agent worse=my_controllers:PIController.x"
         given = f"--agents --agent {option} {bad} --scenarios constant --runs 1"
         out = compared(given, status=1)
         runs = pd.read_csv(out / "runs.csv")
@@ -300,7 +300,7 @@ class TestCompare:
         said = capsys.readouterr().out
         assert "2 of 4 tasks failed; the others are done" in said
         assert "bad, constant: " in said
-        assert "--agent: 'nowhere:Mine' cannot be imported: ModuleNotFoundError" in said
+        assert "--agent: 'my_controllers:Mine' cannot be imported: AttributeError" in said
         assert (out / "report.md").exists()
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
 

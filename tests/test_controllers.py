@@ -201,6 +201,7 @@ class TestSavedPolicies:
         file = zips / f"{name}.zip"
         (member,) = members_of(f"PPO:{file}")
         assert "weights: 0 M samples a policy" in member.provenance["searched"]
+        assert ("note" in member.provenance) == (name == "bare")  # which is told to the user
         controller = member(PRESETS[preset], 3, SEED)
         found = errors(member, 3, 350, **PRESETS[preset])
         model = PPO.load(file, device="cpu")
@@ -242,20 +243,18 @@ class TestSavedPolicies:
                 "def Mine(): return lambda o: 0.0 * o[:, :1], E"
             )
         )
-        with pytest.raises(ValueError, match="the parameters that it is made for"):
+        with pytest.raises(ValueError, match="must have the parameters of the case"):
             other.run({"delay": 3}, 2, 2, 0)
 
     @pytest.mark.parametrize(
         ("location", "complaint"),
         [
             ("PPO:{}/wide.zip", "env must have the observation space of policy's training"),
-            ("No:{}/bare.zip", "must be such as PPO:model.zip"),
+            ("No:{}/bare.zip", "must begin with an algorithm"),
+            ("SAC:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("PPO:{}/nan.zip", "Expected parameter loc"),
             ("{}/velocity.zip", "must be such as PPO:model.zip"),
-            (
-                "PPO:{}/none.zip",
-                "none.zip' must be such as PPO:model.zip, a file",
-            ),
+            ("PPO:{}/none.zip", "must be such as PPO:model.zip"),
         ],
     )
     def test_what_is_refused(self, location, complaint, zips):

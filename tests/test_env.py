@@ -131,7 +131,7 @@ BAD = {
     "setpoint_amplitude": [-1.0], "setpoint_period": [0, 2.5, 10**400],
     "setpoint_window": [-1], "error_window": [1.0, 10_001], "output_window": ["2"],
     "action_window": [-3, 10**9], "temperature_span": [0.0, INF],
-    "reward": ["cubic", 2], "error_scale": [0.0, -5.0], "move_weight": [-1.0, NAN],
+    "reward": ["cubic", 2], "error_scale": [0.0, -5.0, 1e-100], "move_weight": [-1.0, NAN],
     "render_mode": ["depth_array", "", 3],
 }  # fmt: skip
 

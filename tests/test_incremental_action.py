@@ -107,11 +107,9 @@ def test_other_environments_are_refused():
     made = partial(gymnasium.make_vec, "CartPole-v1", 2)
     for wrapped, env, allowed in [
         (wrap, gymnasium.make("CartPole-v1"), "a MiddlePointEnv"),
-        (
-            wrap,
-            MiddlePointVectorEnv(2),
-            "a MiddlePointEnv.*vector takes many",
-        ),
+        (wrap, "MiddlePoint-v0", "a MiddlePointEnv"),
+        (wrap, MiddlePointVectorEnv(2), "a MiddlePointEnv.*vector takes many"),
+        (wrap_many, "MiddlePoint-v0", "a vector environment"),
         (wrap_many, MiddlePointEnv(), "a vector environment.*mptc_gym.wrappers takes one"),
         (wrap_many, made(vectorization_mode="sync"), "a vector environment of MiddlePointEnv"),
         (wrap_many, made(), "a vector environment of MiddlePointEnv"),

@@ -419,7 +419,9 @@ REFUSED = {
         lambda: (DirectNNController(num_envs=2), NOISY), "num_envs=3"),
     "unknown id": (
         lambda: (law, "MiddlePointNosy-v0"), r"id of an env.*did you mean MiddlePointNoisy-v0"),
-    "another environment": (lambda: (law, "CartPole-v1"), "environment of MiddlePointEnv in"),
+    "another environment": (lambda: (law, "CartPole-v1"), "of this package, got 'CartPole-v1'"),
+    "module without forward": (lambda: (torch.nn.Module(), NOISY), "as agent.actor_mean"),
+    "predict": (lambda: (lambda seen: (law(seen), None), NOISY), "a model, not its predict"),
     "no environment": (lambda: (law, 7), "env must be an id, an EnvSpec, environments, or a f"),
     "function that makes a batch": (lambda: (law, many), "where it makes many, call it"),
     "function that makes the same": (

@@ -113,6 +113,7 @@ class TestBatches:
             ({"group": 2}, "group must be an integer from 1"),
             ({"wrapper": partial(DelayObservation, delay=2)}, "wrapper must be the argum"),
             ({"wrapper": {"max_move": 7}}, "max_move must be"),
+            ({"wrapper": 5}, "wrapper must be the arguments"),
             ({"env": "Point-v0"}, "env must be the id of an environment"),
         ],
     )

@@ -33,6 +33,10 @@ _CASES = (
     f"{', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set: "
     f"{', '.join(name for name, *_ in SETPOINTS)}."
 )
+_OUT = (
+    "Folder to write to (default: results/compare; with --presets results/compare-presets; "
+    "where another option chooses what is run, results/compare-other)."
+)
 
 
 @options
@@ -51,9 +55,7 @@ class Options:
     """Run the environment's presets instead of the paper's cases."""
     runs: Runs = RUNS
     """Runs of each controller in each case."""
-    out: Folder | None = None
-    """Folder to write to (default: results/compare, with --presets results/compare-presets, and
-    where another option chooses what is run, results/compare-other)."""
+    out: Annotated[Folder | None, Parameter(help=_OUT)] = None
 
 
 def work(options: Options) -> str:

@@ -235,10 +235,12 @@ def write(
     write_numbers(folder / "estimates.csv", estimates)
     scores = ranked(runs, scales)
     titles = {name: scenarios[name].title for name in scales}
+    members = [each for case in cases for each in case.policies]
+    notes = dict.fromkeys(f"{each['note']}." for each in members if "note" in each)
     sections = [
         Section(
             "Score: 0 without control, 1 at the least possible error",
-            [SCORE],
+            [SCORE, *notes],
             score_table(runs, scores, [*scales]),
             {"scores.png": "The score of each controller, and a tick for each case"},
         ),

@@ -5,6 +5,7 @@ The code of a user's own runs in the tasks that need it: what is wrong with it c
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import pkgutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -54,6 +55,15 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
             raise UsageError(
                 "--agent must be NEW_NAME=MODULE:FACTORY or NEW_NAME=PPO:FILE.zip"
                 f"{taken}, got {text!r}"
+            )
+        module = location.partition(":")[0].partition(".")[0] or "-"
+        if location.endswith(".zip"):
+            if not Path(location.partition(":")[2]).is_file():
+                allowed = "must be such as PPO:model.zip, a file that is there"
+                raise UsageError(f"--agent: {location!r} {allowed}")
+        elif importlib.util.find_spec(module) is None:
+            raise UsageError(
+                f"--agent: {location!r} must be MODULE:FACTORY, and its module be there"
             )
         locations[name] = *locations.get(name, ()), location
     if not (names or own):
@@ -115,15 +125,25 @@ def _saved(location: str) -> Own:
 
     algorithm, _, file = location.partition(":")
     kind = getattr(stable_baselines3, algorithm, None)
-    if not (kind and Path(file).is_file()):
-        raise ValueError(f"{location!r} must be such as PPO:model.zip, a file that is there")
+    if kind is None:
+        with suppress(ImportError):
+            kind = getattr(importlib.import_module("sb3_contrib"), algorithm, None)
+    if kind is None:
+        raise ValueError(f"{location!r} must begin with an algorithm, such as PPO:model.zip")
+    about = {}
     try:
         model = load(file, device="cpu")
     except ValueError:  # not of `mptc_gym.sb3.save`
-        model = kind.load(file, device="cpu")
+        try:
+            model = kind.load(file, device="cpu")
+        except Exception as error:  # whatever a file of another algorithm raises
+            text = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{location!r} cannot be loaded: {text}") from error
+        about["note"] = f"{file} names no environment: run in the plain one, without wrappers"
     weights = sum(weight.numel() for weight in model.policy.parameters())
     samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
-    return Own(lambda: model, provenance={"searched": f"{weights:,} weights: {samples}"})
+    about["searched"] = f"{weights:,} weights: {samples}"
+    return Own(lambda: model, provenance=about)
 
 
 def _make(plant: Parameters, runs: int, seed: int, *, network: Own) -> Any:
@@ -163,9 +183,10 @@ class Policy:
         """Yield the plants that it acts in, with these arguments or refused."""
         env = self._own(samples, arguments) if self.env is None else self.env
         with opened(env, self.runs) as given:
-            if {case_of(each.parameters) for each in given.plants} != {case_of(self.plant)}:
-                raise ValueError("the environment must have the parameters that it is made for")
-            check_fit(self.policy, given)
+            with blame("--agent"):
+                if {case_of(each.parameters) for each in given.plants} != {case_of(self.plant)}:
+                    raise ValueError("the environment must have the parameters of the case")
+                check_fit(self.policy, given)
             yield given
 
     def _own(self, samples: int, arguments: Mapping[str, Any]) -> Any:

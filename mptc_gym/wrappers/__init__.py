@@ -80,7 +80,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         max_move: float = 0.4,
         compensate_dead_zone: bool | float = False,
     ) -> None:
-        parameters = getattr(env.unwrapped, "parameters", None)
+        parameters = getattr(getattr(env, "unwrapped", None), "parameters", None)
         if isinstance(env, VectorEnv) or not isinstance(parameters, Parameters):
             allowed = "a MiddlePointEnv, wrapped or not; mptc_gym.wrappers.vector takes many"
             reject("env", env, allowed)

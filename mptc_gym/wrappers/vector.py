@@ -88,7 +88,7 @@ class IncrementalAction(VectorActionWrapper):
 
 def _parameters(env: VectorEnv[Any, Any, Any]) -> list[Parameters]:
     """Return the arguments of each environment."""
-    inner: Any = env.unwrapped
+    inner: Any = getattr(env, "unwrapped", None)
     if isinstance(inner, MiddlePointVectorEnv):
         return [inner.parameters] * env.num_envs
     plants: list[Any] = []
