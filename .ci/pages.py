@@ -16,7 +16,7 @@ from mptc_gym import evaluation
 from mptc_gym.parameters import argument_table
 
 ROOT = Path(__file__).parent.parent
-SHOWN = {".csv", ".gif", ".ipynb", ".json", ".md", ".png", ".txt"}
+SHOWN = {".csv", ".gif", ".ipynb", ".json", ".md", ".png", ".txt", ".yml"}
 TABLE = markdown.markdown(argument_table(), extensions=["tables"])
 CONSTANTS = re.compile(r'<span class="n">(SEED|EPISODES)</span>')  # in signatures
 PICTURE = re.compile(r'(<img [^>]*src="([^"]+)"[^>]*>)')
@@ -56,4 +56,5 @@ def on_page_content(html: str, **_: object) -> str:
     """
     html = html.replace("<p>::</p>\n", "").replace("<p><arguments></p>", TABLE)
     html = CONSTANTS.sub(lambda name: f"{getattr(evaluation, name[1]):_}", html)
+    html = html.replace('href="README.md"', 'href="../"')  # in the notebook
     return PICTURE.sub(r'<a href="\2">\1</a>', html)

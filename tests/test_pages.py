@@ -17,8 +17,13 @@ from functools import cache
 
 import pytest
 
+from mptc_gym import IDS
 from tests.conftest import ROOT
 
+UNTOLD = {
+    *("PPO", "PPO (hard)", "NN (1992)", "PI (SIMC)", "PI (1992)", "Smith", "neural Smith"),
+    *("self-tuning", "neural self-tuning"),
+}
 PUBLISHED = ROOT / "benchmarks/published"
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text("utf-8")
@@ -62,6 +67,7 @@ def tables(file):
         lines = block.strip("\n").splitlines()
         if block.lstrip().startswith("|"):
             table = {plain(row[0]): dict(enumerate(row)) for row in rows_of(lines)}
+            found.append(by_id(lines, table))
         else:  # columns of a screen end below one another
             table = {}
             for line in lines:
@@ -69,6 +75,21 @@ def tables(file):
                 table[plain(next(iter(cells.values())))] = cells
         found.append(table)
     return found
+
+
+def by_id(lines, table):
+    """Return a table with a row for each preset, and the best that are not told the plant."""
+    turned = {}
+    for j, name in enumerate(map(plain, rows_of(["", "", lines[0]])[0])):
+        if name in IDS:
+            column = {label: row[j] for label, row in table.items()}
+            for who in ("", "PPO"):
+                untold = [column[each] for each in UNTOLD if each in column and who in each]
+                column["best", who] = min(
+                    untold, key=lambda text: float(read(text)[0][0][0]), default=""
+                )
+            turned[IDS[name]] = column
+    return turned
 
 
 def same(number, unit, known):
