@@ -14,7 +14,7 @@ from benchmarks.claims.__main__ import main, sections, table
 from benchmarks.claims.claims import CLAIMS
 from benchmarks.claims.runs import Batch, Claim, converged_at, fail_node, typical
 from benchmarks.lib.statistics import Estimate
-from benchmarks.loop.rollout import join, settled
+from benchmarks.loop.rollout import Trajectory, settled
 from tests.conftest import ROOT, trajectory
 
 GOOD, INFORMATION = {"at_least": 1.0}, {}
@@ -161,7 +161,8 @@ class TestCommand:
 
 def test_the_typical_run_is_the_median_one():
     outputs = [1.0, 9.0, 4.0, 2.0]  # errors 4, 4, 1, 3 of set point 5
-    runs = join([trajectory([5.0], [y], [10.0 * y]) for y in outputs])
+    each = [vars(trajectory([5.0], [y], [10.0 * y])).values() for y in outputs]
+    runs = Trajectory(*map(np.hstack, zip(*each, strict=True)))
     row = typical(runs).iloc[0]
     assert (row["setpoint"], row["output_typical"], row["command_typical"]) == (5, 2, 20)
     assert row["output_p10"] == pytest.approx(1 + 0.3 * (2 - 1))

@@ -21,7 +21,7 @@ from benchmarks.compare.__main__ import main
 from benchmarks.compare.comparison import estimate, ranked, scale_of
 from benchmarks.controllers.roster import ROSTER, looks
 from benchmarks.lib import storage
-from benchmarks.lib.report import Best, Section, on_screen, write_report
+from benchmarks.lib.report import Section, on_screen, write_report
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.rollout import make_plants, measure, rollout
 from benchmarks.loop.scenarios import SCENARIOS
@@ -136,7 +136,9 @@ class TestEstimates:
         assert overall.value == pytest.approx(0.75)
         assert by_scenario == pytest.approx({"constant": 0.75, "square": 0.75})
         best, other = comparison.score_table(runs, scores, [*scales]).to_dict("records")
-        assert (best["controller"], best["travel (t/h)"], best["square"]) == ("b", "12", "0.75")
+        assert (best["controller"], best["travel (t/h)"], best["square"]) == (
+            "**b**", "**12**", "**0.75**",
+        )  # fmt: skip
         assert (other["controller"], other["constant"]) == ("a", "0.25")
 
     @pytest.mark.parametrize("agent", ["self-tuning", "smith"])
@@ -151,7 +153,7 @@ class TestEstimates:
 class TestReport:
     def test_pages(self, tmp_path):
         (tmp_path / "picture.png").write_bytes(b"\x89PNG")
-        table = pd.DataFrame({"name": [Best("a < b")], "value": ["1.0 (0.9 to 1.1)"]})
+        table = pd.DataFrame({"name": ["**a < b**"], "value": ["1.0 (0.9 to 1.1)"]})
         pictures = {"picture.png": "What it shows"}
         sections = [Section("First", ["Some text."], table, pictures), Section("Second")]
         write_report(tmp_path, "Title", sections, "made today")

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from benchmarks.lib import statistics
-from benchmarks.lib.statistics import bootstrap, improvement, median, quantile, share
+from benchmarks.lib.statistics import bootstrap, median, quantile, share
 from tests.conftest import assert_the_seed_is_all_that_differs
 
 
@@ -110,16 +110,3 @@ class TestBootstrap:
         estimate = bootstrap(values, 0.0 * values, seed=0)
         assert (estimate.value, estimate.runs) == (pytest.approx(1028.0 / 16.0), 16)
         assert estimate.high > 100 > estimate.low
-
-
-@pytest.mark.parametrize(
-    ("errors", "expected"),
-    [
-        ([[0.0, 0.0, 0.0, 0.0], [9.0, 9.0, 9.0, 9.0]], (0.5, 0.0, 1.0)),
-        ([0.0, 1.0, 2.0, 3.0], (1.0, 1.0, 1.0)),
-        ([1.0, 2.0, 3.0, 4.0], (0.5, 0.5, 0.5)),  # who does the same is half better
-    ],
-)
-def test_improvement_by_hand(errors, expected):
-    estimate = improvement(np.array(errors), np.array([1.0, 2.0, 3.0, 4.0]), 0)
-    assert (estimate.value, estimate.low, estimate.high) == expected

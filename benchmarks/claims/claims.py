@@ -43,6 +43,7 @@ SQUARE, CONSTANT = (arguments for *_, arguments in CASES)
 SETPOINTS = tuple((title, arguments, samples) for _, title, samples, arguments in CASES[::-1])
 KP, KI = PAPER_PI = (2.2, 0.3)
 SEARCHED_PI = (SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"])
+DELAY = int(Parameters().range_of("delay")[0])
 LEARNING = 600  # samples after which a network counts as trained
 GAINS = {False: "the same gains", True: "gains in proportion"}  # of networks of other shapes
 
@@ -171,11 +172,10 @@ def largest_pole(kp: float, ki: float) -> float:
 
     The actuator is left out. The loop is stable if this is below 1.
     """
-    (up, down), (b, a) = (
-        PIController(kp, ki).transfer(),
-        linear.nominal(Parameters()).transfer(),
-    )
-    closed = polyadd(np.convolve(down, a), np.convolve(up, b))
+    up, down = PIController(kp, ki).transfer()
+    plant = linear.nominal(Parameters())
+    a, b = [1.0, *-plant.alpha], [*np.zeros(DELAY + 1), *plant.beta]
+    closed: Array = polyadd(np.convolve(down, a), np.convolve(up, b))
     return float(np.abs(np.roots(closed)).max())
 
 

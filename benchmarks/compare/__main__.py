@@ -6,7 +6,7 @@ import itertools
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -19,12 +19,8 @@ from benchmarks.loop.scenarios import (
     SCENARIOS,
     SETPOINTS,
     PlantOptions,
-    Scenario,
 )
 from mptc_gym.evaluation import SEED
-
-if TYPE_CHECKING:
-    from benchmarks.compare.comparison import Scale
 
 COMPARED = tuple(name for name, controller in ROSTER.items() if controller.compared)
 RUNS = 100
@@ -60,12 +56,18 @@ class Options:
 
 def work(options: Options) -> str:
     """Run the comparison and write its results, also after an error: of what has finished."""
-    from benchmarks.compare.comparison import Case, run_case, scale_of, write
+    from benchmarks.compare.comparison import run_case, scale_of, write
     from benchmarks.lib.report import show
 
     controllers = chosen(options.agents, options.controllers.agent)
     fan_out = options.controllers.fan_out
-    scenarios = _scenarios(options)
+    there = options.plant.cases(PRESET_SCENARIOS if options.presets else SCENARIOS)
+    if options.presets and options.plant.name:
+        raise UsageError("--presets cannot be combined with --plant, --preset and --set")
+    names = [*there] if options.scenarios is None else options.scenarios
+    scenarios = [there[name] for name in known("--scenarios", names, there)]
+    if not scenarios:
+        raise UsageError("--scenarios: none to run")
     place = "results/compare-presets" if options.presets else "results/compare"
     whole = Options(presets=options.presets, controllers=ControllerOptions(fan_out=fan_out))
     if options != whole:
@@ -73,56 +75,36 @@ def work(options: Options) -> str:
     folder, made = out_folder(options.out or Path(place)), origin()
     # Short tasks last, so that no core waits long at the end; the bounds of drawn plants are
     # the longest of all.
-    by_length = sorted(scenarios.values(), key=lambda each: -each.samples)
+    by_length = sorted(scenarios, key=lambda each: -each.samples)
     tasks: dict[str, Any] = {
         f"bounds of {each.name}": partial(scale_of, each, options.runs)
         for each in sorted(by_length, key=lambda each: not each.parameters.ranges)
+    } | {
+        f"{controller.name}, {each.name}": partial(run_case, each, controller, options.runs)
+        for controller, each in itertools.product(controllers.values(), by_length)
     }
-    for controller, each in itertools.product(controllers.values(), by_length):
-        tasks[f"{controller.name}, {each.name}"] = partial(
-            run_case, each, controller, options.runs
-        )
-    cases: dict[tuple[str, str], Case] = {}
-    scales: dict[str, Scale] = {}
-    complete = False
+    found: dict[str, Any] = {}
     try:
-        for _, result in fan_out.stream(tasks, "compare"):
-            if isinstance(result, Case):
-                cases[result.agent, result.scenario] = result
-            else:
-                scales[result.scenario.name] = result
-        complete = True
+        found.update(fan_out.stream(tasks, "compare"))
     finally:
-        if cases:
-            order = itertools.product(controllers, scenarios)
-            finished = [cases[each] for each in order if each in cases]
+        scales = [found.get(f"bounds of {each.name}") for each in scenarios]
+        of_runs = itertools.product(controllers, scenarios)
+        cases = [found.get(f"{agent}, {each.name}") for agent, each in of_runs]
+        if finished := [case for case in cases if case]:
             about = {
-                "complete": complete,
+                "complete": len(found) == len(tasks),
                 **made,
                 "options": {**asdict(options), "agents": [*controllers]},
                 "seeds": [*range(SEED, SEED + options.runs)],
                 "scenarios": {
-                    name: {"samples": each.samples, "arguments": each.arguments}
-                    for name, each in scenarios.items()
+                    each.name: {"samples": each.samples, "arguments": each.arguments}
+                    for each in scenarios
                 },
                 "policies": {each.agent: each.policies for each in finished if each.policies},
             }
             write_json(folder / "provenance.json", about)
-            show(write(finished, scenarios, scales, controllers, folder, made)[:2])
+            show(write(finished, [*filter(None, scales)], controllers, folder, made)[:2])
     return f"The report, tables, data and plots are in {folder}/"
-
-
-def _scenarios(options: Options) -> dict[str, Scenario]:
-    """Return the cases that the options choose."""
-    there = options.plant.cases(PRESET_SCENARIOS if options.presets else SCENARIOS)
-    if options.presets and options.plant.name:
-        raise UsageError("--presets cannot be combined with --plant, --preset and --set")
-    names = known(
-        "--scenarios", [*there] if options.scenarios is None else options.scenarios, there
-    )
-    if not names:
-        raise UsageError("--scenarios: none to run")
-    return {name: there[name] for name in names}
 
 
 main = command("compare", Options, work)

@@ -17,17 +17,10 @@ from numpy.typing import NDArray
 from benchmarks.compare import plots
 from benchmarks.compare.plots import Score
 from benchmarks.controllers.roster import Controller, label
-from benchmarks.lib.report import Best, Section, provenance_line, write_report
-from benchmarks.lib.statistics import (
-    Estimate,
-    bootstrap,
-    groups,
-    improvement,
-    percentiles,
-    written,
-)
+from benchmarks.lib.report import Section, provenance_line, write_report
+from benchmarks.lib.statistics import Estimate, bootstrap, percentiles, written
 from benchmarks.lib.storage import write_csv
-from benchmarks.loop.rollout import CHANGE, START, Trajectory, is_random, join, measure
+from benchmarks.loop.rollout import CHANGE, START, Trajectory, is_random, measure
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES, SEED
 
@@ -77,11 +70,9 @@ def run_case(scenario: Scenario, controller: Controller, runs: int) -> Case:
     alike = not (controller.random or is_random(scenario.parameters))
     trajectories, tables = [], []
     for number, member in enumerate(members):
-        trajectory = member.run(
-            scenario.arguments, scenario.samples, 1 if alike else runs, SEED
-        )
-        trajectories.append(trajectory)
-        measures = measure(trajectory, scenario.parameters)
+        of_member = scenario.arguments, scenario.samples, 1 if alike else runs, SEED
+        trajectories.append(member.run(*of_member))
+        measures = measure(trajectories[-1], scenario.parameters)
         about = {"scenario": scenario.name, "agent": controller.name, "policy": number}
         rows = {name: np.broadcast_to(values, runs) for name, values in measures.items()}
         tables.append(pd.DataFrame({**about, "seed": range(SEED, SEED + runs), **rows}))
@@ -89,30 +80,27 @@ def run_case(scenario: Scenario, controller: Controller, runs: int) -> Case:
         scenario.name,
         controller.name,
         pd.concat(tables, ignore_index=True),
-        _responses(join(trajectories), scenario, controller.name),
+        _responses(trajectories, scenario, controller.name),
         [dict(each.provenance) for each in members if each.provenance],
         time.process_time() - began,
     )
 
 
-def _responses(trajectory: Trajectory, scenario: Scenario, agent: str) -> pd.DataFrame:
+def _responses(members: Sequence[Trajectory], scenario: Scenario, agent: str) -> pd.DataFrame:
     """Return the set point and percentiles of y and u_a over the runs, one row per sample.
 
     If the runs differ in their set points, the first run stands for all.
     """
-    if scenario.parameters.setpoint == "random":
-        trajectory = Trajectory(*(values[:, :1] for values in vars(trajectory).values()))
-    k = np.arange(len(trajectory.setpoint))
-    columns = {
-        "agent": agent,
-        "sample": k,
-        "time_s": k * scenario.parameters.sampling_interval,
-        "setpoint": trajectory.setpoint[:, 0],
-    }
+    setpoint = members[0].setpoint[:, 0]
+    k = np.arange(len(setpoint))
+    interval = scenario.parameters.sampling_interval
+    columns = {"agent": agent, "sample": k, "time_s": k * interval, "setpoint": setpoint}
     for signal in ("output", "applied"):
+        values = np.hstack([getattr(each, signal) for each in members])
         # Values that occurred: an interpolated applied input could lie in the dead zone.
-        for name, values in percentiles(getattr(trajectory, signal), "nearest").items():
-            columns[f"{signal}_{name}"] = values
+        drawn = scenario.parameters.setpoint == "random"
+        found = percentiles(values[:, :1] if drawn else values, "nearest")
+        columns |= {f"{signal}_{name}": of_runs for name, of_runs in found.items()}
     return pd.DataFrame(columns)
 
 
@@ -143,11 +131,11 @@ def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
 
     They are the `mean` of |e|, degC; `ratio`, the mean as a multiple of `limit`, the least
     possible error that applies; `difference`, the mean paired difference from the reference
-    agent; and `improvement`, the probability of doing better than that agent. `preview` is the
-    least possible error of any controller. Ends are infinite if runs differ but there is only
-    one.
+    agent; and `improvement`, the probability of doing better than that agent, where ties count
+    half. `preview` is the least possible error of any controller. Ends are infinite if runs
+    differ but there is only one.
     """
-    errors = {agent: _errors(group) for agent, group in groups(runs, "agent")}
+    errors = {agent: _errors(rows) for agent, rows in runs.groupby("agent", sort=False)}
     base = errors[reference].mean(axis=0) if reference in errors else None
     about = {"scenario": scale.scenario.name}
     limits = {"limit": scale.least.value, "preview": scale.preview}
@@ -160,7 +148,8 @@ def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
         rows.append({**about, "agent": agent, **limits, "mean": mean, "ratio": ratio})
         if base is not None and agent != reference:
             rows[-1]["difference"] = bootstrap(values - base, seed=BOOTSTRAP)
-            rows[-1]["improvement"] = improvement(values, base, BOOTSTRAP)
+            better = (values < base) + 0.5 * (values == base)
+            rows[-1]["improvement"] = bootstrap(better, seed=BOOTSTRAP)
     return pd.DataFrame(rows)
 
 
@@ -173,13 +162,16 @@ def ranked(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> dict[str, Score]:
     policies and runs within each case.
     """
     found: dict[str, Score] = {}
-    for agent, of_agent in groups(runs, "agent"):
+    for agent, of_agent in runs.groupby("agent", sort=False):
         tables = {
-            scenario: scales[scenario].least.score(_errors(group))
-            for scenario, group in groups(of_agent, "scenario")
+            str(name): scales[str(name)].least.score(_errors(rows))
+            for name, rows in of_agent.groupby("scenario", sort=False)
         }
         overall = bootstrap(*tables.values(), seed=BOOTSTRAP)
-        found[agent] = overall, {name: float(table.mean()) for name, table in tables.items()}
+        found[str(agent)] = (
+            overall,
+            {name: float(table.mean()) for name, table in tables.items()},
+        )
     return dict(sorted(found.items(), key=lambda each: -each[1][0].value))
 
 
@@ -203,15 +195,14 @@ def _errors(runs: pd.DataFrame) -> Array:
 
 def write(
     cases: Sequence[Case],
-    scenarios: Mapping[str, Scenario],
-    scales: Mapping[str, Scale],
+    found: Sequence[Scale],
     controllers: Mapping[str, Controller],
     folder: Path,
     made: Mapping[str, Any],
 ) -> list[Section]:
     """Write the numbers, pictures and report of finished cases, and return the sections.
 
-    A case without a scale is in the numbers only.
+    A case without a scale, as its bounds have failed, is in the numbers only.
     """
     runs = pd.concat([case.runs for case in cases], ignore_index=True)
     summary = summarise(runs)
@@ -223,18 +214,18 @@ def write(
     }
     for name, rows in responses.items():
         write_numbers(folder / f"{name}.csv", rows)
-    scales = {name: scales[name] for name in scenarios if name in scales}
+    scales = {each.scenario.name: each for each in found if each.scenario.name in responses}
     runs = runs[runs["scenario"].isin([*scales])]
     if runs.empty:
         return []
     reference = str(runs["agent"].iloc[0])
-    by_case = [
-        estimate(rows, scales[name], reference) for name, rows in groups(runs, "scenario")
+    of_cases = [
+        estimate(runs[runs["scenario"] == name], scales[name], reference) for name in scales
     ]
-    estimates = pd.concat(by_case, ignore_index=True)
+    estimates = pd.concat(of_cases, ignore_index=True)
     write_numbers(folder / "estimates.csv", estimates)
     scores = ranked(runs, scales)
-    titles = {name: scenarios[name].title for name in scales}
+    titles = {name: scale.scenario.title for name, scale in scales.items()}
     members = [each for case in cases for each in case.policies]
     notes = dict.fromkeys(f"{each['note']}." for each in members if "note" in each)
     sections = [
@@ -276,12 +267,13 @@ def write(
     for picture in itertools.chain.from_iterable(each.pictures for each in sections):
         (folder / picture).unlink(missing_ok=True)  # of an earlier run
     drawn = [name for name, each in controllers.items() if each.drawn]
-    shown = {name: responses[name] for name in scales}
-    for name, rows in shown.items():
+    shown = []
+    for name, scale in scales.items():
+        rows = responses[name]
         few = rows[rows["agent"].isin(drawn)]
-        shown[name] = rows if few.empty else few
+        shown.append((scale.scenario, rows if few.empty else few))
     try:
-        plots.draw(folder, scenarios, runs, shown, summary, estimates, scores)
+        plots.draw(folder, runs, shown, estimates, scores)
     finally:  # with the pictures that there are
         made_by = provenance_line("compare", made)
         write_report(folder, "Comparison of controllers", sections, made_by)
@@ -319,7 +311,7 @@ def score_table(
         for agent, (overall, by_case) in scores.items()
     ]
     table = pd.DataFrame(rows).fillna("")  # after an interruption, with gaps
-    table.iloc[0] = table.iloc[0].map(Best)
+    table.iloc[0] = table.iloc[0].map("**{}**".format)
     return table
 
 
@@ -334,7 +326,9 @@ def ratio_table(
         bounds[1][name] = f"{scale.preview:.3f}"
     values = estimates["ratio"].map(lambda ratio: ratio.value)
     least = values == values.groupby(estimates["scenario"]).transform("min")
-    cells = estimates["ratio"].map("{:.2f}".format).where(~least, lambda all_: all_.map(Best))
+    cells = (
+        estimates["ratio"].map("{:.2f}".format).where(~least, lambda all_: "**" + all_ + "**")
+    )
     table = _by_agent(estimates, cells, agents)
     return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
 

@@ -23,7 +23,7 @@ from benchmarks.lib.report import (
     panels,
     scale_by_excess,
 )
-from benchmarks.lib.statistics import Estimate, groups, written
+from benchmarks.lib.statistics import Estimate, written
 from benchmarks.loop.scenarios import Scenario
 
 Score = tuple[Estimate, dict[str, float]]  # overall, and by case
@@ -36,10 +36,8 @@ EDGE = "at the edge or beyond"
 
 def draw(
     folder: Path,
-    scenarios: Mapping[str, Scenario],
     runs: pd.DataFrame,
-    responses: Mapping[str, pd.DataFrame],
-    summary: pd.DataFrame,
+    responses: Sequence[tuple[Scenario, pd.DataFrame]],
     estimates: pd.DataFrame,
     scores: Mapping[str, Score],
 ) -> None:
@@ -47,9 +45,9 @@ def draw(
     errors = runs.groupby(["scenario", "agent"])["mae"]
     plot_scores(scores, folder / "scores.png")
     plot_bounds(estimates, errors.max(), [*scores], folder / "bounds.png")
-    plot_travel(summary, estimates, [*scores], folder / "travel.png")
-    for name, rows in responses.items():
-        plot_responses(rows, errors.mean()[name], scenarios[name], folder / f"{name}.png")
+    plot_travel(runs, estimates, [*scores], folder / "travel.png")
+    for case, rows in responses:
+        plot_responses(rows, errors.mean()[case.name], case, folder / f"{case.name}.png")
 
 
 def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
@@ -101,12 +99,12 @@ def plot_bounds(
     path: Path,
 ) -> None:
     """Draw mean errors as multiples of the least possible, with intervals and worst runs."""
-    style, cases = looks(agents), dict(groups(estimates, "scenario"))
+    style, cases = looks(agents), [*estimates["scenario"].unique()]
     height, title = 0.8 + 0.17 * len(agents), "Mean errors, the best score first"
-    with panels(path, [*cases], height, 2, title) as (figure, found):
-        for i, (axes, (case, rows)) in enumerate(zip(found, cases.items(), strict=True)):
+    with panels(path, cases, height, 2, title) as (figure, found):
+        for i, (axes, case) in enumerate(zip(found, cases, strict=True)):
             farthest = NEAREST
-            for row in rows.to_dict("records"):
+            for row in estimates[estimates["scenario"] == case].to_dict("records"):
                 place, look = agents.index(row["agent"]), style[row["agent"]]
                 ratio, end = row["ratio"], worst[case, row["agent"]] / row["limit"]
                 ends = ratio.value, ratio.low, ratio.high, end
@@ -131,26 +129,22 @@ def plot_bounds(
 
 
 def plot_travel(
-    summary: pd.DataFrame, estimates: pd.DataFrame, agents: Sequence[str], path: Path
+    runs: pd.DataFrame, estimates: pd.DataFrame, agents: Sequence[str], path: Path
 ) -> None:
     """Draw the error of every controller against its valve travel, a panel for each case.
 
-    `summary` is what `comparison.summarise` returns. A valve that never moves is not drawn.
+    Both are medians over the runs. A valve that never moves is not drawn.
     """
-    medians = summary.pivot_table(
-        index=["scenario", "agent"], columns="metric", values="median", sort=False
-    ).reset_index()
-    limits = estimates.groupby("scenario")["limit"].first()
-    medians = medians[
-        (medians["total_variation"] > 0.0) & medians["scenario"].isin(limits.index)
-    ]
+    measures = runs.groupby(["scenario", "agent"], sort=False)[["mae", "total_variation"]]
+    medians = measures.median().query("total_variation > 0").reset_index()
     if medians.empty:
         return
-    style, cases = looks(agents), dict(groups(medians, "scenario"))
-    with panels(path, [*cases], 2.4, 2, "Mean error and valve travel") as (figure, found):
-        for axes, (case, rows) in zip(found, cases.items(), strict=True):
-            travel = rows["total_variation"]
-            excess = rows["mae"] / limits[case] - 1.0
+    limits = estimates.groupby("scenario")["limit"].first()
+    style, cases = looks(agents), [*medians["scenario"].unique()]
+    with panels(path, cases, 2.4, 2, "Mean error and valve travel") as (figure, found):
+        for axes, case in zip(found, cases, strict=True):
+            rows = medians[medians["scenario"] == case]
+            travel, excess = rows["total_variation"], rows["mae"] / limits[case] - 1.0
             for agent, x, y in zip(rows["agent"], travel, excess, strict=True):
                 _mark(axes, x, y, style[agent], up=(NEAREST, math.inf))
             scale_by_excess(axes, "y", *excess.clip(NEAREST).agg(["min", "max"]))

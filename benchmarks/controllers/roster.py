@@ -187,10 +187,7 @@ def with_policy(plant: Parameters, *_: int, network: PolicyNetwork) -> PolicyNet
 
 def policies(files: str) -> Mapping[str, PolicyNetwork]:
     """Return the networks in `agents/pretrained` that match a pattern, from any learner."""
-    found = {file.name: PolicyNetwork.load(file) for file in PRETRAINED.glob(files)}
-    if not found:
-        raise FileNotFoundError(f"there is no file {PRETRAINED / files}")
-    return found
+    return {file.name: PolicyNetwork.load(file) for file in PRETRAINED.glob(files)}
 
 
 def law() -> Mapping[str, LawNetwork]:

@@ -44,10 +44,6 @@ _INTERVAL = re.compile(r" (\([^()]* to [^()]*\))</td>")  # shown small, below it
 _PICTURE = re.compile(r'src="([\w.-]+\.png)"')
 
 
-class Best(str):
-    """Text of a cell that is set in bold."""
-
-
 @dataclass(frozen=True)
 class Section:
     """A section of a report."""
@@ -57,7 +53,7 @@ class Section:
     text: Sequence[str] = ()
     """Paragraphs."""
     table: pd.DataFrame | None = None
-    """Table of text cells."""
+    """Table of text cells, in Markdown."""
     pictures: Mapping[str, str] = field(default_factory=dict)
     """Names of PNG files in the report's folder, and for each what it shows, in a sentence."""
 
@@ -111,7 +107,8 @@ def on_screen(table: pd.DataFrame) -> str:
     Nothing is cut: columns that find no room follow below, beside the first column again.
     """
     width = shutil.get_terminal_size((150, 24)).columns
-    cells = table.astype(str).set_index(table.columns[0]).rename_axis(None)
+    cells = table.astype(str).map(lambda cell: cell.replace("**", ""))  # bold on the page
+    cells = cells.set_index(table.columns[0]).rename_axis(None)
     with pd.option_context("display.max_colwidth", None):
         return cells.to_string(line_width=width - 2, max_rows=None)
 
@@ -122,10 +119,7 @@ def _markdown(folder: Path, title: str, sections: Sequence[Section], made: str) 
         parts += [f"## {section.title}"] * bool(section.title)
         parts += section.text
         if section.table is not None:
-            cells = section.table.map(
-                lambda each: f"**{each}**" if type(each) is Best else each
-            )
-            parts.append(cells.to_markdown(index=False, disable_numparse=True))
+            parts.append(section.table.to_markdown(index=False, disable_numparse=True))
         there = [name for name in section.pictures if (folder / name).exists()]
         parts += [f"![{section.pictures[name]}]({name})" for name in there]
     return "\n\n".join([*parts, made]) + "\n"

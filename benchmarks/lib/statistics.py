@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import pandas as pd
 import scipy  # loads its modules on first use
 from numpy.typing import ArrayLike, NDArray
 
@@ -140,17 +138,6 @@ def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
     return Estimate(value, float(low), float(high), together.size)
 
 
-def improvement(
-    errors: NDArray[np.float64], reference: NDArray[np.float64], seed: int
-) -> Estimate:
-    """Estimate the probability that a controller beats the reference in the same run.
-
-    Ties count as half. See `bootstrap` for the shapes.
-    """
-    better = (errors < reference) + 0.5 * (errors == reference)
-    return bootstrap(better, seed=seed)
-
-
 def percentiles(
     values: NDArray[np.float64], method: Literal["linear", "nearest", "higher"] = "linear"
 ) -> dict[str, Any]:
@@ -164,9 +151,3 @@ def percentiles(
         name: np.percentile(values, percentile, axis=-1, method=method)
         for name, percentile in PERCENTILES.items()
     }
-
-
-def groups(table: pd.DataFrame, column: str) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield each name in a column with its rows, in order of first appearance."""
-    for name, rows in table.groupby(column, sort=False):
-        yield str(name), rows

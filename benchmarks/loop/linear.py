@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mptc_gym import Parameters
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
@@ -23,44 +23,7 @@ from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
 
 Array = NDArray[np.float64]
 
-LONGEST = 1e6  # samples within which a plant must settle for a step test
-
-
-@dataclass(frozen=True)
-class LinearModel:
-    """(28) with constant coefficients."""
-
-    a: Sequence[float]
-    """Coefficients of A, from z^0 on."""
-    b: Sequence[float]
-    """Coefficients of B, from z^-1 on."""
-    c: Sequence[float] = (1.0,)
-    """Coefficients of C, from z^0 on."""
-    delay: int = 0
-    """d, samples."""
-    sampling_interval: float = 8.0
-    """s."""
-
-    @property
-    def gain(self) -> float:
-        """Steady-state gain B(1) / A(1), degC per t/h; infinite for an integrating plant."""
-        a, b = sum(self.a), sum(self.b)
-        return b / a if a else math.copysign(math.inf, b)
-
-    def transfer(self) -> tuple[Array, Array]:
-        """Return the numerator and denominator from u_a to y, in powers of z^-1."""
-        return np.array([*[0.0] * (self.delay + 1), *self.b]), np.array(self.a)
-
-    def response(self, flow: ArrayLike) -> Array:
-        """Return y(0), y(1), ..., degC, from rest, given u_a(0), u_a(1), ..., t/h."""
-        moved = np.convolve(np.asarray(flow, np.float64), self.transfer()[0])[: np.size(flow)]
-        past = [0.0] * (len(self.a) - 1)
-        found = []
-        for value in moved.tolist():
-            value -= sum(a * y for a, y in zip(self.a[1:], past, strict=True))
-            found.append(value)
-            past = [value, *past[:-1]] if past else past
-        return np.array(found)
+SLOWEST = 1 - 1e-5  # pole of a plant that settles soon enough for a step test
 
 
 @dataclass(frozen=True)
@@ -73,6 +36,12 @@ class Coefficients:
     """Shape (..., length of B)."""
     load: Array
     """A(1), shape (...)."""
+
+    @property
+    def gain(self) -> Array:
+        """Steady-state gain B(1) / A(1), degC per t/h; infinite for an integrating plant."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(self.beta.sum(axis=-1) / (1.0 - self.alpha.sum(axis=-1)))
 
     def impulse_response(self, samples: int) -> Array:
         """Return the effect of 1 t/h at j on y(j + d + 1), ..., degC per t/h, (..., samples).
@@ -121,17 +90,10 @@ def coefficients(
     )
 
 
-def nominal(parameters: Parameters) -> LinearModel:
-    """Return the model of a plant: ranges at their midpoints, drifts at k = 0."""
+def nominal(parameters: Parameters) -> Coefficients:
+    """Return the coefficients of a plant: ranges at their midpoints, drifts at k = 0."""
     middle = {name: sum(parameters.range_of(name)) / 2 for name in PLANT_NUMBERS}
-    at_start = coefficients(parameters, PlantNumbers(**middle), 0)
-    return LinearModel(
-        (1.0, *(-at_start.alpha).tolist()),
-        tuple(at_start.beta.tolist()),
-        tuple(parameters.c),
-        round(middle["delay"]),
-        parameters.sampling_interval,
-    )
+    return coefficients(parameters, PlantNumbers(**middle), 0)
 
 
 def step_test(parameters: Parameters) -> dict[str, float]:
@@ -149,20 +111,22 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     These are arguments of `PIController.simc` and `SmithPredictor`: degC per t/h, and s. The
     delay includes the one sample that any input takes to show.
     """
-    plant = nominal(parameters)
-    slowest = float(np.abs(np.roots(plant.a)).max(initial=0.0))
+    plant, interval = nominal(parameters), parameters.sampling_interval
+    slowest = float(np.abs(np.roots([1.0, *-plant.alpha])).max(initial=0.0))
+    if slowest > SLOWEST:
+        raise ValueError(f"a must be of a stable plant for a step test, got {parameters.a}")
+    if plant.gain == 0.0:
+        raise ValueError(f"b must have a sum other than 0 for a gain, got {parameters.b}")
     # Until 1e-5 of a transient remains; and twice as long, as those of repeated poles are.
-    settling = math.log(1e-5) / math.log(slowest) if 0.0 < slowest < 1.0 else 0.0
-    if slowest >= 1.0 or settling > LONGEST:
-        raise ValueError(f"a must be of a stable plant for a step test, got {plant.a}")
-    if sum(plant.b) == 0.0:
-        raise ValueError(f"b must have a sum other than 0 for a gain, got {plant.b}")
-    samples = plant.delay + len(plant.b) + 2 * math.ceil(settling) + 2
-    response, interval = plant.response(np.ones(samples)), plant.sampling_interval
+    settling = math.log(1e-5) / math.log(slowest) if slowest else 0.0
+    samples = len(parameters.b) + 2 * math.ceil(settling) + 2
+    # From the last sample on at which the output stands still.
+    response = np.append(0.0, plant.impulse_response(samples).cumsum())
     early, late = (_first_reached(response / response[-1], level) for level in (0.283, 0.632))
     time_constant = 1.5 * (late - early)
     # In samples, u(k) shows at y(k + 1) at the earliest.
-    delay = max(1, round(late - time_constant + 1.0))
+    still = round(sum(parameters.range_of("delay")) / 2)
+    delay = max(1, round(still + late - time_constant + 1.0))
     return {
         "gain": float(f"{plant.gain:.4g}"),
         "time_constant": float(f"{time_constant * interval:.3g}"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol
 
@@ -114,8 +114,8 @@ def rollout(
     has the noise and the set point of seed `seed + i`. `before` is called with k before
     the controller acts at sample k, to observe or to damage it.
     """
-    shape = samples, plants.num_envs
-    trajectory = Trajectory(*(np.empty(shape) for _ in fields(Trajectory)))
+    signals = np.empty((len(fields(Trajectory)), samples, plants.num_envs))
+    seeds = [*range(seed, seed + plants.num_envs)]
     agent.reset()
     clock = itertools.count()
 
@@ -124,18 +124,13 @@ def rollout(
             before(next(clock))
         return agent.act(observations)
 
-    for k, (at, after, _) in enumerate(
-        run_batch(plants, act, samples, [*range(seed, seed + shape[1])])
-    ):
-        trajectory.setpoint[k] = at["setpoint"]
-        trajectory.output[k] = at["output"]
-        trajectory.noise[k] = at["noise"]
-        # A step reports the command and the applied input of the sample that it starts at.
-        trajectory.command[k] = after["command"]
-        trajectory.applied[k] = after["applied"]
-        trajectory.next_error[k] = after["error"]
-        trajectory.next_setpoint[k] = after["setpoint"]
-    return trajectory
+    for k, (at, after, _) in enumerate(run_batch(plants, act, samples, seeds)):
+        # A step reports the command and the applied flow of the sample that it starts at.
+        signals[:, k] = (
+            at["setpoint"], at["output"], after["command"], after["applied"], at["noise"],
+            after["error"], after["setpoint"],
+        )  # fmt: skip
+    return Trajectory(*signals)
 
 
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
@@ -145,7 +140,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     - `mae_start`, `mae_changes`, `mae_steady`: what it is the sum of; see `_parts`;
     - `ise`: integral of e^2 over the same samples;
     - `itae`: integral of t |e|, with t counted from the latest set-point change;
-    - `total_variation`: total variation of the applied input; see `travel`;
+    - `total_variation`: valve travel, the total variation of the applied flow, from rest at 0;
     - `overshoot`: excursion of the output beyond the new set point, as a percentage of the
       set-point change; the largest over all changes;
     - `settling_time`: time from a set-point change until the error stays within `SETTLING_BAND`
@@ -165,12 +160,13 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
         saturated = (command <= u_min) | (command >= u_max)
     pairs = zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
     itae, overshoot, settling = np.array([_measure_steps(*each) for each in pairs]).T
+    moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
     return {
         "mae": mean_error(trajectory),
         **_parts(trajectory),
         "ise": interval * np.square(trajectory.next_error).sum(axis=0),
         "itae": interval**2 * itae,
-        "total_variation": travel(trajectory),
+        "total_variation": np.abs(moves).sum(axis=0),
         "overshoot": 100.0 * overshoot,
         "settling_time": interval * settling,
         "dead_zone_share": 100.0 * inside.mean(axis=0),
@@ -221,12 +217,6 @@ def mean_error(trajectory: Trajectory) -> Array:
     return np.asarray(np.abs(trajectory.next_error).mean(axis=0))
 
 
-def travel(trajectory: Trajectory) -> Array:
-    """Return the valve travel of each run, from rest at 0, t/h, shape (runs,)."""
-    moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
-    return np.asarray(np.abs(moves).sum(axis=0))
-
-
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
     """Return whether the last `LAST` errors of each run are all within `SETTLING_BAND`."""
     setpoint, output = trajectory.setpoint[-LAST:], trajectory.output[-LAST:]
@@ -238,9 +228,3 @@ def split(trajectory: Trajectory, sample: int) -> tuple[Trajectory, Trajectory]:
     """Return the trajectory before a sample, and the rest from that sample on."""
     arrays = vars(trajectory).values()
     return Trajectory(*(a[:sample] for a in arrays)), Trajectory(*(a[sample:] for a in arrays))
-
-
-def join(trajectories: Sequence[Trajectory]) -> Trajectory:
-    """Join the runs of several batches into one trajectory."""
-    arrays = zip(*(vars(trajectory).values() for trajectory in trajectories), strict=True)
-    return Trajectory(*(np.hstack(parts) for parts in arrays))

@@ -204,14 +204,13 @@ def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
     They differ from it by the same factors: the delay, the dead zone and the factors on gain
     and time constant, and the noise variance as a share of the square of what the flow reaches.
     """
-    ratios = np.array(_scales(Parameters(**plant))) / np.array(_scales(Parameters()))
-    by_name = dict(zip(SPANS, ratios.tolist(), strict=True))
-
-    def moved(name: str, value: float) -> float:
-        there: float = by_name.get(name, 1.0) * value
-        return round(there) if name in ("delay", "drift_samples") else there
-
-    return [{name: moved(name, each[name]) for name in each} for each in design]
+    here, paper = (np.array(_scales(Parameters(**each))) for each in (plant, {}))
+    factors = dict(zip(SPANS, (here / paper).tolist(), strict=True))
+    moved = [{name: factors.get(name, 1.0) * each[name] for name in each} for each in design]
+    whole = "delay", "drift_samples"
+    return [
+        each | {name: round(each[name]) for name in whole if name in each} for each in moved
+    ]
 
 
 def _scales(plant: Parameters) -> list[float]:
@@ -222,5 +221,5 @@ def _scales(plant: Parameters) -> list[float]:
             "delay", "dead_zone", "gain_factor", "time_constant_factor", "u_min", "u_max"
         )
     )  # fmt: skip
-    reach = nominal(plant).gain * (high - low) / 2.0
+    reach = float(nominal(plant).gain) * (high - low) / 2.0
     return [delay, zone, reach**2, gain, time_constant]
