@@ -22,6 +22,7 @@ from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
 _INCREMENTS: Final = IncrementalAction, VectorIncrementalAction
+_NATIVE: Final = MiddlePointEnv, MiddlePointVectorEnv
 _SB3: Final = "stable_baselines3.common"
 _TOLERANCE: Final = 1e-6  # of infos, degC or t/h, and relative to them
 Act = Callable[[Any], Any]  # observations, one row a plant, to actions
@@ -38,7 +39,10 @@ def rollout(plants: Any, act: Act, samples: int, seeds: list[int]) -> Steps:
     Gymnasium or `Given` ones, and `act` is a function of their observations. Actions of the
     wrong shape, or not finite, are a ValueError.
     """
-    observations, infos = plants.reset(seed=seeds)
+    try:
+        observations, infos = plants.reset(seed=seeds)
+    except RuntimeError as error:  # of a Monitor, in the middle of an episode
+        raise ValueError(f"env must allow another episode: {error}") from error
     shape = plants.num_envs, *plants.single_action_space.shape
     for _ in range(samples):
         actions = _checked(act(observations), shape)
@@ -62,9 +66,10 @@ def _checked(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     raise ValueError(f"policy must return finite actions, shape {shape}, got {found}")
 
 
-def loaded(module: str, name: str) -> Any:
-    """Return a class if its package is imported; otherwise (), which has no instances."""
-    return getattr(sys.modules.get(module), name, ())
+def loaded(name: str) -> Any:
+    """Return a class by its full name if it is imported; otherwise (), without instances."""
+    module, _, kind = name.rpartition(".")
+    return getattr(sys.modules.get(module), kind, ())
 
 
 def behind(policy: Any) -> tuple[Any, Any]:
@@ -85,13 +90,12 @@ def start(policy: Any, n: int) -> Act:
     owner = policy if forms else owner
     if callable(getattr(owner, "reset", None)):
         owner.reset()
-    is_module = isinstance(owner, loaded("torch.nn", "Module"))
+    is_module = isinstance(owner, loaded("torch.nn.Module"))
     # Methods have a name, and modules none.
     forward = is_module and getattr(function, "__name__", "forward") == "forward"
     if forward and owner.forward.__name__ == "_forward_unimplemented":
-        reject(
-            "policy", owner, "a module with forward: its part that acts, as agent.actor_mean"
-        )
+        allowed = "a module with forward: its part that acts, as agent.actor_mean"
+        reject("policy", owner, allowed)
     named: Mapping[str, inspect.Parameter] = {}
     with suppress(TypeError, ValueError):  # of what is not written in Python
         named = inspect.signature(owner.forward if forward else function).parameters
@@ -145,10 +149,10 @@ def _evaluating(module: Any, act: Act, tensors: bool) -> Act:
 
 def is_vec_env(env: Any) -> bool:
     """Whether environments are a `VecEnv` of Stable-Baselines3."""
-    return isinstance(env, loaded(f"{_SB3}.vec_env", "VecEnv"))
+    return isinstance(env, loaded(f"{_SB3}.vec_env.VecEnv"))
 
 
-def _layers(env: Any) -> Iterator[Any]:
+def layers(env: Any) -> Iterator[Any]:
     """Yield environments and all that is in them, the outermost first.
 
     Those in other processes are not among them, but copies of their plants, while they run.
@@ -158,7 +162,7 @@ def _layers(env: Any) -> Iterator[Any]:
         inside = vars(env).get(name, ())
         for each in inside if isinstance(inside, list | tuple) else (inside,):
             if isinstance(each, gymnasium.Env | VectorEnv) or is_vec_env(each):
-                yield from _layers(each)
+                yield from layers(each)
     yield from _asked(env, "unwrapped")
 
 
@@ -171,172 +175,146 @@ def _asked(env: Any, name: str) -> list[Any]:
     return []
 
 
-class Given:
-    """Environments as one batch: each gets a seed of its own, and infos are arrays."""
+def natives(env: Any) -> list[MiddlePointEnv | MiddlePointVectorEnv]:
+    """Return the plants in environments."""
+    return [each for each in layers(env) if isinstance(each, _NATIVE)]
+
+
+def overlap(env: Any, other: Any) -> bool:
+    """Whether environments have a layer in common."""
+    return not {*map(id, layers(env))}.isdisjoint(map(id, layers(other)))
+
+
+class FromVecEnv:
+    """A `VecEnv` of Stable-Baselines3 in the form of a vector environment of Gymnasium."""
 
     def __init__(self, env: Any) -> None:
-        self.env, self.num_envs = env, getattr(env, "num_envs", 1)
-        of_one = "single_" if isinstance(env, VectorEnv) else ""
-        self.single_observation_space = getattr(env, f"{of_one}observation_space")
-        self.single_action_space = getattr(env, f"{of_one}action_space")
-        self.layers = [*_layers(env)]
-        kinds = MiddlePointEnv, MiddlePointVectorEnv
-        self.plants = [each for each in self.layers if isinstance(each, kinds)]
+        self.env, self._innermost, self.num_envs = env, env.unwrapped, env.num_envs
+        self.single_observation_space = env.observation_space
+        self.single_action_space = env.action_space
 
-    def shares(self, other: Given) -> bool:
-        """Whether both have a layer in common."""
-        return not {*map(id, self.layers)}.isdisjoint(map(id, other.layers))
-
-    def traits(self) -> dict[str, Any]:
-        """Return what changes observations and actions, as far as it can be known, by kind."""
-        found: dict[str, Any] = {
-            "observation space": self.single_observation_space,
-            "action space": self.single_action_space,
-            "wrappers": {
-                name
-                for name in ("VecNormalize", "VecFrameStack")
-                for each in self.layers
-                if isinstance(each, loaded(f"{_SB3}.vec_env", name))
-                if getattr(each, "norm_obs", True)
-            },
-        }
-        if self.plants:  # unlike closed processes, which cannot be asked
-            moves = [each._arguments for each in self.layers if isinstance(each, _INCREMENTS)]
-            moves += [each for layer in self.layers for each in _asked(layer, "_arguments")]
-            found["action wrappers"] = {f"IncrementalAction{each}" for each in moves}
-            found["windows"] = {plant.parameters.windows for plant in self.plants}
-        return found
-
-    def reset(self, *, seed: list[int]) -> Any:
+    def reset(self, *, seed: list[int]) -> tuple[Any, Infos]:
         """Reset all, with a seed each."""
-        try:
-            if not is_vec_env(self.env):
-                return self.env.reset(seed=seed)
-            self.env.unwrapped._seeds = [*seed]  # its own `seed` may repeat them
-            return self.env.reset(), _columns(self.env.unwrapped.reset_infos)
-        except RuntimeError as error:
-            if "before done" not in str(error):
-                raise
-            raise ValueError(
-                "env is in the middle of an episode that its Monitor does not let it leave: "
-                "wrap it in Monitor(env, allow_early_resets=True)"
-            ) from error
+        self._innermost._seeds = [*seed]  # its own `seed` may repeat them
+        return self.env.reset(), _columns(self._innermost.reset_infos)
 
     def step(self, actions: Any) -> Any:
         """Step all."""
-        if not is_vec_env(self.env):
-            return self.env.step(actions)
         observations, rewards, ended, infos = self.env.step(actions)
-        if not infos[0]:  # a `GymnasiumVecEnv` fills its list where episodes end
-            infos = getattr(self.env.unwrapped, "infos", infos)
-        return observations, rewards, ended, np.zeros_like(ended), _columns(infos)
-
-    def frozen(self) -> Iterator[tuple[Any, str]]:
-        """Yield all that normalises, with the name of the flag that freezes its statistics."""
-        for layer in self.layers:
-            if _asked(layer, "update_running_mean"):
-                raise ValueError(
-                    "env must not normalise in other processes, where its statistics cannot be "
-                    "frozen: make it in this one, by DummyVecEnv or SyncVectorEnv"
-                )
-            of_sb3 = isinstance(layer, loaded(f"{_SB3}.vec_env", "VecNormalize"))
-            flag = "training" if of_sb3 else "update_running_mean"
-            if not (of_sb3 or hasattr(type(layer), flag)):
-                continue
-            yield layer, flag
-            found = getattr(layer, "obs_rms", {})
-            for each in found.values() if isinstance(found, dict) else [found]:
-                if not each.mean.any() and (each.var == 1.0).all():
-                    raise ValueError(
-                        "env must have the statistics of the training in its "
-                        f"{type(layer).__name__}, which has seen nothing: load or copy them"
-                    )
-
-    def restart(self, policy: Any) -> None:
-        """Reset all with fresh seeds, so that training never meets the episodes of a score."""
-        with suppress(Exception):  # a Monitor may not allow it; what is broken raised its own
-            self.reset(seed=np.random.SeedSequence().generate_state(self.num_envs).tolist())
-        algorithm = loaded(f"{_SB3}.base_class", "BaseAlgorithm")
-        if isinstance(policy, algorithm) and policy.env and self.shares(Given(policy.env)):
-            policy._last_obs = None  # its training begins anew
+        # A `GymnasiumVecEnv` fills its list where episodes end.
+        columns = _columns(infos) or getattr(self._innermost, "infos", {})
+        return observations, rewards, ended, np.zeros_like(ended), columns
 
 
-def _columns(infos: Any) -> Infos:
-    """Return infos as arrays; a list has a dict for each environment."""
-    if isinstance(infos, Mapping):
-        return infos
+def _columns(infos: list[dict[str, Any]]) -> Infos:
+    """Return infos as arrays, one element per environment."""
     names = [name for name, value in infos[0].items() if isinstance(value, int | float)]
     return {name: np.array([each.get(name, np.nan) for each in infos]) for name in names}
 
 
+def _normalisers(env: Any) -> Iterator[tuple[Any, str]]:
+    """Yield all that normalises, with the name of the flag that freezes its statistics."""
+    for layer in layers(env):
+        if _asked(layer, "update_running_mean"):
+            raise ValueError(
+                "env must not normalise in other processes, where its statistics cannot be "
+                "frozen: use DummyVecEnv or SyncVectorEnv"
+            )
+        of_sb3 = isinstance(layer, loaded(f"{_SB3}.vec_env.VecNormalize"))
+        if not (of_sb3 or hasattr(type(layer), "update_running_mean")):
+            continue
+        yield layer, "training" if of_sb3 else "update_running_mean"
+        found = getattr(layer, "obs_rms", {})
+        for each in found.values() if isinstance(found, dict) else [found]:
+            if not each.mean.any() and (each.var == 1.0).all():
+                raise ValueError(
+                    f"env must have the statistics of the training in {type(layer).__name__}, "
+                    "which has seen nothing: load or copy them"
+                )
+
+
 @contextmanager
-def opened(env: Any, n: int, policy: Any = None) -> Iterator[Given]:
+def opened(env: Any, n: int, policy: Any = None) -> Iterator[Any]:
     """Yield given environments, or n that a function makes, frozen and ready for episodes.
 
     Those of a function are closed afterwards. Others are as before, but for a new episode.
     """
-    with ExitStack() as stack:
-        batch = _batch(env, n)
-        if batch is not env:
-            stack.callback(batch.close)
-        given = Given(batch)
-        if sum(getattr(each, "num_envs", 1) for each in given.plants) != given.num_envs:
-            reject("env", env, "an open environment of MiddlePointEnv in NumPy, wrapped or not")
-        for layer, flag in given.frozen():
-            stack.callback(setattr, layer, flag, getattr(layer, flag))
-            setattr(layer, flag, False)
-        stack.callback(given.restart, policy)
-        yield given
-
-
-def _batch(env: Any, n: int) -> Any:
-    """Return environments that exist, or n of a function, to be stepped together."""
-    if isinstance(env, VectorEnv) or is_vec_env(env):
-        return env
-    exists = isinstance(env, gymnasium.Env)
-    if not (exists or callable(env)):
+    given = isinstance(env, gymnasium.Env | VectorEnv) or is_vec_env(env)
+    if not (given or callable(env)):
         allowed = "an id, an EnvSpec, environments, or a function that makes one"
         reject("env", env, f"{allowed} (a model that was loaded has no environments)")
+    with ExitStack() as stack:
+        plants = FromVecEnv(env) if is_vec_env(env) else env
+        if not given or isinstance(env, gymnasium.Env):
+            plants = SyncVectorEnv([lambda: env] if given else [partial(_one, env)] * n)
+            stack.callback(plants.close)
+            plants.closed = given  # then it is not ours to close
+        if sum(getattr(each, "num_envs", 1) for each in natives(plants)) != plants.num_envs:
+            reject("env", env, "an open environment of MiddlePointEnv in NumPy, wrapped or not")
+        for layer, flag in _normalisers(plants):
+            stack.callback(setattr, layer, flag, getattr(layer, flag))
+            setattr(layer, flag, False)
+        if given:
+            stack.callback(_restart, plants, policy)
+        yield plants
 
-    def one() -> Any:
-        made = env if exists else env()
-        if not isinstance(made, gymnasium.Env):
-            allowed = "a function that makes one environment; where it makes many, call it"
-            reject("env", made, allowed)
-        return made
 
-    batch = SyncVectorEnv([one] * (1 if exists else n))
-    batch.closed = exists  # then it is not ours to close
-    return batch
+def _one(make: Callable[[], Any]) -> gymnasium.Env[Any, Any]:
+    """Return the environment that a function makes."""
+    made = make()
+    if not isinstance(made, gymnasium.Env):
+        allowed = "a function that makes one environment; where it makes many, call it"
+        reject("env", made, allowed)
+    return made
+
+
+def _restart(plants: Any, policy: Any) -> None:
+    """Reset plants with fresh seeds, so that training never meets the episodes of a score."""
+    with suppress(Exception):  # a Monitor may not allow it; what is broken raised its own
+        plants.reset(seed=np.random.SeedSequence().generate_state(plants.num_envs).tolist())
+    algorithm = loaded(f"{_SB3}.base_class.BaseAlgorithm")
+    if isinstance(policy, algorithm) and policy.env and overlap(policy.env, plants):
+        policy._last_obs = None  # its training begins anew
 
 
 def check_fit(policy: Any, plants: Any) -> None:
     """Refuse environments that a policy was not made for, if it is one that can tell."""
     _, owner = behind(policy)
-    kinds = ("base_class", "BaseAlgorithm"), ("policies", "BaseModel")
-    is_model = any(isinstance(policy, loaded(f"{_SB3}.{file}", name)) for file, name in kinds)
-    if not is_model and not hasattr(owner, "check_environment"):
-        return
-    given = plants if isinstance(plants, Given) else Given(plants)
-    here = given.traits()
-    if not is_model:
+    if hasattr(owner, "check_environment"):
+        here = _traits(plants)
         wrapped = ", ".join(here["wrappers"] | here["action wrappers"])
-        owner.check_environment(given.plants[0].parameters, wrapped, given.num_envs)
+        owner.check_environment(natives(plants)[0].parameters, wrapped, plants.num_envs)
+    models = loaded(f"{_SB3}.base_class.BaseAlgorithm"), loaded(f"{_SB3}.policies.BaseModel")
+    if not isinstance(policy, models):
         return
-    trained = {
-        "observation space": policy.observation_space,
-        "action space": policy.action_space,
+    pairs: dict[str, tuple[Any, Any]] = {
+        "observation space": (policy.observation_space, plants.single_observation_space),
+        "action space": (policy.action_space, plants.single_action_space),
     }
-    if getattr(policy, "env", None) is not None and not is_vec_env(given.env):
-        trained = {**Given(policy.env).traits(), **trained}
-    for name, its in trained.items():
-        if its != here[name]:
+    own = getattr(policy, "env", None)
+    if own and not isinstance(plants, FromVecEnv):
+        here = _traits(plants)
+        pairs |= {name: (its, here[name]) for name, its in _traits(own).items()}
+    for name, (its, found) in pairs.items():
+        if its != found:
             raise ValueError(
                 f"env must have the {name} of policy's training, {its or 'none'}, got "
-                f"{here[name] or 'none'}: act where it was trained, by evaluate(model, "
-                "model.get_env()), or in others like that: of mptc_gym.sb3.spec_of(model, id), "
-                "in the same VecNormalize and VecFrameStack"
+                f"{found or 'none'}: use evaluate(model, model.get_env()), or mptc_gym.sb3."
+                "spec_of(model, id) in the same VecNormalize and VecFrameStack"
             )
+
+
+def _traits(env: Any) -> dict[str, set[Any]]:
+    """Return what changes observations and actions, as far as it can be known, by kind."""
+    # The `VecEnvWrapper`s of Stable-Baselines3 look for what they lack in what they wrap.
+    seen = {type(each).__name__ for each in layers(env) if getattr(each, "norm_obs", True)}
+    found: dict[str, set[Any]] = {"wrappers": seen & {"VecNormalize", "VecFrameStack"}}
+    if plants := natives(env):  # unlike closed processes, which cannot be asked
+        moves = [each._arguments for each in layers(env) if isinstance(each, _INCREMENTS)]
+        moves += [each for layer in layers(env) for each in _asked(layer, "_arguments")]
+        found["action wrappers"] = {f"IncrementalAction{each}" for each in moves}
+        found["windows"] = {plant.parameters.windows for plant in plants}
+    return found
 
 
 def replayed(steps: Steps, plants: Any, seeds: list[int]) -> Steps:

@@ -175,7 +175,7 @@ valve travel 0 t/h; 100 episodes, all alike
         raise ValueError(f"{', '.join(arguments)} must be given where env is made")
     given = nullcontext(native) if native else acting.opened(env, episodes, policy)
     with given as plants:
-        one, *others = [native.unwrapped] if native else plants.plants
+        one, *others = [native.unwrapped] if native else acting.natives(plants)
         case = case_of(one.parameters)
         if any(case_of(each.parameters) != case for each in others):
             raise ValueError("env must have the same plants, but for windows and rewards")

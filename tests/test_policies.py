@@ -446,7 +446,7 @@ REFUSED = {
             *(found := env.step(action))[:2], found[4]["error"] > 6.5, *found[3:]))),
         "all episodes at once"),
     "VecNormalize without statistics": (
-        lambda: (law, VecNormalize(dummy())), "in its VecNormalize, which has seen nothing"),
+        lambda: (law, VecNormalize(dummy())), "in VecNormalize, which has seen nothing"),
     "new NormalizeObservation": (
         lambda: (law, wrappers.NormalizeObservation(made())),
         "NormalizeObservation, which has seen noth"),

@@ -23,7 +23,7 @@ from benchmarks.controllers.roster import OWN, ROSTER, Controller, limits
 from benchmarks.lib.command import FanOut, Names, blame, options
 from benchmarks.lib.storage import UsageError
 from mptc_gym import IDS, Parameters
-from mptc_gym.acting import check_fit, opened, start
+from mptc_gym.acting import check_fit, natives, opened, start
 from mptc_gym.evaluation import case_of, make_one, native_batch
 
 AgentNames = Annotated[Names, Parameter(help="Controllers to run.", choices=ROSTER)]
@@ -184,7 +184,9 @@ class Policy:
         env = self._own(samples, arguments) if self.env is None else self.env
         with opened(env, self.runs) as given:
             with blame("--agent"):
-                if {case_of(each.parameters) for each in given.plants} != {case_of(self.plant)}:
+                if {case_of(each.parameters) for each in natives(given)} != {
+                    case_of(self.plant)
+                }:
                     raise ValueError("the environment must have the parameters of the case")
                 check_fit(self.policy, given)
             yield given
