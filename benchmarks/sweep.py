@@ -229,7 +229,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) -> None:
     """Draw the map, write the report and print it; of plants that drift, with `QUESTIONS`."""
-    from benchmarks.lib.report import Section, provenance_line, show, write_report
+    from benchmarks.lib.report import Section, write_report
 
     draw(runs, out / "map.png", nominal)
     ends = runs[[name for name in SPANS if name in runs]].agg(["min", "max"])
@@ -244,8 +244,7 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) 
         asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
         if asked and "gain_drift" in runs and len(compared := differences(runs, asked)):
             sections.append(Section(title, [DIFFERENCES], compared))
-    write_report(out, "Controllers on other plants", sections, provenance_line("sweep", made))
-    show(sections)
+    write_report(out, "Controllers on other plants", sections, "sweep", made)
 
 
 def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:

@@ -69,9 +69,9 @@ def work(options: Options) -> str:
     """Run the search, and write and print its results."""
     import pandas as pd
 
-    from benchmarks.lib.report import Section, provenance_line, show, write_report
+    from benchmarks.lib.report import Section, write_report
 
-    name, made = options.controller, provenance_line("tune", origin())
+    name, made = options.controller, origin()
     out = out_folder(options.out / name)
     trials = search(name, options.trials, options.runs, out)
     # The best gains of a search owe some of their result to luck; new runs show how much.
@@ -82,8 +82,7 @@ def work(options: Options) -> str:
     table = table.sort_values("objective", ignore_index=True).map("{:.4g}".format)
     title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS} new runs"
     sections = [Section(title, [NOTE], table)]
-    write_report(out, f"Gains: {ROSTER[name].label}", sections, made)
-    show(sections)
+    write_report(out, f"Gains: {ROSTER[name].label}", sections, "tune", made)
     return f"All trials are in {out}/trials.csv, the best in {out}/report.md"
 
 

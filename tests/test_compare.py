@@ -156,10 +156,13 @@ class TestReport:
         table = pd.DataFrame({"name": ["**a < b**"], "value": ["1.0 (0.9 to 1.1)"]})
         pictures = {"picture.png": "What it shows"}
         sections = [Section("First", ["Some text."], table, pictures), Section("Second")]
-        write_report(tmp_path, "Title", sections, "made today")
+        made = {"started": "made today", "commit": 10 * "abcd" + "-dirty"}
+        write_report(tmp_path, "Title", sections, "compare", made)
         page = (tmp_path / "report.md").read_text()
         assert page.startswith("# Title\n\n## First\n\nSome text.\n\n| name")
-        assert page.endswith("\n\nmade today\n")
+        assert page.endswith(
+            "\n\nmade today, commit abcdabcdabcd-dirty: python -m benchmarks.compare\n"
+        )
         assert "![What it shows](picture.png)" in page
         assert "| **a < b** | 1.0 (0.9 to 1.1) |" in page
         html = (tmp_path / "report.html").read_text()

@@ -58,21 +58,6 @@ def test_intervals_hold_the_truth_as_often_as_they_promise(how, rng):
     assert 0.92 <= held / trials <= 0.99  # 95 %, and a little more as counts are whole
 
 
-@pytest.mark.parametrize(
-    ("tasks", "complaint"),
-    [
-        (([],), "finite"),
-        (([1.0, math.inf],), "finite"),
-        (([1.0, 2.0], [1.0]), "as many"),
-    ],
-)
-def test_bad_values(tasks, complaint):
-    with pytest.raises(ValueError, match=complaint):
-        bootstrap(*tasks, seed=0)
-    with pytest.raises(ValueError, match="must be numbers"):
-        median([1.0, math.nan])
-
-
 class TestBootstrap:
     def test_the_seed_is_all_that_it_depends_on(self, rng):
         values = rng.normal(size=50)

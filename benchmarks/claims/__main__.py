@@ -53,10 +53,10 @@ def work(options: Options) -> str:
     """Examine the claims and write the verdicts, also where some examinations have failed."""
     from benchmarks.claims.claims import CLAIMS
     from benchmarks.claims.runs import Batch
-    from benchmarks.lib.report import provenance_line, show, write_report
+    from benchmarks.lib.report import write_report
 
     chosen = known("CLAIM", options.claims or list(CLAIMS), list(CLAIMS))
-    made, out = provenance_line("claims", origin()), out_folder(options.out)
+    made, out = origin(), out_folder(options.out)
     # The last claims take longest, and start first.
     tasks = {
         name: partial(CLAIMS[name].examined, Batch(options.runs)) for name in reversed(chosen)
@@ -72,8 +72,7 @@ def work(options: Options) -> str:
                 write_csv(out / "figures.csv", curves[0])
                 plot_figures(curves[0], out / "figures.png")
             found = sections(claims, pictures=bool(curves))
-            write_report(out, "The paper's claims", found, made)
-            show(found[:1])
+            write_report(out, "The paper's claims", found, "claims", made, printed=1)
     return f"All numbers are in {out}/report.md and claims.csv"
 
 

@@ -57,7 +57,6 @@ class Options:
 def work(options: Options) -> str:
     """Run the comparison and write its results, also after an error: of what has finished."""
     from benchmarks.compare.comparison import run_case, scale_of, write
-    from benchmarks.lib.report import show
 
     controllers = chosen(options.agents, options.controllers.agent)
     fan_out = options.controllers.fan_out
@@ -103,7 +102,7 @@ def work(options: Options) -> str:
                 "policies": {each.agent: each.policies for each in finished if each.policies},
             }
             write_json(folder / "provenance.json", about)
-            show(write(finished, [*filter(None, scales)], controllers, folder, made)[:2])
+            write(finished, [*filter(None, scales)], controllers, folder, made)
     return f"The report, tables, data and plots are in {folder}/"
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.compare import plots
 from benchmarks.compare.plots import Score
 from benchmarks.controllers.roster import Controller, label
-from benchmarks.lib.report import Section, provenance_line, write_report
+from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles, written
 from benchmarks.lib.storage import write_csv
 from benchmarks.loop.rollout import CHANGE, START, Trajectory, is_random, measure
@@ -199,8 +199,8 @@ def write(
     controllers: Mapping[str, Controller],
     folder: Path,
     made: Mapping[str, Any],
-) -> list[Section]:
-    """Write the numbers, pictures and report of finished cases, and return the sections.
+) -> None:
+    """Write the numbers, pictures and report of finished cases, and print the main tables.
 
     A case without a scale, as its bounds have failed, is in the numbers only.
     """
@@ -217,7 +217,7 @@ def write(
     scales = {each.scenario.name: each for each in found if each.scenario.name in responses}
     runs = runs[runs["scenario"].isin([*scales])]
     if runs.empty:
-        return []
+        return
     reference = str(runs["agent"].iloc[0])
     of_cases = [
         estimate(runs[runs["scenario"] == name], scales[name], reference) for name in scales
@@ -275,9 +275,8 @@ def write(
     try:
         plots.draw(folder, runs, shown, estimates, scores)
     finally:  # with the pictures that there are
-        made_by = provenance_line("compare", made)
-        write_report(folder, "Comparison of controllers", sections, made_by)
-    return sections
+        title = "Comparison of controllers"
+        write_report(folder, title, sections, "compare", made, printed=2)
 
 
 def write_numbers(path: Path, table: pd.DataFrame) -> None:
@@ -319,18 +318,17 @@ def ratio_table(
     estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
 ) -> pd.DataFrame:
     """Return the least possible and the mean errors as multiples; the least are in bold."""
-    bounds = [{"controller": "least possible (°C)"}, {"controller": "with foresight (°C)"}]
+    bounds = pd.DataFrame({"controller": ["least possible (°C)", "with foresight (°C)"]})
     for name, scale in scales.items():
         mark = "*" * (scale.least.kind == "reference")
-        bounds[0][name] = f"{scale.least.value:.3f}{mark}"
-        bounds[1][name] = f"{scale.preview:.3f}"
+        bounds[name] = [f"{scale.least.value:.3f}{mark}", f"{scale.preview:.3f}"]
     values = estimates["ratio"].map(lambda ratio: ratio.value)
     least = values == values.groupby(estimates["scenario"]).transform("min")
     cells = (
         estimates["ratio"].map("{:.2f}".format).where(~least, lambda all_: "**" + all_ + "**")
     )
     table = _by_agent(estimates, cells, agents)
-    return pd.concat([pd.DataFrame(bounds), table], ignore_index=True)
+    return pd.concat([bounds, table], ignore_index=True)
 
 
 def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:

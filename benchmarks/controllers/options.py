@@ -56,14 +56,15 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
                 "--agent must be NEW_NAME=MODULE:FACTORY or NEW_NAME=PPO:FILE.zip"
                 f"{taken}, got {text!r}"
             )
-        module = location.partition(":")[0].partition(".")[0] or "-"
-        if location.endswith(".zip"):
-            if not Path(location.partition(":")[2]).is_file():
-                allowed = "must be such as PPO:model.zip, a file that is there"
-                raise UsageError(f"--agent: {location!r} {allowed}")
-        elif importlib.util.find_spec(module) is None:
+        before, _, after = location.partition(":")
+        if not (
+            Path(after).is_file()
+            if location.endswith(".zip")
+            else importlib.util.find_spec(before.partition(".")[0] or "-")
+        ):
             raise UsageError(
-                f"--agent: {location!r} must be MODULE:FACTORY, and its module be there"
+                f"--agent: {location!r} must be such as PPO:model.zip, a file that is there, "
+                "or MODULE:FACTORY, of a module that is there"
             )
         locations[name] = *locations.get(name, ()), location
     if not (names or own):

@@ -14,7 +14,7 @@ from benchmarks.identify.log import read_log
 from benchmarks.identify.model import Model, identify
 from benchmarks.identify.options import Options
 from benchmarks.identify.plant import plant_arguments, plant_ranges
-from benchmarks.lib.report import COLOURS, Section, drawn, provenance_line, show, write_report
+from benchmarks.lib.report import COLOURS, Section, drawn, write_report
 from benchmarks.lib.statistics import ENDS
 from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
 
@@ -53,9 +53,8 @@ def execute(options: Options) -> str:
     write_json(out / "plant.json", plant)
     write_json(out / "ranges.json", ranges)
     write_json(out / "controllers.json", controllers(model, found))
-    sections, title = report(model, found), f"The plant of {options.log.name}"
-    write_report(out, title, sections, provenance_line("identify", made))
-    show(sections)
+    title = f"The plant of {options.log.name}"
+    write_report(out, title, report(model, found), "identify", made)
     seconds = time.process_time() - began
     return f"{seconds:.1f} s of processor time. The plant and the report are in {out}/"
 

@@ -58,13 +58,25 @@ class Section:
     """Names of PNG files in the report's folder, and for each what it shows, in a sentence."""
 
 
-def write_report(folder: Path, title: str, sections: Sequence[Section], made: str) -> None:
+def write_report(
+    folder: Path,
+    title: str,
+    sections: Sequence[Section],
+    command: str,
+    origin: Mapping[str, Any],
+    printed: int | None = None,
+) -> None:
     """Write `report.md` and `report.html`, with the pictures that there are.
 
-    `made` is their provenance line.
+    The last line is the time, the commit and the command of `benchmarks` that made it. The
+    first sections, as many as `printed` or all, are printed, too, without their pictures.
     """
     import markdown
 
+    called = sys.argv[1:] if command in sys.argv[0] else []
+    line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])
+    commit = origin["commit"]  # a hash of 40 digits, possibly with "-dirty"
+    made = f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}"
     page = _markdown(folder, title, sections, made)
     write_text(folder / "report.md", page)
     body = markdown.markdown(page, extensions=["tables", "toc"])
@@ -76,29 +88,17 @@ def write_report(folder: Path, title: str, sections: Sequence[Section], made: st
     )
     page = f'<!doctype html><html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
     write_text(folder / "report.html", page)
+    width = shutil.get_terminal_size((150, 24)).columns
+    for section in sections[:printed]:
+        for text in filter(None, [section.title, *section.text]):
+            print(textwrap.fill(text, width))
+        if section.table is not None:
+            print(on_screen(section.table))
 
 
 def _embedded(picture: Path) -> str:
     data = base64.b64encode(picture.read_bytes()).decode()
     return f'src="data:image/png;base64,{data}"'
-
-
-def provenance_line(command: str, origin: Mapping[str, Any]) -> str:
-    """Return the time, the commit and the command of `benchmarks` that made a report."""
-    called = sys.argv[1:] if command in sys.argv[0] else []
-    commit = origin["commit"]  # a hash of 40 digits, possibly with "-dirty"
-    line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])
-    return f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}"
-
-
-def show(sections: Sequence[Section]) -> None:
-    """Print sections, without their pictures."""
-    width = shutil.get_terminal_size((150, 24)).columns
-    for section in sections:
-        for text in filter(None, [section.title, *section.text]):
-            print(textwrap.fill(text, width))
-        if section.table is not None:
-            print(on_screen(section.table))
 
 
 def on_screen(table: pd.DataFrame) -> str:
