@@ -53,8 +53,11 @@ def recorded(samples=1200, seed=700, **plant):
 
 @cache
 def good():
-    """Return what is found in a log of the paper's plant."""
-    return identify(recorded())
+    """Return what is found in a log of the paper's plant, from an operating point, with gaps."""
+    log = recorded()
+    log = replace(log, flow=log.flow + 480.0, temperature=log.temperature + 385.0)
+    log.temperature[[200, 201, 500, 777]] = np.nan
+    return identify(log, Knowledge(operating_flow=480.0))
 
 
 class TestFit:
@@ -84,16 +87,11 @@ class TestFit:
             assert low <= truth <= high, name
             assert value == pytest.approx(truth, rel=0.2), name
         assert good().warnings == []
+        assert good().operating_flow == 480.0
+        assert good().operating_temperature == pytest.approx(385.0, abs=0.5)
+        assert np.isfinite(good().simulated).all()
 
-    def test_operating_point_is_found_and_deviations_are_from_it(self):
-        log = recorded()
-        shifted = replace(log, flow=log.flow + 480.0, temperature=log.temperature + 385.0)
-        shifted.temperature[[200, 201, 500, 777]] = np.nan  # gaps are left out
-        model = identify(shifted, Knowledge(operating_flow=480.0))
-        assert model.plant.gain == pytest.approx(good().plant.gain, rel=0.05)
-        assert np.isfinite(model.simulated).all()
-        assert model.operating_flow == 480.0
-        assert model.operating_temperature == pytest.approx(385.0, abs=0.5)
+    def test_operating_flow_by_hand(self):
         # 0 or the first flow if it is in the middle half of the range, else the middle.
         for flows, found in (
             ([480, 470, 490], 480), ([60, 100, 0, 40], 60), ([5, -10], 0), ([100, 0, 100], 50),
@@ -102,7 +100,7 @@ class TestFit:
 
     def test_dead_zone_is_known_up_to_the_gap_between_commands(self):
         generator = np.random.default_rng(701)
-        flow = np.repeat(generator.choice([-7.0, -3.0, 0.0, 3.0, 7.0], 40), 40)
+        flow = np.repeat(generator.choice([-7.0, -3.0, 0.0, 3.0, 7.0], 20), 40)
         model = identify(Log(flow, answer(flow, generator), 8.0))
         zone = model.estimates["dead_zone"]
         assert (zone.low, zone.high) == (pytest.approx(3.0), pytest.approx(7.0))
@@ -134,17 +132,17 @@ class TestFit:
         # A real log. A plain impulse response of both heaters explains 97 %.
         log = read_log(TCLAB, Columns(flow="heater1", temperature="temperature1",
                                       disturbance=("heater2",)))  # fmt: skip
-        thinned = {"heater2": log.disturbances["heater2"][::3]}
-        model = identify(Log(log.flow[::3], log.temperature[::3], 3.0, thinned))
+        thinned = {"heater2": log.disturbances["heater2"][::5]}
+        model = identify(Log(log.flow[::5], log.temperature[::5], 5.0, thinned))
         assert 0.96 < model.explained[0] < 1.0
         # Two levels, and the middle between them at first, do not test a valve.
         (warning,) = model.warnings
         assert "does not test the valve" in warning
+        assert recommended(model) == []
         assert any("heater2 is a known disturbance" in note for note in model.notes)
 
 
 VALVES = {  # what is said of them, and how they move
-    "backlash": lambda p, u: min(max(p, u - 3.0), u + 3.0),
     "stiction": lambda p, u: u if abs(u - p) > 5.0 else p,
     "a second at most": lambda p, u: p + min(max(u - p, -0.3), 0.3),
 }
@@ -153,7 +151,7 @@ VALVES = {  # what is said of them, and how they move
 class TestValves:
     @pytest.mark.parametrize("said", VALVES)
     def test_valve_is_named(self, said):
-        log, passed = recorded(noise=0.01), [0.0]
+        log, passed = recorded(700, noise=0.01), [0.0]
         for u in log.flow:
             passed.append(VALVES[said](passed[-1], u))
         flow = np.array(passed[1:])
@@ -201,16 +199,16 @@ class TestTuning:
         wild, _ = Loops([plant], 1.0).judged(PIController(-3.0, -0.03))
         assert wild[0] == np.inf
 
-    @pytest.mark.parametrize("direction", [-1.0, 1.0])
-    def test_typed_controllers_hold_a_real_loop(self, direction):
+    @pytest.mark.parametrize(("direction", "zone"), [(1.0, 5.0), (-1.0, 0.0)])
+    def test_typed_controllers_hold_a_real_loop(self, direction, zone):
         """The arguments are those of `agents`; kp has the sign that engineers expect."""
         b = [direction * each for each in PAPER.b]
-        model = identify(recorded(b=b, dead_zone=0.0, noise=0.01))
+        model = good() if zone else identify(recorded(800, b=b, dead_zone=zone, noise=0.01))
         found = recommended(model, smith=True)
         listed = json.loads(json.dumps(controllers(model, found)))
         assert listed["warnings"] == []
         assert [each["controller"] for each in listed["recommended"]] == ["pi-simc", "smith"]
-        env = gymnasium.make("MiddlePoint-v0", b=b, dead_zone=0.0, setpoint=3.0)
+        env = gymnasium.make("MiddlePoint-v0", b=b, dead_zone=zone, setpoint=4.0)
         makers = [PIController, SmithPredictor]
         for each, made in zip(listed["recommended"], makers, strict=True):
             assert np.sign(each["kp"]) == -direction  # the gain of the paper's B is negative
@@ -246,7 +244,7 @@ def closed_loop(log):
     plant = study.Plant(
         fault="none", size=0.1, zone=0.0, h=8.0, gain=-7.0, delay=150.0, lags=[161.0], lead=0.0
     )
-    noise = log.temperature - good().simulated
+    noise = np.random.default_rng(706).normal(0.0, 0.5, 1200)
     return study.simulate(plant, np.zeros(1200), noise, -0.1, 161.0)
 
 
@@ -260,12 +258,9 @@ REFUSED = {
     ),
 }  # fmt: skip
 DOUBTED = {
-    "does not test the valve": lambda log: (
-        10.0 * np.sign(log.flow), answer(10.0 * np.sign(log.flow), np.random.default_rng(705))
-    ),
-    "The delay may be longer": lambda log: (log.flow, np.roll(log.temperature, 300)),
+    "The delay may be longer": lambda log: (log.flow, np.roll(log.temperature, 175)),
     "The plant seems to change: gain by time": lambda log: (
-        log.flow, log.temperature * np.linspace(0.4, 1.6, 1200)
+        log.flow, log.temperature * np.linspace(0.4, 1.6, 700)
     ),
 }  # fmt: skip
 
@@ -279,7 +274,7 @@ class TestGuards:
 
     @pytest.mark.parametrize("said", DOUBTED)
     def test_nothing_is_recommended_on_a_doubtful_model(self, said):
-        flow, temperature = DOUBTED[said](recorded())
+        flow, temperature = DOUBTED[said](recorded(700))
         model = identify(Log(flow, temperature, 8.0))
         assert re.search(said, " ".join(model.warnings))
         assert controllers(model, recommended(model)) == {
@@ -288,7 +283,7 @@ class TestGuards:
         assert report(model, [])[0].text[0].startswith("**Nothing is recommended.**")
 
     def test_flow_behind_the_valve_needs_no_test_of_it(self):
-        flow = 10.0 * np.sign(recorded().flow)
+        flow = 10.0 * np.sign(recorded(800).flow)
         log = Log(flow, answer(flow, np.random.default_rng(705)), 8.0)
         assert identify(log, Knowledge(applied=True)).warnings == []
 
@@ -303,12 +298,12 @@ class TestPlant:
         env = gymnasium.make("MiddlePoint-v0", max_episode_steps=1200, **calm)
         env.reset()
         low, high, outputs = arguments["u_min"], arguments["u_max"], [0.0]
-        for u in model.log.flow[:-1]:
+        for u in model.log.flow[:-1] - model.operating_flow:
             action = np.array([2.0 * (u - low) / (high - low) - 1.0], np.float32)
             outputs.append(env.step(action)[-1]["output"])
         simulated = model.simulated - model.operating_temperature
         np.testing.assert_allclose(simulated[600:], outputs[600:], atol=2e-3)
-        left = np.var(model.log.temperature - model.simulated)
+        left = np.nanvar(model.log.temperature - model.simulated)
         noise = signal.lfilter(arguments["c"], arguments["a"], np.eye(1, 3000)[0])
         assert arguments["noise_variance"] * (noise**2).sum() == pytest.approx(left, rel=0.4)
 
