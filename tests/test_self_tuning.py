@@ -13,10 +13,8 @@ from agents import (
     SmithPredictor,
     self_tuning,
 )
-from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.loop.linear import step_test
 from benchmarks.loop.rollout import make_plants, measure, rollout
-from mptc_gym import PRESETS, Parameters
+from mptc_gym import Parameters
 
 SHOWN = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
 STEP_TEST = {**SHOWN, "dead_zone": 5.0}
@@ -106,35 +104,16 @@ def test_the_network_does_not_hunt_beside_a_dead_zone(shown, dead_zone, setpoint
     assert travel(run) < 80.0
 
 
-def test_behind_the_bank_the_network_takes_no_load_for_a_gain():
-    plant = PRESETS["disturbed"] | {"setpoint_amplitude": 4.5, "delay": 14, "runs": 20}
-    ours, theirs = (
-        mean_error(control(make(**{**STEP_TEST, "delay": 120.0}), **plant))
-        for make in (NeuralSelfTuningController, SelfTuningController)
-    )
-    assert ours < theirs - 0.015
-
-
-@pytest.mark.parametrize("plant", [{"time_constant_factor": 1.5}, {"delay": 21}])
-def test_on_a_calm_plant_the_valve_is_as_calm_as_with_the_model_given(plant):
-    # Where the given numbers are wrong, both learn of it once; then nothing is left to do.
-    shown = {**STEP_TEST, "delay": 8.0 * (plant.get("delay", 18) + 1)}
-    makers = neural, NeuralSelfTuningController
-    given, ours = (control(make(**shown), 700, **plant) for make in makers)
-    assert travel(ours) < 1.2 * travel(given) + 2.0
-    assert mean_error(ours) < 1.04 * mean_error(given)
-
-
 def test_thousands_of_quiet_samples_teach_nothing():
     controller, estimates = tuning(), []
     setpoint = [0.0] + [5.0] * 300 + [-5.0] * 300 + [0.0]  # the last one is held
-    plants = make_plants(1, 6_000, setpoint=setpoint, delay=26, gain_factor=1.3)
+    plants = make_plants(1, 4_000, setpoint=setpoint, delay=26, gain_factor=1.3)
 
     def watch(k):
-        if k in (1500, 5_999):
+        if k in (1500, 3_999):
             estimates.append(controller.estimates)
 
-    trajectory = rollout(plants, controller, 6_000, 0, watch)
+    trajectory = rollout(plants, controller, 4_000, 0, watch)
     assert not trajectory.applied[1500:].any()
     before, after = estimates
     assert before["delay"] == pytest.approx(8.0 * 27, abs=16.0)
@@ -176,6 +155,7 @@ def seen(rng):
 @pytest.mark.parametrize(
     ("make", "commands"),
     [
+        (SelfTuningController, [13.017, 84.534, 74.986, 114.897, 30.924]),
         (NeuralSmithPredictor, [5.045, 21.073, 26.834, 39.262, 23.213]),
         (NeuralSelfTuningController, [10.56, 53.156, 32.792, 86.13, 48.734]),
     ],
@@ -215,31 +195,3 @@ def test_neither_a_wrong_gain_nor_a_steady_load_leaves_an_offset():
     assert mean_error(gain, 500) < 0.05
     load = {"disturbance_amplitude": 2.0, "disturbance_interval": 1e6, "setpoint": 4.0}
     assert mean_error(control(tuning(), 1500, dead_zone=0.0, delay=12, **load), 1300) < 0.05
-
-
-@pytest.mark.parametrize(
-    "plant",
-    [
-        {"a": [1.0, -2.4, 1.91, -0.504], "b": [0.002, 0.002, 0.002], "c": [1.0]},
-        {"delay": 60, "time_constant_factor": 0.25},
-    ],
-)
-def test_a_plant_unlike_those_of_the_training(plant):
-    shown = step_test(Parameters(**plant)) | {"dead_zone": 2.0}
-    size = 5.0 * abs(shown["gain"])
-    run = control(neural(**shown), 300, **plant, dead_zone=2.0, setpoint_amplitude=size)
-    assert mean_error(run, 250) < 0.05 * size
-
-
-LOAD = {"disturbance_amplitude": 1.5, "disturbance_interval": 150.0}
-
-
-@pytest.mark.parametrize(("outside", "times"), [({"noise_variance": 0.4}, 1.03), (LOAD, 1.2)])
-def test_a_load_is_told_from_noise(outside, times):
-    # Once it has seen some; what knows the plant and its noise sets the scale.
-    plant = {"setpoint": 5.0, "delay": 14, **outside}
-    ours = neural(**step_test(Parameters(**plant)), dead_zone=5.0)
-    best = PredictiveController(Parameters(**plant), 4)
-    runs = (control(each, 800, 4, 7_000_000, **plant) for each in (ours, best))
-    error, least = (mean_error(run, 300) for run in runs)
-    assert error < times * least
