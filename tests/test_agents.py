@@ -141,11 +141,6 @@ class TestEveryController:
                 controller.act(bad)
             assert np.array_equal(controller.act(np.ones(6)), twin.act(np.ones(6)))
 
-    def test_bad_limits(self, make):
-        for u_min, u_max in [(1, 1.0), (2, 1.0), (-np.inf, 1.0)]:
-            with pytest.raises(ValueError, match="u_min"):
-                make(u_min=u_min, u_max=u_max)
-
     def test_a_loop_in_a_batch_is_one_alone_whatever_else_it_is_shown(self, make, rng):
         batch = of_loops(make, 3)
         singles = [make(seed=i) if "seed" in vars(batch) else make() for i in range(3)]
@@ -275,12 +270,9 @@ class TestDirectNN:
             changed.append(not same(nn.weights, before))
         assert np.flatnonzero(changed).tolist() == [0, 3, 6, 7]  # and not 10
 
-    def test_extreme_inputs_do_not_overflow_and_others_than_its_loops_are_refused(self):
+    def test_extreme_inputs_do_not_overflow(self):
         batch = DirectNNController(input_scale=1e6, num_envs=2)
         assert np.isfinite(batch.act([[-1e3] * 6, [1e3] * 6])).all()
-        for num_envs, observations in [(3, np.zeros(6)), (None, np.zeros((2, 6)))]:
-            with pytest.raises(ValueError, match="observation must have shape"):
-                DirectNNController(num_envs=num_envs).act(observations)
 
 
 def test_simc_by_hand():
@@ -466,7 +458,7 @@ BAD = {
     partial(PIController.simc, **PLANT): [
         ("gain", 0.0), ("gain", np.nan), ("time_constant", 0.0), ("delay", -1.0),
         ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0),
-        ("anti_windup", "no"),
+        ("anti_windup", "no"), ("u_min", 10.0), ("u_min", 11.0), ("u_min", -np.inf),
     ],
     partial(SmithPredictor, **TOLD): [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)],
     partial(NeuralSmithPredictor, **PLANT): [
@@ -475,7 +467,7 @@ BAD = {
     partial(SelfTuningController, **PLANT): [
         ("shortest_delay_samples", 0), ("longest_delay_samples", 6),
         ("longest_delay_samples", 10.0), ("longest_delay_samples", 10**9),
-        ("forgetting", 0.0), ("forgetting", 1.1), ("u_min", 10.0),
+        ("forgetting", 0.0), ("forgetting", 1.1),
     ],
     partial(NeuralSelfTuningController, **PLANT): [("aggressiveness", -1)],
     policy: [

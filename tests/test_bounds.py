@@ -328,18 +328,6 @@ class TestPredictiveController:
         (found,) = mean_error(run_mpc(1, **case))
         assert limit * (1 - 1e-4) <= found <= 1.02 * limit
 
-    @pytest.mark.parametrize(
-        "plant", [{}, {"a": (1.0, -0.9), "b": (-0.1, 0.0, -0.05), "c": (1.0,), "delay": 2}]
-    )
-    def test_it_foresees_the_plant_exactly(self, plant):
-        # Without a dead zone and far from the limits the output comes to the set point at the
-        # first sample that a command can reach, and stays.
-        free = {"dead_zone": 0.0, "u_min": -1e3, "u_max": 1e3, "setpoint": 5.0}
-        output = run_mpc(1, 60, **plant, **free).output[:, 0]
-        first = Parameters(**plant).delay + 1
-        assert np.all(output[:first] == 0.0)
-        assert output[first:] == pytest.approx(5.0, abs=1e-3)
-
     def test_it_is_of_minimum_variance_where_nothing_limits_it(self):
         plant = {"a": (1.0, -0.9), "b": (-0.5,), "c": (1.0, 0.8, 0.15), "delay": 3}
         free = {"dead_zone": 0.0, "u_min": -1e3, "u_max": 1e3, "setpoint": 0.0}

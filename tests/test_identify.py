@@ -53,7 +53,7 @@ def recorded(samples=1200, seed=700, **plant):
 
 @cache
 def good():
-    """Return what is found in a log of the paper's plant, from an operating point, with gaps."""
+    """Return what is found in a log with gaps of the paper's plant, not around 0."""
     log = recorded()
     log = replace(log, flow=log.flow + 480.0, temperature=log.temperature + 385.0)
     log.temperature[[200, 201, 500, 777]] = np.nan
