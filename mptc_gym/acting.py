@@ -18,10 +18,7 @@ from mptc_gym.checks import reject, shorten
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.plant import action_from_command
 from mptc_gym.vector_env import MiddlePointVectorEnv
-from mptc_gym.wrappers import IncrementalAction
-from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
-_INCREMENTS: Final = IncrementalAction, VectorIncrementalAction
 _NATIVE: Final = MiddlePointEnv, MiddlePointVectorEnv
 _SB3: Final = "stable_baselines3.common"
 _TOLERANCE: Final = 1e-6  # of infos, degC or t/h, and relative to them
@@ -167,7 +164,9 @@ def layers(env: Any) -> Iterator[Any]:
 
 
 def _asked(env: Any, name: str) -> list[Any]:
-    """Return an attribute of environments in other processes, if these run and have it."""
+    """Return an attribute of a layer, or of environments in its processes, if they run."""
+    if name in vars(env):
+        return [vars(env)[name]]
     with suppress(Exception):  # whatever closed ones raise
         if "processes" in vars(env):
             ask = getattr(env, "env_method", None) or env.call
@@ -310,8 +309,7 @@ def _traits(env: Any) -> dict[str, set[Any]]:
     seen = {type(each).__name__ for each in layers(env) if getattr(each, "norm_obs", True)}
     found: dict[str, set[Any]] = {"wrappers": seen & {"VecNormalize", "VecFrameStack"}}
     if plants := natives(env):  # unlike closed processes, which cannot be asked
-        moves = [each._arguments for each in layers(env) if isinstance(each, _INCREMENTS)]
-        moves += [each for layer in layers(env) for each in _asked(layer, "_arguments")]
+        moves = [each for layer in layers(env) for each in _asked(layer, "_increments")]
         found["action wrappers"] = {f"IncrementalAction{each}" for each in moves}
         found["windows"] = {plant.parameters.windows for plant in plants}
     return found

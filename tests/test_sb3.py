@@ -111,10 +111,7 @@ class TestBatches:
         [
             ({"n_envs": 0}, "n_envs must be an integer from 1"),
             ({"group": 2}, "group must be an integer from 1"),
-            (
-                {"wrapper": partial(DelayObservation, delay=2)},
-                "env must be of this packa",
-            ),
+            ({"wrapper": partial(DelayObservation, delay=2)}, "env must be of this pack"),
             ({"wrapper": {"max_move": 7}}, "max_move must be"),
             ({"wrapper": 5}, "wrapper must be the arguments"),
             ({"env": "Point-v0"}, "env must be the id of an environment"),

@@ -89,9 +89,9 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         )
         gymnasium.ActionWrapper.__init__(self, env)
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
-        self._arguments = max_move, compensate_dead_zone
+        self._increments = max_move, compensate_dead_zone
         self._numbers = {name: parameters.range_of(name)[0] for name in NUMBERS}
-        self._actuator = Actuator(self._numbers, *self._arguments)
+        self._actuator = Actuator(self._numbers, *self._increments)
         self._flow = 0.0  # wanted, t/h
 
     def reset(
@@ -100,7 +100,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         """Reset the environment, and set the wanted flow to 0."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._numbers |= {name: info[name] for name in NUMBERS if name in info}
-        self._actuator = Actuator(self._numbers, *self._arguments)
+        self._actuator = Actuator(self._numbers, *self._increments)
         self._flow = 0.0
         return observation, info
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,8 @@ from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from mptc_gym.acting import natives
 from mptc_gym.checks import many_actions, reject
-from mptc_gym.parameters import Parameters
-from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers import NUMBERS, Actuator
 
 __all__ = ["IncrementalAction"]
@@ -39,15 +37,20 @@ class IncrementalAction(VectorActionWrapper):
         max_move: float = 0.4,
         compensate_dead_zone: bool | float = False,
     ) -> None:
-        plants = _parameters(env)
+        plants = natives(env) if isinstance(env, VectorEnv) else []
+        sizes = [getattr(each, "num_envs", 1) for each in plants]
+        if not plants or sum(sizes) != env.num_envs:
+            kind = "a vector environment of MiddlePointEnv in NumPy"
+            reject("env", env, f"{kind}; mptc_gym.wrappers takes one")
         super().__init__(env)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._arguments = max_move, compensate_dead_zone
+        self._increments = max_move, compensate_dead_zone
         self._numbers = {
-            name: np.array([plant.range_of(name)[0] for plant in plants]) for name in NUMBERS
+            name: np.repeat([each.parameters.range_of(name)[0] for each in plants], sizes)
+            for name in NUMBERS
         }
-        self._actuator = Actuator(self._numbers, *self._arguments)
+        self._actuator = Actuator(self._numbers, *self._increments)
         self._mode = AutoresetMode(env.metadata["autoreset_mode"])
         self._flows = np.zeros(self.num_envs)  # wanted, t/h
         self._ended = np.zeros(self.num_envs, np.bool_)  # to be reset by the next step
@@ -81,20 +84,6 @@ class IncrementalAction(VectorActionWrapper):
         """Set the wanted flow to 0 where an episode has begun, and store what was drawn."""
         for name in {*NUMBERS} & {*infos}:
             self._numbers[name][begun] = infos[name][begun]
-        self._actuator = Actuator(self._numbers, *self._arguments)
+        self._actuator = Actuator(self._numbers, *self._increments)
         self._flows[begun] = 0.0
         self._ended = self._ended & ~begun
-
-
-def _parameters(env: VectorEnv[Any, Any, Any]) -> list[Parameters]:
-    """Return the arguments of each environment."""
-    inner: Any = getattr(env, "unwrapped", None)
-    if isinstance(inner, MiddlePointVectorEnv):
-        return [inner.parameters] * env.num_envs
-    plants: list[Any] = []
-    with suppress(AttributeError):  # from environments that are not plants
-        plants = list(inner.get_attr("parameters"))
-    if not plants or not all(isinstance(plant, Parameters) for plant in plants):
-        allowed = "a vector environment of MiddlePointEnv in NumPy; mptc_gym.wrappers takes one"
-        reject("env", env, allowed)
-    return plants
