@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -195,18 +196,18 @@ def table(
     import pandas as pd
 
     rows = [pd.DataFrame()]
-    for i, plant in enumerate(plants):
-        for agent in agents:
-            scale, of_agent = found.get(f"plant {i}"), found.get(f"plant {i}, {agent}")
-            if scale is None or of_agent is None:
-                continue
-            task = pd.DataFrame({"plant": i, "agent": agent, **of_agent})
-            task["limit"] = scale["limit"]
-            task["ratio"] = task["mae"] / task["limit"]
-            # By no control in the same noise.
-            task["oscillates"] = task["swing"] > scale["swing"] + OSCILLATES
-            task["useless"] = task["mae"] >= scale["mae"]
-            rows.append(task.assign(**plant))
+    for (i, plant), agent in itertools.product(enumerate(plants), agents):
+        scale, of_agent = found.get(f"plant {i}"), found.get(f"plant {i}, {agent}")
+        if scale is None or of_agent is None:
+            continue
+        about = {"plant": i, "agent": agent, **of_agent, "limit": scale["limit"]}
+        # By no control in the same noise.
+        compared = {
+            "ratio": of_agent["mae"] / scale["limit"],
+            "oscillates": of_agent["swing"] > scale["swing"] + OSCILLATES,
+            "useless": of_agent["mae"] >= scale["mae"],
+        }
+        rows.append(pd.DataFrame({**about, **compared, **plant}))
     return pd.concat(rows, ignore_index=True)
 
 
@@ -260,15 +261,14 @@ def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.Data
     runs = runs[runs["agent"].isin(agents)]
     runs = runs[runs.groupby("plant")["agent"].transform("nunique") == len(agents)]
     for name, which in GROUPS.items():
-        group = runs.query(which)
-        errors = group.pivot_table(index="plant", columns=["agent", "run"], values="mae")
-        if len(errors) < 2:
-            continue
-        rows.append({"plants": name, "number": str(len(errors))})
-        for pair in pairs:
-            ours, theirs = (errors[agent].to_numpy() for agent in pair)
-            column = " - ".join(map(label, pair))
-            rows[-1][column] = f"{bootstrap(ours - theirs, seed=SEED):+.3f}"
+        cells = runs.query(which)
+        errors = cells.pivot_table(index="plant", columns=["agent", "run"], values="mae")
+        if len(errors) > 1:
+            rows.append({"plants": name, "number": str(len(errors))})
+            for ours, theirs in pairs:
+                difference = errors[ours].to_numpy() - errors[theirs].to_numpy()
+                column = f"{label(ours)} - {label(theirs)}"
+                rows[-1][column] = f"{bootstrap(difference, seed=SEED):+.3f}"
     return pd.DataFrame(rows)
 
 

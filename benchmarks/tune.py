@@ -109,7 +109,7 @@ def search(name: str, count: int, runs: int, out: Path) -> pd.DataFrame:
                     each: trial.suggest_float(each, *span, log=True) for each, span in spans
                 }
                 task = {f"trial {i}": partial(score, name, runs, FIRST_RUN, gains)}
-                rows += FanOut(jobs=1).run(task, kept=kept).values()
+                rows += dict(FanOut(jobs=1).stream(task, kept=kept)).values()
                 study.tell(trial, rows[-1]["objective"])
                 advance()
     finally:

@@ -183,7 +183,7 @@ class Options:
 def work(options):
     try:
         print("up", flush=True)
-        options.fan_out.run({name: partial(time.sleep, 60) for name in "abcd"})
+        dict(options.fan_out.stream({name: partial(time.sleep, 60) for name in "abcd"}))
     finally:
         print("writes", flush=True)
         time.sleep(2)

@@ -47,7 +47,7 @@ def work(n, calls=None, seconds=0.0):
 
 
 def run(given, folder=None, jobs=2):
-    return FanOut(jobs=jobs).run(given, kept=folder and Kept(folder))
+    return dict(FanOut(jobs=jobs).stream(given, kept=folder and Kept(folder)))
 
 
 def counted(calls):
@@ -77,7 +77,6 @@ def test_jobs_and_order_do_not_matter():
     for given, jobs in ((there, 1), (there, 2), (back, 2)):
         results = run(given, jobs=jobs)
         assert results == {f"plant {seed}": draw(seed) for seed in range(5)}
-        assert list(results) == list(given)
     assert run({"pid": os.getpid}, jobs=1) == {"pid": os.getpid()}
     assert os.getpid() not in run({"one": os.getpid, "two": os.getpid}).values()
 
@@ -144,7 +143,7 @@ node = {"num_cpus": 2, "object_store_memory": 80_000_000, "include_dashboard": F
 cluster = Cluster(initialize_head=True, head_node_args=node)
 os.environ["RAY_ADDRESS"] = cluster.address
 work = {f"plant {seed}": partial(pow, 0.1, seed) for seed in range(3)} | {"where": os.getpid}
-there, here = dict(FanOut(backend="ray").stream(work)), FanOut(jobs=1).run(work)
+there, here = dict(FanOut(backend="ray").stream(work)), dict(FanOut(jobs=1).stream(work))
 assert there.pop("where") != here.pop("where") and there == here, there
 print("the same numbers")
 cluster.shutdown()
@@ -173,4 +172,4 @@ def test_where_there_is_no_cluster_it_says_so(monkeypatch, tmp_path):
     monkeypatch.setenv("RAY_ADDRESS", "auto")
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
     with pytest.raises(UsageError, match="--backend: no Ray cluster can be reached: start one"):
-        FanOut(backend="ray").run(work(1))
+        dict(FanOut(backend="ray").stream(work(1)))

@@ -104,10 +104,8 @@ def write_package(fan_out: FanOut) -> str:
     from benchmarks.bounds.least import least_possible
 
     case: dict[str, Any] = {"samples": SAMPLES, "seed": SEED, "episodes": EPISODES + MORE}
-    found = fan_out.run(
-        {name: partial(least_possible, **case, **each) for name, each in PACKAGED.items()},
-        "bounds",
-    )
+    tasks = {name: partial(least_possible, **case, **each) for name, each in PACKAGED.items()}
+    found = dict(fan_out.stream(tasks, "bounds"))
     about = {
         "command": "python -m benchmarks.bounds --package",
         "commit": commit(),

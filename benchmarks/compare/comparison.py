@@ -228,6 +228,14 @@ def write(
     titles = {name: scale.scenario.title for name, scale in scales.items()}
     members = [each for case in cases for each in case.policies]
     notes = dict.fromkeys(f"{each['note']}." for each in members if "note" in each)
+    paired = pd.DataFrame()
+    if "difference" in estimates:
+        others = estimates.dropna(subset=["difference"])
+        pairs = zip(others["difference"], others["improvement"], strict=True)
+        cells = [f"{mean:+.3f}; {100 * better.value:.0f} %" for mean, better in pairs]
+        paired = _by_agent(others, cells, [*others["agent"].unique()])
+    parts = runs[runs["scenario"] == "hard"].groupby("agent")[[*PARTS]].mean()
+    parts = parts.sort_values("mae").map("{:.3f}".format).rename(index=label, columns=PARTS)
     sections = [
         Section(
             "Score: 0 without control, 1 at the least possible error",
@@ -249,12 +257,12 @@ def write(
         Section(
             f"Difference to {label(reference)} (°C), 95 % interval",
             [PAIRED],
-            paired_table(estimates),
+            paired,
         ),
         Section(
             "Where the error arises: `hard`",
             ["Contributions to the mean error, °C: means of all runs."],
-            parts_table(runs[runs["scenario"] == "hard"]),
+            parts.rename_axis("controller").reset_index(),
         ),
         Section("What each controller costs", [COSTS], costs_table(cases, controllers)),
         Section(
@@ -331,28 +339,12 @@ def ratio_table(
     return pd.concat([bounds, table], ignore_index=True)
 
 
-def paired_table(estimates: pd.DataFrame) -> pd.DataFrame:
-    """Return differences from the reference, one row for each other agent."""
-    if "difference" not in estimates:
-        return pd.DataFrame()
-    others = estimates.dropna(subset=["difference"])
-    pairs = zip(others["difference"], others["improvement"], strict=True)
-    cells = [f"{mean:+.3f}; {100 * better.value:.0f} %" for mean, better in pairs]
-    return _by_agent(others, cells, [*others["agent"].unique()])
-
-
 def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
     table = rows.assign(cell=cells).pivot_table(
         index="agent", columns="scenario", values="cell", aggfunc="first", sort=False
     )
     table = table.loc[[*agents]].fillna("").rename(index=label)
     return table.rename_axis(index="controller", columns=None).reset_index()
-
-
-def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean error of a case and its parts, the least first."""
-    means = runs.groupby("agent")[[*PARTS]].mean().sort_values("mae").map("{:.3f}".format)
-    return means.rename(index=label, columns=PARTS).rename_axis("controller").reset_index()
 
 
 def costs_table(cases: Sequence[Case], controllers: Mapping[str, Controller]) -> pd.DataFrame:

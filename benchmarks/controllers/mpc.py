@@ -95,7 +95,10 @@ class PredictiveController:
                 for first in (np.zeros_like(edge), edge)
             ]
             plans = [self._optimise(model.Q, target, plan, first) for first in firsts]
-            costs = [_cost(model.Q, target, np.ascontiguousarray(p.T)) for p in plans]
+            costs = [
+                np.einsum("ni,nij,nj->n", u, model.Q, u) / 2 - (target * u).sum(axis=1)
+                for u in (np.ascontiguousarray(each.T) for each in plans)
+            ]
             rests = costs[0] <= costs[1]
             plan = np.where(inside, np.where(rests, *plans), plan)
             command = np.where(inside, np.where(rests, 0.0, edge), command)
@@ -206,11 +209,6 @@ class _Model(Coefficients):
         for j in range(HORIZON):
             G[:, j:, j] = response[:, : HORIZON - j]
         return cls(**vars(now), G=G, Q=G.transpose(0, 2, 1) @ G)
-
-
-def _cost(Q: Array, target: Array, plan: Array) -> Array:
-    cost: Array = np.einsum("ni,nij,nj->n", plan, Q, plan) / 2 - (target * plan).sum(axis=1)
-    return cost
 
 
 def _outer(vectors: Array, variances: Array) -> Array:

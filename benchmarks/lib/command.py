@@ -242,13 +242,6 @@ class FanOut:
     backend: Literal["loky", "ray"] = "loky"
     """Where tasks run: loky for this machine, ray for the Ray cluster at RAY_ADDRESS."""
 
-    def run(
-        self, tasks: Mapping[str, Task], title: str = "", kept: Kept | None = None
-    ) -> dict[str, Any]:
-        """Run tasks, and return their results in the order of `tasks`; see `stream`."""
-        results = dict(self.stream(tasks, title, kept))
-        return {name: results[name] for name in tasks}
-
     def stream(
         self, tasks: Mapping[str, Task], title: str = "", kept: Kept | None = None
     ) -> Iterator[tuple[str, Any]]:

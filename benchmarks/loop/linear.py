@@ -23,6 +23,7 @@ from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
 
 Array = NDArray[np.float64]
 
+LEVELS = 0.283, 0.632  # of a step response, which time constant and delay are read off
 SLOWEST = 1 - 1e-5  # pole of a plant that settles soon enough for a step test
 
 
@@ -122,7 +123,13 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     samples = len(parameters.b) + 2 * math.ceil(settling) + 2
     # From the last sample on at which the output stands still.
     response = np.append(0.0, plant.impulse_response(samples).cumsum())
-    early, late = (_first_reached(response / response[-1], level) for level in (0.283, 0.632))
+    response /= response[-1]
+    first = [int(np.argmax(response >= level)) for level in LEVELS]
+    # When it first reaches the levels, in samples, by linear interpolation.
+    early, late = (
+        k - 1 + (level - response[k - 1]) / (response[k] - response[k - 1])
+        for k, level in zip(first, LEVELS, strict=True)
+    )
     time_constant = 1.5 * (late - early)
     # In samples, u(k) shows at y(k + 1) at the earliest.
     still = round(sum(parameters.range_of("delay")) / 2)
@@ -133,13 +140,6 @@ def step_test(parameters: Parameters) -> dict[str, float]:
         "delay": delay * interval,
         "sampling_interval": interval,
     }
-
-
-def _first_reached(response: Array, level: float) -> float:
-    """Return when a response first reaches a level, in samples, by linear interpolation."""
-    k = int(np.argmax(response >= level))
-    before, after = response[k - 1], response[k]
-    return float(k - 1 + (level - before) / (after - before))
 
 
 @dataclass(frozen=True)

@@ -84,10 +84,8 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
     """Return the plant numbers that the environment draws for each run, shape (runs,)."""
     numbers = Ranges(parameters).given.chosen(tuple(PLANT_NUMBERS))
     if parameters.ranges:
-        plants = make_plants(runs, 1, **asdict(parameters))
-        _, info = plants.reset(seed=seed)
-        plants.close()
-        numbers |= {name: np.array(info[name]) for name in parameters.ranges}
+        _, info = make_plants(runs, 1, **asdict(parameters)).reset(seed=seed)
+        numbers |= {name: info[name] for name in parameters.ranges}
     return PlantNumbers(
         **{name: np.broadcast_to(value, runs).copy() for name, value in numbers.items()}
     )

@@ -45,8 +45,8 @@ def work(options: Options) -> str:
     out, name = out_folder(options.out), options.network
     seeds = range(SEED, SEED + (options.networks or NETWORKS[name]))
     tasks = {f"seed {seed}": task_of(options, seed) for seed in seeds}
-    trained = options.fan_out.run(tasks, "training", Kept(out / "tasks"))
-    networks = dict(zip(seeds, trained.values(), strict=True))
+    trained = dict(options.fan_out.stream(tasks, "training", Kept(out / "tasks")))
+    networks = {seed: trained[f"seed {seed}"] for seed in seeds}
     rows = {seed: dict(network.provenance["validation"]) for seed, network in networks.items()}
     for seed, network in networks.items():
         rows[seed]["CPU (s)"] = network.provenance["cpu_seconds"]
