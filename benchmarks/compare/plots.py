@@ -56,9 +56,10 @@ def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
     with drawn(path, 1.2 + 0.3 * len(scores), "Scores, the best first") as figure:
         axes = figure.subplots()
         for place, (agent, (overall, by_case)) in enumerate(scores.items()):
-            away = np.clip([1.0 - score for score in by_case.values()], NEAREST, FARTHEST)
-            axes.plot(away, [place] * len(away), "|", color=style[agent][0], alpha=0.5)
-            _mark(axes, 1.0 - overall.value, place, style[agent], across=(NEAREST, FARTHEST))
+            away = 1.0 - np.array([overall.value, *by_case.values()])
+            mean, *cases = np.clip(away, NEAREST, FARTHEST)
+            axes.plot(cases, [place] * len(cases), "|", color=style[agent][0], alpha=0.5)
+            _mark(axes, mean, place, style[agent], mean == away[0])
             text = written(overall.value, ".3f")
             axes.annotate(text, (1.01, place), xycoords=("axes fraction", "data"), va="center")
         _list_controllers(axes, [*scores])
@@ -73,18 +74,10 @@ def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
         )
 
 
-def _mark(
-    axes: Axes,
-    x: float,
-    y: float,
-    look: tuple[str, str],
-    across: tuple[float, float] = (-math.inf, math.inf),
-    up: tuple[float, float] = (-math.inf, math.inf),
-) -> None:
-    """Draw a marker, hollow at an edge of the ranges `across` and `up` that it is beyond."""
-    place = float(np.clip(x, *across)), float(np.clip(y, *up))
-    face = look[0] if place == (x, y) else "white"
-    axes.plot(*place, look[1], color=look[0], markerfacecolor=face, markersize=5)
+def _mark(axes: Axes, x: float, y: float, look: tuple[str, str], inside: bool) -> None:
+    """Draw a marker, hollow where it stands at an edge for what is beyond."""
+    face = look[0] if inside else "white"
+    axes.plot(x, y, look[1], color=look[0], markerfacecolor=face, markersize=5)
 
 
 def _list_controllers(axes: Axes, agents: Sequence[str]) -> None:
@@ -112,7 +105,7 @@ def plot_bounds(
                 axes.plot([mean, end], [place] * 2, color=look[0], alpha=0.4, linewidth=1)
                 if math.isfinite(high):
                     axes.plot([low, high], [place] * 2, color=look[0], linewidth=3)
-                _mark(axes, ratio.value - 1.0, place, look, across=(NEAREST, math.inf))
+                _mark(axes, mean, place, look, mean == ratio.value - 1.0)
                 farthest = max(farthest, end)
             _list_controllers(axes, agents)
             axes.tick_params(labelleft=i % 2 == 0)
@@ -146,7 +139,7 @@ def plot_travel(
             rows = medians[medians["scenario"] == case]
             travel, excess = rows["total_variation"], rows["mae"] / limits[case] - 1.0
             for agent, x, y in zip(rows["agent"], travel, excess, strict=True):
-                _mark(axes, x, y, style[agent], up=(NEAREST, math.inf))
+                _mark(axes, x, max(y, NEAREST), style[agent], y >= NEAREST)
             scale_by_excess(axes, "y", *excess.clip(NEAREST).agg(["min", "max"]))
             axes.set_xscale("log")
             axes.set_xlim(0.7 * travel.min(), 1.4 * travel.max())

@@ -5,8 +5,6 @@ It shows how close a controller can come to the bounds of `benchmarks.bounds`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,8 +59,7 @@ class PredictiveController:
         lag = np.arange(len(parameters.b))
         self._shows = self._delay[:, np.newaxis, np.newaxis] + lag - ahead[:, np.newaxis] + 1
         self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON)
-        self._models: dict[int, _Model] = {}  # by age, samples
-        self._model(0)  # raises an error if the plant is not linear
+        self._models: dict[int, tuple[Coefficients, Array, Array]] = {}  # by age, samples
         self.reset()
 
     def reset(self) -> None:
@@ -81,11 +78,11 @@ class PredictiveController:
         setpoint = seen[:, 0]
         if self._k:
             self._filter(setpoint - seen[:, self._p.setpoint_window])
-        model = self._model(self._k)
+        _, G, Q = self._model(self._k)
         free = np.take_along_axis(self._predict(), self._reached, axis=1)
-        target = np.einsum("ni,nij->nj", setpoint[:, np.newaxis] - free, model.G)
+        target = np.einsum("ni,nij->nj", setpoint[:, np.newaxis] - free, G)
         start = np.vstack([self._plan[1:], self._plan[-1:]])
-        plan = self._optimise(model.Q, target, start)
+        plan = self._optimise(Q, target, start)
         command = plan[0]
         inside = np.abs(command) < self._dead_zone
         if inside.any():
@@ -94,9 +91,9 @@ class PredictiveController:
                 applied_flow(first, self._dead_zone, self._u_min, self._u_max)
                 for first in (np.zeros_like(edge), edge)
             ]
-            plans = [self._optimise(model.Q, target, plan, first) for first in firsts]
+            plans = [self._optimise(Q, target, plan, first) for first in firsts]
             costs = [
-                np.einsum("ni,nij,nj->n", u, model.Q, u) / 2 - (target * u).sum(axis=1)
+                np.einsum("ni,nij,nj->n", u, Q, u) / 2 - (target * u).sum(axis=1)
                 for u in (np.ascontiguousarray(each.T) for each in plans)
             ]
             rests = costs[0] <= costs[1]
@@ -112,7 +109,7 @@ class PredictiveController:
     def _filter(self, output: Array) -> None:
         """Advance the state from k - 1 to k, and correct it with the reading y(k)."""
         k, b = self._k, len(self._p.b)
-        model = self._model(k)
+        model, *_ = self._model(k)
         F, Q = self._transition(k, model)
         x = np.einsum("nij,nj->ni", F, self._state)
         past = np.take_along_axis(
@@ -125,7 +122,7 @@ class PredictiveController:
         self._state = x + gain * (output - x[:, 0])[:, np.newaxis]
         self._covariance = P - gain[:, :, np.newaxis] * P[:, np.newaxis, 0]
 
-    def _transition(self, k: int, model: _Model) -> tuple[Array, Array]:
+    def _transition(self, k: int, model: Coefficients) -> tuple[Array, Array]:
         """Return the state transition from k - 1 to k, and the process noise's covariance."""
         changes = k % LOAD_INTERVAL == 0
         F = np.zeros((self._num_envs, self._size, self._size))
@@ -147,7 +144,7 @@ class PredictiveController:
         past = self._shows.clip(0)
         moved = self._inputs[np.arange(self._num_envs)[:, np.newaxis, np.newaxis], past]
         ahead = range(self._k + 1, self._k + 1 + moved.shape[1])
-        models = [self._model(k) for k in ahead]
+        models = [self._model(k)[0] for k in ahead]
         moved *= np.stack([model.beta for model in models], axis=1)
         outputs = [self._state[:, i] for i in range(n_y - 1, -1, -1)]
         xi = self._state[:, n_y:-2]
@@ -165,11 +162,19 @@ class PredictiveController:
             outputs.append(output)
         return np.stack(outputs[n_y:], axis=1)
 
-    def _model(self, k: int) -> _Model:
-        """Return the plant's coefficients for the step to sample k."""
+    def _model(self, k: int) -> tuple[Coefficients, Array, Array]:
+        """Return the plants for the step to sample k; G, from planned inputs to outputs; G' G.
+
+        The sum of squared errors of a plan u is u G' G u - 2 (target G) u, but for a constant.
+        """
         age = k // DRIFT_INTERVAL * DRIFT_INTERVAL if self._drifts else 0
         if age not in self._models:
-            self._models[age] = _Model.of(coefficients(self._p, self._numbers, age))
+            plants = coefficients(self._p, self._numbers, age)
+            response = plants.impulse_response(HORIZON)
+            G = np.zeros((self._num_envs, HORIZON, HORIZON))
+            for j in range(HORIZON):
+                G[:, j:, j] = response[:, : HORIZON - j]
+            self._models[age] = plants, G, G.transpose(0, 2, 1) @ G
         return self._models[age]
 
     def _optimise(
@@ -193,22 +198,6 @@ class PredictiveController:
             if np.abs(plan - before).max() < TOLERANCE:
                 break
         return plan
-
-
-@dataclass(frozen=True)
-class _Model(Coefficients):
-    """Coefficients of the loops at one time; G maps planned inputs to outputs, Q is G' G."""
-
-    G: Array
-    Q: Array
-
-    @classmethod
-    def of(cls, now: Coefficients) -> _Model:
-        response = now.impulse_response(HORIZON)
-        G = np.zeros((len(response), HORIZON, HORIZON))
-        for j in range(HORIZON):
-            G[:, j:, j] = response[:, : HORIZON - j]
-        return cls(**vars(now), G=G, Q=G.transpose(0, 2, 1) @ G)
 
 
 def _outer(vectors: Array, variances: Array) -> Array:
