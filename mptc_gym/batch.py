@@ -103,7 +103,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
         """Apply normalised actions, shape (num_envs, 1), for one sample.
 
-        Returns observations, shape (num_envs, observation_size), then rewards, terminations,
+        Returns observations, shape (num_envs, size), then rewards, terminations,
         truncations and infos, shape (num_envs,). The masks of the infos may be one array.
 
         Raises

@@ -33,7 +33,7 @@ Action = NDArray[np.float32]
 
 
 def observation_space(parameters: Parameters) -> Space[Observation]:
-    """Return the bounds of the observation, shape (observation_size,), float32.
+    """Return the bounds of the observation, shape (size,), float32.
 
     They depend on the set point only if it exceeds the transmitter's range, so that a policy
     trained on one set point can run on another.
@@ -220,8 +220,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             parameters.reward == "quadratic",
             parameters.move_weight,
         )
-        size = parameters.observation_size
-        self._layout = parameters.temperature_span, *parameters.heads, size
+        # Where errors, outputs and actions begin in the observation, and where it ends.
+        heads = np.cumsum(parameters.windows).tolist()
+        self._layout = parameters.temperature_span, *heads
         self._ranges = Ranges(parameters)
         self._signals = Signals.of(parameters)
         self._has_more_info = parameters.is_disturbed or parameters.drifts
@@ -257,12 +258,11 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         # At rest u is 0, whichever action that is.
         self._action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         rest_action = _limited(self._action, 1.0)
-        size, actions = parameters.observation_size, parameters.action_window
+        _, error_head, output_head, action_head, size = self._layout
         # One spare element at the end: see step.
-        self._window = [0.0] * (size - actions) + [rest_action] * (actions + 1)
+        self._window = [0.0] * action_head + [rest_action] * (size - action_head + 1)
         self._ahead.clear()
 
-        error_head, output_head, action_head = parameters.heads
         self._window[0] = setpoint
         self._window[error_head] = setpoint
         self._window[output_head] = 0.0

@@ -179,7 +179,7 @@ class Parameters(PlantNumbers[Number]):
                 (self.disturbance_amplitude, self.disturbance_walk_variance),
                 "0 for this a, which is not stable and has no steady state",
             )
-        if self.observation_size == 0:
+        if not any(self.windows):
             names = "setpoint_window, error_window, output_window, action_window"
             reject(names, self.windows, "such that the observation has at least one element")
 
@@ -265,17 +265,6 @@ class Parameters(PlantNumbers[Number]):
     def windows(self) -> tuple[int, int, int, int]:
         """Sizes of the observation's blocks: set points, errors, outputs, actions."""
         return self.setpoint_window, self.error_window, self.output_window, self.action_window
-
-    @property
-    def observation_size(self) -> int:
-        """Number of elements of the observation."""
-        return sum(self.windows)
-
-    @property
-    def heads(self) -> tuple[int, int, int]:
-        """Indices where errors, outputs and actions begin in the observation."""
-        setpoints, errors, outputs, _ = self.windows
-        return setpoints, setpoints + errors, setpoints + errors + outputs
 
 
 ARGUMENTS: Final[Mapping[str, Argument]] = MappingProxyType(

@@ -19,7 +19,7 @@ from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.record import Record
 from mptc_gym.signals import BLOCK, Indices, Ranges, Signals, Streams, Values, plant_numbers
 
-Observations = NDArray[np.float32]  # shape (num_envs, observation_size)
+Observations = NDArray[np.float32]  # shape (num_envs, size)
 
 NOISE_BYTES = 1 << 27  # at most, in a block of noise, unless one sample takes more
 STEPS_PER_SHIFT = 64  # steps after which the window of observations is moved back
