@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from copy import copy
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
@@ -15,7 +16,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym.checks import one_action, one_of, plain
-from mptc_gym.parameters import Parameters, insert_table
+from mptc_gym.parameters import Parameters, insert_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.record import Record
 from mptc_gym.signals import ONE, Ranges, Signals, Streams, plant_numbers
@@ -230,6 +231,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         self._root: np.random.Generator | None = None  # source of the streams
         # y_d, n, w and the measurement noise of the samples ahead, the next one last.
         self._ahead: list[tuple[float, ...]] = []
+
+    # `Parameters` alone lists the arguments; help() and editors see them spelt out here.
+    __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from types import MappingProxyType
@@ -297,3 +298,15 @@ def insert_table(docstring: str | None) -> str | None:
 
 
 Parameters.__doc__ = insert_table(Parameters.__doc__)
+
+
+def spelt_out(function: Callable[..., Any]) -> inspect.Signature:
+    """Return a method's signature for help(), with each argument in place of **arguments."""
+    own = [*inspect.signature(function).parameters.values()]
+    arguments = [
+        each.replace(annotation="float | Sequence[float]")
+        if each.name in PLANT_NUMBERS
+        else each
+        for each in inspect.signature(Parameters).parameters.values()
+    ]
+    return inspect.Signature([*own[1:-1], *arguments])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from gymnasium.error import DependencyNotInstalled
 from gymnasium.vector import AutoresetMode
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.checks import is_count, one_of, reject
+from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import action_from_command
 from mptc_gym.signals import Levels
 from mptc_gym.torch_plant import TorchPlants
@@ -165,6 +167,8 @@ class MiddlePointTorchEnv(BatchEnv):
         # Precomputed returns of the steps ahead, the next one last.
         self._ahead: list[tuple[Any, ...]] = []
         self._shown = _Window(self.parameters.windows, self._episodes, differentiable)
+
+    __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions, for truncated backpropagation.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import logger
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.checks import is_count, many_actions, one_of, plain, reject
 from mptc_gym.env import NO_MODE, Frame, MiddlePointEnv
+from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.record import Record
 from mptc_gym.signals import BLOCK, Indices, Ranges, Signals, Streams, Values, plant_numbers
@@ -112,6 +114,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             parameters.reward == "quadratic",
             parameters.move_weight,
         )
+
+    __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]

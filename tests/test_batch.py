@@ -1,5 +1,6 @@
 """Test the shell that batches in NumPy and in PyTorch share."""
 
+import inspect
 from functools import partial
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
 
-from mptc_gym import PRESETS, MiddlePointVectorEnv
+from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters
 from mptc_gym.batch import FACTORS, INFO
 from tests.arguments import MODES, NOISY
 from tests.conftest import assert_the_seed_is_all_that_differs
@@ -23,6 +24,7 @@ def library(request):
         return SimpleNamespace(
             cls=MiddlePointVectorEnv,
             array=np.array,
+            own={"render_mode"},
             shared={},
             types=[{}],
             make=partial(_made, MiddlePointVectorEnv),
@@ -33,6 +35,7 @@ def library(request):
     return SimpleNamespace(
         cls=MiddlePointTorchEnv,
         array=torch.tensor,
+        own={"device", "dtype", "differentiable"},
         # Several steps may return the same, as documented.
         shared={*FACTORS, *(f"_{name}" for name in (*INFO, *FACTORS, "disturbance"))},
         types=[{"dtype": torch.float32}, {"dtype": torch.float64}],
@@ -70,6 +73,9 @@ def test_spaces_modes_and_arguments_are_those_of_gymnasium_s_environments(librar
     for mode in [*MODES, *AutoresetMode]:
         envs = library.make(autoreset_mode=mode)
         assert envs.metadata["autoreset_mode"] is envs.autoreset_mode is AutoresetMode(mode)
+    shell = {"num_envs", "max_episode_steps", "autoreset_mode"}
+    names = set(inspect.signature(library.cls).parameters)
+    assert names == shell | library.own | set(inspect.signature(Parameters).parameters)
 
 
 SEEDS = [
