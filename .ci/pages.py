@@ -26,10 +26,8 @@ TO_SOURCE = re.compile(r"(\]\((?!https?:)[^)#]+\.py)\)")
 @event_priority(100)  # before plugins that look for their own files, such as notebooks
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the tracked pages and the files that they show, and a page for each source file."""
-    tracked = subprocess.run(
-        ["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True
-    )
-    for name in tracked.stdout.splitlines():
+    tracked = subprocess.check_output(["git", "ls-files"], cwd=ROOT, text=True)
+    for name in tracked.splitlines():
         path = ROOT / name
         if name.startswith((".", "tests")) or not path.exists():
             continue
