@@ -8,11 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from agents import DirectNNController
 from benchmarks.claims import claims
 from benchmarks.claims.__main__ import main, sections, table
 from benchmarks.claims.claims import CLAIMS
-from benchmarks.claims.runs import Batch, Claim, converged_at, fail_node, typical
+from benchmarks.claims.runs import Batch, Claim, converged_at, typical
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.rollout import Trajectory, settled
 from tests.conftest import ROOT, trajectory
@@ -94,24 +93,6 @@ def test_settled_are_the_last_50_samples(early, output, has):
     outputs = np.array([0.0] * early + [output] * (100 - early))
     for sign in (1.0, -1.0):
         assert settled(trajectory([sign * 5.0] * 100, sign * outputs)) == [has]
-
-
-@pytest.mark.parametrize("stuck_at", [0, 1])
-def test_a_failed_node_gives_the_same_whatever_it_is_fed(stuck_at, rng):
-    network = DirectNNController(num_envs=4, eta=0.0, eta_theta=0.0)
-    fail_node(network, stuck_at)
-    weights = network.weights
-    healthy = DirectNNController(num_envs=4, n_hidden=2)
-    # A network of the other two nodes, with the stuck output in the threshold.
-    healthy.weights = type(weights)(
-        weights.W[..., 1:, :], weights.theta_1[..., 1:], weights.W_1[..., 1:],
-        weights.theta_2 + stuck_at * weights.W_1[..., 0],
-    )  # fmt: skip
-    network.learning = healthy.learning = False
-    for observation in rng.normal(scale=5, size=(5, 4, 6)):
-        network.act(observation)
-        healthy.act(observation)
-        np.testing.assert_allclose(network.command, healthy.command, rtol=1e-12)
 
 
 def run_claims(out, *given, runs, status=0):
