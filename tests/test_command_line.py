@@ -79,7 +79,6 @@ REFUSED = {
     "sweep": [
         (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),
         (["--plants", "10"], "--plants and --design-seed are for --design random"),
-        (["--design-seed", "3"], "--plants and --design-seed are for --design random"),
     ],
     "train": [([], "NETWORK is missing: one of nn-smith, ppo, ppo-hard")],
     "watch": [

@@ -68,7 +68,6 @@ class TestTransmitter:
         record = run(MiddlePointEnv(output_window=1, **noisy), -np.ones(300))
         assert np.abs(record["observation"][:, -1]).max() == 5.0
         assert record["output"][-1] > 6.8
-        np.testing.assert_array_equal(record["error"], record["setpoint"] - record["output"])
 
 
 class TestDisturbance:
