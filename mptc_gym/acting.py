@@ -248,7 +248,7 @@ def opened(env: Any, n: int, policy: Any = None) -> Iterator[Any]:
             plants = SyncVectorEnv([lambda: env] if given else [partial(_one, env)] * n)
             stack.callback(plants.close)
             plants.closed = given  # then it is not ours to close
-        if sum(getattr(each, "num_envs", 1) for each in natives(plants)) != plants.num_envs:
+        if not natives(plants):
             reject("env", env, "an open environment of MiddlePointEnv in NumPy, wrapped or not")
         for layer, flag in _normalisers(plants):
             stack.callback(setattr, layer, flag, getattr(layer, flag))

@@ -354,6 +354,10 @@ RIGHT = {
     "PPO on a batch": lambda _: live(PPO, make_vec_env(NOISY, N, **SHORT)),
     "PPO in IncrementalAction": lambda _: live(
         PPO, make_vec_env(NOISY, N, wrapper=VELOCITY, **SHORT), lambda: moved(made())),
+    "PPO in a VecEnv that differs": lambda _: (
+        m := model_of(PPO, make_vec_env(NOISY, N, wrapper=VELOCITY)), dummy(), predicting(m)),
+    "PPO, rewards normalised": lambda _: (
+        m := model_of(PPO, VecNormalize(dummy(), norm_obs=False)), NOISY, predicting(m)),
     "SAC": lambda _: live(SAC, made()),
     "DQN": lambda _: live(DQN, levels(), levels),
     "RecurrentPPO": lambda _: live(RecurrentPPO, dummy()),

@@ -38,14 +38,14 @@ class IncrementalAction(VectorActionWrapper):
         compensate_dead_zone: bool | float = False,
     ) -> None:
         plants = natives(env) if isinstance(env, VectorEnv) else []
-        sizes = [getattr(each, "num_envs", 1) for each in plants]
-        if not plants or sum(sizes) != env.num_envs:
+        if not plants:
             kind = "a vector environment of MiddlePointEnv in NumPy"
             reject("env", env, f"{kind}; mptc_gym.wrappers takes one")
         super().__init__(env)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._increments = max_move, compensate_dead_zone
+        sizes = [getattr(each, "num_envs", 1) for each in plants]
         self._numbers = {
             name: np.repeat([each.parameters.range_of(name)[0] for each in plants], sizes)
             for name in NUMBERS
