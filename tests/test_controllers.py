@@ -89,7 +89,7 @@ def test_it_asks_for_its_own_windows(member):
 
 def test_a_copy_goes_on_like_the_original_in_mid_episode(member, rng):
     controller = member(ACTUATOR, 2, 5)
-    size = sum(Parameters(**member.arguments(ACTUATOR)).windows)
+    size = sum(Parameters(**ACTUATOR, **member.observation).windows)
     before, after = np.float32(rng.uniform(-3, 3, (2, 30, 2, size)))
     for observation in before:
         controller.act(observation)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents import DirectNNController, PIController
 from agents.direct_nn import Weights
-from benchmarks.lib.statistics import Estimate, exact, median, percentiles, quantile, share
+from benchmarks.lib.statistics import Estimate, percentiles, quantile, share
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, mean_error, rollout
 from mptc_gym import PRESETS, Parameters
 
@@ -154,7 +154,9 @@ class Claim:
         the bound, and not shown if no part of the interval does.
         """
         if not isinstance(found, Estimate):
-            found = median(found) if np.ndim(found) else exact(float(np.asarray(found)))
+            values = np.asarray(found, dtype=np.float64)
+            one = float(values.flat[0])
+            found = quantile(values, 0.5) if values.ndim else Estimate(one, one, one, 1)
         bounds = {"at least": at_least, "at most": at_most}
         asked = [f"{name} {bound:g}" for name, bound in bounds.items() if math.isfinite(bound)]
         shown = "undecided" if asked else ""

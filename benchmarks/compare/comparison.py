@@ -318,7 +318,7 @@ def score_table(
         for agent, (overall, by_case) in scores.items()
     ]
     table = pd.DataFrame(rows).fillna("")  # after an interruption, with gaps
-    table.iloc[0] = table.iloc[0].map("**{}**".format)
+    table.iloc[0] = table.iloc[0].map(lambda cell: cell and f"**{cell}**")
     return table
 
 

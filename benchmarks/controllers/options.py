@@ -194,12 +194,12 @@ class Policy:
 
     def _own(self, samples: int, arguments: Mapping[str, Any]) -> Any:
         """Return the environments of a saved model, or plain ones, for these arguments."""
-        make = partial(make_one, IDS["paper"], {**arguments, "max_episode_steps": samples})
-        with suppress(AttributeError, ImportError):
-            if self.policy.get_env() is not None:
-                from mptc_gym.sb3 import spec_of
+        made_by: Any = IDS["paper"]
+        more = {**arguments, "max_episode_steps": samples}
+        if getattr(self.policy, "get_env", lambda: None)() is not None:
+            from mptc_gym.sb3 import spec_of
 
-                plant = {each: arguments[each] for each in {*arguments} - {*WINDOWS}}
-                spec = spec_of(self.policy, max_episode_steps=samples, **plant)
-                make = partial(make_one, spec, {})
+            plant = {each: more[each] for each in more if each not in WINDOWS}
+            made_by, more = spec_of(self.policy, **plant), {}
+        make = partial(make_one, made_by, more)
         return native_batch(make(), self.runs) or make

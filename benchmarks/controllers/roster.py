@@ -86,13 +86,9 @@ class Controller:
             for file, network in sorted(self.networks().items())
         ]
 
-    def arguments(self, plant: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a plant's arguments of the environment, with the observation windows."""
-        return {**plant, **self.observation}
-
     def __call__(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
         """Return a controller for `runs` plants, made for the plant with these arguments."""
-        return self.make(Parameters(**self.arguments(plant)), runs, seed)
+        return self.make(Parameters(**{**plant, **self.observation}), runs, seed)
 
     def run(
         self,
@@ -103,7 +99,7 @@ class Controller:
         controller: Agent | None = None,
     ) -> Trajectory:
         """Run the given controller, by default a new one for this plant; see `rollout`."""
-        agent, arguments = controller or self(plant, runs, seed), self.arguments(plant)
+        agent, arguments = controller or self(plant, runs, seed), {**plant, **self.observation}
         opened: Any = getattr(agent, "opened", None)  # of a user's, that acts in its own
         with (
             opened(samples, **arguments)

@@ -43,11 +43,6 @@ def written(value: float, form: str) -> str:
     return text.lstrip("-") if set(text) <= set("-0.") else text
 
 
-def exact(value: float) -> Estimate:
-    """Return the estimate of a value that is not random: one run, an interval of zero width."""
-    return Estimate(float(value), float(value), float(value), 1)
-
-
 def student(values: ArrayLike) -> Estimate:
     """Estimate the mean over runs, shape (runs,), with Student's t interval.
 
@@ -80,11 +75,6 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
     high = np.inf if np.isnan(interval.high) else interval.high
     value = np.quantile(ordered, probability, method=method)
     return Estimate(float(value), float(low), float(high), len(ordered))
-
-
-def median(values: ArrayLike) -> Estimate:
-    """Estimate the median over runs; see `quantile`."""
-    return quantile(values, 0.5)
 
 
 def share(happened: NDArray[np.bool_]) -> Estimate:
