@@ -301,23 +301,17 @@ class TestLeastPossible:
             least_possible(**{**ask, **other})
         assert len(list(tmp_path.rglob("*.pkl"))) == 5
 
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            ({"samples": 0}, "samples must be an integer"),
-            ({"samples": 9, "episodes": 0}, "episodes must be an integer"),
-            ({"samples": 9, "kind": "best"}, "kind must be one of"),
-            ({"samples": 9, "kind": "causal"}, 'kind must not be "causal"'),
-            ({"samples": 9, "delay": -1}, "delay must be"),
-            (
-                {"samples": 600, "kind": "reference", "setpoint_period": 100},
-                "must be held until the plant has settled",
-            ),
-        ],
-    )
-    def test_bad_arguments(self, arguments, message):
-        with pytest.raises(ValueError, match=message):
-            least_possible(folder=None, **arguments)
+    def test_bad_arguments(self):
+        for message, arguments in {
+            "samples must be an integer": {"samples": 0},
+            "episodes must be an integer": {"episodes": 0},
+            "kind must be one of": {"kind": "best"},
+            'kind must not be "causal"': {"kind": "causal"},
+            "delay must be": {"delay": -1},
+            "must be held until": {"kind": "reference", "setpoint_period": 100},
+        }.items():
+            with pytest.raises(ValueError, match=message):
+                least_possible(folder=None, **{"samples": 600, **arguments})
 
 
 class TestPredictiveController:

@@ -105,22 +105,19 @@ def test_plant_without_a_new_steady_state_is_refused():
             step_test(Parameters(**{name: values}))
 
 
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        (None, "plant.json cannot be read: No such file"),
-        ("{", "plant.json must be a JSON file"),
-        ("[1, 2]", "plant.json must be a JSON file of arguments"),
-        ('{"delay": -1}', "delay must be"),
-        ("[" * 100_000, "plant.json must be a JSON file"),
-    ],
-)
-def test_bad_plant_file_is_named(tmp_path, text, complaint):
+def test_bad_plant_file_is_named(tmp_path):
     path = tmp_path / "plant.json"
-    if text is not None:
-        path.write_text(text)
-    with pytest.raises(UsageError, match=f"^--plant: .*{complaint}"):
-        PlantOptions(plant=path).arguments()
+    for text, complaint in {
+        None: "plant.json cannot be read: No such file",
+        "{": "plant.json must be a JSON file",
+        "[1, 2]": "plant.json must be a JSON file of arguments",
+        '{"delay": -1}': "delay must be",
+        "[" * 100_000: "plant.json must be a JSON file",
+    }.items():
+        if text is not None:
+            path.write_text(text)
+        with pytest.raises(UsageError, match=f"^--plant: .*{complaint}"):
+            PlantOptions(plant=path).arguments()
 
 
 STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of the paper's plant

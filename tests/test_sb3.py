@@ -106,20 +106,17 @@ class TestBatches:
         with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
             two_batches("NextStep")
 
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            ({"n_envs": 0}, "n_envs must be an integer from 1"),
-            ({"group": 2}, "group must be an integer from 1"),
-            ({"wrapper": partial(DelayObservation, delay=2)}, "env must be of this pack"),
-            ({"wrapper": {"max_move": 7}}, "max_move must be"),
-            ({"wrapper": 5}, "wrapper must be the arguments"),
-            ({"env": "Point-v0"}, "env must be the id of an environment"),
-        ],
-    )
-    def test_bad_arguments_are_named(self, arguments, message):
-        with pytest.raises(ValueError, match=message):
-            make_vec_env(**arguments)
+    def test_bad_arguments_are_named(self):
+        for message, arguments in {
+            "n_envs must be an integer from 1": {"n_envs": 0},
+            "group must be an integer from 1": {"group": 2},
+            "env must be of this pack": {"wrapper": partial(DelayObservation, delay=2)},
+            "max_move must be": {"wrapper": {"max_move": 7}},
+            "wrapper must be the arguments": {"wrapper": 5},
+            "env must be the id of an environment": {"env": "Point-v0"},
+        }.items():
+            with pytest.raises(ValueError, match=message):
+                make_vec_env(**arguments)
 
 
 class TestZips:
