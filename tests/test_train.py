@@ -1,30 +1,44 @@
-"""Training through the plant: what is drawn, differentiated, kept and chosen."""
+"""Training: through the plant, what is differentiated and chosen; by PPO, what groups share."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
+import pandas as pd
 import pytest
+import torch
+from stable_baselines3.common.buffers import RolloutBuffer
 
-torch = pytest.importorskip("torch")
-
-from agents import LawNetwork, NeuralSmithPredictor  # noqa: E402
-from agents.networks import PRETRAINED  # noqa: E402
-from benchmarks.controllers.roster import ROSTER  # noqa: E402
-from benchmarks.loop.rollout import make_plants, rollout  # noqa: E402
-from benchmarks.train import __main__ as program  # noqa: E402
-from benchmarks.train import loops, ppo, through_plant  # noqa: E402
-from benchmarks.train.loops import Draw, Loops, environment  # noqa: E402
-from benchmarks.train.through_plant import Net, Training, loss_of, train, validate  # noqa: E402
-from mptc_gym import Parameters  # noqa: E402
+from agents import LawNetwork, NeuralSmithPredictor, PolicyNetwork
+from agents.networks import PRETRAINED
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.examples import sb3
+from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.train import __main__ as program
+from benchmarks.train import loops, ppo, through_plant
+from benchmarks.train.loops import Draw, Loops, environment
+from benchmarks.train.through_plant import Net, Training, loss_of, train, validate
+from mptc_gym import Parameters
+from mptc_gym.wrappers.vector import IncrementalAction
+from tests.conftest import ROOT
 
 SMALL = Training(steps=4, plants=4, samples=60, stretches=2, choosing=4, adding=3)
+RECIPE = replace(
+    ppo.RECIPES["ppo"],
+    plants=((8, {"setpoint": "random"}), (16, {"setpoint": "random", "noise_variance": 0.5})),
+    cases={"short": {"max_episode_steps": 20}},
+    hidden=(8,),
+    memory=40,
+    steps=1024,
+)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     monkeypatch.setattr(through_plant, "VALIDATION_PLANTS", 4)
     monkeypatch.setattr(through_plant, "VALIDATION_SAMPLES", 40)
+    for name, value in {"n_steps": 32, "batch_size": 64}.items():
+        monkeypatch.setitem(sb3.SETTINGS, name, value)
 
 
 def lively(training, seed=0):
@@ -154,3 +168,110 @@ def test_the_command_lists_trainings_by_their_seeds(
     if network == "nn-smith":
         best = LawNetwork.load(tmp_path / "nn-smith.npz").provenance["training"]["seed"]
         assert f"Validation chooses seed {best}" in shown
+
+
+def weights(network):
+    return np.concatenate([array.ravel() for layer in network.layers for array in layer])
+
+
+class TestPPO:
+    def test_a_seed_gives_a_policy_that_differs_from_that_of_another(self):
+        first, again, other = (ppo.train(RECIPE, seed) for seed in (0, 0, 1))
+        assert np.array_equal(weights(first), weights(again))
+        assert not np.array_equal(weights(first), weights(other))
+        # Without biases and with tanh, what holds at +5 degC holds at -5.
+        assert not any(bias.any() for _, bias in first.layers)
+        about = first.provenance
+        assert about["seed"] == 0
+        assert about["steps"] >= RECIPE.steps
+        assert about["cpu_seconds"] > 0.0
+        assert about["validation"].keys() == {"short"}
+        json.dumps(about)
+
+    def test_a_group_meets_the_same_and_no_comparison_does(self):
+        plants = ppo.begin(RECIPE, 0).get_env()
+        plants.reset()
+        plants.step(np.random.default_rng(0).uniform(-1, 1, (24, 1)).astype(np.float32))
+        groups = plants.infos["setpoint"].reshape(-1, ppo.GROUP)
+        assert (groups == groups[:, :1]).all()
+        assert len(np.unique(groups[:, 0])) == 3
+        seeds = {seed for batch in plants.batches for seed in batch.unwrapped.np_random_seed}
+        assert len(seeds) == 3
+        assert min(seeds) >= 1 << 32
+
+    def test_what_a_group_has_in_common_is_no_advantage(self):
+        model = ppo.begin(RECIPE, 0)
+        spaces = model.observation_space, model.action_space
+        buffer, plain = (
+            kind(3, *spaces, gamma=0.9, n_envs=16) for kind in (sb3.GroupBuffer, RolloutBuffer)
+        )
+        rewards = np.random.default_rng(0).normal(size=(3, 16)).astype(np.float32)
+        common = np.repeat([[1.0, 5.0]], ppo.GROUP, axis=1).astype(np.float32)
+        found = []
+        for each, more in ((buffer, 0.0), (buffer, common), (plain, 0.0)):
+            each.reset()
+            each.rewards[:] = rewards + more
+            each.compute_returns_and_advantage(torch.zeros(16), np.zeros(16))
+            found.append((each.advantages.copy(), each.returns.copy()))
+        np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-5)
+        np.testing.assert_array_equal(found[0][1], found[2][1])  # for the value function
+        apart = (found[2][0] - found[0][0]).reshape(3, 2, ppo.GROUP)
+        assert np.ptp(apart, axis=2).max() < 1e-5
+
+
+class TestExport:
+    def test_changes_by_hand(self):
+        window = torch.tensor([[8.0, 6.0, 5.0, 1.0, 4.0, 4.0, 0.0]])  # newest first
+        # Means of 8, of 6, of 5 and 1, and of the rest.
+        assert sb3.changes(window, 2)[0].tolist() == pytest.approx([2.0, 3.0, 3.0 - 8.0 / 3.0])
+
+    @pytest.mark.parametrize(
+        ("recipe", "scale"),  # of the action: with limits that matter
+        [(RECIPE, 300.0), (replace(RECIPE, levels=True, hidden=(), dead_zone=0.0), 1.0)],
+    )
+    def test_without_torch_it_does_what_it_does_in_its_wrapper(self, recipe, scale):
+        model = ppo.begin(recipe, 5)
+        with torch.no_grad():
+            model.policy.action_net.weight.mul_(scale)
+        network = ppo.export(model, recipe)
+        plants = make_plants(3, 80, setpoint=5.0, noise_variance=0.5, **recipe.windows)
+        run = rollout(plants, network, 80, seed=1)
+        wrapped = IncrementalAction(
+            plants, max_move=ppo.MAX_MOVE, compensate_dead_zone=recipe.dead_zone
+        )
+        observations, info = wrapped.reset(seed=1)
+        moves = []
+        for k in range(80):
+            np.testing.assert_allclose(run.output[k], info["output"], atol=1e-3)
+            seen = observations @ ppo.features(recipe).T
+            moves.append(model.predict(seen, deterministic=True)[0])
+            observations, *_, info = wrapped.step(moves[-1])
+            np.testing.assert_allclose(run.applied[k], info["applied"], atol=1e-3)
+        assert np.ptp(run.applied) > 1.0
+        assert (np.abs(moves).max() == 1.0) == (scale > 1.0)
+
+
+@pytest.mark.parametrize("name", ppo.RECIPES)
+def test_the_budget_of_the_search_is_that_of_its_log(name):
+    log = pd.read_csv(ROOT / "benchmarks/published/ppo_trials.csv")
+    trials = log[log.policy == name]
+    samples, minutes = trials.samples.sum() / 1e6, trials.cpu_seconds.sum() / 60
+    said = f"{len(trials)} trials: {samples:.0f} M samples, {minutes:.0f} min"
+    assert ROSTER[name].searched.endswith(said)
+
+
+class TestMembers:
+    @pytest.mark.parametrize("name", ppo.RECIPES)
+    def test_those_of_the_project_are_of_the_recipes(self, name):
+        recipe = ppo.RECIPES[name]
+        asked = json.loads(json.dumps(asdict(recipe)))
+        members = ROSTER[name].members()
+        assert [each.provenance["file"] for each in members] == [
+            f"{name}-{seed}.npz" for seed in range(10_000, 10_005)
+        ]
+        for each in members:
+            network = PolicyNetwork.load(PRETRAINED / each.provenance["file"])
+            assert asked.items() <= each.provenance["recipe"].items()
+            count = sum(W.size for W, _ in network.layers)
+            assert f"{count:,} weights" in each.searched
+            assert f": {recipe.steps / 1e6:g} M samples a policy" in each.searched
