@@ -305,9 +305,13 @@ def check_fit(policy: Any, plants: Any) -> None:
 
 def _traits(env: Any) -> dict[str, set[Any]]:
     """Return what changes observations and actions, as far as it can be known, by kind."""
-    # The `VecEnvWrapper`s of Stable-Baselines3 look for what they lack in what they wrap.
-    seen = {type(each).__name__ for each in layers(env) if getattr(each, "norm_obs", True)}
-    found: dict[str, set[Any]] = {"wrappers": seen & {"VecNormalize", "VecFrameStack"}}
+    kinds = {
+        kind.__name__
+        for each in layers(env)
+        if vars(each).get("norm_obs", True)  # a VecNormalize may be of rewards alone
+        for kind in type(each).mro()
+    }
+    found: dict[str, set[Any]] = {"wrappers": kinds & {"VecNormalize", "VecFrameStack"}}
     if plants := natives(env):  # unlike closed processes, which cannot be asked
         moves = [each for layer in layers(env) for each in _asked(layer, "_increments")]
         found["action wrappers"] = {f"IncrementalAction{each}" for each in moves}

@@ -319,10 +319,8 @@ RIGHT = {
         lambda: wrappers.TimeLimit(MiddlePointEnv(**BARE), LENGTH)),
     "one environment": lambda _: memory(made()),
     "one in mid-episode": lambda _: memory(halfway(made())),
-    "one with Monitor": lambda _: memory(Monitor(made())),
     "native batch": lambda _: memory(many()),
     "native batch, SameStep": lambda _: memory(many(autoreset_mode="SameStep")),
-    "native batch, Disabled": lambda _: memory(many(autoreset_mode="Disabled")),
     "AsyncVectorEnv": lambda _: memory(AsyncVectorEnv([made] * N, context="fork")),
     "vector IncrementalAction": lambda _: memory(
         IncrementalBatch(many(), **VELOCITY), lambda: moved(made())),
@@ -350,7 +348,6 @@ RIGHT = {
         PPO, wrappers.FrameStackObservation(made(), 2),
         lambda: wrappers.FrameStackObservation(made(), 2)),
     "dict observations": lambda _: live(PPO, dummy(blocks), blocks),
-    "PPO": lambda _: live(PPO, dummy()),
     "PPO on a batch": lambda _: live(PPO, make_vec_env(NOISY, N, **SHORT)),
     "PPO in IncrementalAction": lambda _: live(
         PPO, make_vec_env(NOISY, N, wrapper=VELOCITY, **SHORT), lambda: moved(made())),
@@ -419,6 +416,9 @@ REFUSED = {
         lambda: (PIController(u_max=6.0), NOISY), "limits of env, u_min=-10.0, u_max=10.0"),
     "controller in a wrapper": (
         lambda: (PIController(), moved(made())), "not be wrapped.*Increm"),
+    "controller in frames": (
+        lambda: (PIController(), Stack(VecNormalize(dummy(), norm_obs=False), 2)),
+        "not be wrapped.*VecFrameStack"),
     "controller of too few loops": (
         lambda: (DirectNNController(num_envs=2), NOISY), "num_envs=3"),
     "unknown id": (
