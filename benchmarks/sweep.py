@@ -19,7 +19,7 @@ from benchmarks.controllers.roster import ROSTER, Controller, label
 from benchmarks.lib.command import Folder, Runs, Seed, blame, command, options
 from benchmarks.lib.storage import Kept, UsageError, origin, out_folder, write_csv, write_json
 from benchmarks.loop.rollout import Trajectory, held, measure
-from benchmarks.loop.scenarios import SPANS, PlantOptions, around, grid, random_design
+from benchmarks.loop.scenarios import SPANS, PlantOptions, around, random_design
 from mptc_gym import Parameters
 
 if TYPE_CHECKING:
@@ -132,7 +132,9 @@ def work(options: Options) -> str:
 
 def design(options: Options, nominal: Arguments) -> list[Arguments]:
     """Return the arguments in which the plants of the design differ from the nominal one."""
-    plants = grid()
+    gains, delays = np.linspace(0.75, 1.65, 10).round(6).tolist(), range(2, 42, 2)
+    cells = itertools.product(gains, delays)
+    plants = [{"delay": delay, "gain_factor": gain} for gain, delay in cells]
     if options.design == "random":
         plants = random_design(options.plants or 200, options.design_seed or 0, SAMPLES)
     elif options.plants or options.design_seed is not None:

@@ -18,7 +18,7 @@ from benchmarks.lib.command import Repeated, blame, options
 from benchmarks.lib.storage import UsageError
 from benchmarks.loop.linear import nominal
 from mptc_gym import PRESETS, Parameters
-from mptc_gym.parameters import slowest_pole
+from mptc_gym.parameters import PLANT_NUMBERS, slowest_pole
 
 Arguments = dict[str, Any]  # of the environment
 
@@ -159,16 +159,6 @@ SPANS = {
     "gain_factor": (0.75, 1.6),
     "time_constant_factor": (0.5, 2.0),
 }
-GRID = {"delay": range(2, 42, 2), "gain_factor": np.linspace(0.75, 1.65, 10)}
-
-
-def grid() -> list[Arguments]:
-    """Return the paper's plant with other delays and gains, without noise."""
-    return [
-        {"delay": delay, "gain_factor": round(float(gain), 6)}
-        for gain in GRID["gain_factor"]
-        for delay in GRID["delay"]
-    ]
 
 
 def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
@@ -215,11 +205,7 @@ def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
 
 def _scales(plant: Parameters) -> list[float]:
     """Return a plant's delay, dead zone, variance of the reach, and factors, as in `SPANS`."""
-    delay, zone, gain, time_constant, low, high = (
-        sum(plant.range_of(name)) / 2.0
-        for name in (
-            "delay", "dead_zone", "gain_factor", "time_constant_factor", "u_min", "u_max"
-        )
-    )  # fmt: skip
-    reach = float(nominal(plant).gain) * (high - low) / 2.0
-    return [delay, zone, reach**2, gain, time_constant]
+    middle = {name: sum(plant.range_of(name)) / 2.0 for name in PLANT_NUMBERS}
+    reach = float(nominal(plant).gain) * (middle["u_max"] - middle["u_min"]) / 2.0
+    middle["noise_variance"] = reach**2
+    return [middle[name] for name in SPANS]
