@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -54,20 +55,6 @@ def change(level, samples, **arguments):
     """Return the least sum of |e| after a change from rest at 0 to a level."""
     of_plant, setpoint = course_of(samples + 110, **arguments), np.full(samples, level)
     return reference(of_plant, unknown(of_plant), setpoint).error.sum()
-
-
-class Plan:
-    """Follows a plan, whatever is measured: a controller that knows all beforehand."""
-
-    def __init__(self, flow, u_min, u_max):
-        self._actions = action_from_command(flow, u_min, u_max)
-
-    def reset(self):
-        self._k = 0
-
-    def act(self, observation):
-        self._k += 1
-        return np.full((len(observation), 1), self._actions[self._k - 1])
 
 
 # Plants that differ in everything: u_max nearer than u_min, no delay, and three slow poles.
@@ -164,7 +151,9 @@ class TestProgramme:
         least = least_possible(samples=300, kind="preview", folder=None, **case)
         best = best_plan([*setpoint, 6.0], **arguments)
         assert best.flow.min() == pytest.approx(-12.0)
-        runs = rollout(make_plants(1, 301, **case), Plan(best.flow, -12.0, 6.0), 300, seed=0)
+        actions = iter(action_from_command(best.flow, -12.0, 6.0))
+        knowing = SimpleNamespace(reset=dict, act=lambda _: np.full((1, 1), next(actions)))
+        runs = rollout(make_plants(1, 301, **case), knowing, 300, seed=0)
         np.testing.assert_allclose(runs.output[:, 0], best.output[:-1], atol=1e-4)
         found = mean_error(runs)
         assert found[0] == pytest.approx(least.value, rel=1e-4)

@@ -132,8 +132,8 @@ class TestFit:
         # A real log. A plain impulse response of both heaters explains 97 %.
         log = read_log(TCLAB, Columns(flow="heater1", temperature="temperature1",
                                       disturbance=("heater2",)))  # fmt: skip
-        thinned = {"heater2": log.disturbances["heater2"][::5]}
-        model = identify(Log(log.flow[::5], log.temperature[::5], 5.0, thinned))
+        thinned = {"heater2": log.disturbances["heater2"][::10]}
+        model = identify(Log(log.flow[::10], log.temperature[::10], 10.0, thinned))
         assert 0.96 < model.explained[0] < 1.0
         # Two levels, and the middle between them at first, do not test a valve.
         (warning,) = model.warnings

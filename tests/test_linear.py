@@ -61,12 +61,6 @@ def test_an_integrating_plant_has_a_gain_of_one_sign():
     assert nominal(Parameters(a=[1.0, -1.0], b=[-0.1])).gain == -np.inf
 
 
-def first_order(gain, time_constant, delay):
-    """Return arguments of a plant of first order, with `delay` samples until an input shows."""
-    pole = np.exp(-8.0 / time_constant)
-    return {"a": [1.0, -pole], "b": [gain * (1.0 - pole)], "delay": delay - 1}
-
-
 def test_paper_plant_shows_the_numbers_its_controllers_are_tuned_with():
     found = step_test(Parameters())
     # Steady-state gain -0.0496 / 0.0727, the time constant of the pole at 0.9515, 19 samples.
@@ -79,7 +73,9 @@ def test_paper_plant_shows_the_numbers_its_controllers_are_tuned_with():
 @pytest.mark.parametrize("time_constant", [4.0, 60.0, 900.0])
 @pytest.mark.parametrize("delay", [1, 5, 80])
 def test_plant_of_first_order_shows_its_own_numbers(gain, time_constant, delay):
-    found = step_test(Parameters(**first_order(gain, time_constant, delay)))
+    pole = np.exp(-8.0 / time_constant)
+    plant = Parameters(a=[1.0, -pole], b=[gain * (1.0 - pole)], delay=delay - 1)
+    found = step_test(plant)
     assert found["gain"] == pytest.approx(gain, rel=1e-3)
     assert found["time_constant"] == pytest.approx(time_constant, rel=0.01, abs=1.0)
     assert found["delay"] == 8.0 * delay
