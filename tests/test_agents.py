@@ -290,27 +290,24 @@ def test_simc_by_hand():
         PIController.simc(**plant, delay=0.0)
 
 
-class TestSmithPredictor:
-    @pytest.mark.parametrize(
-        ("setpoint", "actuator"),
-        [
-            (6.5, {"dead_zone": 0.0}),  # takes more than the limits
-            (2.0, {"dead_zone": 5.0, "u_min": -3.0}),  # the limit lies inside the dead zone
-        ],
-    )
-    @pytest.mark.parametrize("delay", [0, 18])
-    def test_with_the_right_model_there_is_no_delay_to_the_loop(
-        self, setpoint, actuator, delay
-    ):
-        # On a plant that is its model, the output is that of the loop without delay, later.
-        pole = np.exp(-8 / 161)
-        plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), **actuator}
-        plant["setpoint"] = setpoint
-        smith = SmithPredictor(**{**TOLD, "delay": 8.0 * (delay + 1), **actuator})
-        late = rollout(make_plants(1, 200, **plant, delay=delay), smith, 200, seed=0)
-        prompt = PIController(smith.kp, smith.ki, anti_windup=True, u_min=smith.u_min)
-        soon = rollout(make_plants(1, 200, **plant, delay=0), prompt, 200, seed=0)
-        np.testing.assert_allclose(late.output[delay:], soon.output[: 200 - delay], atol=1e-4)
+@pytest.mark.parametrize(
+    ("setpoint", "actuator"),
+    [
+        (6.5, {"dead_zone": 0.0}),  # takes more than the limits
+        (2.0, {"dead_zone": 5.0, "u_min": -3.0}),  # the limit lies inside the dead zone
+    ],
+)
+@pytest.mark.parametrize("delay", [0, 18])
+def test_with_the_right_model_there_is_no_delay_to_the_loop(setpoint, actuator, delay):
+    # On a plant that is its model, the output is that of the loop without delay, later.
+    pole = np.exp(-8 / 161)
+    plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), **actuator}
+    plant["setpoint"] = setpoint
+    smith = SmithPredictor(**{**TOLD, "delay": 8.0 * (delay + 1), **actuator})
+    late = rollout(make_plants(1, 200, **plant, delay=delay), smith, 200, seed=0)
+    prompt = PIController(smith.kp, smith.ki, anti_windup=True, u_min=smith.u_min)
+    soon = rollout(make_plants(1, 200, **plant, delay=0), prompt, 200, seed=0)
+    np.testing.assert_allclose(late.output[delay:], soon.output[: 200 - delay], atol=1e-4)
 
 
 def test_a_command_on_the_edge_of_the_dead_zone_has_an_effect():

@@ -22,17 +22,16 @@ def idle(observations):
     return np.zeros((len(observations), 1), np.float32)
 
 
-class TestPresets:
-    @pytest.mark.parametrize("name", PRESETS)
-    def test_each_has_an_id_of_its_own(self, name):
-        ids = [
-            gymnasium.make(IDS[name]),
-            gymnasium.make("MiddlePoint-v0", **PRESETS[name]),
-            gymnasium.make(EnvSpec.from_json(gymnasium.make(IDS[name]).spec.to_json())),
-        ]
-        batch = gymnasium.make_vec(IDS[name], num_envs=1)
-        assert {env.unwrapped.parameters for env in ids} == {batch.parameters}
-        assert {env.spec.max_episode_steps for env in ids} == {1200}
+@pytest.mark.parametrize("name", PRESETS)
+def test_each_has_an_id_of_its_own(name):
+    ids = [
+        gymnasium.make(IDS[name]),
+        gymnasium.make("MiddlePoint-v0", **PRESETS[name]),
+        gymnasium.make(EnvSpec.from_json(gymnasium.make(IDS[name]).spec.to_json())),
+    ]
+    batch = gymnasium.make_vec(IDS[name], num_envs=1)
+    assert {env.unwrapped.parameters for env in ids} == {batch.parameters}
+    assert {env.spec.max_episode_steps for env in ids} == {1200}
 
 
 class TestEvaluate:

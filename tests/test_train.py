@@ -136,18 +136,17 @@ class TestGradient:
         assert after["all"] < before["all"]
 
 
-class TestNetworks:
-    def test_the_one_of_the_project_is_that_of_the_defaults(self):
-        network = LawNetwork.load(PRETRAINED / "nn-smith.npz")
-        kept = network.provenance
-        assert kept["training"] == json.loads(json.dumps(through_plant.asdict(Training())))
-        assert kept["cpu_seconds"] > 60.0
-        count = sum(W.size + len(b) for W, b in (*network.choosing, *network.adding))
-        of = Training()
-        samples = of.steps * of.plants * of.samples / 1e6
-        for name in ("nn-smith", "nn-self-tuning"):
-            assert f"{count:,} weights" in ROSTER[name].searched
-            assert f": {samples:.0f} M samples" in ROSTER[name].searched
+def test_the_one_of_the_project_is_that_of_the_defaults():
+    network = LawNetwork.load(PRETRAINED / "nn-smith.npz")
+    kept = network.provenance
+    assert kept["training"] == json.loads(json.dumps(through_plant.asdict(Training())))
+    assert kept["cpu_seconds"] > 60.0
+    count = sum(W.size + len(b) for W, b in (*network.choosing, *network.adding))
+    of = Training()
+    samples = of.steps * of.plants * of.samples / 1e6
+    for name in ("nn-smith", "nn-self-tuning"):
+        assert f"{count:,} weights" in ROSTER[name].searched
+        assert f": {samples:.0f} M samples" in ROSTER[name].searched
 
 
 @pytest.mark.parametrize(
@@ -260,18 +259,17 @@ def test_the_budget_of_the_search_is_that_of_its_log(name):
     assert ROSTER[name].searched.endswith(said)
 
 
-class TestMembers:
-    @pytest.mark.parametrize("name", ppo.RECIPES)
-    def test_those_of_the_project_are_of_the_recipes(self, name):
-        recipe = ppo.RECIPES[name]
-        asked = json.loads(json.dumps(asdict(recipe)))
-        members = ROSTER[name].members()
-        assert [each.provenance["file"] for each in members] == [
-            f"{name}-{seed}.npz" for seed in range(10_000, 10_005)
-        ]
-        for each in members:
-            network = PolicyNetwork.load(PRETRAINED / each.provenance["file"])
-            assert asked.items() <= each.provenance["recipe"].items()
-            count = sum(W.size for W, _ in network.layers)
-            assert f"{count:,} weights" in each.searched
-            assert f": {recipe.steps / 1e6:g} M samples a policy" in each.searched
+@pytest.mark.parametrize("name", ppo.RECIPES)
+def test_those_of_the_project_are_of_the_recipes(name):
+    recipe = ppo.RECIPES[name]
+    asked = json.loads(json.dumps(asdict(recipe)))
+    members = ROSTER[name].members()
+    assert [each.provenance["file"] for each in members] == [
+        f"{name}-{seed}.npz" for seed in range(10_000, 10_005)
+    ]
+    for each in members:
+        network = PolicyNetwork.load(PRETRAINED / each.provenance["file"])
+        assert asked.items() <= each.provenance["recipe"].items()
+        count = sum(W.size for W, _ in network.layers)
+        assert f"{count:,} weights" in each.searched
+        assert f": {recipe.steps / 1e6:g} M samples a policy" in each.searched
