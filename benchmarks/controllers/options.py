@@ -19,7 +19,7 @@ from cyclopts import Parameter
 
 from agents.controller import PAPER_WINDOWS
 from agents.networks import WINDOWS
-from benchmarks.controllers.roster import OWN, ROSTER, Controller, limits
+from benchmarks.controllers.roster import OWN, ROSTER, Controller, everything, limits
 from benchmarks.lib.command import FanOut, Names, blame, options
 from benchmarks.lib.storage import UsageError
 from mptc_gym import IDS, Parameters
@@ -69,10 +69,9 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
         locations[name] = *locations.get(name, ()), location
     if not (names or own):
         raise UsageError("--agents, --agent: no controller to run")
+    draws: Any = {"random": True, "drawn": True, "told": everything}
     return {name: ROSTER[name] for name in names} | {
-        name: Controller(
-            name, name, OWN[0], _make, networks=partial(_found, each), random=True, drawn=True
-        )
+        name: Controller(name, name, OWN[0], _make, networks=partial(_found, each), **draws)
         for name, each in locations.items()
     }
 
@@ -147,9 +146,9 @@ def _saved(location: str) -> Own:
     return Own(lambda: model, provenance=about)
 
 
-def _make(plant: Parameters, runs: int, seed: int, *, network: Own) -> Any:
+def _make(*, network: Own, **told: Any) -> Any:
     """Call a user's factory with the arguments that it accepts, by name."""
-    offered = {"parameters": plant, "num_envs": runs, "seed": seed, **limits(plant)}
+    offered = {**told, **limits(told["parameters"])}
     accepted = inspect.signature(network.make).parameters
     if not any(each.kind is each.VAR_KEYWORD for each in accepted.values()):
         offered = {name: offered[name] for name in offered if name in accepted}
@@ -157,7 +156,7 @@ def _make(plant: Parameters, runs: int, seed: int, *, network: Own) -> Any:
     if hasattr(made, "reset") and hasattr(made, "act"):
         return made
     policy, env = made if isinstance(made, tuple) else (made, None)
-    return Policy(policy, env, plant, runs)
+    return Policy(policy, env, told["parameters"], told["num_envs"])
 
 
 @dataclass

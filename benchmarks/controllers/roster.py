@@ -36,6 +36,39 @@ COMMISSIONING_SEED = 3_000_000  # of plants and noise during commissioning
 OWN = (("#5B3FA6", "P"), ("#A08CDB", "X"), ("#B22222", "P"), ("#F08080", "X"))
 
 
+def limits(plant: Parameters, *_: int) -> dict[str, Any]:
+    """Return the limits of the flow, the widest possible if they are drawn."""
+    return {"u_min": plant.range_of("u_min")[0], "u_max": plant.range_of("u_max")[1]}
+
+
+def tested(plant: Parameters, *_: int) -> dict[str, Any]:
+    """Return a step test and the limits."""
+    return {**step_test(plant), **limits(plant)}
+
+
+def data_sheet(plant: Parameters, *_: int) -> dict[str, Any]:
+    """Return a step test and the actuator's data sheet, the middle of a drawn dead zone."""
+    return {**tested(plant), "dead_zone": sum(plant.range_of("dead_zone")) / 2}
+
+
+def smith(plant: Parameters, *_: int) -> dict[str, Any]:
+    """Return the data sheet, and a closed loop with half the plant's time constant."""
+    known = data_sheet(plant)
+    half = float(f"{known['time_constant'] / 2:.2g}")
+    return {**known, "closed_loop_time_constant": half}
+
+
+def direction(plant: Parameters, runs: int, seed: int) -> dict[str, Any]:
+    """Return the direction of the plant's response, and the limits."""
+    sign = 1 if nominal(plant).gain > 0.0 else -1
+    return {"direction": sign, "num_envs": runs, "seed": seed, **limits(plant)}
+
+
+def everything(plant: Parameters, runs: int, seed: int) -> dict[str, Any]:
+    """Return all arguments of the environment."""
+    return {"parameters": plant, "num_envs": runs, "seed": seed}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Controller:
     """A controller, or one that was trained, as all commands know it."""
@@ -47,8 +80,10 @@ class Controller:
     look: tuple[str, str] = field(kw_only=False)
     """Colour and marker in pictures; relatives have shades of one hue and the same marker."""
     make: Callable[..., Agent] = field(kw_only=False)
-    """Function of the plant that it is made for (`Parameters`), the number of runs, and a seed;
-    run i uses `seed + i`. Searched gains are passed by name, and a `network` of its own."""
+    """Makes it from what it is told, searched gains by name, and a `network` of its own."""
+    told: Callable[[Parameters, int, int], Mapping[str, Any]] = limits
+    """Arguments of `make`: what it is told of the plant, for a number of runs and a seed; run i
+    uses `seed + i`."""
     knows: str = ""
     """Prior knowledge: what it is told about the plant."""
     searched: str = ""
@@ -88,7 +123,8 @@ class Controller:
 
     def __call__(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
         """Return a controller for `runs` plants, made for the plant with these arguments."""
-        return self.make(Parameters(**{**plant, **self.observation}), runs, seed)
+        parameters = Parameters(**{**plant, **self.observation})
+        return self.make(**self.told(parameters, runs, seed))
 
     def run(
         self,
@@ -120,65 +156,22 @@ class Controller:
         return controller
 
 
-def limits(plant: Parameters) -> dict[str, Any]:
-    """Return the limits of the flow, the widest possible if they are drawn."""
-    return {"u_min": plant.range_of("u_min")[0], "u_max": plant.range_of("u_max")[1]}
-
-
-def data_sheet(plant: Parameters) -> dict[str, Any]:
-    """Return a step test and the actuator's data sheet, the middle of a drawn dead zone."""
-    dead_zone = sum(plant.range_of("dead_zone")) / 2
-    return {**step_test(plant), **limits(plant), "dead_zone": dead_zone}
-
-
-def with_limits(make: Callable[..., Any], plant: Parameters, *_: int, **gains: Any) -> Any:
-    """Return a controller that knows its gains and the limits of the flow, nothing else."""
-    return make(**gains, **limits(plant))
-
-
-def with_data_sheet(
-    make: Callable[..., Agent], plant: Parameters, *_: int, **network: LawNetwork
-) -> Agent:
-    """Return a controller that knows what `data_sheet` says, perhaps with a network."""
-    return make(**data_sheet(plant), **network)
-
-
-def simc_pi(plant: Parameters, runs: int = 1, seed: int = 0) -> PIController:
-    """Return a PI controller tuned by the SIMC rule from a step test alone."""
-    return PIController.simc(**step_test(plant), **limits(plant))
-
-
-def smith(plant: Parameters, runs: int = 1, seed: int = 0) -> SmithPredictor:
-    """Return a Smith predictor whose closed loop has half the plant's time constant."""
-    known = data_sheet(plant)
-    half = float(f"{known['time_constant'] / 2:.2g}")
-    return SmithPredictor(**known, closed_loop_time_constant=half)
-
-
-def direct_nn(plant: Parameters, runs: int, seed: int, **gains: Any) -> DirectNNController:
-    """Return the paper's network, which knows the direction of the plant's response."""
-    direction = 1 if nominal(plant).gain > 0.0 else -1
-    return DirectNNController(
-        num_envs=runs, seed=seed, direction=direction, **limits(plant), **gains
-    )
-
-
-def frozen_nn(plant: Parameters, runs: int, seed: int) -> Agent:
+def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
     """Return the paper's network after it has learnt on the plant that it is made for."""
-    controller: Any = ROSTER["nn"].in_service(asdict(plant), runs, seed)
+    controller: Any = ROSTER["nn"].in_service(asdict(parameters), num_envs, seed)
     controller.learning = False
     return controller  # type: ignore[no-any-return]
 
 
-def with_policy(plant: Parameters, *_: int, network: PolicyNetwork) -> PolicyNetwork:
+def with_policy(parameters: Parameters, network: PolicyNetwork, **_: int) -> PolicyNetwork:
     """Return a trained policy for the actuator's limits.
 
     If it compensates a dead zone, that is the plant's, where it is a number.
     """
-    increments = network.increments
-    if increments and increments.dead_zone and not isinstance(plant.dead_zone, Sequence):
-        increments = replace(increments, dead_zone=plant.dead_zone)
-    return replace(network, increments=increments, **limits(plant))
+    increments, zone = network.increments, parameters.dead_zone
+    if increments and increments.dead_zone and not isinstance(zone, Sequence):
+        increments = replace(increments, dead_zone=zone)
+    return replace(network, increments=increments, **limits(parameters))
 
 
 def policies(files: str) -> Mapping[str, PolicyNetwork]:
@@ -202,11 +195,11 @@ _RULE = "nothing: one step test, a rule"
 
 _CONTROLLERS = (
     Controller(
-        "nothing", "no control", ("#8C8C8C", "x"), partial(with_limits, IdleValve),
+        "nothing", "no control", ("#8C8C8C", "x"), IdleValve,
         knows="nothing", searched="nothing", observation={}, compared=False, swept=False,
     ),
     Controller(
-        "nn", "NN (1992)", ("#D55E00", "o"), direct_nn,
+        "nn", "NN (1992)", ("#D55E00", "o"), DirectNNController, told=direction,
         knows="direction", searched=_NN, random=True, learns=True, drawn=True,
         gains={
             "eta": (1e-3, 10.0),
@@ -218,56 +211,59 @@ _CONTROLLERS = (
         },
     ),
     Controller(
-        "nn-frozen", "NN (1992), frozen", ("#7A3600", "o"), frozen_nn,
+        "nn-frozen", "NN (1992), frozen", ("#7A3600", "o"), frozen_nn, told=everything,
         knows="direction", searched=f"{_NN}; 1,200 samples before", random=True, compared=False,
     ),
     Controller(
-        "pi", "PI (1992)", ("#CC79A7", "s"), partial(with_limits, PIController),
+        "pi", "PI (1992)", ("#CC79A7", "s"), PIController,
         knows="gains of the paper", searched="2 gains, not stated how", drawn=True,
         gains={"kp": (0.1, 10.0), "ki": (1e-3, 1.0)},
     ),
     Controller(
-        "pi-simc", "PI (SIMC)", ("#8E3B6B", "s"), simc_pi, knows=_STEP_TEST, searched=_RULE
+        "pi-simc", "PI (SIMC)", ("#8E3B6B", "s"), PIController.simc, told=tested,
+        knows=_STEP_TEST, searched=_RULE,
     ),
     Controller(
         "pi-searched", "PI (searched)", ("#4F1F3B", "s"),
-        partial(with_limits, PIController, kp=SEARCHED_GAINS["kp"], ki=SEARCHED_GAINS["ki"]),
+        partial(PIController, kp=SEARCHED_GAINS["kp"], ki=SEARCHED_GAINS["ki"]),
         knows="gains of the search",
         searched="2 gains by 800 trials: 566 M samples, 3 min", swept=False,
     ),
     Controller(
-        "smith", "Smith", ("#56B4E9", "^"), smith,
+        "smith", "Smith", ("#56B4E9", "^"), SmithPredictor, told=smith,
         knows=_DATA_SHEET, searched=_RULE,
     ),
     Controller(
         "self-tuning", "self-tuning", ("#00B98A", "v"),
-        partial(with_data_sheet, SelfTuningController), knows=f"{_DATA_SHEET}; delay range",
+        SelfTuningController, told=data_sheet, knows=f"{_DATA_SHEET}; delay range",
         searched="30 settings by hand, not counted; one step test",
     ),
     Controller(
-        "mpc", "MPC", ("#000000", "*"), PredictiveController,
+        "mpc", "MPC", ("#000000", "*"), PredictiveController, told=everything,
         knows="everything but the future", searched="nothing", swept=False,
     ),
     Controller(
-        "ppo", "PPO", ("#E69F00", "D"), with_policy, knows="dead zone", drawn=True,
+        "ppo", "PPO", ("#E69F00", "D"), with_policy, told=everything,
+        knows="dead zone", drawn=True,
         searched="388 weights on the paper's plant: 5 M samples a policy; settings by 79 "
         "trials: 121 M samples, 30 min",
         networks=partial(policies, "ppo-[0-9]*.npz"),
     ),
     Controller(
-        "ppo-hard", "PPO (hard)", ("#8F6200", "D"), with_policy, knows="nothing",
+        "ppo-hard", "PPO (hard)", ("#8F6200", "D"), with_policy, told=everything,
+        knows="nothing",
         searched="12,608 weights on plants that vary: 4 M samples a policy; settings by 43 "
         "trials: 36 M samples, 12 min",
         networks=partial(policies, "ppo-hard-*.npz"),
     ),
     Controller(
         "nn-smith", "neural Smith", ("#0072B2", "^"),
-        partial(with_data_sheet, NeuralSmithPredictor), knows=_DATA_SHEET,
+        NeuralSmithPredictor, told=data_sheet, knows=_DATA_SHEET,
         searched=f"{_LAW}; one step test", networks=law, drawn=True,
     ),
     Controller(
         "nn-self-tuning", "neural self-tuning", ("#00664B", "v"),
-        partial(with_data_sheet, NeuralSelfTuningController),
+        NeuralSelfTuningController, told=data_sheet,
         knows=f"{_DATA_SHEET}; delay range",
         searched=f"{_LAW}; 31 settings by hand; one step test", networks=law,
     ),
