@@ -22,7 +22,6 @@ from benchmarks.compare.comparison import estimate, ranked, scale_of
 from benchmarks.controllers.roster import ROSTER, looks
 from benchmarks.lib import storage
 from benchmarks.lib.report import Section, on_screen, write_report
-from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.rollout import make_plants, measure, rollout
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
@@ -173,16 +172,6 @@ class TestReport:
         assert width / 2 < max(map(len, shown.splitlines())) <= width
         assert shown.count("11.5") == shown.count("1.00 (0.99 to 1.01)") == 7
 
-    def test_numbers_and_estimates_in_csv(self, tmp_path):
-        columns = {
-            "a": ["x", "y"],
-            "s": [1.5, np.inf],
-            "e": [Estimate(2.0, 1.0, 3.0, 4), np.nan],
-        }
-        comparison.write_numbers(tmp_path / "table.csv", pd.DataFrame(columns))
-        written = (tmp_path / "table.csv").read_bytes()
-        assert written == b"a,s,e,e_low,e_high\nx,1.5,2.0,1.0,3.0\ny,not settled,,,\n"
-
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "file.txt"
@@ -295,9 +284,7 @@ class TestCompare:
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
 
     @pytest.mark.usefixtures("undrawn")
-    def test_where_limits_are_drawn_shares_are_not_measured(
-        self, compared, monkeypatch, tmp_path
-    ):
+    def test_where_limits_are_drawn_shares_are_not_measured(self, monkeypatch, tmp_path):
         monkeypatch.chdir(tmp_path)
         assert main(["--preset", "hard", "--agents", "pi", "--runs", "2", "--jobs", "1"]) == 0
         (folder,) = (tmp_path / "results").iterdir()  # of its own, as it is a part

@@ -61,7 +61,7 @@ def test_a_batch_is_its_members_again_and_mirrored(entry, member):
         plant = {**limits, "b": [sign * b for b in Parameters().b], "noise_variance": 0.1}
         controller = controller or member(plant, runs, seed)
         plant["setpoint_amplitude"] = 6.0
-        return controller, member.run(plant, 500, runs, seed, controller)
+        return controller, member.run(plant, 350, runs, seed, controller)
 
     controller, batch = run(3, 5)
     # Where a network has learnt, its noise then was that of its place in the batch.
