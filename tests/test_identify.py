@@ -80,17 +80,6 @@ class TestFit:
         at_rest = plant.response(h, np.array([1e-9]))[0]
         assert at_rest.real == pytest.approx(plant.gain, rel=1e-3)
 
-    def test_paper_plant_is_found(self):
-        truths = {"delay": 18, "dead_zone": 5.0, "gain": -0.6825, "time_constant": 161.0}
-        for name, truth in truths.items():
-            value, low, high = good().estimates[name]
-            assert low <= truth <= high, name
-            assert value == pytest.approx(truth, rel=0.2), name
-        assert good().warnings == []
-        assert good().operating_flow == 480.0
-        assert good().operating_temperature == pytest.approx(385.0, abs=0.5)
-        assert np.isfinite(good().simulated).all()
-
     def test_operating_flow_by_hand(self):
         # 0 or the first flow if it is in the middle half of the range, else the middle.
         for flows, found in (
@@ -189,7 +178,20 @@ class TestValves:
         assert not found["unsafe"]
 
 
-class TestTuning:
+class TestFound:
+    """What is found in a log of the paper's plant, and recommended for it."""
+
+    def test_paper_plant_is_found(self):
+        truths = {"delay": 18, "dead_zone": 5.0, "gain": -0.6825, "time_constant": 161.0}
+        for name, truth in truths.items():
+            value, low, high = good().estimates[name]
+            assert low <= truth <= high, name
+            assert value == pytest.approx(truth, rel=0.2), name
+        assert good().warnings == []
+        assert good().operating_flow == 480.0
+        assert good().operating_temperature == pytest.approx(385.0, abs=0.5)
+        assert np.isfinite(good().simulated).all()
+
     def test_ms_is_that_of_the_loop(self):
         # A plant of first order, and the stability limit of pure integration with a delay.
         plant, pi = Plant(40.0, np.array([100.0 + 0j]), np.array([2.0 + 0j])), (-0.5, -0.005)
@@ -246,6 +248,50 @@ class TestTuning:
         assert open_["slowed"] > 1.3 * known["slowed"]
         assert open_["sensitivity"][1] <= 1.8
 
+    def test_plant_is_the_environment_s(self):
+        # The environment does what the simulation of the log shows, once it has forgotten that
+        # it was at rest before k = 0.
+        model = good()
+        arguments = json.loads(json.dumps(plant_arguments(model)))
+        calm = {**arguments, "noise_variance": 0.0}
+        env = gymnasium.make("MiddlePoint-v0", max_episode_steps=1200, **calm)
+        env.reset()
+        low, high, outputs = arguments["u_min"], arguments["u_max"], [0.0]
+        for u in model.log.flow[:-1] - model.operating_flow:
+            action = np.array([2.0 * (u - low) / (high - low) - 1.0], np.float32)
+            outputs.append(env.step(action)[-1]["output"])
+        simulated = model.simulated - model.operating_temperature
+        np.testing.assert_allclose(simulated[600:], outputs[600:], atol=2e-3)
+        left = np.nanvar(model.log.temperature - model.simulated)
+        noise = signal.lfilter(arguments["c"], arguments["a"], np.eye(1, 3000)[0])
+        assert arguments["noise_variance"] * (noise**2).sum() == pytest.approx(left, rel=0.4)
+
+    def test_ranges_hold_the_plant_and_can_be_drawn_from(self):
+        plant, ranges = plant_arguments(good()), plant_ranges(good())
+        env = gymnasium.make("MiddlePoint-v0", **json.loads(json.dumps(ranges)))
+        env.reset(seed=0)
+        factors = {"gain_factor": 1.0, "time_constant_factor": 1.0}
+        names = [name for name, value in ranges.items()
+                 if isinstance(value, list) and name not in "abc"]  # fmt: skip
+        assert {"delay", "dead_zone", "noise_variance", *factors} <= set(names)
+        for name in names:
+            low, high = ranges[name]
+            assert low <= {**plant, **factors}[name] <= high
+
+    def test_plant_that_the_environment_does_not_have_is_refused_with_advice(self):
+        log = replace(good().log, temperature=1e8 * good().log.temperature)
+        model = replace(good(), log=log, simulated=1e8 * good().simulated)
+        with pytest.raises(ValueError, match=r"noise_variance .* --temperature-unit"):
+            plant_ranges(model)
+
+    def test_units_are_those_of_the_log(self):
+        columns = Columns(flow_unit="%", temperature_unit="K")
+        model = replace(good(), log=replace(good().log, columns=columns))
+        text = str([section.text for section in report(model, recommended(model))])
+        assert "t/h" not in text
+        assert "°C" not in text
+        assert "% per K" in text
+
 
 def closed_loop(log):
     plant = study.Plant(
@@ -293,44 +339,6 @@ class TestGuards:
         flow = 10.0 * np.sign(recorded(800).flow)
         log = Log(flow, answer(flow, np.random.default_rng(705)), 8.0)
         assert identify(log, Knowledge(applied=True)).warnings == []
-
-
-class TestPlant:
-    def test_plant_is_the_environment_s(self):
-        # The environment does what the simulation of the log shows, once it has forgotten that
-        # it was at rest before k = 0.
-        model = good()
-        arguments = json.loads(json.dumps(plant_arguments(model)))
-        calm = {**arguments, "noise_variance": 0.0}
-        env = gymnasium.make("MiddlePoint-v0", max_episode_steps=1200, **calm)
-        env.reset()
-        low, high, outputs = arguments["u_min"], arguments["u_max"], [0.0]
-        for u in model.log.flow[:-1] - model.operating_flow:
-            action = np.array([2.0 * (u - low) / (high - low) - 1.0], np.float32)
-            outputs.append(env.step(action)[-1]["output"])
-        simulated = model.simulated - model.operating_temperature
-        np.testing.assert_allclose(simulated[600:], outputs[600:], atol=2e-3)
-        left = np.nanvar(model.log.temperature - model.simulated)
-        noise = signal.lfilter(arguments["c"], arguments["a"], np.eye(1, 3000)[0])
-        assert arguments["noise_variance"] * (noise**2).sum() == pytest.approx(left, rel=0.4)
-
-    def test_ranges_hold_the_plant_and_can_be_drawn_from(self):
-        plant, ranges = plant_arguments(good()), plant_ranges(good())
-        env = gymnasium.make("MiddlePoint-v0", **json.loads(json.dumps(ranges)))
-        env.reset(seed=0)
-        factors = {"gain_factor": 1.0, "time_constant_factor": 1.0}
-        names = [name for name, value in ranges.items()
-                 if isinstance(value, list) and name not in "abc"]  # fmt: skip
-        assert {"delay", "dead_zone", "noise_variance", *factors} <= set(names)
-        for name in names:
-            low, high = ranges[name]
-            assert low <= {**plant, **factors}[name] <= high
-
-    def test_plant_that_the_environment_does_not_have_is_refused_with_advice(self):
-        log = replace(good().log, temperature=1e8 * good().log.temperature)
-        model = replace(good(), log=log, simulated=1e8 * good().simulated)
-        with pytest.raises(ValueError, match=r"noise_variance .* --temperature-unit"):
-            plant_ranges(model)
 
 
 def table(**columns):
@@ -411,14 +419,6 @@ class TestLog:
         np.testing.assert_allclose(log.temperature, expected.temperature, 1e-9, 1e-9)
         assert log.sampling_interval == pytest.approx(8.0)
         assert not any("missing" in note for note in log.notes)
-
-    def test_units_are_those_of_the_log(self):
-        columns = Columns(flow_unit="%", temperature_unit="K")
-        model = replace(good(), log=replace(good().log, columns=columns))
-        text = str([section.text for section in report(model, recommended(model))])
-        assert "t/h" not in text
-        assert "°C" not in text
-        assert "% per K" in text
 
     def test_clocks_may_jitter_by_a_quarter_of_a_sample(self, read):
         jitter = np.random.default_rng(718).uniform(-2.0, 2.0, 400)
