@@ -284,6 +284,19 @@ class TestCompare:
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
 
     @pytest.mark.usefixtures("undrawn")
+    def test_a_case_that_no_controller_has_finished_is_left_out(self, compared, monkeypatch):
+        def run_case(scenario, *given, run=comparison.run_case):
+            if scenario.name == "square":
+                raise ArithmeticError("a fault")
+            return run(scenario, *given)
+
+        monkeypatch.setattr(comparison, "run_case", run_case)
+        out = compared("--agents pi smith --scenarios square constant --runs 1", status=1)
+        estimates = pd.read_csv(out / "estimates.csv")
+        assert estimates["scenario"].tolist() == ["constant"] * 2
+        assert "| PI (1992)" in (out / "report.md").read_text()
+
+    @pytest.mark.usefixtures("undrawn")
     def test_where_limits_are_drawn_shares_are_not_measured(self, monkeypatch, tmp_path):
         monkeypatch.chdir(tmp_path)
         assert main(["--preset", "hard", "--agents", "pi", "--runs", "2", "--jobs", "1"]) == 0
