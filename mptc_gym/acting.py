@@ -122,8 +122,7 @@ def _predicting(predict: Any, named: Mapping[str, inspect.Parameter], n: int) ->
 def _evaluating(module: Any, act: Act, tensors: bool) -> Act:
     """Return the function of a `torch.nn.Module`, in evaluation mode and without gradients."""
     torch: Any = sys.modules["torch"]
-    numbers = (*module.parameters(), *module.buffers())
-    like = next(filter(torch.is_floating_point, numbers), torch.empty(0))
+    like = next(module.parameters(), torch.empty(0))
 
     def tensor(seen: Any) -> Any:
         if isinstance(seen, Mapping):

@@ -363,7 +363,7 @@ class ScoreCallback(BaseCallback):
         env, arguments = self._env, self._arguments
         if isinstance(env, str | EnvSpec):
             env, arguments = spec_of(self.model, env, **arguments), {}
-        elif not callable(env) and overlap(env, self.training_env):
+        elif overlap(env, self.training_env):
             raise ValueError("env must not be the environments of the training: make others")
         # Not kept in place of the id: the next model may have other windows.
         self._score_in: Any = partial(evaluate, env=env, **arguments)

@@ -163,6 +163,11 @@ class Network(torch.nn.Module):
         return torch.tanh(scale * self.layers(seen))
 
 
+class OfBlocks(torch.nn.Module):
+    def forward(self, seen):
+        return -0.3 * seen["errors"][..., :1]
+
+
 class Acting(Network):
     def act(self, observations):
         assert isinstance(observations, np.ndarray)
@@ -312,12 +317,16 @@ RIGHT = {
     "its forward": lambda _: network((m := Network()).forward, m),
     "a partial of a module": lambda _: network(partial(m := Network(), scale=1.0), m),
     "module with act": lambda _: network(Acting()),
+    "module of dicts": lambda _: (
+        OfBlocks(), dummy(blocks), lambda: lambda seen: -0.3 * seen["errors"][:1], blocks),
     "spec with wrappers": lambda _: plain(law, moved(made()).spec, lambda: moved(made())),
     "function that makes one": lambda _: memory(made),
     "the same, in a wrapper": lambda _: memory(scaled, scaled),
     "the same, without a spec": lambda _: memory(
         lambda: wrappers.TimeLimit(MiddlePointEnv(**BARE), LENGTH)),
     "one environment": lambda _: memory(made()),
+    "drawn limits": lambda _: memory(make := partial(
+        made, u_min=[-12.0, -8.0], u_max=[8.0, 12.0]), make),
     "one in mid-episode": lambda _: memory(halfway(made())),
     "native batch": lambda _: memory(many()),
     "native batch, SameStep": lambda _: memory(many(autoreset_mode="SameStep")),
@@ -567,6 +576,8 @@ def test_what_is_learnt_carries_over_to_the_next_round(learns):
 def test_without_an_end_of_its_own_it_has_1200_samples(limit):
     plants = MiddlePointVectorEnv(N, max_episode_steps=limit)
     assert evaluate(law, plants, episodes=2).score is not None
+    endless = evaluate(law, "MiddlePoint-v0", episodes=2, max_episode_steps=-1)
+    assert endless.score is not None
     # Its spec says 1200.
     short = gymnasium.make_vec("MiddlePoint-v0", N, max_episode_steps=50)
     assert evaluate(law, short, episodes=2).score is None
