@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy import linalg, optimize, signal, stats
+from scipy import linalg, optimize, signal
 
 from benchmarks.bounds import __main__ as command
 from benchmarks.bounds import least
@@ -82,18 +82,6 @@ def test_a_plant_of_first_order_by_hand():
 
 
 class TestProgramme:
-    def test_zero_outside_the_unit_circle(self):
-        # HiGHS' presolve gives up. A flow of one sign cannot do better than an error of 17 in
-        # the half periods at -17, and a plain step of it is a plan, and so no better.
-        plant = {"a": [1, 0.0875, 0.0495, -0.0053], "b": [-8.6, 96.0, -26.3], "delay": 18}
-        limits = {"dead_zone": 0, "u_min": 0, "u_max": 0.386, "setpoint_amplitude": 17}
-        found = least_possible(samples=1200, kind="preview", folder=None, **plant, **limits)
-        k = np.arange(1201)
-        u = np.where(k % 600 < 281, 17.0 * sum(plant["a"]) / sum(plant["b"]), 0.0)
-        y = signal.lfilter([0.0] * 19 + plant["b"], plant["a"], u)
-        setpoint = np.where(k % 600 < 300, 17.0, -17.0)
-        assert 8.5 < found.value <= np.abs(setpoint - y)[1:].mean() < 9.5
-
     def test_what_is_left_out_is_small_beside_the_largest_response(self, monkeypatch):
         # In other units of the flow, as much is left out, and the errors are the same.
         sizes, errors, solve = [], [], optimize.linprog
@@ -215,14 +203,6 @@ class TestUnknown:
             (least,) = bound.mean_error(np.array([m]))
             found = np.abs(m - y[0])
             assert least < found.mean() + 3 * found.std() / np.sqrt(draws)
-
-    def test_of_noise_alone_it_is_the_mean_of_the_folded_normal(self):
-        bound = unknown(course_of(60, noise_variance=0.5)).of(59, 60)
-        deviation = np.sqrt(minimum_variance(Parameters(noise_variance=0.5)))
-        for m in (0.0, 0.3, 1.0, 2.5):
-            (least,) = bound.mean_error(np.array([m]))
-            expected = stats.foldnorm.mean(m / deviation, scale=deviation)
-            assert least == pytest.approx(expected, rel=0.01)
 
 
 class TestCausal:
