@@ -6,10 +6,9 @@ from scipy import signal
 
 from agents import PIController, SmithPredictor
 from benchmarks.lib.storage import UsageError
-from benchmarks.loop.linear import nominal, step_test, time_varying_model
+from benchmarks.loop.linear import nominal, step_test
 from benchmarks.loop.scenarios import PlantOptions
 from mptc_gym import MiddlePointEnv, Parameters
-from mptc_gym.signals import Ranges, plant_numbers
 from tests.conftest import run
 
 OTHER = {"delay": 7, "gain_factor": 1.3, "time_constant_factor": 2.0, "dead_zone": 0.0}
@@ -36,17 +35,6 @@ def test_the_nominal_model_is_the_environment(rng):
     assert model.impulse_response(900).sum() == pytest.approx(model.gain, rel=1e-4)
     slow, paper = (np.roots([1, *-each.alpha]).max() for each in (model, nominal(Parameters())))
     assert 1 - paper == pytest.approx(2.0 * (1 - slow))
-
-
-def test_a_course_is_the_environment_while_it_drifts(rng):
-    arguments = {**OTHER, **DRIFT}
-    flow, output = outputs(rng, **arguments)
-    parameters = Parameters(**arguments)
-    of_plant = time_varying_model(
-        parameters, plant_numbers(Ranges(parameters).given, 0), len(flow)
-    )
-    np.testing.assert_allclose(of_plant.flow_response() @ flow, output, rtol=0, atol=1e-12)
-    assert np.abs(response(nominal(parameters), flow, 7) - output).max() > 0.1
 
 
 def test_ranges_stand_for_their_middle_and_what_is_added_does_not_show():
