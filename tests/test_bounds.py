@@ -241,15 +241,6 @@ class TestCausal:
 
 
 class TestLeastPossible:
-    def test_drawn_episodes_are_those_of_the_environment(self):
-        # Without noise, a run and the bound of its plant and set point can be compared.
-        arguments = {"delay": [5, 30], "gain_factor": [0.8, 1.4], "setpoint": 4.0}
-        arguments["dead_zone"] = 0.0
-        least = least_possible(samples=400, episodes=4, folder=None, **arguments)
-        found = errors(MPC, 4, 400, **arguments)
-        assert np.all(found > np.array(least.episodes) * (1 - 1e-6))
-        np.testing.assert_allclose(found, least.episodes, rtol=0.02)
-
     def test_score(self):
         least = least_possible(samples=600, folder=None, setpoint=5.0)
         idle = least.idle.value
