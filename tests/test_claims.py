@@ -28,31 +28,23 @@ def asked(*bounds):
 
 
 class TestVerdicts:
-    @pytest.mark.parametrize(
-        ("bounds", "criterion", "shown", "verdict"),
-        [
+    def test_the_whole_interval_must_keep_the_criterion(self):
+        both = {"at_least": 0.5, "at_most": 1.9}
+        for bounds, criterion, shown, verdict in [
             ({"at_least": 0.5}, "at least 0.5", "yes", "holds"),
             ({"at_most": 1.5}, "at most 1.5", "undecided", "does not hold"),
             ({"at_least": 2.5}, "at least 2.5", "no", "does not hold"),
             ({"at_most": 0.5}, "at most 0.5", "no", "does not hold"),
-            ({"at_least": 0.5, "at_most": 1.9}, "at least 0.5 and at most 1.9", "undecided",
-             "does not hold"),
+            (both, "at least 0.5 and at most 1.9", "undecided", "does not hold"),
             (INFORMATION, "", "", "cannot be tested from the text"),
-        ],
-    )  # fmt: skip
-    def test_the_whole_interval_must_keep_the_criterion(
-        self, bounds, criterion, shown, verdict
-    ):
-        claim = asked(bounds)
-        assert (claim.findings[0]["criterion"], claim.findings[0]["shown"]) == (
-            criterion,
-            shown,
-        )
-        assert claim.verdict == verdict
-        # Information beside it changes nothing, something that is shown does.
-        assert asked(bounds, INFORMATION).verdict == verdict
-        with_good = "holds" if shown in ("yes", "") else "holds in part"
-        assert asked(bounds, GOOD).verdict == with_good
+        ]:
+            claim, finding = asked(bounds), asked(bounds).findings[0]
+            assert (finding["criterion"], finding["shown"]) == (criterion, shown)
+            assert claim.verdict == verdict
+            # Information beside it changes nothing, something that is shown does.
+            assert asked(bounds, INFORMATION).verdict == verdict
+            with_good = "holds" if shown in ("yes", "") else "holds in part"
+            assert asked(bounds, GOOD).verdict == with_good
 
     def test_the_report_by_hand(self):
         good, none = asked(GOOD), Claim("none", "", "It cannot be", "", examine=None)
@@ -86,13 +78,11 @@ def test_known_sequences_converge_where_they_should():
     assert list(converged_at(paths)) == [70, 29, 201, 0]
 
 
-@pytest.mark.parametrize(
-    ("early", "output", "has"), [(50, 5.2, True), (50, 5.3, False), (51, 5.0, False)]
-)
-def test_settled_are_the_last_50_samples(early, output, has):
-    outputs = np.array([0.0] * early + [output] * (100 - early))
-    for sign in (1.0, -1.0):
-        assert settled(trajectory([sign * 5.0] * 100, sign * outputs)) == [has]
+def test_settled_are_the_last_50_samples():
+    for early, output, has in (50, 5.2, True), (50, 5.3, False), (51, 5.0, False):
+        outputs = np.array([0.0] * early + [output] * (100 - early))
+        for sign in (1.0, -1.0):
+            assert settled(trajectory([sign * 5.0] * 100, sign * outputs)) == [has]
 
 
 def run_claims(out, *given, runs, status=0):

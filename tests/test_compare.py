@@ -62,19 +62,16 @@ class TestMeasures:
         for name, samples in zip(names, (299, 181, 720), strict=True):
             np.testing.assert_allclose(1200 * counted[name], samples)
 
-    @pytest.mark.parametrize(
-        ("setpoint", "output", "time"),
-        [
+    def test_settling(self):
+        for setpoint, output, time in [
             # Within 5 % of 10 from the third sample after the change on.
             ([10] * 5, [0, 9.6, 9.49, 9.51, 10.5], 3),
             # Of two changes the longer counts: 1 sample, then 2.
             ([10, 10, 10, 0, 0, 0], [0, 10, 10, 10, 10, 0], 2),
             ([10, 10, 10, 10, 0, 0], [0, 10, 10, 9, 0, 0], math.inf),
             ([10, 10, 10, 10, 0, 0], [0, 10, 10, 10, 1, 2], math.inf),
-        ],
-    )
-    def test_settling(self, setpoint, output, time):
-        assert measured(trajectory(setpoint, output))["settling_time"] == time
+        ]:
+            assert measured(trajectory(setpoint, output))["settling_time"] == time
 
     def test_input_by_hand(self):
         commands = [6, 4.9, 5, -12, -10, -4]
