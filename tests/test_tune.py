@@ -84,5 +84,6 @@ class TestSearch:
 def test_the_pages_of_the_searches_name_the_defaults():
     pages = (ROOT / f"benchmarks/published/tune_{name}.md" for name in ("nn", "pi"))
     nn, pi = (page.read_text(encoding="utf-8") for page in pages)
-    assert "(eta {0.eta:g}, eta_1 {0.eta_1:g})".format(DirectNNController()) in nn
+    own = DirectNNController()
+    assert f"({', '.join(f'{name} {getattr(own, name):g}' for name in tune.TUNED['nn'])})" in nn
     assert "gains, {kp:g} and {ki:g}, are".format(**SEARCHED_GAINS) in pi

@@ -7,12 +7,14 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.bounds.least import least_possible
-from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.roster import ROSTER, Controller, everything
 from benchmarks.lib.report import on_screen
 from benchmarks.lib.statistics import student
+from benchmarks.loop.linear import nominal
 from benchmarks.loop.rollout import mean_error
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import SEED
+from mptc_gym.plant import action_from_command
 
 SAMPLES = 1200
 ODD = {"delay": 30, "u_min": -12.0, "u_max": 6.0, "dead_zone": 4.0, "setpoint_amplitude": 3.0}
@@ -32,9 +34,36 @@ CASES = {
 }
 
 
+class Counting:
+    """A controller that counts samples, and so knows when the square wave changes.
+
+    On that wave it applies the flow that holds the set point d + 10 samples ahead.
+    """
+
+    def __init__(self, parameters, **_):
+        self.plant, self.gain = parameters, nominal(parameters).gain
+        self.limits = [np.mean(parameters.range_of(name)) for name in ("u_min", "u_max")]
+
+    def reset(self):
+        self.k = self.plant.range_of("delay")[0] + 10
+
+    def act(self, observation):
+        level = np.asarray(observation, np.float64)[:, :1]
+        if self.plant.setpoint == "square":
+            period, amplitude = self.plant.setpoint_period, self.plant.setpoint_amplitude
+            high = self.k % period < (period + 1) // 2
+            level = np.full_like(level, amplitude if high else -amplitude)
+        self.k += 1
+        return action_from_command(level / self.gain, *self.limits)
+
+
 def controllers():
-    """Return the controllers of the roster by name, of trained ones the first."""
-    return {name: entry.members()[0] for name, entry in ROSTER.items()}
+    """Return the roster's controllers by name, of trained ones the first, and `Counting`."""
+    counting = Controller("counting", "counting", ("", ""), Counting, told=everything)
+    return {
+        **{name: entry.members()[0] for name, entry in ROSTER.items()},
+        "counting": counting,
+    }
 
 
 def errors(factory, runs, samples, **arguments):
