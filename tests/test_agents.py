@@ -103,6 +103,7 @@ def gain_of(weight, bias, **arguments):
 )  # fmt: skip
 def test_pi_by_hand(arguments, errors, commands):
     controller = PIController(**arguments)
+    assert controller.command == 0.0
     low, high = controller.u_min, controller.u_max
     for e, u in zip(errors, commands, strict=True):
         action = controller.act([0, 0, 0, e, 9, 9])

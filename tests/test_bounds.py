@@ -57,6 +57,17 @@ def change(level, samples, **arguments):
     return reference(of_plant, unknown(of_plant), setpoint).error.sum()
 
 
+def test_responses_to_single_flows_are_those_of_the_plant():
+    found, parameters = course_of(40, delay=3, dead_zone=0.5), Parameters()
+    pulse = signal.lfilter([0.0] * 4 + list(parameters.b), parameters.a, np.eye(40)[0])
+    for j in (0, 7, 39):
+        np.testing.assert_allclose(found.flow_response()[j:, j], pulse[: 40 - j], atol=1e-12)
+        assert not found.flow_response()[:j, j].any()
+    # A limit within which 0 is no flow, but where the dead zone makes it one.
+    lowest = [course_of(9, u_min=2.0, dead_zone=zone).low for zone in (0.0, 0.5)]
+    assert lowest == [2.0, 0.0]
+
+
 # Plants that differ in everything: u_max nearer than u_min, no delay, and three slow poles.
 ODD = [
     {"delay": 30, "u_min": -12.0, "u_max": 6.0, "dead_zone": 4.0},
@@ -90,7 +101,11 @@ class TestProgramme:
         for unit in (1.0, 1e4):
             plant = {"a": [1.0, -0.5], "b": [0.2 * unit, -0.5 * unit], "dead_zone": 0.0}
             limits = {"u_min": -30.0 / unit, "u_max": 20.0 / unit, "delay": 2}
-            errors.append(best_plan(np.repeat([1.5, -1.0], 40), **plant, **limits).error)
+            found = best_plan(np.repeat([1.5, -1.0], 40), **plant, **limits)
+            errors.append(found.error)
+            # Its zero is outside the unit circle: the flows are planned, and give the outputs.
+            moved = signal.lfilter([0.0] * 3 + plant["b"], plant["a"], found.flow)
+            np.testing.assert_allclose(found.output, moved, atol=1e-6)
         assert sizes[0] == sizes[1]
         np.testing.assert_allclose(*errors, atol=1e-5)
 

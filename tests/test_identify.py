@@ -80,6 +80,11 @@ class TestFit:
         at_rest = plant.response(h, np.array([1e-9]))[0]
         assert at_rest.real == pytest.approx(plant.gain, rel=1e-3)
 
+    def test_half_rule_by_hand(self):
+        # 1 / ((10 s + 1) (4 s + 1)): half of the 4 s goes to the lag, and half to the delay.
+        plant = Plant(3.0, np.array([10.0, 4.0]) + 0j, np.array([10.0, -4.0]) / 6.0 + 0j)
+        assert plant.first_order() == pytest.approx((12.0, 5.0))
+
     def test_operating_flow_by_hand(self):
         # 0 or the first flow if it is in the middle half of the range, else the middle.
         for flows, found in (

@@ -26,6 +26,8 @@ def test_quantile_of_some_that_never_end():
 
 
 def test_few_runs_promise_little():
+    # Student's t of one degree of freedom: 12.7 standard errors.
+    assert statistics.student([1.0, 3.0]).high == pytest.approx(2.0 + 12.706, abs=1e-3)
     estimate = quantile([1.0, 2.0, 3.0], 0.5)
     assert (estimate.value, estimate.low, estimate.high) == (2.0, -math.inf, math.inf)
 
