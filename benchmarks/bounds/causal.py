@@ -57,7 +57,8 @@ class SetPointLaw:
         self._reach = gain * min(-model.low, model.high)
         # Noise blurs the sign of a small error; equally probable thresholds represent it.
         deviation = unknown.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
-        blur = scipy.stats.halfnorm.ppf((np.arange(THRESHOLDS) + 0.5) / THRESHOLDS)
+        shares = (np.arange(THRESHOLDS) + 0.5) / THRESHOLDS
+        blur = scipy.special.ndtri((1.0 + shares) / 2.0)  # of |a standard normal number|
         self._blur = deviation * blur if deviation > 0.0 else np.zeros(1)
         # After a change the output stands still for `lag` samples. Then it approaches what the
         # limits allow; this is the share of the way that it has made, by age of the level.

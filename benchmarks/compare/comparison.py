@@ -8,14 +8,12 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.compare import plots
-from benchmarks.compare.plots import Score
 from benchmarks.controllers.roster import Controller, label
 from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles, written
@@ -23,6 +21,9 @@ from benchmarks.lib.storage import write_csv
 from benchmarks.loop.rollout import CHANGE, START, Trajectory, is_random, measure
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES, SEED
+
+if TYPE_CHECKING:
+    from benchmarks.compare.plots import Score
 
 Array = NDArray[np.float64]
 BOOTSTRAP = 0  # seed of the bootstraps
@@ -280,6 +281,8 @@ def write(
         rows = responses[name]
         few = rows[rows["agent"].isin(drawn)]
         shown.append((scale.scenario, rows if few.empty else few))
+    from benchmarks.compare import plots  # here: processes that run cases do without
+
     try:
         plots.draw(folder, runs, shown, estimates, scores)
     finally:  # with the pictures that there are

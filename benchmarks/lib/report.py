@@ -17,18 +17,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullLocator
-from PIL import Image
 
 from benchmarks.lib.storage import replacing, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _STYLE = """
 :root { color-scheme: light dark; }
@@ -155,6 +153,11 @@ def drawn(path: Path, height: float, title: str = "") -> Iterator[Figure]:
 
     The title says what the figure shows.
     """
+    import matplotlib as mpl  # here: slow to import, and many reports have no picture
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from PIL import Image
+
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, height))
         if title:
@@ -195,11 +198,13 @@ def draw_legend(figure: Figure, entries: dict[str, Any]) -> None:
 
 def scale_by_excess(axes: Axes, name: str, low: float, high: float) -> None:
     """Make the axis "x" or "y" of `multiple - 1` logarithmic, with multiples as its ticks."""
+    from matplotlib import ticker
+
     axes.set(**{f"{name}scale": "log", f"{name}lim": (low / 1.3, high * 1.3)})
     axis = getattr(axes, f"{name}axis")
-    axis.set_major_locator(FixedLocator(EXCESSES))
+    axis.set_major_locator(ticker.FixedLocator(EXCESSES))
     axis.set_major_formatter(lambda excess, _: f"{1 + excess:g}")
-    axis.set_minor_locator(NullLocator())
+    axis.set_minor_locator(ticker.NullLocator())
 
 
 def draw_actuator(axes: Axes, parameters: Any) -> None:
