@@ -90,7 +90,7 @@ def start(policy: Any, n: int) -> Act:
     is_module = isinstance(owner, loaded("torch.nn.Module"))
     # Methods have a name, and modules none.
     forward = is_module and getattr(function, "__name__", "forward") == "forward"
-    if forward and owner.forward.__name__ == "_forward_unimplemented":
+    if forward and getattr(owner.forward, "__name__", "") == "_forward_unimplemented":
         allowed = "a module with forward: its part that acts, as agent.actor_mean"
         reject("policy", owner, allowed)
     named: Mapping[str, inspect.Parameter] = {}
@@ -253,7 +253,7 @@ def opened(env: Any, n: int, policy: Any = None) -> Iterator[Any]:
             stack.callback(setattr, layer, flag, getattr(layer, flag))
             setattr(layer, flag, False)
         if given:
-            stack.callback(_restart, plants, policy)
+            stack.callback(_restart, plants, policy, _fresh(plants))
         yield plants
 
 
@@ -266,13 +266,28 @@ def _one(make: Callable[[], Any]) -> gymnasium.Env[Any, Any]:
     return made
 
 
-def _restart(plants: Any, policy: Any) -> None:
-    """Reset plants with fresh seeds, so that training never meets the episodes of a score."""
+def _fresh(plants: Any) -> list[int]:
+    """Return new seeds that follow from the last ones, so that a training can be repeated."""
+    each_last: list[Any] = [each.np_random_seed for each in natives(plants)]
+    last = np.hstack(each_last).tolist()
+    entropy = None if None in last else [abs(seed) for seed in last]
+    return [*map(int, np.random.SeedSequence(entropy).generate_state(plants.num_envs))]
+
+
+def _restart(plants: Any, policy: Any, seeds: list[int]) -> None:
+    """Reset plants with other seeds, so that training never meets the episodes of a score."""
+    observations = None
     with suppress(Exception):  # a Monitor may not allow it; what is broken raised its own
-        plants.reset(seed=np.random.SeedSequence().generate_state(plants.num_envs).tolist())
+        observations, _ = plants.reset(seed=seeds)
     algorithm = loaded(f"{_SB3}.base_class.BaseAlgorithm")
-    if isinstance(policy, algorithm) and policy.env and overlap(policy.env, plants):
-        policy._last_obs = None  # its training begins anew
+    if not (isinstance(policy, algorithm) and policy.env and overlap(policy.env, plants)):
+        return
+    # Its training begins anew. In a callback it goes on with these, and would store a None.
+    of_model = isinstance(plants, FromVecEnv) and plants.env is policy.env
+    policy._last_obs = observations if of_model else None
+    policy._last_episode_starts = np.ones(plants.num_envs, np.bool_)
+    if of_model and policy.get_vec_normalize_env() is not None:
+        policy._last_original_obs = policy.get_vec_normalize_env().get_original_obs()
 
 
 def check_fit(policy: Any, plants: Any) -> None:

@@ -235,8 +235,10 @@ def _spec(model: Any) -> EnvSpec:
     plants = model.get_env() if isinstance(model, BaseAlgorithm) else None
     if plants is None:
         raise ValueError("policy must be a model with its environments: see mptc_gym.sb3.load")
-    spec, *_ = plants.get_attr("spec")
+    spec, *others = plants.get_attr("spec")
     try:
+        if any(each.to_json() != spec.to_json() for each in others):
+            raise ValueError("they differ")
         # Gymnasium cannot make the Monitor that each model adds, and it changes nothing.
         kept = tuple(each for each in spec.additional_wrappers if each.name != "Monitor")
         spec = dataclasses.replace(spec, additional_wrappers=kept)

@@ -554,14 +554,32 @@ class TestEnvironmentsAreLeftAsTheyWere:
     def test_training_goes_on_after_a_score_in_its_own_environments(self, algorithm):
         model = model_of(algorithm, VecNormalize(dummy(n=1))).learn(64)
         evaluate(model, model.get_env(), episodes=EPISODES)
-        assert model._last_obs is None
+        (level,) = model._last_original_obs
+        assert level[3] == level[0]  # the first error of an episode is its set point
         count = model.get_env().obs_rms.count
         model.learn(64, reset_num_timesteps=False)
         assert model.num_timesteps == 128
-        assert model.get_env().obs_rms.count == count + 65  # with that of a reset
+        assert model.get_env().obs_rms.count == count + 64
         kept = model._last_obs
         evaluate(model.policy, dummy(), episodes=EPISODES)
         assert model._last_obs is kept  # of others it forgets nothing
+
+
+def test_a_score_in_a_callback_spoils_no_sample_and_can_be_repeated():
+    def trained():
+        model = model_of(SAC, dummy(n=1))
+
+        def score(*_):
+            if model.num_timesteps % 20 == 0:
+                evaluate(model, model.get_env(), episodes=2)
+            return True
+
+        model.learn(64, callback=score)
+        return model.replay_buffer.observations[:64]
+
+    seen = trained()
+    assert np.isfinite(seen).all()
+    np.testing.assert_array_equal(seen, trained())
 
 
 @pytest.mark.parametrize("learns", [False, True])
