@@ -12,9 +12,8 @@ from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
-from cyclopts import Parameter
 
-from benchmarks.lib.command import Count, Names, command, options
+from benchmarks.lib.command import Count, Names, Parameter, command, options
 from benchmarks.lib.storage import UnfinishedError, out_folder
 from mptc_gym import PRESETS, __version__, evaluate
 

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER, Controller, label
-from benchmarks.lib.command import Folder, Runs, Seed, blame, command, options
+from benchmarks.lib.command import Folder, Parameter, Runs, Seed, blame, command, options
 from benchmarks.lib.storage import Kept, UsageError, origin, out_folder, write_csv, write_json
 from benchmarks.loop.rollout import Trajectory, held, measure
 from benchmarks.loop.scenarios import SPANS, PlantOptions, around, random_design
@@ -119,7 +118,9 @@ def work(options: Options) -> str:
             tasks[f"plant {i}, {name}"] = task
     found: dict[str, Any] = {}
     try:
-        found.update(options.controllers.fan_out.stream(tasks, "sweep", Kept(out / "tasks")))
+        # The code of a user's own may change without a new commit.
+        kept = None if options.controllers.agent else Kept(out / "tasks")
+        found.update(options.controllers.fan_out.stream(tasks, "sweep", kept))
     finally:
         runs = table(plants, list(members), found)
         if not runs.empty:

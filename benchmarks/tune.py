@@ -9,10 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from cyclopts import Parameter
 
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Count, FanOut, Folder, Runs, command, options, progress_bar
+from benchmarks.lib.command import (
+    Count,
+    FanOut,
+    Folder,
+    Parameter,
+    Runs,
+    command,
+    options,
+    progress_bar,
+)
 from benchmarks.lib.storage import Kept, origin, out_folder, write_csv
 from benchmarks.loop.rollout import mean_error, settled, split
 

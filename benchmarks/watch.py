@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Seed, command, known, options
+from benchmarks.lib.command import Parameter, Seed, command, known, options
 from benchmarks.lib.storage import UsageError, out_folder, replacing
 from benchmarks.loop.rollout import Trajectory, held
 from benchmarks.loop.scenarios import SCENARIOS, PlantOptions

@@ -132,9 +132,9 @@ def test_a_missing_package_is_named_with_its_extra(
     assert f'{package} is not installed: pip install -e ".[{extra}]"' in said
 
 
-def test_without_cyclopts_a_command_names_the_extra():
-    program = "import sys; sys.modules['cyclopts'] = None; import benchmarks.claims.__main__"
-    done = python("-c", program)
+@pytest.mark.parametrize("name", ["sweep", "compare.__main__"])
+def test_without_cyclopts_a_command_names_the_extra(name):
+    done = python("-c", f"import sys; sys.modules['cyclopts'] = None; import benchmarks.{name}")
     assert done.returncode == 2
     assert 'cyclopts is not installed: pip install -e ".[compare]"' in done.stderr
     assert "Traceback" not in done.stderr

@@ -1,7 +1,9 @@
 """The robustness study: its plants, its tasks, and what it makes of them."""
 
+import importlib
 import itertools
 import json
+import sys
 from unittest.mock import Mock
 
 import numpy as np
@@ -84,6 +86,19 @@ class TestCommand:
         # If it knows each plant, a controller does better.
         told = run_sweep(tmp_path, "--agents smith --told each")
         assert told["mae"].mean() < first["mae"].mean() - 0.05
+
+    @pytest.mark.usefixtures("quick")
+    def test_a_function_acts_in_each_plant_as_its_code_is_now(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(storage, "commit", lambda: "abc")
+        monkeypatch.syspath_prepend(tmp_path)
+        found = []
+        for gain in (-0.1, -0.2):
+            monkeypatch.delitem(sys.modules, "own_law", raising=False)
+            code = f"def law():\n    return lambda seen: {gain} * seen[:, 3:4]  # {gain:9}\n"
+            (tmp_path / "own_law.py").write_text(code)
+            importlib.invalidate_caches()
+            found.append(run_sweep(tmp_path / "out", "--agents pi --agent mine=own_law:law"))
+        assert not found[0]["mae"].equals(found[1]["mae"])
 
     @pytest.mark.usefixtures("quick")
     @pytest.mark.parametrize(

@@ -8,11 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import Parameter
-
 from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Folder, Names, Runs, command, known, options
+from benchmarks.lib.command import Folder, Names, Parameter, Runs, command, known, options
 from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
 from benchmarks.loop.scenarios import (
     PRESET_SCENARIOS,

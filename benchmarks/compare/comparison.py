@@ -218,6 +218,8 @@ def write(
     scales = {each.scenario.name: each for each in found if each.scenario.name in responses}
     runs = runs[runs["scenario"].isin([*scales])]
     if runs.empty:
+        for name in ("report.md", "report.html", "estimates.csv"):  # of an earlier run
+            (folder / name).unlink(missing_ok=True)
         return
     reference = str(runs["agent"].iloc[0])
     of_cases = [

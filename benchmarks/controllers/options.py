@@ -15,12 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import Parameter
-
 from agents.controller import PAPER_WINDOWS
 from agents.networks import WINDOWS
 from benchmarks.controllers.roster import OWN, ROSTER, Controller, everything, limits
-from benchmarks.lib.command import FanOut, Names, blame, options
+from benchmarks.lib.command import FanOut, Names, Parameter, blame, options
 from benchmarks.lib.storage import UsageError
 from mptc_gym import IDS, Parameters
 from mptc_gym.acting import check_fit, natives, opened, start
@@ -156,7 +154,7 @@ def _make(*, network: Own, **told: Any) -> Any:
     if hasattr(made, "reset") and hasattr(made, "act"):
         return made
     policy, env = made if isinstance(made, tuple) else (made, None)
-    return Policy(policy, env, told["parameters"], told["num_envs"])
+    return Policy(policy, env, told["num_envs"])
 
 
 @dataclass
@@ -167,7 +165,6 @@ class Policy:
     env: Any
     """An environment, or a function that makes one. None for that of the model, if it was saved
     with one, or else for the plain one."""
-    plant: Parameters
     runs: int
 
     def reset(self) -> None:
@@ -184,9 +181,8 @@ class Policy:
         env = self._own(samples, arguments) if self.env is None else self.env
         with opened(env, self.runs) as given:
             with blame("--agent"):
-                if {case_of(each.parameters) for each in natives(given)} != {
-                    case_of(self.plant)
-                }:
+                case = case_of(Parameters(**arguments))
+                if any(case_of(each.parameters) != case for each in natives(given)):
                     raise ValueError("the environment must have the parameters of the case")
                 check_fit(self.policy, given)
             yield given

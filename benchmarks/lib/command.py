@@ -63,7 +63,8 @@ def stop(error: BaseException, program: str = "python -m benchmarks") -> NoRetur
 
 
 try:
-    from cyclopts import App, CycloptsError, MissingArgumentError, Parameter
+    from cyclopts import App, CycloptsError, MissingArgumentError
+    from cyclopts import Parameter as Parameter  # for the commands, whose first import this is
     from cyclopts.validators import Number
 except ImportError as _missing:
     stop(_missing)

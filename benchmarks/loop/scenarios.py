@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from cyclopts import Parameter
 
-from benchmarks.lib.command import Repeated, blame, options
+from benchmarks.lib.command import Parameter, Repeated, blame, options
 from benchmarks.lib.storage import UsageError
 from benchmarks.loop.linear import nominal
 from mptc_gym import PRESETS, Parameters

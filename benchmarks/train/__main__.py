@@ -7,9 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import Parameter
-
-from benchmarks.lib.command import Count, FanOut, Folder, command, options
+from benchmarks.lib.command import Count, FanOut, Folder, Parameter, command, options
 from benchmarks.lib.storage import Kept, out_folder, replacing
 
 SEED = 10_000  # of the first network; the others follow
