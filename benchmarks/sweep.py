@@ -123,6 +123,8 @@ def work(options: Options) -> str:
         found.update(options.controllers.fan_out.stream(tasks, "sweep", kept))
     finally:
         runs = table(plants, list(members), found)
+        if missing := len(tasks) - len(found):
+            made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
         if not runs.empty:
             write_json(out / "provenance.json", made | {"options": asdict(options)})
             write_csv(out / "runs.csv", runs)

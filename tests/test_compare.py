@@ -277,7 +277,7 @@ class TestCompare:
         assert "2 of 4 tasks failed; the others are done" in said
         assert "bad, constant: " in said
         assert "--agent: 'my_controllers:Mine' cannot be imported: AttributeError" in said
-        assert (out / "report.md").exists()
+        assert "**Unfinished: 2 of 4 tasks are missing.**" in (out / "report.md").read_text()
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
 
     @pytest.mark.usefixtures("undrawn")
@@ -292,6 +292,13 @@ class TestCompare:
         estimates = pd.read_csv(out / "estimates.csv")
         assert estimates["scenario"].tolist() == ["constant"] * 2
         assert "| PI (1992)" in (out / "report.md").read_text()
+
+    @pytest.mark.usefixtures("undrawn")
+    def test_one_run_of_what_is_drawn_has_no_interval(self, compared):
+        out = compared("--agents pi nn --scenarios constant --runs 1")
+        ends = pd.read_csv(out / "estimates.csv").set_index("agent")[["mean_low", "mean_high"]]
+        assert ends.loc["nn"].isna().all()  # first weights are drawn
+        assert ends.loc["pi", "mean_low"] == ends.loc["pi", "mean_high"]
 
     @pytest.mark.usefixtures("undrawn")
     def test_where_limits_are_drawn_shares_are_not_measured(self, monkeypatch, tmp_path):

@@ -87,6 +87,8 @@ def work(options: Options) -> str:
         scales = [found.get(f"bounds of {each.name}") for each in scenarios]
         of_runs = itertools.product(controllers, scenarios)
         cases = [found.get(f"{agent}, {each.name}") for agent, each in of_runs]
+        if missing := len(tasks) - len(found):
+            made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
         if finished := [case for case in cases if case]:
             about = {
                 "complete": len(found) == len(tasks),

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.controllers.roster import Controller, label
+from benchmarks.controllers.roster import ROSTER, Controller, label
 from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles, written
 from benchmarks.lib.storage import write_csv
@@ -143,7 +143,8 @@ def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for agent, values in errors.items():
         mean = bootstrap(values, seed=BOOTSTRAP)
-        if values.size == 1 and is_random(scale.scenario.parameters):
+        draws = str(agent) in ROSTER and ROSTER[str(agent)].random
+        if values.size == 1 and (draws or is_random(scale.scenario.parameters)):
             mean = replace(mean, low=-math.inf, high=math.inf)
         ratio = mean.scaled(1 / scale.least.value)
         rows.append({**about, "agent": agent, **limits, "mean": mean, "ratio": ratio})
@@ -295,15 +296,16 @@ def write(
 def write_numbers(path: Path, table: pd.DataFrame) -> None:
     """Write a table of numbers, texts and estimates as CSV.
 
-    An estimate becomes three columns: its value and the ends of its interval. Infinite values,
-    which apart from these ends are settling times, are written in words.
+    An estimate becomes three columns: its value and the ends of its interval, empty if they are
+    unknown. Infinite values, which apart from these are settling times, are written in words.
     """
     columns: dict[Any, Any] = {}
     for name, cells in table.items():
         columns[name] = cells
         if any(isinstance(cell, Estimate) for cell in cells):
             for end, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
-                columns[f"{name}{suffix}"] = [getattr(cell, end, math.nan) for cell in cells]
+                ends = [getattr(cell, end, math.nan) for cell in cells]
+                columns[f"{name}{suffix}"] = [x if math.isfinite(x) else math.nan for x in ends]
     flat = pd.DataFrame(columns)
     write_csv(path, flat.astype(object).where(flat != math.inf, "not settled"))
 

@@ -66,8 +66,9 @@ def write_report(
 ) -> None:
     """Write `report.md` and `report.html`, with the pictures that there are.
 
-    The last line is the time, the commit and the command of `benchmarks` that made it. The
-    first sections, as many as `printed` or all, are printed, too, without their pictures.
+    The last line is the time, the commit and the command of `benchmarks` that made it, the
+    first one what is `missing` of its tasks by the origin, if anything is. The first sections,
+    as many as `printed` or all, are printed, too, without their pictures.
     """
     import markdown
 
@@ -75,6 +76,9 @@ def write_report(
     line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])
     commit = origin["commit"]  # a hash of 40 digits, possibly with "-dirty"
     made = f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}"
+    if "missing" in origin:
+        sections = [Section("", [f"**Unfinished: {origin['missing']}.**"]), *sections]
+        printed = printed and printed + 1
     page = _markdown(folder, title, sections, made)
     write_text(folder / "report.md", page)
     body = markdown.markdown(page, extensions=["tables", "toc"])
