@@ -30,7 +30,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env import sync_envs_normalization as synchronise
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from mptc_gym.acting import natives, overlap
+from mptc_gym.acting import check_fit, natives, opened, overlap
 from mptc_gym.checks import MOST_PLANTS, count, reject
 from mptc_gym.evaluation import (
     EPISODES,
@@ -373,6 +373,10 @@ class ScoreCallback(BaseCallback):
         if self.path is not None:
             with tempfile.TemporaryDirectory() as folder:  # what cannot be saved is said now
                 save(self.model, Path(folder, "model"))
+        make = partial(make_one, env, {}) if isinstance(env, EnvSpec) else env
+        if callable(make):
+            with opened(make, 1) as plants:
+                check_fit(self.model, plants)
 
     def _hand_over(self) -> None:
         """Give the statistics of the training to the environments of the scores."""
