@@ -21,7 +21,10 @@ REFERENCE = ROSTER["nn-smith"]  # whose errors those of the film are multiples o
 PICTURES = 60  # of a film, after the first
 STYLE: Any = {"font.size": 15, "axes.spines.top": False, "axes.spines.right": False}
 _AGENT = f"Who controls: {', '.join(ROSTER)}, or your own as in `compare`, NAME=MODULE:FACTORY."
-_CASE = f"Case to run: {', '.join(SCENARIOS)}, or a plant of your own: square, constant, run."
+_CASE = (
+    f"Case to run: {', '.join(SCENARIOS)}, or a plant of your own: square, constant, run "
+    "(default: the first)."
+)
 
 
 @options
@@ -30,7 +33,7 @@ class Options:
     """Make a film of a controller at work."""
 
     agent: Annotated[str, Parameter(help=_AGENT)] = "nn"
-    scenario: Annotated[str, Parameter(help=_CASE)] = "square"
+    scenario: Annotated[str | None, Parameter(help=_CASE)] = None
     plant: PlantOptions = field(default_factory=PlantOptions)
     seed: Seed = 0
     """Seed of noise and initial weights."""
@@ -41,7 +44,7 @@ class Options:
 def work(options: Options) -> str:
     """Run a controller on a case and write a film of it."""
     cases = options.plant.cases(SCENARIOS)
-    case = cases[known("--scenario", [options.scenario], cases)[0]]
+    case = cases[known("--scenario", [options.scenario or next(iter(cases))], cases)[0]]
     own = [options.agent] if "=" in options.agent else []
     (controller,) = chosen(
         [] if own else known("--agent", [options.agent], ROSTER), own

@@ -66,6 +66,12 @@ def test_a_film_shows_steps_side_by_side(given, plant, steps, written, tmp_path,
     assert f"PI (1992): error {found} times that of" in capsys.readouterr().out
 
 
+def test_a_plant_with_set_points_of_its_own_needs_no_scenario(monkeypatch, capsys):
+    monkeypatch.setattr(watch, "write_film", lambda *_: "found")
+    assert main(["--agent", "pi", "--set", "setpoint=random"]) == 0
+    assert "run.gif" in capsys.readouterr().out
+
+
 def test_what_cannot_be_written_is_said_before_anything_is_run(refused, monkeypatch):
     monkeypatch.setattr(type(watch.REFERENCE), "run", None)
     assert "--video: " in refused(main, ["--video", "/proc/x.gif"])

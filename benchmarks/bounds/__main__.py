@@ -66,8 +66,12 @@ def work(options: Options) -> str:
     }
     print(", ".join(filter(None, ["Mean |e| in °C", options.plant.name])) + ":")
     _show("", ["no control", *HEADINGS.values(), *["MPC"] * bool(options.mpc)])
-    for name, cells in options.fan_out.stream(tasks):
-        _show(name, cells)
+    found: dict[str, list[str]] = {}
+    try:
+        found.update(options.fan_out.stream(tasks, "bounds"))
+    finally:
+        for name in [each for each in tasks if each in found]:
+            _show(name, found[name])
     return "\n" + textwrap.fill(NOTE, shutil.get_terminal_size((150, 24)).columns)
 
 
