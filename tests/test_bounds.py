@@ -1,6 +1,7 @@
 """The bounds against independent computations, and the controllers that come near them."""
 
 import itertools
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -334,6 +335,14 @@ def test_the_command(capsys, monkeypatch):
 
     monkeypatch.setattr(command, "row", interrupted)
     given = ["--episodes", "1", "--mpc", "1", "--jobs", "1"]
+    answers = command.FanOut.stream
+    backwards = lambda *given: reversed([*answers(*given)])  # noqa: E731
+    with monkeypatch.context() as other:
+        other.setattr(command.FanOut, "stream", backwards)
+        other.setattr(command, "row", lambda case, *_: [case.name])
+        assert main(given) == 0
+    names = re.findall("^(constant|noisy) ", capsys.readouterr().out, re.MULTILINE)
+    assert names == ["constant", "noisy"]
     assert main(given) == 130  # what came before the interruption is printed
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["constant", "5.0000", "0.2307", "0.2307", "0.2307"] in rows

@@ -168,6 +168,7 @@ class TestReport:
         shown = on_screen(table)
         assert width / 2 < max(map(len, shown.splitlines())) <= width
         assert shown.count("11.5") == shown.count("1.00 (0.99 to 1.01)") == 7
+        assert shown.startswith("agent ")
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):

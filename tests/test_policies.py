@@ -163,6 +163,12 @@ class Network(torch.nn.Module):
         return torch.tanh(scale * self.layers(seen))
 
 
+def of_partial():
+    made = Network()
+    made.forward = partial(made.forward, scale=0.5)
+    return made
+
+
 class OfBlocks(torch.nn.Module):
     def forward(self, seen):
         return -0.3 * seen["errors"][..., :1]
@@ -314,6 +320,7 @@ RIGHT = {
         DirectNNController(num_envs=EPISODES, learning=False), NOISY, None),
     "module": lambda _: network(Network()),
     "module in float64": lambda _: network(Network(torch.float64)),
+    "its forward is a partial": lambda _: network(of_partial()),
     "its forward": lambda _: network((m := Network()).forward, m),
     "a partial of a module": lambda _: network(partial(m := Network(), scale=1.0), m),
     "module with act": lambda _: network(Acting()),

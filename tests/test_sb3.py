@@ -152,6 +152,10 @@ class TestZips:
             (lambda: VecFrameStack(make_vec_env(), 2), "in VecFrameStack to be saved here"),
             (MiddlePointEnv, "must come from gymnasium.make or make_vec_env, .* got None"),
             (two_batches, "must come from gymnasium.make or make_vec_env"),
+            (
+                lambda: DummyVecEnv([one, lambda: gymnasium.make("MiddlePointNoisy-v0")]),
+                "differ",
+            ),
             (lambda: TransformObservation(one(), abs, None), "can be imported and rec"),
             (lambda: type("Local", (DelayObservation,), {})(one(), 2), "can be imported"),
         ],
