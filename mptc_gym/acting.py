@@ -33,7 +33,7 @@ def rollout(plants: Any, act: Act, samples: int, seeds: list[int]) -> Steps:
     Yield the infos at sample k, those at k + 1, and whether the episodes have ended.
 
     This is the one loop, for scores, benchmarks and tests. `plants` are a vector environment of
-    Gymnasium or `Given` ones, and `act` is a function of their observations. Actions of the
+    Gymnasium or a `FromVecEnv`, and `act` is a function of their observations. Actions of the
     wrong shape, or not finite, are a ValueError.
     """
     try:
@@ -282,12 +282,13 @@ def _restart(plants: Any, policy: Any, seeds: list[int]) -> None:
     algorithm = loaded(f"{_SB3}.base_class.BaseAlgorithm")
     if not (isinstance(policy, algorithm) and policy.env and overlap(policy.env, plants)):
         return
-    # Its training begins anew. In a callback it goes on with these, and would store a None.
-    of_model = isinstance(plants, FromVecEnv) and plants.env is policy.env
-    policy._last_obs = observations if of_model else None
-    policy._last_episode_starts = np.ones(plants.num_envs, np.bool_)
-    if of_model and policy.get_vec_normalize_env() is not None:
-        policy._last_original_obs = policy.get_vec_normalize_env().get_original_obs()
+    policy._last_obs = None  # its training begins anew
+    if isinstance(plants, FromVecEnv) and plants.env is policy.env:
+        # In a callback it goes on with these, and would store the None.
+        policy._last_obs = observations
+        policy._last_episode_starts = np.ones(plants.num_envs, np.bool_)
+        if (normalised := policy.get_vec_normalize_env()) is not None:
+            policy._last_original_obs = normalised.get_original_obs()
 
 
 def check_fit(policy: Any, plants: Any) -> None:

@@ -235,10 +235,8 @@ def _spec(model: Any) -> EnvSpec:
     plants = model.get_env() if isinstance(model, BaseAlgorithm) else None
     if plants is None:
         raise ValueError("policy must be a model with its environments: see mptc_gym.sb3.load")
-    spec, *others = plants.get_attr("spec")
+    spec, *_ = plants.get_attr("spec")
     try:
-        if any(each.to_json() != spec.to_json() for each in others):
-            raise ValueError("they differ")
         # Gymnasium cannot make the Monitor that each model adds, and it changes nothing.
         kept = tuple(each for each in spec.additional_wrappers if each.name != "Monitor")
         spec = dataclasses.replace(spec, additional_wrappers=kept)
@@ -258,14 +256,20 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     The zip is that of `model.save` with one more member, `mptc_gym.json`; `.zip` is added to a
     name without an ending. A `VecEnvWrapper`, such as `VecNormalize` or `VecFrameStack`, is no
     part of a spec: a model in one is saved as Stable-Baselines3 does, by `model.save` and
-    `VecNormalize.save`. ValueError if the environments cannot be made from their spec, or the
-    file cannot be written.
+    `VecNormalize.save`. ValueError if the environments differ or cannot be made from their
+    spec, or the file cannot be written.
     """
     path, spec = _zip_path(path), _spec(model)
     if isinstance(outermost := model.get_env(), VecEnvWrapper):
         raise ValueError(
             f"policy must not be in {type(outermost).__name__} to be saved here: save it by "
             "model.save(path), and the statistics by model.get_vec_normalize_env().save(path)"
+        )
+    first, *others = cast("VecEnv", outermost).get_attr("spec")
+    if any(each is not first and each.to_json() != first.to_json() for each in others):
+        raise ValueError(
+            "policy must have environments that do not differ to be saved here, as `load` "
+            "makes all by the spec of the first: save it by model.save(path)"
         )
     algorithm = f"{type(model).__module__}:{type(model).__name__}"
     record = json.dumps({"algorithm": algorithm, "spec": spec.to_json()})

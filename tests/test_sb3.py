@@ -205,6 +205,9 @@ def test_spec_of_a_model_has_its_windows_and_wrappers():
         evaluate(model, spec_of(model, HARD, action_window=3))
     with pytest.raises(ValueError, match="must be a model with its env"):
         spec_of(model.policy)
+    # Plants may differ in a training.
+    both = DummyVecEnv([one, lambda: gymnasium.make("MiddlePointNoisy-v0")])
+    assert spec_of(model_of(both), HARD).kwargs["error_window"] == 3
 
 
 class TestScoreCallback:
