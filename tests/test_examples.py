@@ -5,16 +5,13 @@ import re
 import runpy
 import sys
 from functools import partial
-from types import SimpleNamespace
 
 import gymnasium
 import matplotlib.pyplot as plt
-import numpy as np
 from stable_baselines3 import PPO
 
 import mptc_gym.sb3
-from benchmarks.datasets import arguments_of, record
-from benchmarks.examples import offline, through_plant
+from benchmarks.examples import through_plant
 from mptc_gym import evaluate
 from mptc_gym.sb3 import load, spec_of
 from tests.conftest import ROOT
@@ -45,14 +42,6 @@ def test_stable_baselines3_learns_with_the_lines_of_the_page():
     assert [model.n_envs for model in models] == [1, 64]
     for model in models:
         assert model.learn(1).num_timesteps == 8 * model.n_envs
-
-
-def test_an_offline_clone_does_what_was_logged():
-    logged = [SimpleNamespace(**episode) for episode in record("paper", "smith", 8)]
-    high = np.repeat([50.0, 100.0, 1.0], [3, 3, 20]).astype(np.float32)
-    actor = offline.clone(logged, high, steps=400, seed=0)
-    # 0.6 degC is the error of the controller that was logged; no control has 2.4.
-    assert evaluate(actor, episodes=4, **arguments_of("paper")).mean_error < 0.95
 
 
 def test_the_notebook_runs_and_shows_what_it_showed(capsys, monkeypatch):
