@@ -252,7 +252,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         if self._streams is None or self._root is not self.np_random:
             self._root = self.np_random
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
-            self._streams = Streams.spawn(seeds)
+            self._streams = Streams.of_seed(seeds.entropy, seeds.spawn_key)
         parameters = self.parameters
         drawn = self._ranges.draw([self._streams])
         setpoint = self._signals.reset(ONE, [self._streams], drawn).item()

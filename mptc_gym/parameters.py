@@ -9,7 +9,6 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
-from types import MappingProxyType
 from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
@@ -83,10 +82,10 @@ class PlantNumbers(Generic[Value]):
         return {name: getattr(self, name) for name in names}
 
 
-def slowest_pole(a: Sequence[float]) -> complex | None:
-    """Return the pole of 1 / A with the largest magnitude, or None if there is no pole."""
-    poles = np.roots(a)
-    return complex(poles[np.argmax(np.abs(poles))]) if len(poles) else None
+def slowest_pole(a: Sequence[float]) -> complex:
+    """Return the pole of 1 / A with the largest magnitude, or 0 if there is no pole."""
+    poles = np.roots([*a, 0.0])
+    return complex(poles[np.argmax(np.abs(poles))])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,19 +108,13 @@ class Parameters(PlantNumbers[Number]):
     # The plant, (28): A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k). With an unstable A, y
     # may grow beyond all floats.
     a: Sequence[float] = _arg(
-        (1.0, -0.45181, -0.47546),
-        checks.polynomial,
-        "1",
-        "A in (28), from z^0 on; begins with 1",
+        (1.0, -0.45181, -0.47546), checks.polynomial, "1", "A in (28), from z^0; begins with 1"
     )
     b: Sequence[float] = _arg(
         (-0.04560, -0.00404), checks.numbers, "degC per t/h", "B in (28), from z^-1 on"
     )
     c: Sequence[float] = _arg(
-        (1.0, -0.35740, -0.03392),
-        checks.polynomial,
-        "1",
-        "C in (28), from z^0 on; begins with 1",
+        (1.0, -0.35740, -0.03392), checks.polynomial, "1", "C in (28), from z^0; begins with 1"
     )
     drift_samples: int = _arg(
         1200, checks.duration, "samples", "how long gain and time constant drift"
@@ -174,7 +167,7 @@ class Parameters(PlantNumbers[Number]):
         self._check_actuator()
         if self.changes_time_constant:
             self._check_time_constant()
-        if self.is_disturbed and not np.all(np.abs(np.roots(self.a)) < 1.0):
+        if self.is_disturbed and not abs(slowest_pole(self.a)) < 1.0:
             reject(
                 "disturbance_amplitude, disturbance_walk_variance",
                 (self.disturbance_amplitude, self.disturbance_walk_variance),
@@ -214,18 +207,16 @@ class Parameters(PlantNumbers[Number]):
 
     def _check_time_constant(self) -> None:
         """Refuse changes of the time constant that are undefined for A."""
-        pole, least = slowest_pole(self.a), self.range_of("time_constant_factor")[0]
-        least *= min(self.range_of("time_constant_drift")[0], 1.0)
-        if pole is None or pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
-            found = "no pole" if pole is None else f"the slowest pole {pole:g}"
-            allowed = f"1 for this a, which has {found}, not one between 0 and 1"
-        elif least < 1.0 - pole.real:
-            rate = f"{1.0 - pole.real:g}"
-            allowed = f"such that the factor is never below {rate}, where that pole comes to 0"
+        names = "time_constant_factor", "time_constant_drift"
+        pole, (factor, drift) = slowest_pole(self.a), (self.range_of(name)[0] for name in names)
+        rate = 1.0 - pole.real
+        if pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
+            allowed = f"1 for this a, whose slowest pole is {pole:g}, not one between 0 and 1"
+        elif factor * min(drift, 1.0) < rate:
+            allowed = f"such that the factor is never below {rate:g}, where that pole is 0"
         else:
             return
-        names = "time_constant_factor, time_constant_drift"
-        reject(names, (self.time_constant_factor, self.time_constant_drift), allowed)
+        reject(", ".join(names), tuple(self.chosen(names).values()), allowed)
 
     def range_of(self, name: str) -> tuple[float, float]:
         """Return the lowest and the highest value that a plant number can take."""
@@ -240,27 +231,25 @@ class Parameters(PlantNumbers[Number]):
     @property
     def is_disturbed(self) -> bool:
         """Whether there is a load disturbance."""
-        names = "disturbance_amplitude", "disturbance_walk_variance"
-        return any(self.range_of(name)[1] > 0.0 for name in names)
+        return self._can_differ(0.0, "disturbance_amplitude", "disturbance_walk_variance")
 
-    def _scales(self, *names: str) -> bool:
-        """Whether factors differ, or may come to differ, from 1."""
-        return any(self.range_of(name) != (1.0, 1.0) for name in names)
+    def _can_differ(self, value: float, *names: str) -> bool:
+        return any(self.range_of(name) != (value, value) for name in names)
 
     @property
     def drifts(self) -> bool:
         """Whether the dynamics change within an episode."""
-        return self._scales("gain_drift", "time_constant_drift")
+        return self._can_differ(1.0, "gain_drift", "time_constant_drift")
 
     @property
     def changes_time_constant(self) -> bool:
         """Whether the time constant differs, or may come to differ, from that of A."""
-        return self._scales("time_constant_factor", "time_constant_drift")
+        return self._can_differ(1.0, "time_constant_factor", "time_constant_drift")
 
     @property
     def changes_dynamics(self) -> bool:
         """Whether the coefficients of (28) differ, or may come to differ, from A and B."""
-        return self.drifts or self._scales("gain_factor", "time_constant_factor")
+        return self.drifts or self._can_differ(1.0, "gain_factor", "time_constant_factor")
 
     @property
     def windows(self) -> tuple[int, int, int, int]:
@@ -268,14 +257,10 @@ class Parameters(PlantNumbers[Number]):
         return self.setpoint_window, self.error_window, self.output_window, self.action_window
 
 
-ARGUMENTS: Final[Mapping[str, Argument]] = MappingProxyType(
-    {each.name: each.metadata["argument"] for each in fields(Parameters)}
-)
+ARGUMENTS: Final = {each.name: each.metadata["argument"] for each in fields(Parameters)}
 """The declaration of each argument, by name."""
 
-PLANT_NUMBERS: Final[Mapping[str, int]] = MappingProxyType(
-    {each.name: place for place, each in enumerate(fields(PlantNumbers))}
-)
+PLANT_NUMBERS: Final = {each.name: i for i, each in enumerate(fields(PlantNumbers))}
 """The arguments that can be ranges, by name, and the index of the draw that each takes."""
 
 
@@ -289,12 +274,8 @@ def argument_table() -> str:
 
 
 def insert_table(docstring: str | None) -> str | None:
-    """Insert the table of arguments at its placeholder in a docstring."""
-    if docstring is None:  # under `python -OO`
-        return None
-    before = docstring.partition("<arguments>")[0]
-    indentation = before[before.rfind("\n") + 1 :]  # none from Python 3.13 on
-    return docstring.replace("<arguments>", argument_table().replace("\n", f"\n{indentation}"))
+    """Insert the table of arguments in a docstring, which is None under `python -OO`."""
+    return docstring and inspect.cleandoc(docstring).replace("<arguments>", argument_table())
 
 
 Parameters.__doc__ = insert_table(Parameters.__doc__)
@@ -302,11 +283,8 @@ Parameters.__doc__ = insert_table(Parameters.__doc__)
 
 def spelt_out(function: Callable[..., Any]) -> inspect.Signature:
     """Return a method's signature for help(), with each argument in place of **arguments."""
-    own = [*inspect.signature(function).parameters.values()]
-    arguments = [
-        each.replace(annotation="float | Sequence[float]")
-        if each.name in PLANT_NUMBERS
-        else each
-        for each in inspect.signature(Parameters).parameters.values()
-    ]
-    return inspect.Signature([*own[1:-1], *arguments])
+    spelt = [*inspect.signature(function).parameters.values()][1:-1]
+    for each in inspect.signature(Parameters).parameters.values():
+        number = "float | Sequence[float]" if each.name in PLANT_NUMBERS else each.annotation
+        spelt.append(each.replace(annotation=number))
+    return inspect.Signature(spelt)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from operator import mul
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,7 @@ class Dynamics:
         self._sum = sum(parameters.a)
         self._quotient: tuple[float, ...] | None = None
         if parameters.changes_time_constant:
-            pole = cast("complex", slowest_pole(parameters.a)).real  # as Parameters has checked
+            pole = slowest_pole(parameters.a).real  # as Parameters has checked
             self._rate = 1.0 - pole
             quotient = [1.0]  # Q, by Horner's scheme
             for coefficient in parameters.a[1:-1]:

@@ -12,27 +12,25 @@ _BOILER: Final[dict[str, Any]] = {
     "disturbance_walk_variance": 0.0005,
 }
 
+_SPREAD: Final[dict[str, Any]] = {
+    "delay": [12, 24],
+    "dead_zone": [3.0, 7.0],
+    "gain_factor": [0.75, 1.5],
+    "time_constant_factor": [0.75, 1.5],
+}
+
 PRESETS: Final[dict[str, dict[str, Any]]] = {
     "paper": {},
     "dead-zone-7": {"dead_zone": 7.0},
     "noisy": {"noise_variance": 0.5},
     "disturbed": _BOILER,
     "fouling": {**_BOILER, "gain_drift": [0.5, 1.5], "time_constant_drift": [0.8, 1.5]},
-    "randomised": {
-        "delay": [12, 24],
-        "dead_zone": [3.0, 7.0],
-        "noise_variance": [0.0, 0.5],
-        "gain_factor": [0.75, 1.5],
-        "time_constant_factor": [0.75, 1.5],
-    },
+    "randomised": {**_SPREAD, "noise_variance": [0.0, 0.5]},
     "hard": {
         **_BOILER,
-        "delay": [12, 24],
-        "dead_zone": [3.0, 7.0],
+        **_SPREAD,
         "noise_variance": [0.25, 1.0],
-        "gain_factor": [0.75, 1.5],
         "gain_drift": [0.7, 1.4],
-        "time_constant_factor": [0.75, 1.5],
         "time_constant_drift": [0.8, 1.25],
         "setpoint": "random",
     },

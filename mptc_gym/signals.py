@@ -13,7 +13,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ PLANTS_AT_A_TIME = 32  # few enough that their draws stay in the processor's cac
 LOAD_INTERVAL = 10  # samples between changes of the load disturbance
 LEVELS_AT_A_TIME = 60  # of the load disturbance, generated together
 ONE = np.zeros(1, np.intp)  # the indices of one plant
+_PCG64 = {"bit_generator": "PCG64", "has_uint32": 0, "uinteger": 0}  # and its state
 
 
 class EpisodeStream:
@@ -46,23 +47,21 @@ class EpisodeStream:
 
     generator: np.random.Generator  # of the current episode
 
-    def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
-        self._seeds = entropy, spawn_key, pool_size
+    def __init__(self, entropy: Any, spawn_key: tuple[int, ...]) -> None:
+        self._seeds = entropy, spawn_key
         self._episode = 0
 
     def next_episode(self) -> np.random.Generator:
         """Move to the start of the next episode and return the generator there."""
         if self._episode == 0:
-            entropy, spawn_key, pool_size = self._seeds
-            seeds = np.random.SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size)
+            entropy, spawn_key = self._seeds
+            seeds = np.random.SeedSequence(entropy, spawn_key=spawn_key)
             self.generator = np.random.Generator(np.random.PCG64(seeds))
-            origin: Any = self.generator.bit_generator.state["state"]
-            self._origin = origin["state"], origin["inc"]
+            self._origin = self.generator.bit_generator.state["state"]
         else:
             # Taken from the generator, as a copy of it may have its own bit generator.
-            bits = cast("np.random.PCG64", self.generator.bit_generator)
-            at: Any = dict(zip(("state", "inc"), self._origin, strict=True))
-            bits.state = {"bit_generator": "PCG64", "state": at, "has_uint32": 0, "uinteger": 0}
+            bits: Any = self.generator.bit_generator
+            bits.state = {**_PCG64, "state": self._origin}
             bits.advance(self._episode << 64)
         self._episode += 1
         return self.generator
@@ -77,15 +76,9 @@ class Streams(NamedTuple):
     measurement_noise: EpisodeStream
 
     @classmethod
-    def spawn(cls, seeds: np.random.SeedSequence) -> Streams:
-        """Make the streams of a seed sequence, each from one of its children."""
-        children = seeds.spawn(len(cls._fields))
-        return cls(*(EpisodeStream(c.entropy, c.spawn_key, c.pool_size) for c in children))
-
-    @classmethod
-    def of_seed(cls, seed: int) -> Streams:
-        """Make the streams that `spawn` makes from `SeedSequence(seed)`, but faster."""
-        return cls(*(EpisodeStream(seed, (place,)) for place in range(len(cls._fields))))
+    def of_seed(cls, seed: Any, key: tuple[int, ...] = ()) -> Streams:
+        """Make the streams of a `SeedSequence`: those that it spawns, but faster."""
+        return cls(*(EpisodeStream(seed, (*key, place)) for place in range(len(cls._fields))))
 
 
 class Ranges:
@@ -127,10 +120,10 @@ class Ranges:
 
 def plant_numbers(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
     """Return the numbers of plant i of many."""
-    arrays = numbers.chosen(tuple(PLANT_NUMBERS))
-    return PlantNumbers(
-        **{name: (array[i] if array.ndim else array).item() for name, array in arrays.items()}
-    )
+    own = {
+        name: (each[i] if each.ndim else each).item() for name, each in vars(numbers).items()
+    }
+    return PlantNumbers(**own)
 
 
 def colours(parameters: Parameters) -> dict[str, Sequence[float]]:
