@@ -13,16 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from agents import PIController, SmithPredictor
+from agents import PIController
 from benchmarks.identify import study
-from benchmarks.identify.__main__ import main
-from benchmarks.identify.advice import Loops, recommended
+from benchmarks.identify.__main__ import Options, main
+from benchmarks.identify.advice import controllers, plants, responses, sensitivities
 from benchmarks.identify.fit import Plant
 from benchmarks.identify.log import Log, read_log
-from benchmarks.identify.model import identify, operating_flow
-from benchmarks.identify.options import Columns, Knowledge
-from benchmarks.identify.plant import plant_arguments, plant_ranges
-from benchmarks.identify.report import controllers, report
+from benchmarks.identify.model import identify, resting_flow
+from benchmarks.identify.report import report
 from mptc_gym import Parameters
 from tests.conftest import ROOT
 
@@ -57,7 +55,7 @@ def good():
     log = recorded()
     log = replace(log, flow=log.flow + 480.0, temperature=log.temperature + 385.0)
     log.temperature[[200, 201, 500, 777]] = np.nan
-    return identify(log, Knowledge(operating_flow=480.0))
+    return identify(log, operating_flow=480.0)
 
 
 class TestFit:
@@ -90,7 +88,7 @@ class TestFit:
         for flows, found in (
             ([480, 470, 490], 480), ([60, 100, 0, 40], 60), ([5, -10], 0), ([100, 0, 100], 50),
         ):  # fmt: skip
-            assert operating_flow(np.array(flows)) == found
+            assert resting_flow(np.array(flows)) == found
 
     def test_dead_zone_is_known_up_to_the_gap_between_commands(self):
         generator = np.random.default_rng(701)
@@ -124,15 +122,15 @@ class TestFit:
 
     def test_heater_beside_another_one(self):
         # A real log. A plain impulse response of both heaters explains 97 %.
-        log = read_log(TCLAB, Columns(flow="heater1", temperature="temperature1",
-                                      disturbance=("heater2",)))  # fmt: skip
+        names = {"flow": "heater1", "temperature": "temperature1", "disturbance": ("heater2",)}
+        log = read_log(Options(TCLAB, **names))
         thinned = {"heater2": log.disturbances["heater2"][::10]}
         model = identify(Log(log.flow[::10], log.temperature[::10], 10.0, thinned))
         assert 0.96 < model.explained[0] < 1.0
         # Two levels, and the middle between them at first, do not test a valve.
         (warning,) = model.warnings
         assert "does not test the valve" in warning
-        assert recommended(model) == []
+        assert controllers(model)["recommended"] == []
         assert any("heater2 is a known disturbance" in note for note in model.notes)
 
 
@@ -156,7 +154,7 @@ class TestValves:
             assert model.plant.gain == pytest.approx(-0.6825, rel=0.05)
         else:
             assert re.search(rf"{said} of [\d.]+ .*The test that tells", model.warnings[0])
-            assert recommended(model) == []
+            assert controllers(model)["recommended"] == []
 
     @pytest.mark.parametrize("seed", [91_010, 91_011])
     def test_sound_plants_are_found_and_controlled(self, seed):
@@ -200,14 +198,13 @@ class TestFound:
     def test_ms_is_that_of_the_loop(self):
         # A plant of first order, and the stability limit of pure integration with a delay.
         plant, pi = Plant(40.0, np.array([100.0 + 0j]), np.array([2.0 + 0j])), (-0.5, -0.005)
-        calm, margin = Loops([plant], 1.0).judged(PIController(*pi))
+        loops = responses([plant], 1.0)
+        calm, wild = (sensitivities(PIController(*x), *loops) for x in (pi, (-3.0, -0.03)))
         at = np.geomspace(1e-4, np.pi, 4000)
         s = np.exp(1j * at) - 1.0
         law = 0.5 + 0.005 * (s + 1.0) / s
         late = 1.0 + law * replace(plant, delay=48.0).response(1.0, at)  # a fifth longer
         assert calm[0] == pytest.approx(1.0 / np.abs(late).min(), rel=1e-3)
-        assert margin > 40.0
-        wild, _ = Loops([plant], 1.0).judged(PIController(-3.0, -0.03))
         assert wild[0] == np.inf
 
     @pytest.mark.parametrize(("direction", "zone"), [(1.0, 5.0), (-1.0, 0.0)])
@@ -215,25 +212,20 @@ class TestFound:
         """The arguments are those of `agents`; kp has the sign that engineers expect."""
         b = [direction * each for each in PAPER.b]
         model = good() if zone else identify(recorded(800, b=b, dead_zone=zone, noise=0.01))
-        found = recommended(model, smith=True)
-        listed = json.loads(json.dumps(controllers(model, found)))
-        assert listed["warnings"] == []
-        assert [each["controller"] for each in listed["recommended"]] == ["pi-simc", "smith"]
+        listed = json.loads(json.dumps(controllers(model)))
+        (pi,) = listed["recommended"]
+        assert (listed["warnings"], pi["controller"]) == ([], "pi-simc")
+        assert np.sign(pi["kp"]) == -direction  # the gain of the paper's B is negative
+        assert pi["action"] == ("reverse" if direction < 0.0 else "direct")
+        assert max(pi["sensitivity"]) <= 1.8
         env = gymnasium.make("MiddlePoint-v0", b=b, dead_zone=zone, setpoint=4.0)
-        makers = [PIController, SmithPredictor]
-        for each, made in zip(listed["recommended"], makers, strict=True):
-            assert np.sign(each["kp"]) == -direction  # the gain of the paper's B is negative
-            assert each["action"] == ("reverse" if direction < 0.0 else "direct")
-            assert max(each["sensitivity"]) <= 1.8
-            assert each["delay_margin"] >= model.plant.delay / 5.0
-            controller = made(**each["arguments"])
-            observation, _ = env.reset(seed=0)
-            for _ in range(400):
-                controller.act(observation)
-                action = np.array([controller.command / 10.0], np.float32)
-                observation, *_, info = env.step(action)
-            assert abs(info["error"]) < 0.05
-        pi = listed["recommended"][0]
+        controller = PIController(**pi["arguments"])
+        observation, _ = env.reset(seed=0)
+        for _ in range(400):
+            controller.act(observation)
+            action = np.array([controller.command / 10.0], np.float32)
+            observation, *_, info = env.step(action)
+        assert abs(info["error"]) < 0.05
         assert pi["arguments"]["kp"] == -pi["kp"]
         assert pi["arguments"]["ki"] == pytest.approx(-pi["kp"] * 8.0 / pi["ti"])
         assert pi["ti"] == pytest.approx(161.0, rel=0.1)  # SIMC's: the time constant
@@ -247,8 +239,10 @@ class TestFound:
     def test_what_the_log_leaves_open_slows_the_loop(self):
         more = good().possible.copy()
         more[::10] = [replace(each, gains=1.5 * each.gains) for each in more[::10]]
-        (known,), (open_,) = recommended(good()), recommended(replace(good(), possible=more))
-        assert known["controller"] == "pi-simc"  # a Smith predictor is made on request
+        (known,), (open_,) = (
+            controllers(each)["recommended"]
+            for each in (good(), replace(good(), possible=more))
+        )
         assert known["slowed"] < 1.4
         assert open_["slowed"] > 1.3 * known["slowed"]
         assert open_["sensitivity"][1] <= 1.8
@@ -257,7 +251,7 @@ class TestFound:
         # The environment does what the simulation of the log shows, once it has forgotten that
         # it was at rest before k = 0.
         model = good()
-        arguments = json.loads(json.dumps(plant_arguments(model)))
+        arguments = json.loads(json.dumps(plants(model)[0]))
         calm = {**arguments, "noise_variance": 0.0}
         env = gymnasium.make("MiddlePoint-v0", max_episode_steps=1200, **calm)
         env.reset()
@@ -272,7 +266,7 @@ class TestFound:
         assert arguments["noise_variance"] * (noise**2).sum() == pytest.approx(left, rel=0.4)
 
     def test_ranges_hold_the_plant_and_can_be_drawn_from(self):
-        plant, ranges = plant_arguments(good()), plant_ranges(good())
+        plant, ranges = plants(good())
         env = gymnasium.make("MiddlePoint-v0", **json.loads(json.dumps(ranges)))
         env.reset(seed=0)
         factors = {"gain_factor": 1.0, "time_constant_factor": 1.0}
@@ -287,12 +281,12 @@ class TestFound:
         log = replace(good().log, temperature=1e8 * good().log.temperature)
         model = replace(good(), log=log, simulated=1e8 * good().simulated)
         with pytest.raises(ValueError, match=r"noise_variance .* --temperature-unit"):
-            plant_ranges(model)
+            plants(model)
 
     def test_units_are_those_of_the_log(self):
-        columns = Columns(flow_unit="%", temperature_unit="K")
-        model = replace(good(), log=replace(good().log, columns=columns))
-        text = str([section.text for section in report(model, recommended(model))])
+        log = replace(good().log, flow_unit="%", temperature_unit="K")
+        model = replace(good(), log=log)
+        text = str([section.text for section in report(model, controllers(model))])
         assert "t/h" not in text
         assert "°C" not in text
         assert "% per K" in text
@@ -335,15 +329,14 @@ class TestGuards:
         flow, temperature = DOUBTED[said](recorded(700))
         model = identify(Log(flow, temperature, 8.0))
         assert re.search(said, " ".join(model.warnings))
-        assert controllers(model, recommended(model)) == {
-            "recommended": [], "warnings": model.warnings,
-        }  # fmt: skip
-        assert report(model, [])[0].text[0].startswith("**Nothing is recommended.**")
+        advised = controllers(model)
+        assert advised == {"recommended": [], "warnings": model.warnings}
+        assert report(model, advised)[0].text[0].startswith("**Nothing is recommended.**")
 
     def test_flow_behind_the_valve_needs_no_test_of_it(self):
         flow = 10.0 * np.sign(recorded(800).flow)
         log = Log(flow, answer(flow, np.random.default_rng(705)), 8.0)
-        assert identify(log, Knowledge(applied=True)).warnings == []
+        assert identify(log, applied=True).warnings == []
 
 
 def table(**columns):
@@ -410,7 +403,7 @@ def read(tmp_path):
 
     def of_text(text, **columns):
         (tmp_path / "log.csv").write_text(text)
-        return read_log(tmp_path / "log.csv", Columns(**columns))
+        return read_log(Options(tmp_path / "log.csv", **columns))
 
     return of_text
 
@@ -448,7 +441,7 @@ class TestLog:
 
 
 def test_everything_is_written(tmp_path, capsys):
-    assert main([str(EXAMPLE), "--out", str(tmp_path), "--smith"]) == 0
+    assert main([str(EXAMPLE), "--out", str(tmp_path)]) == 0
     plant = json.loads((tmp_path / "plant.json").read_text())
     gymnasium.make("MiddlePoint-v0", **plant).reset(seed=0)
     gymnasium.make("MiddlePoint-v0", **json.loads((tmp_path / "ranges.json").read_text()))

@@ -3,19 +3,85 @@
 from __future__ import annotations
 
 import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
 
-from benchmarks.identify.options import Options
-from benchmarks.lib.command import command
+from benchmarks.lib.command import Finite, Folder, Repeated, command, options
+from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
 
 # NumPy reads it when it is imported. Threads for small matrices only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Fit a plant to a recorded log, and tune a PI controller for it.
+
+    The log is a table with a heading; each row holds the temperature at its time and the flow
+    commanded from that time on.
+    """
+
+    log: Path = field(kw_only=False)
+    """The log, a CSV file."""
+    out: Folder = Path("results/identify")
+    time: str = "time"
+    """Column of the times, numbers or dates."""
+    flow: str = "flow"
+    """Column of the flow."""
+    temperature: str = "temperature"
+    """Column of the temperature."""
+    disturbance: Repeated = ()
+    """Column of a measured disturbance (repeatable)."""
+    time_unit: Literal["ms", "s", "min", "h", "D"] = "s"
+    """Unit of the times, unless these are dates; D are days."""
+    flow_unit: str = "t/h"
+    """Unit of the flow, for the report."""
+    temperature_unit: str = "°C"
+    """Unit of the temperature, for the report."""
+    applied: bool = False
+    """The flow was measured behind the valve, so that nothing is asked about the valve."""
+    operating_flow: Finite | None = None
+    """Flow at the operating point, around which a dead zone lies (default: 0 or the first flow
+    if it is well inside the range of the flows, else the middle of the range)."""
+    u_min: Finite | None = None
+    """Smallest flow, from the operating point (default: the log's)."""
+    u_max: Finite | None = None
+    """Largest flow, from the operating point (default: the log's)."""
+
+
 def work(options: Options) -> str:
     """Identify a plant from a log and write the results."""
-    from benchmarks.identify.report import execute  # slow to import
+    # These are slow to import.
+    from benchmarks.identify.advice import controllers, plants
+    from benchmarks.identify.log import read_log
+    from benchmarks.identify.model import identify
+    from benchmarks.identify.report import draw, report
+    from benchmarks.lib.report import write_report
 
-    return execute(options)
+    made, began, out = origin(), time.process_time(), out_folder(options.out)
+    try:
+        model = identify(
+            read_log(options),
+            applied=options.applied,
+            operating_flow=options.operating_flow,
+            u_min=options.u_min,
+            u_max=options.u_max,
+        )
+        plant, ranges = plants(model)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    advised = controllers(model)
+    draw(model, out / "identify.png")
+    written = {"plant": plant, "ranges": ranges, "controllers": advised}
+    for name, content in written.items():
+        write_json(out / f"{name}.json", content)
+    title = f"The plant of {options.log.name}"
+    write_report(out, title, report(model, advised), "identify", made)
+    seconds = time.process_time() - began
+    return f"{seconds:.1f} s of processor time. The plant and the report are in {out}/"
 
 
 main = command("identify", Options, work, interrupted="nothing is written.")

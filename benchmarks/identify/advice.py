@@ -1,4 +1,4 @@
-"""Tune controllers that are safe with the plants that a log leaves possible."""
+"""Turn an identified plant into a PI controller, and into the environment's arguments."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.polynomial import polyadd
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
-from agents import PIController, SmithPredictor
-from benchmarks.identify.fit import Array, Plant
+from agents import PIController
+from benchmarks.identify.fit import Array, Complex, Plant
 from benchmarks.identify.model import Model
+from mptc_gym import Parameters
+from mptc_gym.parameters import slowest_pole
 
 MOST_SENSITIVE = 1.8  # largest Ms of a recommended loop
 SHARE = 0.95  # of the possible plants that must stay within it
@@ -18,94 +23,175 @@ DELAYS = (1.0, 0.8, 0.9, 1.1, 1.2)  # of each of them, as multiples of its own
 SLOWER = 1.15 ** np.arange(30)  # closed loops that are tried, as multiples of the rule's
 
 
-class Loops:
-    """Loops of a controller with many plants, each with its own delay and with others."""
-
-    def __init__(self, plants: list[Plant], h: float) -> None:
-        slowest = max(plants[0].delay + plants[0].slowest, h)
-        self._frequency = np.geomspace(2e-3 / slowest, math.pi / h, 400)
-        self._back = np.exp(-1j * h * self._frequency)
-        self._responses = np.array([
-            [replace(each, delay=x * each.delay).response(h, self._frequency) for x in DELAYS]
-            for each in plants
-        ])  # fmt: skip
-
-    def judged(self, controller: PIController) -> tuple[Array, float]:
-        """Return Ms with each plant, and the delay margin with the first, s.
-
-        Ms is the largest over the delays, and infinite if a loop is unstable. 1 + L begins at
-        -90 degrees, because of the integrator, and ends real: by Nyquist's criterion the loop
-        is stable if it does not encircle 0, and the controller has no pole outside the circle.
-        """
-        up, down = controller.transfer()
-        response = np.polyval(up[::-1], self._back) / np.polyval(down[::-1], self._back)
-        opened = self._responses * response
-        turns = np.unwrap(np.angle(1.0 + opened), axis=-1)
-        stable = np.abs(turns[..., -1] - turns[..., 0] - math.pi / 2.0) < 1.0
-        stable &= np.abs(np.roots(down)).max() < 1.0 + 1e-6
-        peaks = np.where(stable, 1.0 / np.abs(1.0 + opened).min(axis=-1), np.inf).max(axis=-1)
-        own = opened[0, 0]
-        of_one = np.flatnonzero((np.abs(own[:-1]) >= 1.0) != (np.abs(own[1:]) >= 1.0))
-        left = (np.angle(own[of_one]) + math.pi) % (2.0 * math.pi) / self._frequency[of_one]
-        return peaks, float(left.min(initial=math.inf))
+def responses(plants: list[Plant], h: float) -> tuple[Complex, Complex]:
+    """Return 1 / z, and there the responses of plants, each with its own delay and others."""
+    slowest = max(plants[0].delay + plants[0].slowest, h)
+    frequency = np.geomspace(2e-3 / slowest, math.pi / h, 400)
+    found = [
+        [replace(each, delay=x * each.delay).response(h, frequency) for x in DELAYS]
+        for each in plants
+    ]
+    return np.exp(-1j * h * frequency), np.array(found)
 
 
-def recommended(model: Model, *, smith: bool = False) -> list[dict[str, Any]]:
-    """Return a PI controller by SIMC's rule, and a Smith predictor if it is asked for.
+def sensitivities(controller: PIController, back: Complex, answers: Complex) -> Array:
+    """Return Ms with each plant, of `responses`.
 
-    Each is slowed until Ms is at most 1.8 with 95 % of the plants that the log leaves possible,
-    with their delays a fifth longer and shorter among them. It is left out if that fails, and
-    so is a Smith predictor with a delay margin of less than a fifth of the delay. Nothing is
-    recommended on a model with warnings.
-
-    Returns
-    -------
-    list
-        Entries of `controllers.json`. `kp` is that of u = kp (e + integral of e / ti), positive
-        where the flow rises when the temperature is below its set point. `model` has the sample
-        in its delay that any flow takes to show. `arguments` are those of
-        `agents.PIController` or `agents.SmithPredictor`, `sensitivity` is Ms with the most
-        likely plant and with 95 % of the possible ones, `slowed` how much slower the closed
-        loop is than by the rule.
+    Ms is the largest over the delays, and infinite if a loop is unstable. 1 + L begins at -90
+    degrees, because of the integrator, and ends real: by Nyquist's criterion the loop is stable
+    if it does not encircle 0.
     """
-    h, plant, found = model.log.sampling_interval, model.plant, list[dict[str, Any]]()
-    lag, delay = plant.first_order()
-    told: dict[str, Any] = {"gain": plant.gain, "time_constant": lag, "delay": delay + h}
-    shared = {"sampling_interval": h, "u_min": model.u_min, "u_max": model.u_max}
-    zone, loops = model.estimates["dead_zone"].value, Loops([plant, *model.possible], h)
+    up, down = controller.transfer()
+    near = 1.0 + answers * (np.polyval(up[::-1], back) / np.polyval(down[::-1], back))
+    turns = np.unwrap(np.angle(near), axis=-1)
+    stable = np.abs(turns[..., -1] - turns[..., 0] - math.pi / 2.0) < 1.0
+    peaks = np.where(stable, 1.0 / np.abs(near).min(axis=-1), np.inf)
+    return np.asarray(peaks.max(axis=-1))
 
-    def pi(slower: float) -> PIController:
-        # A flow that is held for a sample is half a sample late.
-        rule = {
-            "delay": delay + h / 2.0,
-            "closed_loop_time_constant": slower * (delay + h / 2.0),
-        }
-        return PIController.simc(**told | rule | shared)
 
-    def predictor(slower: float) -> PIController:
-        rule = {"closed_loop_time_constant": slower * max(lag / 2.0, h), "dead_zone": zone}
-        return SmithPredictor(**told | rule | shared)
+def tuned(model: Model) -> tuple[PIController, list[float], float] | None:
+    """Return a PI by SIMC's rule, slowed until Ms is at most 1.8 with 95 % of possible plants.
 
-    rules = {"pi-simc": pi, "smith": predictor} if smith else {"pi-simc": pi}
-    for name, rule in ({} if model.warnings else rules).items():
-        for slower in SLOWER.tolist():
-            made = rule(slower)
-            (own, *others), margin = loops.judged(made)
-            worst = float(np.quantile(others, SHARE, method="higher"))
-            if max(own, worst) > MOST_SENSITIVE or (name == "smith" and margin < delay / 5.0):
-                continue
-            names = [each.name for each in fields(made) if each.init]
-            found.append({
-                "controller": name,
-                "kp": -made.kp,
-                "ti": made.kp / made.ki * h,
-                "action": "reverse" if made.kp < 0.0 else "direct",
-                "sampling_interval": h,
-                "model": told,
-                "arguments": {each: getattr(made, each) for each in names},
-                "sensitivity": [float(own), worst],
-                "delay_margin": margin,
-                "slowed": slower,
-            })  # fmt: skip
-            break
-    return found
+    The others are Ms with the most likely plant and with these, and how much slower the closed
+    loop is than by the rule. None if no loop is slow enough.
+    """
+    h, (lag, delay) = model.log.sampling_interval, model.plant.first_order()
+    late = delay + h / 2.0  # as a flow is held for a sample
+    loops = responses([model.plant, *model.possible], h)
+    for slower in SLOWER.tolist():
+        pi = PIController.simc(
+            gain=model.plant.gain, time_constant=lag, delay=late,
+            closed_loop_time_constant=slower * late, sampling_interval=h,
+            u_min=model.u_min, u_max=model.u_max,
+        )  # fmt: skip
+        own, *others = sensitivities(pi, *loops)
+        worst = np.quantile(others, SHARE, method="higher")
+        if max(own, worst) <= MOST_SENSITIVE:
+            return pi, [float(own), float(worst)], slower
+    return None
+
+
+def controllers(model: Model) -> dict[str, Any]:
+    """Return the content of `controllers.json`: a PI, or why there is none.
+
+    `kp` is that of u = kp (e + integral of e / ti), positive where the flow rises when the
+    temperature is below its set point. `model` has the sample in its delay that any flow takes
+    to show. `arguments` are those of `agents.PIController`.
+    """
+    found = None if model.warnings else tuned(model)
+    if found is None:
+        none = (
+            f"However slow a controller is made, Ms is above {MOST_SENSITIVE} with one in "
+            "twenty of the plants that the log leaves possible. Record a longer log, with "
+            "larger steps."
+        )
+        return {"recommended": [], "warnings": model.warnings or [none]}
+    (pi, sensitivity, slower), (lag, delay) = found, model.plant.first_order()
+    h, rest = model.log.sampling_interval, model.operating_flow
+    flow, degree = model.log.flow_unit, model.log.temperature_unit
+    entry = {
+        "controller": "pi-simc",
+        "kp": -pi.kp,
+        "ti": pi.kp / pi.ki * h,
+        "action": "reverse" if pi.kp < 0.0 else "direct",
+        "sampling_interval": h,
+        "model": {"gain": model.plant.gain, "time_constant": lag, "delay": delay + h},
+        "arguments": {each.name: getattr(pi, each.name) for each in fields(pi) if each.init},
+        "sensitivity": sensitivity,
+        "slowed": slower,
+        "units": {"kp": f"{flow} per {degree}", "ti": "s", "flow": flow, "temperature": degree},
+        "operating_point": {"flow": rest, "temperature": model.operating_temperature},
+        "limits": {"low": rest + model.u_min, "high": rest + model.u_max},
+    }
+    return {"recommended": [entry], "warnings": []}
+
+
+def plants(model: Model) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the contents of `plant.json` and `ranges.json`: arguments of `MiddlePoint-v0`.
+
+    In the ranges, intervals stand for estimates.
+    """
+    arguments = _arguments(model)
+    ranges = arguments | _ranges(model, arguments)
+    try:
+        for each in (arguments, ranges):
+            Parameters(**each)
+    except ValueError as error:
+        raise ValueError(
+            f"the environment does not have such plants: {error}. See whether the units are "
+            "right (--flow-unit, --temperature-unit, --time-unit), or scale the columns"
+        ) from error
+    return arguments, ranges
+
+
+def _arguments(model: Model) -> dict[str, Any]:
+    """Return the arguments of the most likely plant, sampled exactly at the log's interval.
+
+    The set point stays the environment's default if the plant can reach it in time; otherwise
+    it is made smaller and slower.
+    """
+    h, plant, defaults = model.log.sampling_interval, model.plant, Parameters()
+    delay, (b, *uppers), (a, *lowers) = plant.sampled(h)
+    for upper, lower in zip(uppers, lowers, strict=True):  # a sum of fractions
+        b, a = polyadd(np.convolve(b, lower), np.convolve(upper, a)), np.convolve(a, lower)
+    c, variance = _noise(model.log.temperature - model.simulated, a.real)
+    limits, gain = (abs(model.u_min), abs(model.u_max)), abs(plant.gain)
+    reach = float(f"{0.8 * gain * (min(limits) or max(limits)):.2g}")
+    span = float(f"{1.5 * gain * max(limits):.2g}")
+    period = 2 * round((plant.delay + 4.0 * plant.slowest) / h)
+    suited = {
+        "setpoint_amplitude": min(reach, defaults.setpoint_amplitude),
+        "temperature_span": max(span, defaults.temperature_span),
+        "setpoint_period": max(period, defaults.setpoint_period),
+    }
+    return {
+        "a": a.real.tolist(),
+        "b": b.real.tolist(),
+        "c": c.tolist(),
+        "delay": delay,
+        "dead_zone": model.estimates["dead_zone"].value,
+        "u_min": model.u_min,
+        "u_max": model.u_max,
+        "noise_variance": variance,
+        "sampling_interval": h,
+        **{name: x for name, x in suited.items() if x != getattr(defaults, name)},
+    }
+
+
+def _noise(left: Array, a: Array) -> tuple[Array, float]:
+    """Return C, with real roots, and the variance of xi, such that C xi / A is like a series.
+
+    C begins as A, for white noise, and minimises the prediction errors xi.
+    """
+    left = np.nan_to_num(left - np.nanmean(left))
+    roots = np.clip(np.r_[np.abs(np.roots(a)), 0.1], 0.1, 0.98)
+
+    def errors(q: Array) -> Array:
+        return np.asarray(lfilter(a, np.poly(np.tanh(q)), left))
+
+    q = least_squares(errors, np.arctanh(roots), method="lm", max_nfev=60).x
+    return np.asarray(np.poly(np.tanh(q))), float(np.var(errors(q)))
+
+
+def _ranges(model: Model, arguments: dict[str, Any]) -> dict[str, list[float]]:
+    """Return the intervals, as ranges to draw from."""
+    names = "delay", "dead_zone", "gain", "time_constant"
+    delay, zone, gain, constant = (model.estimates[name] for name in names)
+    chance = 2.0 * np.sqrt(2.0 / len(model.log.flow))  # of a variance, about
+    factors = np.sort([gain.low / gain.value, gain.high / gain.value])
+    whole, most = arguments["delay"], max(-model.u_min, model.u_max)
+    ranges = {
+        "delay": [min(int(delay.low), whole), max(int(delay.high), whole)],
+        "dead_zone": [zone.low, min(zone.high, 0.99 * most)],
+        "noise_variance": [arguments["noise_variance"] * x for x in (1 - chance, 1 + chance)],
+        "gain_factor": np.clip(factors, 0.1, 10.0).tolist(),
+    }
+    pole = complex(slowest_pole(arguments["a"]) or 0.0)
+    if pole.imag == 0.0 and 0.0 < pole.real < 1.0:
+        # The environment's time constant is 1 / (1 - pole) samples, at least 1.
+        rate, times = 1.0 - pole.real, np.maximum([constant.low, constant.high], 1e-9)
+        rates = np.maximum(-np.expm1(-model.log.sampling_interval / times), 1e-12)
+        fast, slow = (rate / rates).tolist()
+        low = min(max(fast, 1.000001 * rate), 1.0)
+        ranges["time_constant_factor"] = [low, max(min(slow, 10.0), 1.0)]
+    return {name: x for name, x in ranges.items() if x[0] < x[1]}

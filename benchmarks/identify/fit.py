@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
@@ -14,8 +16,6 @@ Complex = NDArray[np.complex128]
 
 BLOCKS = 30  # means of the temperature in a delay and a lag: more take time, and say no more
 ORDER = 8  # of the autoregressive model of the noise, in blocks
-# Shapes of plants and their parameters: the delay, the logarithm of the first lag, one more.
-SHAPES = {"one lag": 2, "two lags": 3, "three lags": 3, "a zero": 3, "a pair": 3}
 
 
 @dataclass(frozen=True)
@@ -78,35 +78,27 @@ class Plant:
         return np.asarray(np.concatenate([np.zeros(whole), sum(moved)])[: len(flow)])
 
 
-def one_lag(lag: float, delay: float = 0.0) -> Plant:
-    """Return a plant of first order with gain 1."""
-    return Plant(delay, np.array([lag + 0j]), np.ones(1, np.complex128))
+def in_series(lags: ArrayLike, delay: float = 0.0) -> Plant:
+    """Return the plant of gain 1 with lags behind one another, by partial fractions."""
+    each = np.asarray(lags, np.complex128)
+    others = each[:, np.newaxis] - each
+    np.fill_diagonal(others, 1.0)
+    return Plant(delay, each, each ** (len(each) - 1) / np.prod(others, axis=1))
 
 
-@dataclass(frozen=True)
-class Solution:
-    """The best coefficients for given parameters, and what they leave."""
+class Solution(NamedTuple):
+    """The best coefficients, those of the plants first, and what they leave."""
 
     c: Array
-    """Those of the plants first."""
     errors: Array
     """Of the blocks, weighted: white noise if all is right."""
     weighted: Array
     """The columns that the coefficients multiply, weighted."""
-    simulated: Array
-    """Temperatures of the blocks by flow and disturbances alone, without noise and loads."""
-    fitted: Array
-    """Temperatures of the blocks by all columns."""
-
-    @property
-    def deviance(self) -> float:
-        """Minus twice the logarithm of the likelihood."""
-        return len(self.errors) * float(np.log(np.mean(self.errors**2) + 1e-14))
 
 
 @dataclass(frozen=True)
-class Problem:
-    """A log as it is fitted, and what is known so far of valve, noise and loads."""
+class Fit:
+    """A log, what is known so far of its valve, noise and loads, and a plant for it."""
 
     flow: Array
     """Flow behind the valve, row by row, t/h from where it was at first."""
@@ -126,64 +118,76 @@ class Problem:
     """Times of steps of an unmeasured load, s."""
     extra: tuple[Array, ...] = ()
     """Further inputs of the plant, with gains of their own."""
+    shape: str = "one lag"
+    """Of the plant."""
+    p: Array = field(default_factory=lambda: np.zeros(2))
+    """Parameters of the plant: the delay, the logarithm of the first lag, and one more."""
+
+    def at(self, p: Array) -> Fit:
+        """Return the fit of other parameters."""
+        return replace(self, p=p)
+
+    def behind(self, passed: Array) -> Fit:
+        """Return the fit with another flow behind the valve."""
+        return replace(self, flow=passed - passed[0])
 
     def means(self, x: Array) -> Array:
         """Return the means of blocks of rows."""
         count = len(x) // self.rows
         return np.asarray(x[: count * self.rows].reshape(count, self.rows).mean(axis=1))
 
-    def in_blocks(self, rows: int) -> Problem:
-        """Return the problem of a log of single rows in blocks."""
+    def in_blocks(self, rows: int) -> Fit:
+        """Return the fit to a log of single rows in blocks."""
         blocks = replace(self, rows=rows)
         return replace(blocks, temperature=blocks.means(self.temperature))
 
-    def behind(self, passed: Array) -> Problem:
-        """Return the problem with another flow behind the valve."""
-        return replace(self, flow=passed - passed[0])
-
-    def units(self, shape: str, p: Array) -> list[Plant]:
-        """Return the plants of gain 1 whose weighted sum is the plant of a shape."""
-        delay, longest = self.scale * max(float(p[0]), 0.0), len(self.flow) * self.h / 3.0
-        first = float(np.exp(np.clip(p[1], np.log(self.h / 4.0), np.log(longest))))
-        if shape == "one lag":
-            return [one_lag(first, delay)]
+    @cached_property
+    def units(self) -> list[Plant]:
+        """The plants of gain 1 whose weighted sum is the plant."""
+        delay, longest = self.scale * max(float(self.p[0]), 0.0), len(self.flow) * self.h / 3.0
+        first = float(np.exp(np.clip(self.p[1], np.log(self.h / 4.0), np.log(longest))))
         # The second is never quite the first: equal ones have no partial fractions.
-        second = first * min(np.exp(np.clip(p[2], -6.0, 0.0)), 0.97)
-        if shape == "a zero":
-            return [one_lag(first, delay), one_lag(second, delay)]
-        lags = np.array([first, second, 0.9 * second][: 3 if shape == "three lags" else 2]) + 0j
-        if shape == "a pair":
-            lags = first * np.exp(1j * np.clip(p[2], 0.1, 1.45) * np.array([1.0, -1.0]))
-        others = lags[:, np.newaxis] - lags
-        np.fill_diagonal(others, 1.0)
-        return [Plant(delay, lags, lags ** (len(lags) - 1) / np.prod(others, axis=1))]
+        second = first * min(np.exp(np.clip(self.p[-1], -6.0, 0.0)), 0.97)
+        turned = np.exp(1j * np.clip(self.p[-1], 0.1, 1.45) * np.array([1.0, -1.0]))
+        units: dict[str, list[ArrayLike]] = {
+            "one lag": [[first]],
+            "two lags": [[first, second]],
+            "three lags": [[first, second, 0.9 * second]],
+            "a zero": [[first], [second]],
+            "a pair": [first * turned],
+        }
+        return [in_series(lags, delay) for lags in units[self.shape]]
 
-    def columns(self, shape: str, p: Array) -> tuple[Array, int]:
-        """Return what temperatures are a weighted sum of, and how many of these are inputs.
+    @cached_property
+    def columns(self) -> tuple[Array, int]:
+        """What temperatures are a weighted sum of, and how many of these are inputs.
 
         The plants come first, then extra inputs, the measured disturbances, what is left of
         the time before the log, the loads and the base line.
         """
-        units, (lag,) = self.units(shape, p), self.units("one lag", p)
-        now, times = one_lag(lag.slowest), np.arange(len(self.flow)) * self.h
-        found = [each.simulated(self.flow, self.h) for each in units]
-        found += [lag.simulated(each, self.h) for each in self.extra]
+        times, units, lag = (
+            np.arange(len(self.flow)) * self.h,
+            self.units,
+            self.units[0].slowest,
+        )
+        late, now = in_series([lag], units[0].delay), in_series([lag])
         # A disturbance has lags of its own: three fixed ones make any slow response.
-        wide = [one_lag(ratio * lag.slowest) for ratio in (0.3, 1.0, 3.0)]
+        wide = [in_series([ratio * lag]) for ratio in (0.3, 1.0, 3.0)]
+        found = [unit.simulated(self.flow, self.h) for unit in units]
+        found += [late.simulated(each, self.h) for each in self.extra]
         found += [plant.simulated(each, self.h) for each in self.known for plant in wide]
         inputs = len(found)
         for each in np.unique(np.concatenate([unit.lags for unit in units])):
             decay = np.exp(-times / each)
             found.append(decay.real if each.imag >= 0.0 else decay.imag)
-        steps = [np.heaviside(times - at, 1.0) for at in self.loads]
-        found += [now.simulated(each, self.h) for each in steps]
-        return np.column_stack(
-            [*map(self.means, found), np.ones(len(self.temperature))]
-        ), inputs
+        found += [now.simulated(np.heaviside(times - at, 1.0), self.h) for at in self.loads]
+        ones = np.ones(len(self.temperature))
+        return np.column_stack([*map(self.means, found), ones]), inputs
 
-    def solve(self, shape: str, p: Array) -> Solution:
-        """Return the best coefficients for the parameters of a shape."""
-        table, inputs = self.columns(shape, p)
+    @cached_property
+    def solution(self) -> Solution:
+        """The best coefficients for the parameters."""
+        table, inputs = self.columns
         whole, n = np.column_stack([table, self.temperature]), len(self.weights)
         w = sum(
             share * whole[n - 1 - i : len(whole) - i] for i, share in enumerate(self.weights)
@@ -196,26 +200,43 @@ class Problem:
         size = np.sqrt((a**2).sum(axis=0) + weak**2) + 1e-12
         square = (a / size).T @ (a / size) + np.diag((weak / size) ** 2 + 1e-11)
         c = np.linalg.solve(square, (a / size).T @ b) / size
-        return Solution(c, b - a @ c, a, table[:, :inputs] @ c[:inputs], table @ c)
+        return Solution(c, b - a @ c, a)
 
-    def plant(self, shape: str, p: Array, c: Array) -> Plant:
-        """Return the plant of a shape with coefficients."""
-        units = self.units(shape, p)
-        gains = np.concatenate([x * each.gains for x, each in zip(c, units, strict=False)])
-        return Plant(units[0].delay, np.concatenate([each.lags for each in units]), gains)
+    @cached_property
+    def deviance(self) -> float:
+        """Minus twice the logarithm of the likelihood."""
+        errors = self.solution.errors
+        return len(errors) * float(np.log(np.mean(errors**2) + 1e-14))
 
-    def refined(self, shape: str, p: Array, evaluations: int = 40) -> tuple[float, Array]:
-        """Return the least deviance near parameters, and where it is."""
+    @property
+    def price(self) -> float:
+        """Akaike's criterion."""
+        return self.deviance + 2.0 * (len(self.p) + len(self.units))
+
+    @property
+    def plant(self) -> Plant:
+        """The plant of the best coefficients."""
+        return self.plant_of(self.solution.c)
+
+    def plant_of(self, c: Array) -> Plant:
+        """Return the plant of other coefficients."""
+        gains = [x * each.gains for x, each in zip(c, self.units, strict=False)]
+        lags = np.concatenate([each.lags for each in self.units])
+        return Plant(self.units[0].delay, lags, np.concatenate(gains))
+
+    def refined(self, evaluations: int = 40) -> Fit:
+        """Return the fit of the least deviance near the parameters."""
         # Steps are relative to the place: about 1, so that all are as long.
         found = least_squares(
-            lambda q: self.solve(shape, p + q - 1.0).errors, np.ones(len(p)), method="lm",
-            diff_step=0.01, ftol=3e-5, xtol=1e-3, max_nfev=evaluations,
+            lambda q: self.at(self.p + q - 1.0).solution.errors, np.ones(len(self.p)),
+            method="lm", diff_step=0.01, ftol=3e-5, xtol=1e-3, max_nfev=evaluations,
         )  # fmt: skip
-        return self.solve(shape, p + found.x - 1.0).deviance, p + found.x - 1.0
+        return self.at(self.p + found.x - 1.0)
 
-    def reweighted(self, shape: str, p: Array) -> Problem:
-        """Return the problem with weights from the noise that the parameters leave."""
-        left = self.temperature - self.solve(shape, p).simulated
+    def reweighted(self) -> Fit:
+        """Return the fit with weights from the noise that this one leaves."""
+        table, inputs = self.columns
+        left = self.temperature - table[:, :inputs] @ self.solution.c[:inputs]
         order = min(ORDER, len(left) // 15)
         lagged = np.column_stack([left[order - i : len(left) - i] for i in range(order + 1)])
         lagged = lagged[np.isfinite(lagged).all(axis=1)]

@@ -6,13 +6,14 @@ import io
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.identify.options import Columns
+if TYPE_CHECKING:
+    from benchmarks.identify.__main__ import Options
 
 Array = NDArray[np.float64]
 
@@ -23,25 +24,23 @@ SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}
 
 @dataclass(frozen=True)
 class Log:
-    """A recorded log with one row a sample.
-
-    - `flow`: the flow from the time of its row on;
-    - `temperature`: the temperature at the time of its row; NaN where it is unknown;
-    - `sampling_interval`: in s;
-    - `disturbances`: other measured inputs, by column;
-    - `columns`: where it was read, and the units;
-    - `notes`: what was read, and what was done about numbers that are missing.
-    """
+    """A recorded log with one row a sample."""
 
     flow: Array
+    """The flow from the time of its row on."""
     temperature: Array
+    """The temperature at the time of its row; NaN where it is unknown."""
     sampling_interval: float
+    """s."""
     disturbances: dict[str, Array] = field(default_factory=dict)
-    columns: Columns = field(default_factory=Columns)
+    """Other measured inputs, by column."""
+    flow_unit: str = "t/h"
+    temperature_unit: str = "°C"
     notes: tuple[str, ...] = ()
+    """What was read, and what was done about numbers that are missing."""
 
 
-def read_log(path: Path, columns: Columns | None = None) -> Log:
+def read_log(given: Options) -> Log:
     """Read a table with a heading.
 
     The separator may be a comma, a semicolon or a tab, the decimal mark a point or a comma.
@@ -51,10 +50,8 @@ def read_log(path: Path, columns: Columns | None = None) -> Log:
     ValueError
         If the table cannot be read; the message names the column, and the line if there is one.
     """
-    columns = columns or Columns()
-    table = _table(path)
-    flow, temperature = columns.flow, columns.temperature
-    names = [columns.time, flow, temperature, *columns.disturbance]
+    table, temperature = _table(given.log), given.temperature
+    names = [given.time, given.flow, temperature, *given.disturbance]
     if len(set(names)) < len(names):
         raise ValueError(f"each column can be one thing only, got {', '.join(names)}")
     for name in names:
@@ -63,7 +60,7 @@ def read_log(path: Path, columns: Columns | None = None) -> Log:
                 f"the log has no column {name!r}; it has {', '.join(map(repr, table))}. Name "
                 "the right ones with --time, --flow, --temperature and --disturbance"
             )
-    interval, places = _sampled(_times(table[columns.time], SECONDS[columns.time_unit]))
+    interval, places = _sampled(_times(table[given.time], SECONDS[given.time_unit]))
     numbers = table[names[1:]].apply(_numbers)
     kept = numbers.set_index(places).reindex(range(places[-1] + 1))[-MOST:]
     notes = [f"Read {len(table):,} rows, one every {interval:g} s; {len(kept):,} are used."]
@@ -75,9 +72,15 @@ def read_log(path: Path, columns: Columns | None = None) -> Log:
                 f"{count} of {len(kept)} values of {column!r} are missing: too many"
             )
     held = kept.ffill().bfill()
-    others = {name: held[name].to_numpy() for name in columns.disturbance}
-    temperatures = kept[temperature].to_numpy()
-    return Log(held[flow].to_numpy(), temperatures, interval, others, columns, tuple(notes))
+    return Log(
+        held[given.flow].to_numpy(),
+        kept[temperature].to_numpy(),
+        interval,
+        {name: held[name].to_numpy() for name in given.disturbance},
+        given.flow_unit,
+        given.temperature_unit,
+        tuple(notes),
+    )
 
 
 def _table(path: Path) -> pd.DataFrame:

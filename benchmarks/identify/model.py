@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.identify.fit import Array, Plant, Problem
+from benchmarks.identify.fit import Array, Fit, Plant
 from benchmarks.identify.log import Log
-from benchmarks.identify.options import Knowledge
 from benchmarks.identify.search import FAULT, Found, draws, possible_zones, search
-from benchmarks.identify.valve import HYSTERESES, SOUND, VALVES
+from benchmarks.identify.valve import HYSTERESES, VALVES
 
 LAGS = 30  # of the autocorrelation of the errors, blocks
 COMMANDS = 5  # distinct ones, at least, that test a valve
@@ -39,6 +39,8 @@ class Model:
     found: Found
     possible: list[Plant]
     """Plants drawn from all that the log leaves possible."""
+    tested: bool
+    """Whether the log tells what the valve does."""
     estimates: dict[str, Interval]
     """`delay` (samples), `dead_zone` (t/h), `gain` (degC per t/h) and `time_constant` (s, of
     the slowest lag)."""
@@ -54,73 +56,147 @@ class Model:
     """Temperatures without noise, degC, one a row."""
     explained: tuple[float, float]
     """What a fit to the first two thirds explains of the last third; see `held_out`."""
-    notes: list[str]
-    """Remarks for the user."""
-    warnings: list[str]
-    """Why no controller should be tuned on the model; empty if it may be used."""
 
     @property
     def plant(self) -> Plant:
         """The most likely plant."""
-        return self.found.plant
+        return self.found.best.plant
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know of the log and the fit."""
+        best, valve, log = self.found.best, self.found.valve, self.log
+        size, unit = valve.size, log.flow_unit
+        times = ", ".join(f"{at / 60.0:.0f}" for at in sorted(best.loads))
+        remarks = {
+            f"The valve seems to move by {size / best.h:.3g} {unit} a second at most, which "
+            "plant.json cannot hold.": valve.name == "rate limit",
+            f"The valve seems to end at ±{size:.3g} {unit} from the operating point.":
+            valve.name == "saturation",
+            "Beyond the dead zone the flow seems to rise from 0, which plant.json cannot hold.":
+            valve.name == "subtractive dead zone",
+            f"The log is sampled {best.rows} times as often as the plant needs: means of "
+            f"{best.rows} rows are fitted.": best.rows > 1,
+            f"Loads seem to have moved the temperature at {times} min.": bool(best.loads),
+        }  # fmt: skip
+        gains = best.solution.c[len(best.units) :][: 3 * len(best.known)].reshape(-1, 3)
+        known = [
+            f"{name} is a known disturbance with a gain of {gain:.4g} {log.temperature_unit} a "
+            "unit, which plant.json cannot hold."
+            for name, gain in zip(log.disturbances, gains.sum(axis=1), strict=True)
+        ]
+        return [*log.notes, *(each for each, holds in remarks.items() if holds), *known]
+
+    @cached_property
+    def warnings(self) -> list[str]:
+        """Why no controller should be tuned on the model; empty if it may be used."""
+        found, gain = self.found, self.estimates["gain"]
+        errors = found.best.solution.errors
+        alike = np.correlate(errors, errors, "full")[len(errors) :][:LAGS] / (errors @ errors)
+        large = float(np.mean(np.abs(alike) > max(0.1, 2.5 / np.sqrt(len(errors)))))
+        bar = max(found.valve.drop - FAVOUR, FAULT)
+        rivals = [abs(each.fit.plant.gain) for each in found.rivals if each.drop > bar]
+        doubts = {
+            "The log does not test the valve, as the flow had so few values, and nothing is "
+            "known of its dead zone. Record a log with a dozen flows, or the flow behind the "
+            "valve (--applied).": not self.tested,
+            said_of_fault(found, self.log.flow_unit): found.fault is not None,
+            "Valves of two kinds explain the log alike, and the plants behind them differ. "
+            + TEST: max(rivals, default=1.0) > RIVAL * min(rivals, default=1.0),
+            "Not even the direction is known in which the temperature answers the flow. Move "
+            "the flow to and fro a dozen times, further than here, and hold it until the "
+            "temperature has settled.": gain.low * gain.high <= 0.0,
+            "The delay may be longer than a sixth of the log, which is not looked for: record "
+            "a longer one.": self.estimates["delay"].high >= len(self.log.flow) / 6.0,
+            "The model leaves more than half open: the noise hides the response, or it "
+            "changes. Move the flow further, and look for other inputs (--disturbance).":
+            max(self.explained) < 0.5,
+            f"The prediction errors are far from white ({100 * large:.0f} % of their "
+            "autocorrelations are large): the plant or its disturbances are not of the "
+            "model's form.": large > 0.25,
+        }  # fmt: skip
+        return [sentence for sentence, holds in doubts.items() if holds]
 
 
-def identify(log: Log, knowledge: Knowledge | None = None, seed: int = 0) -> Model:
+def said_of_fault(found: Found, unit: str) -> str:
+    """Return what seems to be wrong with the valve or the plant, and the test that tells."""
+    fault, *others = found.faults
+    if fault.name not in HYSTERESES:
+        return (
+            f"The plant seems to change: {fault.name}. Identify each level, time or direction "
+            "from a log of its own."
+        )
+    rivals = [each for each in others if each.drop >= fault.drop - FAULT]
+    alike = any(each.name in HYSTERESES for each in rivals)
+    return (
+        f"The valve does not seem to pass what it is told: {fault.name} of {fault.size:.2g} "
+        f"{unit}{', or another fault of the valve' if alike else ''}. {TEST} If the "
+        "temperature follows alike, the plant is not of the model's form."
+    )
+
+
+def identify(
+    log: Log,
+    *,
+    applied: bool = False,
+    operating_flow: float | None = None,
+    u_min: float | None = None,
+    u_max: float | None = None,
+) -> Model:
     """Return the plant of a log, with warnings of what speaks against it.
+
+    The prior knowledge is that of the command's options.
 
     Raises
     ------
     ValueError
         If the log does not show a plant at all; the message says why.
     """
-    told, h = knowledge or Knowledge(), log.sampling_interval
-    level = np.nanmean(log.temperature)
     _check(log)
-    rest = operating_flow(log.flow, told.operating_flow)
+    h, level = log.sampling_interval, float(np.nanmean(log.temperature))
+    rest = resting_flow(log.flow, operating_flow)
     command, moved = log.flow - rest, log.temperature - level
     known = tuple(each - each[0] for each in log.disturbances.values())
-    problem = Problem(command - command[0], moved, h, known)
-    found = search(problem, command, applied=told.applied)
-    plant, valve, largest = found.plant, found.valve, float(np.abs(command).max())
+    found = search(Fit(command - command[0], moved, h, known), command, applied=applied)
+    best, plant, valve = found.best, found.best.plant, found.valve
     if plant.slowest > len(command) * h / 5.0:
         raise ValueError(
             "the log does not show where the temperature settles: record a longer one, in "
             "which the flow is held until the temperature has nearly settled"
         )
-    zones = possible_zones(found, command)
-    drawn = draws(found, zones, np.random.default_rng(seed))
-    possible, at = [each for each, _ in drawn], [i for _, i in drawn]
-    size = valve.size if valve.name.endswith("dead zone") else 0.0
-    zone = _interval(size, [*zones.low[at], *zones.high[at]])
+    # Of flows that differ by noise alone, one counts.
+    flows = np.unique(np.round(log.flow / (0.02 * np.ptp(log.flow))))
+    tested = applied or len(flows) >= COMMANDS
+    possible, zone = _possible(found, command)
     delay = _interval(plant.delay / h, [each.delay / h for each in possible])
-    tested = told.applied or commands(log.flow) >= COMMANDS
     estimates = {
         "delay": Interval(delay.value, max(delay.low - 0.5, 0.0), delay.high + 0.5),
-        "dead_zone": zone if tested else Interval(0.0, 0.0, largest),
+        "dead_zone": zone if tested else Interval(0.0, 0.0, float(np.abs(command).max())),
         "gain": _interval(plant.gain, [each.gain for each in possible]),
         "time_constant": _interval(plant.slowest, [each.slowest for each in possible]),
     }
-    doubts = [] if tested else [
-        "The log does not test the valve, as the flow had so few values, and nothing is known "
-        "of its dead zone. Record a log with a dozen flows, or the flow behind the valve "
-        "(--applied)."
-    ]  # fmt: skip
-    explained, fine = held_out(found), replace(found.problem, rows=1, temperature=moved)
-    start = VALVES.get(valve.name, SOUND).passed(command, valve.size)[0]
     end = valve.size if valve.name == "saturation" else np.inf
+    start = VALVES[valve.name].passed(command, valve.size)[0]
+    c = best.solution.c
     return Model(
-        log, found, possible, estimates, rest,
-        operating_temperature=float(level + found.solution.c[-1] - plant.gain * start),
-        u_min=max(float(command.min()), -end) if told.u_min is None else told.u_min,
-        u_max=min(float(command.max()), end) if told.u_max is None else told.u_max,
-        simulated=level + fine.columns(found.shape, found.p)[0] @ found.solution.c,
-        explained=explained,
-        notes=[*log.notes, *_notes(found, log)],
-        warnings=doubts + _warnings(found, log, estimates, explained),
+        log, found, possible, tested, estimates, rest,
+        operating_temperature=float(level + c[-1] - plant.gain * start),
+        u_min=max(float(command.min()), -end) if u_min is None else u_min,
+        u_max=min(float(command.max()), end) if u_max is None else u_max,
+        simulated=level + replace(best, rows=1, temperature=moved).columns[0] @ c,
+        explained=held_out(best),
     )  # fmt: skip
 
 
-def operating_flow(flow: Array, given: float | None = None) -> float:
+def _possible(found: Found, command: Array) -> tuple[list[Plant], Interval]:
+    """Return plants that the log leaves possible, and the dead zone."""
+    zones, valve = possible_zones(found, command), found.valve
+    plants, drawn = zip(*draws(found.fits, zones, np.random.default_rng(0)), strict=True)
+    size, at = valve.size if valve.name.endswith("dead zone") else 0.0, list(drawn)
+    return list(plants), _interval(size, [*zones.low[at], *zones.high[at]])
+
+
+def resting_flow(flow: Array, given: float | None = None) -> float:
     """Return 0 or the first flow if it is well inside the range, else the range's middle."""
     low, high = float(flow.min()), float(flow.max())
     if given is not None and not 2.0 * low - high <= given <= 2.0 * high - low:
@@ -131,11 +207,6 @@ def operating_flow(flow: Array, given: float | None = None) -> float:
     middle, quarter = (low + high) / 2.0, (high - low) / 4.0
     inside = [each for each in (0.0, float(flow[0])) if abs(each - middle) <= quarter]
     return [*inside, middle][0] if given is None else given
-
-
-def commands(flow: Array) -> int:
-    """Return how many distinct flows a log has, but for noise."""
-    return len(np.unique(np.round(flow / (0.02 * np.ptp(flow)))))
 
 
 def _interval(value: float, values: list[float]) -> Interval:
@@ -175,94 +246,20 @@ def follows(flow: Array, temperature: Array) -> bool:
     return typical < 0.5 * moved and int(own.sum()) < 4
 
 
-def held_out(found: Found) -> tuple[float, float]:
+def held_out(fit: Fit) -> tuple[float, float]:
     """Return what a fit to the first two thirds explains of the last: variance, and changes.
 
     A straight line is taken from the errors, for what is slow. Changes are those over one
     response, among which slow disturbances do not count.
     """
-    problem, y = found.problem, found.problem.temperature
+    y = fit.temperature
     cut = 2 * len(y) // 3
-    first = replace(problem, temperature=np.where(np.arange(len(y)) < cut, y, np.nan))
-    solved = first.solve(found.shape, first.refined(found.shape, found.p)[1])
-    y, error = y[cut:], (y - solved.fitted)[cut:]
+    first = replace(fit, temperature=np.where(np.arange(len(y)) < cut, y, np.nan)).refined()
+    error = y - first.columns[0] @ first.solution.c
+    y, error = y[cut:], error[cut:]
     known = np.flatnonzero(np.isfinite(y))
     line = np.polyval(np.polyfit(known, error[known], 1), np.arange(len(y)))
-    later = int(problem.scale / problem.h / problem.rows) + 1
+    later = int(fit.scale / fit.h / fit.rows) + 1
     later = min(later, len(y) // 3)
     changes = np.nanvar(error[later:] - error[:-later]) / np.nanvar(y[later:] - y[:-later])
     return float(1.0 - np.nanvar(error - line) / np.nanvar(y - line)), float(1.0 - changes)
-
-
-def _notes(found: Found, log: Log) -> list[str]:
-    """Return what a user should know of the fit."""
-    problem, size, unit = found.problem, found.valve.size, log.columns.flow_unit
-    of_valve = {
-        "rate limit": f"The valve seems to move by {size / problem.h:.3g} {unit} a second at "
-        "most, which plant.json cannot hold.",
-        "saturation": f"The valve seems to end at ±{size:.3g} {unit} from the operating point.",
-        "subtractive dead zone": "Beyond the dead zone the flow seems to rise from 0, which "
-        "plant.json cannot hold.",
-    }
-    notes = [of_valve[found.valve.name]] if found.valve.name in of_valve else []
-    if problem.rows > 1:
-        notes.append(
-            f"The log is sampled {problem.rows} times as often as the plant needs: means of "
-            f"{problem.rows} rows are fitted."
-        )
-    if problem.loads:
-        times = ", ".join(f"{at / 60.0:.0f}" for at in sorted(problem.loads))
-        notes.append(f"Loads seem to have moved the temperature at {times} min.")
-    first = len(problem.units(found.shape, found.p))
-    for i, name in enumerate(log.disturbances):
-        gain = found.solution.c[first + 3 * i : first + 3 * i + 3].sum()
-        notes.append(
-            f"{name} is a known disturbance with a gain of {gain:.4g} "
-            f"{log.columns.temperature_unit} a unit, which plant.json cannot hold."
-        )
-    return notes
-
-
-def _warnings(
-    found: Found, log: Log, estimates: dict[str, Interval], explained: tuple[float, float]
-) -> list[str]:
-    """Return why no controller should be tuned on a model, a sentence each."""
-    errors, gain = found.solution.errors, estimates["gain"]
-    alike = np.correlate(errors, errors, "full")[len(errors) :][:LAGS] / (errors @ errors)
-    large = float(np.mean(np.abs(alike) > max(0.1, 2.5 / np.sqrt(len(errors)))))
-    bar = max(found.valve.drop - FAVOUR, FAULT)
-    rivals = [abs(each.gain) for each in found.rivals if each.drop > bar]
-    doubts = {
-        fault_sentence(found, log.columns.flow_unit): found.fault is not None,
-        "Valves of two kinds explain the log alike, and the plants behind them differ. "
-        + TEST: max(rivals, default=1.0) > RIVAL * min(rivals, default=1.0),
-        "Not even the direction is known in which the temperature answers the flow. Move the "
-        "flow to and fro a dozen times, further than here, and hold it until the temperature "
-        "has settled.": gain.low * gain.high <= 0.0,
-        "The delay may be longer than a sixth of the log, which is not looked for: record a "
-        "longer one.": estimates["delay"].high >= len(log.flow) / 6.0,
-        "The model leaves more than half open: the noise hides the response, or it changes. "
-        "Move the flow further, and look for other inputs (--disturbance).":
-        max(explained) < 0.5,
-        f"The prediction errors are far from white ({100 * large:.0f} % of their "
-        "autocorrelations are large): the plant or its disturbances are not of the model's "
-        "form.": large > 0.25,
-    }  # fmt: skip
-    return [sentence for sentence, holds in doubts.items() if holds]
-
-
-def fault_sentence(found: Found, unit: str) -> str:
-    """Return what seems to be wrong with the valve or the plant, and the test that tells."""
-    fault = found.fault or found.valve
-    if fault in found.faults and fault.name not in HYSTERESES:
-        return (
-            f"The plant seems to change: {fault.name}. Identify each level, time or direction "
-            "from a log of its own."
-        )
-    others = [each.drop for each in found.faults[1:] if each.name in HYSTERESES]
-    alone = max(others, default=0.0) < fault.drop - FAULT
-    return (
-        f"The valve does not seem to pass what it is told: {fault.name} of {fault.size:.2g} "
-        f"{unit}{'' if alone else ', or another fault of the valve'}. {TEST} If the "
-        "temperature follows alike, the plant is not of the model's form."
-    )

@@ -1,24 +1,17 @@
-"""Identify a plant from a log, and write the plant, its controllers and a report."""
+"""Report on an identified plant, its controller and the log."""
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from benchmarks.identify.advice import MOST_SENSITIVE, recommended
-from benchmarks.identify.log import read_log
-from benchmarks.identify.model import Model, identify
-from benchmarks.identify.options import Options
-from benchmarks.identify.plant import plant_arguments, plant_ranges
-from benchmarks.lib.report import COLOURS, Section, drawn, write_report
+from benchmarks.identify.model import Model
+from benchmarks.lib.report import COLOURS, Section, drawn
 from benchmarks.lib.statistics import ENDS
-from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
 
-LABELS = {"pi-simc": "PI (SIMC)", "smith": "Smith"}
 SHOWN = 4_000  # rows that are drawn, the last ones of a log: more would blur
 HOW = (
     "u is Kp times the sum of r - y and its integral over time divided by Ti, where u is "
@@ -29,95 +22,54 @@ HOW = (
     "Ms is the most that the loop amplifies a disturbance while no limit and no dead zone "
     "is met: with the model, and with 95 % of the plants that the log leaves possible, "
     "their delay a fifth longer and shorter among them. Around set points that need a flow "
-    "within a dead zone the loops cycle. More controllers: `python -m benchmarks.compare "
+    "within a dead zone the loop cycles. More controllers: `python -m benchmarks.compare "
     "--plant plant.json`.",
 )
 
 
-def execute(options: Options) -> str:
-    """Identify a plant from a log and write the results."""
-    made, began, out = origin(), time.process_time(), out_folder(options.out)
-    try:
-        model = identify(read_log(options.log, options.columns), options.knowledge)
-        plant, ranges = plant_arguments(model), plant_ranges(model)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
-    found = recommended(model, smith=options.smith)
-    if not found and not model.warnings:
-        model.warnings.append(
-            f"However slow a controller is made, Ms is above {MOST_SENSITIVE} with one in "
-            "twenty of the plants that the log leaves possible. Record a longer log, with "
-            "larger steps."
-        )
-    draw(model, out / "identify.png")
-    write_json(out / "plant.json", plant)
-    write_json(out / "ranges.json", ranges)
-    write_json(out / "controllers.json", controllers(model, found))
-    title = f"The plant of {options.log.name}"
-    write_report(out, title, report(model, found), "identify", made)
-    seconds = time.process_time() - began
-    return f"{seconds:.1f} s of processor time. The plant and the report are in {out}/"
-
-
-def controllers(model: Model, found: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the content of `controllers.json`."""
-    flow, degree = model.log.columns.flow_unit, model.log.columns.temperature_unit
-    rest = model.operating_flow
-    shared = {
-        "units": {"kp": f"{flow} per {degree}", "ti": "s", "flow": flow, "temperature": degree},
-        "operating_point": {"flow": rest, "temperature": model.operating_temperature},
-        "limits": {"low": rest + model.u_min, "high": rest + model.u_max},
-    }
-    return {"recommended": [each | shared for each in found], "warnings": model.warnings}
-
-
-def report(model: Model, found: list[dict[str, Any]]) -> list[Section]:
-    """Return the sections of the report."""
-    flow, degree = model.log.columns.flow_unit, model.log.columns.temperature_unit
+def report(model: Model, advised: dict[str, Any]) -> list[Section]:
+    """Return the sections of the report; `advised` is the content of `controllers.json`."""
+    flow, degree = model.log.flow_unit, model.log.temperature_unit
     rest = model.operating_flow
     units = {"delay": "samples", "dead_zone": flow, "gain": f"{degree} per {flow}"}
     rows = [
         (name.replace("_", " "), f"{at:.4g}", f"[{low:.4g}, {high:.4g}]", units.get(name, "s"))
         for name, (at, low, high) in model.estimates.items()
     ]
-    warned = [f"**Nothing is recommended.** {' '.join(model.warnings)}"]
-    advised = [
-        f"Recommended: {LABELS[each['controller']]} with Kp = {each['kp']:.4g} {flow} per "
-        f"{degree} and Ti = {each['ti']:.3g} s, {each['action']} acting."
-        for each in found
+    advice = [
+        f"Recommended: PI (SIMC) with Kp = {each['kp']:.4g} {flow} per {degree} and "
+        f"Ti = {each['ti']:.3g} s, {each['action']} acting. Ms is "
+        f"{each['sensitivity'][0]:.2f} to {each['sensitivity'][1]:.2f}; the loop is "
+        f"{each['slowed']:.2f} times slower than by the rule."
+        for each in advised["recommended"]
     ]
+    refused = [f"**Nothing is recommended.** {' '.join(advised['warnings'])}"]
     text = [
-        *(warned if model.warnings else []),
+        *([] if advice else refused),
         "Fitted to the first two thirds of the log, the model explains "
         f"{100 * max(model.explained[0], 0.0):.1f} % of the temperature's variance in the "
         "last, by simulation from the flow, but for a straight line.",
-        *advised,
+        *advice,
         *model.notes,
         f"All numbers are deviations from the operating point: a flow of {rest:g} {flow}, at "
         f"which the temperature is {model.operating_temperature:.4g} {degree}. The flow can be "
         f"between {rest + model.u_min:g} and {rest + model.u_max:g} {flow}. Brackets are 95 % "
         "intervals.",
     ]
-    loops = {
-        "controller": [LABELS[each["controller"]] for each in found],
-        "Ms": ["{:.2f} to {:.2f}".format(*each["sensitivity"]) for each in found],
-        "delay margin (s)": [f"{each['delay_margin']:.0f}" for each in found],
-        "slower than by the rule": [f"{each['slowed']:.2f} times" for each in found],
-    }
     table = pd.DataFrame(rows, columns=["", "value", "95 %", "unit"])
     shown = {"identify.png": "The log, the model and the response to a step"}
     sections = [
         Section("What the log shows", text, table),
         Section("The log and the model", pictures=shown),
-        Section("Recommended controllers", HOW, pd.DataFrame(loops)),
+        Section("How to type the controller", HOW),
     ]
-    return sections if found else sections[:2]
+    return sections if advice else sections[:2]
 
 
 def draw(model: Model, path: Path) -> None:
     """Draw the log with the model's simulation of it, and the step response with its band."""
     log, shown, h = model.log, slice(-SHOWN, None), model.log.sampling_interval
-    flow, degree = log.columns.flow_unit, log.columns.temperature_unit
+    flow, degree = log.flow_unit, log.temperature_unit
     minutes = (np.arange(len(log.flow)) * h / 60.0)[shown]
     title = "The log as recorded and as the model simulates it, and its response to a step"
     with drawn(path, 5, title) as figure:

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.identify.advice import recommended
+from benchmarks.identify.advice import controllers
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import identify
-from benchmarks.identify.options import Knowledge
 from benchmarks.lib.storage import ROOT, write_text
 
 FINE = 5  # steps of the simulator in a sample
@@ -109,11 +108,11 @@ def tried(seed: int, fault: str) -> dict[str, Any]:
     )
     found: dict[str, Any] = {"fault": fault, "logs": 1, "recommended": 0, "unsafe": 0}
     with suppress(ValueError):  # refused
-        model = identify(Log(flow, temperature, h), Knowledge(operating_flow=0.0))
+        model = identify(Log(flow, temperature, h), operating_flow=0.0)
         for name, true in {"delay": delay / h, "gain": gain, "dead_zone": zone}.items():
             _, low, high = model.estimates[name]
             found[name] = 100.0 * (low - 1e-9 <= true <= high + 1e-9)
-        for each in recommended(model):
+        for each in controllers(model)["recommended"]:
             typed = each["kp"], each["ti"]
             off = max(sensitivity(plant, *typed, stretch) for stretch in (0.8, 1.2))
             found |= {"Ms": sensitivity(plant, *typed), "Ms, delay a fifth off": off}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.identify.fit import Array, Problem, one_lag
+from benchmarks.identify.fit import Array, Fit, in_series
 
 Passed = Callable[[Array, float], Array]
 
@@ -37,9 +37,9 @@ class Kind:
     """Shares of the delay to try: some valves look like a part of it."""
 
 
-SOUND = Kind(lambda u, _: u, (0.0,))
 # A linear controller can be tuned for the plant behind these.
 VALVES = {
+    "none": Kind(lambda u, _: u, (0.0,)),
     "dead zone": Kind(lambda u, size: np.where(np.abs(u) < size, 0.0, u)),
     "subtractive dead zone": Kind(
         lambda u, size: np.sign(u) * np.maximum(np.abs(u) - size, 0.0)
@@ -73,77 +73,54 @@ class Hypothesis:
     """t/h, of a rate t/h a row; of a change its share of the gain."""
     drop: float
     """What it takes from the deviance."""
-    problem: Problem
-    p: Array
-    gain: float
-    """Of the plant behind it."""
+    fit: Fit
 
 
-def with_valve(
-    problem: Problem, shape: str, p: Array, command: Array, kinds: dict[str, Kind]
+def with_valves(
+    fit: Fit, command: Array, kinds: dict[str, Kind], plain: Fit | None = None
 ) -> list[Hypothesis]:
-    """Return a sound valve and other kinds, each with its best size, the likeliest first.
+    """Return kinds of valves, each with its best size and plant, the likeliest first.
 
-    `command` is the flow commanded, from the operating point.
+    `command` is the flow commanded, from the operating point. What they explain is that beyond
+    a plain fit, by default that of the first kind.
     """
-    found, largest, plain = list[Hypothesis](), float(np.abs(command).max()), 0.0
-    for name, kind in {"none": SOUND, **kinds}.items():
-        unit = largest * (problem.h / problem.scale if name == "rate limit" else 1.0)
-        places = [np.r_[share * p[0], p[1:]] for share in kind.delays]
+    found, largest = [], float(np.abs(command).max())
+    for name, kind in kinds.items():
+        unit = largest * (fit.h / fit.scale if name == "rate limit" else 1.0)
+        places = [fit.at(np.r_[share * fit.p[0], fit.p[1:]]) for share in kind.delays]
         sizes = [unit * share for share in kind.sizes]
-        # A size at a place, and the place at that size, in turns.
-        for finer in FINER:
-            passed = [(problem.behind(kind.passed(command, size)), size) for size in sizes]
-            tried = [(*each, q) for each in passed for q in places]
-            behind, size, q = min(tried, key=lambda x: x[0].solve(shape, x[2]).deviance)
-            deviance, q = behind.refined(shape, q, 12)
-            sizes, places = [size * factor for factor in finer], [q]
-        plain = plain if found else deviance
-        gain = behind.plant(shape, q, behind.solve(shape, q).c).gain
-        drop = plain - deviance
-        found.append(Hypothesis(name, size, drop, behind, q, gain))
-    return sorted(found, key=lambda each: -round(each.drop))
-
-
-def with_hysteresis(problem: Problem, shape: str, p: Array, command: Array) -> list[Hypothesis]:
-    """Return backlash and stiction, each with its best size, plant and noise."""
-    own, found = problem.reweighted(shape, p), []
-    plain = own.refined(shape, p, 12)[0]
-    for name, kind in HYSTERESES.items():
-        places = [np.r_[share * p[0], p[1:]] for share in kind.delays]
-        sizes = [float(np.abs(command).max()) * share for share in kind.sizes]
-        # The plant that was found without hysteresis is too slow: each size has its own.
+        # A size at a place, and the place at that size, in turns. The plant that was found
+        # without hysteresis is too slow for one: there each size has its own place.
         for finer in FINER:
             tried = []
             for size in sizes:
-                behind = problem.behind(kind.passed(command, size))
-                prices = [behind.solve(shape, q).deviance for q in places]
-                nearest = places[int(np.argmin(prices))]
-                tried.append((*behind.refined(shape, nearest, 8), size, behind))
-            _, q, size, behind = min(tried, key=lambda each: each[0])
-            sizes, places = [size * factor for factor in finer], [q]
-        # Nor is the noise what that plant left.
-        behind = behind.reweighted(shape, q)
-        deviance, q = behind.refined(shape, q, 12)
-        gain = behind.plant(shape, q, behind.solve(shape, q).c).gain
-        found.append(Hypothesis(name, size, plain - deviance, behind, q, gain))
-    return found
+                passed = kind.passed(command, size)
+                nearest = min(
+                    (each.behind(passed) for each in places), key=lambda each: each.deviance
+                )
+                tried.append((size, nearest.refined(8) if name in HYSTERESES else nearest))
+            size, best = min(tried, key=lambda each: each[1].deviance)
+            if name not in HYSTERESES:
+                best = best.refined(12)
+            places, sizes = [best], [size * factor for factor in finer]
+        if name in HYSTERESES:  # nor is the noise what that plant left
+            best = best.reweighted().refined(12)
+        plain = plain or best
+        found.append(Hypothesis(name, size, plain.deviance - best.deviance, best))
+    return sorted(found, key=lambda each: -round(each.drop))
 
 
-def with_change(problem: Problem, shape: str, p: Array) -> list[Hypothesis]:
+def with_changes(fit: Fit) -> list[Hypothesis]:
     """Return what changes a plant's gain or speed, each as one more input of the plant."""
-    flow, plain = problem.flow, problem.refined(shape, p, 12)[0]
-    answer = one_lag(problem.units(shape, p)[0].slowest).simulated(flow, problem.h)
+    flow, plain, found = fit.flow, fit.refined(12).deviance, []
+    answer = in_series([fit.units[0].slowest]).simulated(flow, fit.h)
     inputs = {
         "gain by level": flow**2 / np.abs(flow).max(),
         "gain by time": flow * np.linspace(-1.0, 1.0, len(flow)),
-        "speed by direction": np.abs(np.gradient(answer, problem.h)) * problem.scale,
+        "speed by direction": np.abs(np.gradient(answer, fit.h)) * fit.scale,
     }
-    found = []
     for name, each in inputs.items():
-        more = replace(problem, extra=(each,))
-        deviance, q = more.refined(shape, p, 16)
-        c, units = more.solve(shape, q).c, len(more.units(shape, q))
-        gain = float(c[:units].sum())
-        found.append(Hypothesis(name, float(c[units]) / gain, plain - deviance, more, q, gain))
+        more = replace(fit, extra=(each,)).refined(16)
+        size = float(more.solution.c[len(more.units)]) / more.plant.gain
+        found.append(Hypothesis(name, size, plain - more.deviance, more))
     return found
