@@ -25,27 +25,15 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     effect. Such an action is moved outwards by one float. Arguments broadcast.
     """
     action = np.asarray(2.0 * (command - u_min) / (u_max - u_min) - 1.0, dtype=np.float32)
-    if np.any(np.asarray(dead_zone) > 0.0):
+    if np.ndim(dead_zone) or dead_zone > 0.0:
         arrives = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0
         lost = (np.abs(command) >= dead_zone) & (np.abs(arrives) < dead_zone)
-        # The plant adds 1, which rounds away steps finer than the float spacing at 1.
-        outwards = np.copysign(np.spacing(np.maximum(np.abs(action), np.float32(1))), command)
-        action = np.where(lost, action + outwards, action).astype(np.float32)
+        if lost.any():
+            # The plant adds 1, which rounds away steps finer than the float spacing at 1.
+            step = np.spacing(np.maximum(np.abs(action), np.float32(1)))
+            action = np.where(lost, action + np.copysign(step, command), action)
+            action = action.astype(np.float32)
     return action
-
-
-def compensate_dead_zone(flow: Any, dead_zone: float, u_min: float, u_max: float) -> Array:
-    """Spread wanted flows over those that pass the dead zone.
-
-    With z the dead zone and v the wanted flow, the command is z + (u_max - z) v / u_max above
-    0, -z + (u_min + z) v / u_min below, and 0 at 0. A limit inside the dead zone is reached by
-    commanding its edge, which (29) limits. In place of v, `flow` is 2 v / (u_max - u_min).
-    """
-    limit = np.where(flow > 0.0, u_max, -u_min)
-    limit = np.where(flow == 0.0, 1.0, limit)
-    share = np.abs(flow) * ((u_max - u_min) / 2.0 / limit)
-    command: Array = np.sign(flow) * (dead_zone + share * np.maximum(limit - dead_zone, 0.0))
-    return command
 
 
 def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:

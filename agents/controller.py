@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache
 from numbers import Integral, Real
 from typing import Annotated, Any, Final, get_type_hints
 
@@ -19,40 +18,26 @@ PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}  # the paper's 
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
 MOST = 1_000_000  # nodes, loops, elements or samples; a larger number is a mistake
 
-
-def check_count(name: str, value: Any, least: int, most: int | None = None) -> int:
-    """Return `value` if it is an integer within bounds; otherwise raise a ValueError."""
-    counts = isinstance(value, Integral) and not isinstance(value, bool)
-    if counts and value >= least and (most is None or int(value) <= most):
-        return int(value)
-    bound = f"of at least {least}" if most is None else f"from {least} to {most:,}"
-    raise ValueError(f"{name} must be an integer {bound}, got {value!r}")
-
-
-def check_number(
-    name: str, value: Any, least: float = -math.inf, above: float = -math.inf
-) -> float:
-    """Return `value` if it is a finite number within bounds; otherwise raise a ValueError."""
-    number = isinstance(value, Real) and not isinstance(value, bool)
-    if number and value >= least and value > above and math.isfinite(value):
-        return float(value)
-    bound = "" if least == -math.inf else f" of at least {least:g}"
-    bound += "" if above == -math.inf else f" above {above:g}"
-    raise ValueError(f"{name} must be a finite number{bound}, got {value!r}")
+# Types of arguments, each with what is allowed, in words and as a condition.
+Number = Annotated[float, "a finite number", math.isfinite]
+NotNegative = Annotated[float, "a finite number of at least 0", lambda x: 0.0 <= x < math.inf]
+Positive = Annotated[float, "a finite number above 0", lambda x: 0.0 < x < math.inf]
+Gain = Annotated[float, "a finite number other than 0", lambda x: 0.0 < abs(x) < math.inf]
+Flag = Annotated[bool, "True or False", lambda x: True]
+Index = Annotated[int, "an integer of at least 0", lambda x: x >= 0]
+Count = Annotated[int, "an integer of at least 1", lambda x: x >= 1]
+Size = Annotated[int, f"an integer from 1 to {MOST:,}", lambda x: 1 <= x <= MOST]
 
 
-def check_gain(name: str, value: Any) -> float:
-    """Return `value` if it is a finite number other than 0; otherwise raise a ValueError."""
-    if check_number(name, value) == 0.0:
-        raise ValueError(f"{name} must not be 0, got {value!r}")
-    return float(value)
-
-
-def check_flag(name: str, value: Any) -> bool:
-    """Return `value` if it is True or False; otherwise raise a ValueError."""
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} must be True or False, got {value!r}")
-    return bool(value)
+def check(name: str, value: Any, of: Any) -> Any:
+    """Return `value` if it is of a type such as `Positive`; otherwise raise a ValueError."""
+    plain, (allowed, holds) = of.__origin__, of.__metadata__
+    fits = isinstance(value, bool | np.bool_)
+    if plain is not bool:
+        fits = not fits and isinstance(value, Integral if plain is int else Real)
+    if fits and holds(value):
+        return plain(value)
+    raise ValueError(f"{name} must be {allowed}, got {value!r}")
 
 
 def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
@@ -66,29 +51,11 @@ def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
     raise ValueError(f"{name} must be numbers, got {value!r}")
 
 
-def check_limits(u_min: Any, u_max: Any) -> None:
-    """Raise a ValueError unless the limits are finite and in order."""
-    low, high = check_number("u_min", u_min), check_number("u_max", u_max)
-    if low >= high:
-        raise ValueError(f"u_min must be below u_max = {u_max!r}, got {u_min!r}")
-
-
-# Types of controller arguments, each with its check.
-Number = Annotated[float, check_number]
-NotNegative = Annotated[float, partial(check_number, least=0.0)]
-Positive = Annotated[float, partial(check_number, above=0.0)]
-Gain = Annotated[float, check_gain]
-Flag = Annotated[bool, check_flag]
-Index = Annotated[int, partial(check_count, least=0)]
-Count = Annotated[int, partial(check_count, least=1)]
-Size = Annotated[int, partial(check_count, least=1, most=MOST)]
-
-
 @cache
-def _checks(controller: type[Controller]) -> dict[str, Callable[[str, Any], Any]]:
-    """Return the checks in the types of a controller's arguments, by argument."""
+def _checked_fields(controller: type[Controller]) -> dict[str, Any]:
+    """Return the types of a controller's arguments that say what is allowed, by argument."""
     hints = get_type_hints(controller, include_extras=True).items()
-    return {name: hint.__metadata__[0] for name, hint in hints if hasattr(hint, "__metadata__")}
+    return {name: hint for name, hint in hints if hasattr(hint, "__metadata__")}
 
 
 @dataclass(eq=False, kw_only=True)
@@ -128,16 +95,16 @@ class Controller(ABC):
     _edge = 0.0  # of the dead zone, t/h; a command on it keeps its effect as an action
 
     def __post_init__(self) -> None:
-        for name, check in _checks(type(self)).items():
-            setattr(self, name, check(name, getattr(self, name)))
-        check_limits(self.u_min, self.u_max)
-        self.command = np.float64(0.0)
-        self._loops_before: tuple[int, ...] | None = None  # since `reset`, () or (batch,)
+        for name, of in _checked_fields(type(self)).items():
+            setattr(self, name, check(name, getattr(self, name), of))
+        if self.u_min >= self.u_max:
+            raise ValueError(f"u_min must be below u_max = {self.u_max!r}, got {self.u_min!r}")
+        self.reset()
 
     def reset(self) -> None:
         """Forget the episode, but keep what was learnt."""
         self.command = np.float64(0.0)
-        self._loops_before = None
+        self._loops_before: tuple[int, ...] | None = None  # since `reset`, () or (batch,)
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the controller was not made for: scores would be wrong in silence.
@@ -164,11 +131,9 @@ class Controller(ABC):
                 f"policy must be made with the limits of env, u_min={limits[0]}, "
                 f"u_max={limits[1]}, got {self.u_min}, {self.u_max}"
             )
-        shown = {
-            "setpoint": (0, parameters.setpoint_window),
-            "error": (parameters.setpoint_window, parameters.error_window),
-        }
-        for signal, (place, window) in shown.items():
+        place = 0  # of the newest sample of a signal
+        for signal in ("setpoint", "error"):
+            window = getattr(parameters, f"{signal}_window")
             index = getattr(self, f"{signal}_index", None)  # None where it is not read alone
             if index is not None and (index != place or not window):
                 raise ValueError(
@@ -176,6 +141,7 @@ class Controller(ABC):
                     f"where policy reads it, got setpoint_window={parameters.setpoint_window}, "
                     f"error_window={parameters.error_window}"
                 )
+            place += window
         if wrapped:
             raise ValueError(
                 f"env must not be wrapped, as policy commands the flow itself, got {wrapped}"
@@ -213,17 +179,18 @@ class Controller(ABC):
         now, before = values.shape[:-1], self._loops_before
         if before not in (None, now):
             raise ValueError(
-                f"observation must have shape {(*before, self.n_obs)}, as those before it, "
-                f"until reset; got {values.shape}"
+                f"observation must have shape {(*before, self.n_obs)}, that of the loops since "
+                f"reset or of num_envs, got {values.shape}"
             )
-        self.command = self._control(values)
+        command = self._control(np.atleast_2d(values))
+        self.command = command if len(now) else command[0]
         if self._remembers:
             self._loops_before = now
         return float32_action(self.command, self.u_min, self.u_max, self._edge)[..., np.newaxis]
 
     @abstractmethod
-    def _control(self, observation: NDArray[np.float64]) -> Values:
-        """Return u, t/h, for a checked observation."""
+    def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return u, t/h, shape (loops,), for checked observations, shape (loops, size)."""
 
 
 @dataclass(eq=False, kw_only=True)

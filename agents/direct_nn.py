@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.controller import (
-    MOST,
     Controller,
     Count,
     Flag,
@@ -19,11 +17,9 @@ from agents.controller import (
     NotNegative,
     Number,
     Size,
-    Values,
-    check_count,
-    check_numbers,
+    check,
 )
-from agents.networks import reading
+from agents.networks import check_array, reading, write
 
 Array = NDArray[np.float64]
 
@@ -43,8 +39,7 @@ class Weights:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the weights to a `.npz` file."""
-        with Path(path).open("wb") as file:
-            np.savez(file, **vars(self))
+        write(path, {}, **vars(self))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Weights:
@@ -125,30 +120,30 @@ class DirectNNController(Controller):
     update_interval: Count = 1
 
     def __post_init__(self) -> None:
+        self._batch = () if self.num_envs is None else (self.num_envs,)  # the leading axis
         super().__post_init__()
         self.n_obs = max(self.n_inputs, self.error_index + 1)
         if abs(self.direction) != 1.0:
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
         if self.num_envs is not None:
-            check_count("num_envs", self.num_envs, 1, MOST)
-        self._batch = () if self.num_envs is None else (self.num_envs,)  # the leading axis
+            check("num_envs", self.num_envs, Size)
         self._shapes = {
             "W": (self.n_hidden, self.n_inputs),
             "theta_1": (self.n_hidden,),
             "W_1": (self.n_hidden,),
             "theta_2": (),
         }
-        self._sample = 0  # k
-        seeds = range(self.seed, self.seed + (self.num_envs or 1))
+        seeds, scale = range(self.seed, self.seed + (self.num_envs or 1)), self.weight_scale
         generators = [np.random.default_rng(seed) for seed in seeds]
-        scale = self.weight_scale
+        drawn = {
+            name: [each.uniform(-scale, scale, shape) for each in generators]
+            for name, shape in self._shapes.items()
+        }
         self.weights = Weights(
-            *(
-                np.reshape(
-                    [g.uniform(-scale, scale, shape) for g in generators], self._batch + shape
-                )
-                for shape in self._shapes.values()
-            )
+            **{
+                name: np.reshape(x, self._batch + self._shapes[name])
+                for name, x in drawn.items()
+            }
         )
 
     @property
@@ -162,26 +157,19 @@ class DirectNNController(Controller):
         ValueError
             If a shape does not fit or a value is not finite; the weights are then unchanged.
         """
-        arrays = (self._W, self._theta_1, self._W_1, self._theta_2)
         which = 0 if self.num_envs is None else slice(None)
-        return Weights(*(np.array(array.T[which], order="C") for array in arrays))
+        return Weights(*(np.array(array.T[which], order="C") for array in self._arrays))
 
     @weights.setter
     def weights(self, weights: Weights) -> None:
         arrays = []
         for name, shape in self._shapes.items():
-            array = check_numbers(f"weights.{name}", getattr(weights, name))
-            full_shape = self._batch + shape
-            if array.shape not in (shape, full_shape):
-                raise ValueError(
-                    f"weights.{name} must have shape {full_shape}, got {array.shape}"
-                )
-            if not np.isfinite(array).all():
-                raise ValueError(f"weights.{name} must be finite")
+            given, shapes = getattr(weights, name), (shape, self._batch + shape)
+            array = check_array(f"weights.{name}", given, *shapes, dtype=np.float64)
             every = np.broadcast_to(array, (self.num_envs or 1, *shape))
             arrays.append(np.array(every.T, order="C"))
         # The batch axis is last, so that sums over nodes add long rows; W is (N, N_1, batch).
-        self._W, self._theta_1, self._W_1, self._theta_2 = arrays
+        self._arrays = arrays
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the controller was not made for; see `Controller`."""
@@ -195,29 +183,27 @@ class DirectNNController(Controller):
     def reset(self) -> None:
         """Forget the episode, but keep the weights."""
         super().reset()
-        self._sample = 0
+        self._loops_before = self._batch
+        self._sample = 0  # k
 
-    def _control(self, observation: Array) -> Values:
-        if observation.shape[:-1] != self._batch:
-            expected = "(n_obs,)" if self.num_envs is None else f"({self.num_envs}, n_obs)"
-            raise ValueError(f"observation must have shape {expected}, got {observation.shape}")
-        batch = np.atleast_2d(observation)
-        X = self.input_scale * np.ascontiguousarray(batch[:, : self.n_inputs].T)  # (N, batch)
-        e = batch[:, self.error_index]
+    def _control(self, rows: Array) -> Array:
+        X = self.input_scale * np.ascontiguousarray(rows[:, : self.n_inputs].T)  # (N, batch)
+        e = rows[:, self.error_index]
 
-        X_1 = _sigmoid(_sum_of_rows(self._W * X[:, np.newaxis]) + self._theta_1)  # A
-        X_2 = _sigmoid(_sum_of_rows(self._W_1 * X_1) + self._theta_2)  # B
+        W, theta_1, W_1, theta_2 = self._arrays
+        X_1 = _sigmoid(_sum_of_rows(W * X[:, np.newaxis]) + theta_1)  # A
+        X_2 = _sigmoid(_sum_of_rows(W_1 * X_1) + theta_2)  # B
         u = X_2 * (self.u_max - self.u_min) + self.u_min  # Section 4, last formula
 
         if self.learning and self._sample % self.update_interval == 0:
             delta_1 = e * self.direction * X_2 * (1.0 - X_2)  # (27)
-            delta = delta_1 * self._W_1 * X_1 * (1.0 - X_1)  # D, with W_1(k): before C
-            self._W_1 += self.eta_1 * delta_1 * X_1  # C
-            self._W += self.eta * delta * X[:, np.newaxis]  # D
-            self._theta_2 += self.eta_1_theta * delta_1  # E
-            self._theta_1 += self.eta_theta * delta  # E
+            delta = delta_1 * W_1 * X_1 * (1.0 - X_1)  # D, with W_1(k): before C
+            W_1 += self.eta_1 * delta_1 * X_1  # C
+            W += self.eta * delta * X[:, np.newaxis]  # D
+            theta_2 += self.eta_1_theta * delta_1  # E
+            theta_1 += self.eta_theta * delta  # E
         self._sample += 1
-        return u[0] if observation.ndim == 1 else u
+        return u
 
 
 def _sum_of_rows(terms: Array) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -16,15 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.actuator import compensate_dead_zone
-from agents.controller import (
-    Controller,
-    Values,
-    check_count,
-    check_limits,
-    check_number,
-    check_numbers,
-)
+from agents.controller import Controller, Index, NotNegative, Values, check, check_numbers
 
 Array = NDArray[np.floating[Any]]
 # Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
@@ -54,12 +46,14 @@ def forward(layers: Layers, activation: str, inputs: ArrayLike) -> NDArray[np.fl
     return (x @ last_W.T + last_b).astype(np.float64)
 
 
-def check_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return a copy in float32 if the shape fits and all is finite; otherwise a ValueError."""
+def check_array(
+    name: str, value: ArrayLike, *shapes: tuple[int, ...], dtype: Any = np.float32
+) -> NDArray[Any]:
+    """Return a copy if it has one of the shapes and is finite; otherwise raise a ValueError."""
     with np.errstate(over="ignore"):  # too large for float32 is infinite there, and refused
-        array = np.array(check_numbers(name, value), np.float32)
-    if array.shape != shape:
-        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+        array = np.array(check_numbers(name, value), dtype)
+    if array.shape not in shapes:
+        raise ValueError(f"{name} must have shape {shapes[-1]}, got {array.shape}")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite")
     return array
@@ -96,6 +90,20 @@ def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDAr
             raise ValueError(f"{path} holds no {holds}, or is damaged: {error}") from error
 
 
+def read_layers(file: Mapping[str, Array], layers: int, prefix: str = "") -> Layers:
+    """Return the layers that have the names that `write` gives."""
+    return [(file[f"{prefix}W{i}"], file[f"{prefix}b{i}"]) for i in range(layers)]
+
+
+def write(path: str | PathLike[str], layers: Mapping[str, Layers], **arrays: Any) -> None:
+    """Write layers, by the prefix of their names, and other arrays to an `.npz` file."""
+    for prefix, each in layers.items():
+        for i, (W, b) in enumerate(each):
+            arrays |= {f"{prefix}W{i}": W, f"{prefix}b{i}": b}
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
 @dataclass(frozen=True)
 class Increments:
     """Velocity form: the network's output changes the wanted flow, which is 0 at first."""
@@ -103,12 +111,13 @@ class Increments:
     max_move: float
     """Change of the wanted flow per sample at an output of 1, as a share of half the range."""
     dead_zone: float = 0.0
-    """Half width of the dead zone to compensate, t/h; see `compensate_dead_zone`. If it is 0,
-    the wanted flow is the command."""
+    """Half width z of the dead zone to compensate, t/h, or 0. Wanted flows v are spread over
+    those that pass: the command is z + (u_max - z) v / u_max above 0, 0 at 0, and below
+    -z + (u_min + z) v / u_min. A limit inside the zone is reached by commanding its edge."""
 
     def __post_init__(self) -> None:
-        check_number("max_move", self.max_move, 0)
-        check_number("dead_zone", self.dead_zone, 0)
+        check("max_move", self.max_move, NotNegative)
+        check("dead_zone", self.dead_zone, NotNegative)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -153,7 +162,7 @@ class PolicyNetwork(Controller):
             if name not in WINDOWS:
                 raise ValueError(f"observation must name {', '.join(WINDOWS)}, got {name!r}")
         self.observation = {
-            name: check_count(f"observation[{name!r}]", self.observation.get(name, 0), 0)
+            name: check(f"observation[{name!r}]", self.observation.get(name, 0), Index)
             for name in WINDOWS
         }
         self.n_obs = sum(self.observation.values())
@@ -165,32 +174,26 @@ class PolicyNetwork(Controller):
         self._edge = self.increments.dead_zone if self.increments else 0.0
         self.input_scale = check_array("input_scale", self.input_scale, (self.n_obs,))
         self.layers = check_layers(self.layers, self.n_obs, 1)
-        self._flow: Values | None = None  # wanted, as a share of half the range
 
     @classmethod
     def load(
         cls, path: str | PathLike[str], *, u_min: float = -10.0, u_max: float = 10.0
     ) -> PolicyNetwork:
-        """Read a network written by `save`; errors are those of `reading`.
-
-        Limits that are not finite and in order are a ValueError, too.
-        """
-        check_limits(u_min, u_max)  # here: `reading` would report a damaged file
+        """Read a network written by `save`; errors are those of `reading` and of the limits."""
         with reading(path, "policy network") as file:
             about = json.loads(str(file["about"]))
             if about["format"] != 1:
                 raise ValueError(f"its format is {about['format']!r}, not 1")
             increments = about["increments"]
-            return cls(
-                [(file[f"W{i}"], file[f"b{i}"]) for i in range(about["layers"])],
+            network = cls(
+                read_layers(file, about["layers"]),
                 observation=about["observation"],
                 input_scale=file["input_scale"],
                 activation=about["activation"],
                 increments=None if increments is None else Increments(**increments),
                 provenance=about["provenance"],
-                u_min=u_min,
-                u_max=u_max,
             )
+        return replace(network, u_min=u_min, u_max=u_max)  # no errors of a damaged file
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the network to a `.npz` file."""
@@ -202,11 +205,7 @@ class PolicyNetwork(Controller):
             "increments": None if self.increments is None else asdict(self.increments),
             "provenance": self.provenance,
         }
-        arrays: dict[str, Any] = {"about": json.dumps(about), "input_scale": self.input_scale}
-        for i, (W, b) in enumerate(self.layers):
-            arrays |= {f"W{i}": W, f"b{i}": b}
-        with Path(path).open("wb") as file:
-            np.savez_compressed(file, **arrays)
+        write(path, {"": self.layers}, about=json.dumps(about), input_scale=self.input_scale)
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the network was not made for; see `Controller`."""
@@ -220,22 +219,24 @@ class PolicyNetwork(Controller):
     def reset(self) -> None:
         """Forget the episode, which is the wanted flow in velocity form."""
         super().reset()
-        self._flow = None
+        self._flow: Values = np.float64(0.0)  # wanted, as a share of half the range
 
-    def _control(self, observation: NDArray[np.float64]) -> Values:
-        if observation.shape[-1] != self.n_obs:
+    def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        if rows.shape[1] != self.n_obs:
             raise ValueError(
-                f"observation must have {self.n_obs} elements, got {observation.shape[-1]}: "
+                f"observation must have {self.n_obs} elements, got {rows.shape[1]}: "
                 f"make the environment with the network's `observation`, {self.observation}"
             )
-        outputs = forward(self.layers, self.activation, observation * self.input_scale)
-        output: Values = np.clip(outputs[..., 0], -1.0, 1.0)
-        half_range, lowest = (self.u_max - self.u_min) / 2.0, -1.0
-        if self.increments is not None:
-            lowest, highest = self.u_min / half_range, self.u_max / half_range
-            before = 0.0 if self._flow is None else self._flow
-            moved = before + self.increments.max_move * output
-            self._flow = output = np.clip(moved, lowest, highest)
-            if self._edge > 0.0:
-                return compensate_dead_zone(output, self._edge, self.u_min, self.u_max)
-        return self.u_min + (output - lowest) * half_range
+        outputs = forward(self.layers, self.activation, rows * self.input_scale)
+        output = np.clip(outputs[:, 0], -1.0, 1.0)
+        half_range, z = (self.u_max - self.u_min) / 2.0, self._edge
+        if self.increments is None:
+            return self.u_min + (output + 1.0) * half_range
+        moved, lowest = self._flow + self.increments.max_move * output, self.u_min / half_range
+        self._flow = flow = np.clip(moved, lowest, self.u_max / half_range)
+        if z == 0.0:
+            return self.u_min + (flow - lowest) * half_range
+        limit = np.where(flow > 0.0, self.u_max, np.where(flow < 0.0, -self.u_min, 1.0))
+        share = np.abs(flow) * (half_range / limit)
+        command: NDArray[np.float64] = np.sign(flow) * (z + share * np.maximum(limit - z, 0.0))
+        return command

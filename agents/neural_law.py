@@ -19,8 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import avoid_dead_zone
-from agents.controller import Index, ModelBasedController, NotNegative, Values
-from agents.networks import PRETRAINED, Layers, check_layers, forward, reading
+from agents.controller import Index, ModelBasedController, NotNegative
+from agents.networks import (
+    PRETRAINED,
+    Layers,
+    check_layers,
+    forward,
+    read_layers,
+    reading,
+    write,
+)
 
 Array = NDArray[np.float64]
 
@@ -104,7 +112,8 @@ class Law:
         return value
 
     def __init__(self, prior: Prior, aggressiveness: float = 0.0) -> None:
-        zero = self._zero = prior.unit * 0.0
+        self.prior, zero = prior, prior.unit * 0.0
+        self._zero = zero
         of_load = np.arange(_MEANS) < _LOADS
         self._of_load = self._array(of_load)
         self._alike = self._array(np.equal.outer(of_load, of_load))  # means of one kind
@@ -116,7 +125,7 @@ class Law:
         self._means = zero[:, None] * self._rates
         self._innovations = zero[:, None] + self._array([0.0] * INNOVATIONS)
         self._misses = [self._means[:, :_LOADS] + LEAST_NOISE] * len(MISS_RATES)
-        self._adopt(prior)
+        self.adopt(prior, zero + 1.0, zero)
 
     def adopt(self, prior: Prior, ratio: Any, residual: Any) -> None:
         """Adopt new numbers of the plants, and convert the memory to them.
@@ -136,15 +145,11 @@ class Law:
         self._means = self._xp.concatenate([loads, residuals], axis=1)
         self._innovations = self._innovations * units[:, None]
         self._misses = [misses * units[:, None] for misses in self._misses]
-        self._adopt(prior)
-
-    def _adopt(self, prior: Prior) -> None:
-        xp, self.prior = self._xp, prior
         self._shares = self._of_each_mean((1.0 - prior.fading) / prior.unit, prior.fading)
-        constant, delay = xp.log(prior.time_constant), prior.delay / 20.0 - 1.0
+        constant, delay = self._xp.log(prior.time_constant), prior.delay / 20.0 - 1.0
         uncertainty = 3.0 * prior.uncertainty
         known = [constant, delay, prior.dead_zone, prior.centre, uncertainty]
-        self._known = xp.stack(known, axis=1)
+        self.prior, self._known = prior, self._xp.stack(known, axis=1)
 
     def flow(
         self, network: Network, setpoint: Any, residual: Any, load: Any, state: Any
@@ -268,24 +273,16 @@ class LawNetwork:
     def load(cls, path: str | PathLike[str] = PRETRAINED / "nn-smith.npz") -> LawNetwork:
         """Read networks written by `save`; errors are those of `agents.networks.reading`."""
         with reading(path, "network of the law") as file:
-            choosing, adding = (
-                [(file[f"{part}_W{i}"], file[f"{part}_b{i}"]) for i in range(3)]
-                for part in ("choosing", "adding")
-            )
             return cls(
-                check_layers(choosing, INPUTS, OUTPUTS),
-                check_layers(adding, INPUTS, 1),
+                check_layers(read_layers(file, 3, "choosing_"), INPUTS, OUTPUTS),
+                check_layers(read_layers(file, 3, "adding_"), INPUTS, 1),
                 json.loads(str(file["provenance"])),
             )
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the networks to a `.npz` file."""
-        arrays: dict[str, Any] = {"provenance": json.dumps(dict(self.provenance))}
-        for part, layers in (("choosing", self.choosing), ("adding", self.adding)):
-            for i, (W, b) in enumerate(layers):
-                arrays[f"{part}_W{i}"] = W.astype(np.float32)
-                arrays[f"{part}_b{i}"] = b.astype(np.float32)
-        np.savez_compressed(path, **arrays)
+        layers = {"choosing_": self.choosing, "adding_": self.adding}
+        write(path, layers, provenance=json.dumps(dict(self.provenance)))
 
 
 @dataclass(eq=False, kw_only=True)
@@ -343,21 +340,19 @@ class NeuralSmithPredictor(ModelBasedController):
             centre=(self.u_max + self.u_min) / 2.0 / self._flow,
             uncertainty=self.uncertainty,
         )
-        self._law: Law | None = None
 
     def reset(self) -> None:
         """Forget the episode, and return the model to rest."""
         super().reset()
-        self._law = None
+        self._law: Law | None = None
 
-    def _control(self, observation: Array) -> Values:
-        rows = np.atleast_2d(observation)
+    def _control(self, rows: Array) -> Array:
         if self._law is None:
             self._law = self._start(len(rows))
         if self._k % self._every == 0:
             self._last = self._decide(self._law, rows)
         self._k += 1
-        return self._last if observation.ndim == 2 else np.float64(self._last[0])
+        return self._last
 
     def _start(self, loops: int) -> Law:
         """Set the model to rest, and return the law."""

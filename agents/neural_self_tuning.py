@@ -59,12 +59,11 @@ class NeuralSelfTuningController(SelfTuningController):
         self._half = (self.u_max - self.u_min) / 2.0
         self._flow = self._half * np.sign(self.gain)  # t/h at a flow of 1
         self._authority: Array  # of the bank's model, degC
-        self._rule: Law | None = None
 
     def reset(self) -> None:
         """Forget the episode and what was learnt: the next plant may be different."""
         super().reset()
-        self._rule = None
+        self._rule: Law | None = None
 
     def _informed(self, before: Array) -> Law:
         """Return the law, updated with the bank's estimates."""

@@ -14,13 +14,14 @@ from agents.actuator import applied_flow
 from agents.controller import (
     Controller,
     Flag,
+    Gain,
     Index,
     ModelBasedController,
+    NotNegative,
     Number,
     Positive,
     Values,
-    check_gain,
-    check_number,
+    check,
 )
 
 Array = NDArray[np.float64]
@@ -60,7 +61,6 @@ class PIController(Controller):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.n_obs = self.error_index + 1
-        self._sum: Values | None = None  # of all errors so far
 
     @classmethod
     def simc(
@@ -89,14 +89,14 @@ class PIController(Controller):
         arguments
             Other arguments of the controller.
         """
-        k = check_gain("gain", gain)
-        tau_1 = check_number("time_constant", time_constant, above=0)
-        theta = check_number("delay", delay, 0)
+        k = check("gain", gain, Gain)
+        tau_1 = check("time_constant", time_constant, Positive)
+        theta = check("delay", delay, NotNegative)
         if closed_loop_time_constant is None and theta == 0.0:
             raise ValueError("closed_loop_time_constant must be given where delay is 0")
         tau_c = theta if closed_loop_time_constant is None else closed_loop_time_constant
-        tau_c = check_number("closed_loop_time_constant", tau_c, above=0)
-        interval = check_number("sampling_interval", sampling_interval, above=0)
+        tau_c = check("closed_loop_time_constant", tau_c, Positive)
+        interval = check("sampling_interval", sampling_interval, Positive)
         kp = -tau_1 / (k * (tau_c + theta))  # (23), with the sign of u = -Kp e
         tau_i = min(tau_1, 4 * (tau_c + theta))  # (24)
         return cls(kp, kp * interval / tau_i, **{"anti_windup": True, **arguments})
@@ -104,7 +104,7 @@ class PIController(Controller):
     def reset(self) -> None:
         """Set the integral to zero."""
         super().reset()
-        self._sum = None
+        self._sum: Values = np.float64(0.0)  # of all errors so far
 
     def transfer(self) -> tuple[Array, Array]:
         """Return the transfer function from e to u, valid between the limits.
@@ -117,10 +117,8 @@ class PIController(Controller):
         numerator = np.array([-(self.kp + self.ki), self.kp])
         return numerator, np.array([1.0, -1.0])
 
-    def _control(self, observation: Array) -> Values:
-        error: Values = observation[..., self.error_index]
-        if self._sum is None:
-            self._sum = np.zeros_like(error)
+    def _control(self, rows: Array) -> Array:
+        error: Array = rows[:, self.error_index]
         total = self._sum + error
         command = -self.kp * error - self.ki * total  # Section 5
         if self.anti_windup:
@@ -172,21 +170,17 @@ class SmithPredictor(ModelBasedController, PIController):
         self._pole = math.exp(-self.sampling_interval / self.time_constant)
         self._input_gain = self.gain * (1.0 - self._pole)
         self._delay = max(round(self._delay_samples), 1)
-        self._model: list[Values] = []  # its last undelayed outputs, newest last
 
     def reset(self) -> None:
         """Set the integral to zero, and return the model to rest."""
         super().reset()
-        self._model = []
+        self._model: list[Values] = []  # its last undelayed outputs, newest last
 
     def transfer(self) -> tuple[Array, Array]:
         """Return the transfer function from e to u, valid away from limits and dead zone.
 
-        Returns
-        -------
-        numerator, denominator
-            Coefficients of z^0, z^-1 and so on, of the PI controller with the undelayed minus
-            the delayed model fed back around it.
+        It is that of the PI controller with the undelayed minus the delayed model fed back
+        around it, in the coefficients of `PIController.transfer`.
         """
         pi, integral = super().transfer()
         model = np.array([0.0, self._input_gain]), np.array([1.0, -self._pole])
@@ -197,14 +191,12 @@ class SmithPredictor(ModelBasedController, PIController):
         returning = np.convolve(np.convolve(pi, model[0]), ahead)
         return np.convolve(pi, model[1]), polyadd(outgoing, returning)
 
-    def _control(self, observation: Array) -> Values:
-        if not self._model:
-            rest = np.zeros_like(observation[..., self.error_index])
-            self._model = [rest] * self._delay
-        now, delayed = self._model[-1], self._model[0]
-        foreseen = np.array(observation)
-        foreseen[..., self.error_index] -= now - delayed
+    def _control(self, rows: Array) -> Array:
+        model = self._model or [np.float64(0.0)] * self._delay
+        now, delayed = model[-1], model[0]
+        foreseen = rows.copy()
+        foreseen[:, self.error_index] -= now - delayed
         command = super()._control(foreseen)
         applied = applied_flow(command, self.dead_zone, self.u_min, self.u_max)
-        self._model = [*self._model[1:], self._pole * now + self._input_gain * applied]
+        self._model = [*model[1:], self._pole * now + self._input_gain * applied]
         return command

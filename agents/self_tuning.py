@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import applied_flow, avoid_dead_zone
-from agents.controller import Count, Index, ModelBasedController, Positive, Values, check_count
+from agents.controller import Count, Index, ModelBasedController, Positive
 
 Array = NDArray[np.float64]
 
@@ -108,7 +108,9 @@ class SelfTuningController(ModelBasedController):
         super().__post_init__()
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
         least, most = self.shortest_delay_samples, self.longest_delay_samples
-        check_count("longest_delay_samples", most, least, MOST_DELAY)
+        if not least <= most <= MOST_DELAY:
+            allowed = f"from shortest_delay_samples = {least} to {MOST_DELAY:,}"
+            raise ValueError(f"longest_delay_samples must be {allowed}, got {most!r}")
         if self.forgetting > 1.0:
             raise ValueError(f"forgetting must be above 0, up to 1, got {self.forgetting!r}")
         limit = max(abs(self.u_min), abs(self.u_max))
@@ -133,7 +135,6 @@ class SelfTuningController(ModelBasedController):
         self._gain_range = sorted(self.gain * multiple for multiple in GAINS)
         self._excited = EXCITED * (self.u_max - self.u_min) / 2.0
         self._history = most - 1 + max(MEMORY, self._every) + 2
-        self._loops = 0  # unknown before the first observation
 
     @property
     def estimates(self) -> dict[str, Array]:
@@ -155,7 +156,7 @@ class SelfTuningController(ModelBasedController):
     def reset(self) -> None:
         """Forget the episode and what was learnt: the next plant may be different."""
         super().reset()
-        self._loops = 0
+        self._loops = 0  # unknown before the first observation
 
     def _start(self, loops: int) -> None:
         """Set all signals to rest, and the models to the results of the step test."""
@@ -244,8 +245,7 @@ class SelfTuningController(ModelBasedController):
         by_zone = self._by_response.reshape(self._loops, len(self._zones), -1).sum(2)
         self._zone = self._zones[by_zone.argmax(1)]
 
-    def _control(self, observation: Array) -> Values:
-        rows = np.atleast_2d(observation)
+    def _control(self, rows: Array) -> Array:
         if not self._loops:
             self._start(len(rows))
         setpoint = rows[:, self.setpoint_index]
@@ -262,7 +262,7 @@ class SelfTuningController(ModelBasedController):
         edge = np.where(self._zone > 0.0, self._zone + self._clearance, 0.0)
         command: Array = avoid_dead_zone(self._law(setpoint), edge)
         self._apply(command)
-        return command if observation.ndim == 2 else command[0]
+        return command
 
     def _law(self, setpoint: Array) -> Array:
         """Return the wanted command, t/h."""

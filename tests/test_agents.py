@@ -373,7 +373,7 @@ class TestPolicyNetwork:
         for each in (network, moving):
             each.act([[0.0], [0.0]])
         network.act([[0.0]])
-        with pytest.raises(ValueError, match="until reset"):
+        with pytest.raises(ValueError, match="since reset"):
             moving.act([[0.0]])
         for size in (4, 6):
             with pytest.raises(ValueError, match=r"^observation must .*5[ ,]"):
