@@ -14,11 +14,11 @@ from benchmarks.bounds import least
 from benchmarks.bounds.__main__ import main
 from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.least import least_possible
-from benchmarks.bounds.linear_program import plan, reference
+from benchmarks.bounds.linear_program import equations, plan, reference, response
 from benchmarks.bounds.unknown import noise_variance, unknown
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.lib import storage
-from benchmarks.loop.linear import time_varying_model
+from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS
 from mptc_gym import Parameters
@@ -43,7 +43,7 @@ def minimum_variance(parameters):
 
 def course_of(samples, **arguments):
     parameters = Parameters(**arguments)
-    return time_varying_model(parameters, Ranges(parameters).given, samples)
+    return LinearModel(parameters, Ranges(parameters).given, np.arange(samples))
 
 
 def best_plan(setpoint, /, **arguments):
@@ -60,12 +60,13 @@ def change(level, samples, **arguments):
 
 def test_responses_to_single_flows_are_those_of_the_plant():
     found, parameters = course_of(40, delay=3, dead_zone=0.5), Parameters()
+    G = response(*equations(found, 40))
     pulse = signal.lfilter([0.0] * 4 + list(parameters.b), parameters.a, np.eye(40)[0])
     for j in (0, 7, 39):
-        np.testing.assert_allclose(found.flow_response()[j:, j], pulse[: 40 - j], atol=1e-12)
-        assert not found.flow_response()[:j, j].any()
+        np.testing.assert_allclose(G[j:, j], pulse[: 40 - j], atol=1e-12)
+        assert not G[:j, j].any()
     # A limit within which 0 is no flow, but where the dead zone makes it one.
-    lowest = [course_of(9, u_min=2.0, dead_zone=zone).low for zone in (0.0, 0.5)]
+    lowest = [course_of(9, u_min=2.0, dead_zone=zone).limits[0] for zone in (0.0, 0.5)]
     assert lowest == [2.0, 0.0]
 
 
@@ -193,7 +194,7 @@ class TestUnknown:
             "disturbance_amplitude": 3.0, "disturbance_interval": 25.0,
             "disturbance_walk_variance": 0.02,
         }  # fmt: skip
-        bound = unknown(course_of(620, noise_variance=R, **load)).of(k, k + 1)
+        bound = unknown(course_of(620, noise_variance=R, **load))
         draws, p = 40_000, 0.4
         old = rng.uniform(-3.0, 3.0, draws)  # the level at the last sample that can be known
         jumps = {i: rng.random(draws) < p for i in range(k - 18, k + 1) if i % 10 == 0}
@@ -213,10 +214,10 @@ class TestUnknown:
                 out[1:] = out[:-1].copy()
                 out[0] = noise + sum(CALM.a) * surprise
                 out[0] -= CALM.a[1] * out[1] + CALM.a[2] * out[2]
-        (least,) = bound.mean_error(np.zeros(1))
+        least = bound.mean_error(np.zeros(620))[k]
         assert 0.96 < least / np.abs(told[0]).mean() < 1.01  # slices make it a little smaller
         for m in (0.0, 0.4, 1.5):
-            (least,) = bound.mean_error(np.array([m]))
+            least = bound.mean_error(np.full(620, m))[k]
             found = np.abs(m - y[0])
             assert least < found.mean() + 3 * found.std() / np.sqrt(draws)
 
@@ -228,7 +229,7 @@ class TestCausal:
         samples, plant = 16, {"a": (1.0, -0.6), "b": (-0.24,), "c": (1.0,), "delay": 0}
         case = {"setpoint": "random", "setpoint_period": 15, "noise_variance": 0.1, **plant}
         of_plant = course_of(samples, **case)
-        law = SetPointLaw(Parameters(**case), of_plant, unknown(of_plant))
+        law = SetPointLaw(of_plant, unknown(of_plant))
         past = [-4.0] * 3 + [2.0] * 3
         now = len(past) - 1
         age = now - past.index(past[-1])
@@ -282,7 +283,7 @@ class TestLeastPossible:
             "samples must be an integer": {"samples": 0},
             "episodes must be an integer": {"episodes": 0},
             "kind must be one of": {"kind": "best"},
-            'kind must not be "causal"': {"kind": "causal"},
+            "preview, reference for the set point 'square', got 'causal'": {"kind": "causal"},
             "delay must be": {"delay": -1},
             "must be held until": {"kind": "reference", "setpoint_period": 100},
         }.items():

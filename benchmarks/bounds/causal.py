@@ -28,10 +28,9 @@ import numpy as np
 import scipy  # loads its modules on first use
 from numpy.typing import NDArray
 
-from benchmarks.bounds.unknown import Unknown
-from benchmarks.loop.linear import Coefficients, TimeVaryingModel
+from benchmarks.bounds.linear_program import Unknown, equations, response
+from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import held
-from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
 
@@ -44,17 +43,18 @@ class SetPointLaw:
     The guess uses the plant's dynamics at the start of the episode.
     """
 
-    def __init__(
-        self, parameters: Parameters, model: TimeVaryingModel, unknown: Unknown
-    ) -> None:
-        self._model = model
+    def __init__(self, model: LinearModel, unknown: Unknown) -> None:
+        samples, parameters = len(model.load), model.parameters
+        self._flow_response = response(*equations(model, samples))
+        self._lag = model.lag
         self._amplitude = parameters.setpoint_amplitude
         self._shortest = max(1, -(-parameters.setpoint_period // 6))
         self._longest = max(self._shortest, parameters.setpoint_period // 2)
-        alpha, beta = model.alpha[0], model.beta[0]
-        gain = float(np.abs(beta.sum() / (1.0 - alpha.sum())))
-        pace = float(np.abs(np.roots([1.0, *-alpha])).max(initial=0.0))
-        self._reach = gain * min(-model.low, model.high)
+        at_start = LinearModel(parameters, model.numbers, 0)
+        pace = np.abs(np.roots([1.0, *-at_start.alpha])).max(initial=0.0)
+        low, high = model.limits
+        # An integrating plant reaches everything.
+        self._reach = min(float(np.abs(at_start.gain)), 1e9) * min(-low, high)
         # Noise blurs the sign of a small error; equally probable thresholds represent it.
         deviation = unknown.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
         shares = (np.arange(THRESHOLDS) + 0.5) / THRESHOLDS
@@ -62,7 +62,6 @@ class SetPointLaw:
         self._blur = deviation * blur if deviation > 0.0 else np.zeros(1)
         # After a change the output stands still for `lag` samples. Then it approaches what the
         # limits allow; this is the share of the way that it has made, by age of the level.
-        samples = len(model.load)
         age = np.arange(samples)
         self._share = 1.0 - pace ** np.maximum(age - model.lag + 1, 0)
         # The age from which the largest change within reach has been made.
@@ -73,43 +72,38 @@ class SetPointLaw:
         self._left = np.clip(
             (self._longest - age) / (self._longest - self._shortest + 1), 0.0, 1.0
         )
-        at_start = Coefficients(alpha, beta, model.load[0])
-        after = at_start.impulse_response(max(samples - model.delay - 1, 0))
-        # The response to 1 t/h of flow, by the number of samples since.
-        self._impulse = np.concatenate([np.zeros(model.delay + 1), after])[:samples]
+        # The response to 1 t/h of flow, by the number of samples since the output can follow.
+        dead = model.lag - int(model.numbers.delay) - 1
+        self._impulse = at_start.impulse_response(samples + dead)[dead:]
 
     def penalty(self, setpoint: Array) -> Array:
         """Return pi for one draw of y_d(k), degC times samples per t/h, shape (samples,)."""
-        samples, holds = len(setpoint), held(setpoint)
-        stays = []  # g of each level by age, if it were held for ever
-        changed = []  # what a change adds to the mean of g, summed up to each age
+        samples, holds, before = len(setpoint), held(setpoint), 0.0
+        courses = []  # of each level, by age
         guess = np.zeros(samples)
-        before = 0.0
         for start, end in holds:
-            level = setpoint[start]
-            changed.append(np.cumsum(self._mean_slope(level) * self._left))
-            stays.append(self._slope(before, level) + self._lean(changed[-1]))
-            guess[start:end] = stays[-1][: end - start]
-            before = level
+            # What a change adds to the mean of g, summed up, after zeros for the time before
+            # it; and g, if the level never changed.
+            summed = np.cumsum(self._mean_slope(setpoint[start]) * self._left)
+            change = np.append(np.zeros(self._longest + 1), summed)
+            stay = self._slope(before, setpoint[start]) + self._lean(change)
+            guess[start:end], before = stay[: end - start], setpoint[start]
+            courses.append((stay, change))
         surprise = np.zeros((samples, samples))  # [k, j]: g(k) - E[g(k) | up to j]
-        for (start, end), stay, change in zip(holds, stays, changed, strict=True):
+        for (start, end), course in zip(holds, courses, strict=True):
             for j in range(start, end):
                 ages = np.arange(j + 1 - start, samples - start)
-                expected = self._expected(ages, j - start, stay, change)
-                surprise[j + 1 :, j] = guess[j + 1 :] - expected
-        penalties: Array = (self._model.flow_response() * surprise).sum(axis=0)
-        return penalties
+                surprise[j + 1 :, j] = guess[j + 1 :] - self._expected(ages, j - start, *course)
+        return np.asarray(np.einsum("kj,kj->j", self._flow_response, surprise))
 
     def _expected(self, ages: NDArray[np.intp], now: int, stay: Array, change: Array) -> Array:
         """Return the mean of g at later ages of a level that is still held at age `now`."""
         # The next level begins at one of these ages, all equally probable.
-        first, last = max(self._shortest, now + 1), self._longest
-        count = last - first + 1
+        first = max(self._shortest, now + 1)
+        count = self._longest - first + 1
         gone = np.clip((ages - first + 1) / count, 0.0, 1.0)
-        recent, old = ages - first, ages - last - 1
-        expected: Array = (1.0 - gone) * stay[ages]
-        expected += np.where(recent >= 0, change[np.maximum(recent, 0)], 0.0) / count
-        expected -= np.where(old >= 0, change[np.maximum(old, 0)], 0.0) / count
+        added = (change[ages + count] - change[ages]) / count
+        expected: Array = (1.0 - gone) * stay[ages] + added
         # After one more change g is as often positive as negative, as levels are symmetric.
         return expected
 
@@ -138,16 +132,15 @@ class SetPointLaw:
         At every age a flow is then worth nothing on average: the sum over later ages of its
         response times the mean of g vanishes. This is solved backwards from the last age.
         """
-        lean = np.zeros(len(change))
-        lag = self._model.lag
-        if not self._impulse[lag : lag + 1].any():
+        samples = len(self._left)
+        lean = np.zeros(samples)
+        if not self._impulse[0]:
             return lean
-        for age in range(min(self._longest, len(change)) - 1, self._settled - 1, -1):
-            now = age - lag
-            ages = np.arange(age, min(len(change), age + 200))
-            mean = self._expected(ages, now, lean, change)
-            worth = float(self._impulse[lag : lag + len(ages)] @ mean)
+        for age in range(min(self._longest, samples) - 1, self._settled - 1, -1):
+            now = age - self._lag
+            ages = np.arange(age, min(samples, age + 200))
+            worth = self._impulse[: len(ages)] @ self._expected(ages, now, lean, change)
             count = self._longest - max(self._shortest, now + 1) + 1
             still = min(1.0, (self._longest - age) / count)
-            lean[age] = np.clip(-worth / (self._impulse[lag] * still), -1.0, 1.0)
+            lean[age] = np.clip(-worth / (self._impulse[0] * still), -1.0, 1.0)
         return lean

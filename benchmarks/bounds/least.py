@@ -1,11 +1,10 @@
 """Compute the least possible mean error of any case of the environment, and scores from it.
 
-The kinds "preview" and "causal" are theorems; "reference" holds under a condition. README.md
-says for which controllers. The mean error is that of the rewards, of |e(k)| over k = 1 to N. A
-bound is the mean over the episodes that the environment draws; for each, it is the optimum of
-`linear_program.py`, given what `unknown.py` leaves unknown. A controller at k may know the
-transmitter's readings up to k, and perhaps any set points, plant numbers and loads up to k, but
-not the true output, `info["output"]`. It may undo the dead zone.
+README.md says for which controllers each kind holds. The mean error is that of the rewards, of
+|e(k)| over k = 1 to N. A bound is the mean over the episodes that the environment draws; for
+each, it is the optimum of `linear_program.py`, given what `unknown.py` leaves unknown. A
+controller at k may know the transmitter's readings up to k, and perhaps any set points, plant
+numbers and loads up to k, but not the true output, `info["output"]`. It may undo the dead zone.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from benchmarks.bounds.linear_program import TAIL, plan, reference
 from benchmarks.bounds.unknown import unknown
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.lib.storage import ROOT, Kept
-from benchmarks.loop.linear import time_varying_model
+from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import (
     IdleValve,
     drawn_numbers,
@@ -112,29 +111,31 @@ def least_possible(
     for name, count in (("samples", samples), ("episodes", episodes)):
         if not isinstance(count, int) or count < 1:
             raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
-    drawn = parameters.setpoint == "random"
-    if kind is None and not drawn:
-        case = {**arguments, "samples": samples, "episodes": episodes, "seed": seed}
-        preview = least_possible(kind="preview", folder=folder, **case)
-        with suppress(ValueError):  # the plant does not settle between changes
-            unaware = least_possible(kind="reference", folder=folder, **case)
-            # Foresight makes no difference where nothing changes.
-            return unaware if abs(unaware.value - preview.value) >= 1e-4 else preview
-        return preview
-    kind = kind or "causal"
-    if kind not in KINDS:
-        raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
-    if kind == "causal" and not drawn:
-        raise ValueError(f'kind must not be "causal" for the set point {parameters.setpoint!r}')
-    task = partial(_least_possible, parameters, samples, kind, episodes, seed)
-    if folder is None:
-        return task()
-    with suppress(LookupError):
-        found: LeastPossible = Kept(folder).load(task)
+
+    def of(kind: str) -> LeastPossible:
+        task = partial(_least_possible, parameters, samples, kind, episodes, seed)
+        if folder is None:
+            return task()
+        with suppress(LookupError):
+            kept: LeastPossible = Kept(folder).load(task)
+            return kept
+        found = task()
+        Kept(folder).save(task, found)
         return found
-    found = task()
-    Kept(folder).save(task, found)
-    return found
+
+    drawn = parameters.setpoint == "random"
+    kinds = KINDS if drawn else ("preview", "reference")
+    if kind in kinds or (drawn and kind is None):
+        return of(kind or "causal")
+    if kind is not None:
+        allowed = f"{', '.join(kinds)} for the set point {parameters.setpoint!r}"
+        raise ValueError(f"kind must be one of {allowed}, got {kind!r}")
+    preview = of("preview")
+    with suppress(ValueError):  # the plant does not settle between changes
+        unaware = of("reference")
+        # Foresight makes no difference where nothing changes.
+        return unaware if abs(unaware.value - preview.value) >= 1e-4 else preview
+    return preview
 
 
 def _least_possible(
@@ -162,10 +163,10 @@ def _least(
     """Return the least sum of |e(k)| over k = 1 to N of an episode, degC."""
     # A reference looks beyond the end.
     ahead = int(numbers.delay) + len(parameters.b) + TAIL if kind == "reference" else 0
-    model = time_varying_model(parameters, numbers, len(setpoint) + ahead)
-    unforeseen, penalty = unknown(model), None
+    model = LinearModel(parameters, numbers, np.arange(len(setpoint) + ahead))
+    unforeseen = unknown(model)
     if kind == "reference":
         return reference(model, unforeseen, setpoint).cost
-    if kind == "causal" and parameters.setpoint_amplitude > 0.0:
-        penalty = SetPointLaw(parameters, model, unforeseen).penalty(setpoint)
+    penalised = kind == "causal" and parameters.setpoint_amplitude > 0.0
+    penalty = SetPointLaw(model, unforeseen).penalty(setpoint) if penalised else 0.0
     return plan(model, unforeseen, setpoint, penalty=penalty).cost

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import scipy  # loads its modules on first use
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from benchmarks.bounds.unknown import Unknown
-from benchmarks.loop.linear import TimeVaryingModel
+from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import held
 
 Array = NDArray[np.float64]
@@ -28,6 +28,32 @@ SMOOTH = 1e-4  # price per t/h of travel, which selects the quietest of equal pl
 
 
 @dataclass(frozen=True)
+class Unknown:
+    """Lower bounds of E|m - n|: the highest of the lines intercept + slope * |m|."""
+
+    slopes: Array
+    """Ascending, from 0 to 1; or 1 alone if nothing is unknown. Shape (slopes,)."""
+    intercepts: Array
+    """degC, shape (samples, slopes)."""
+
+    def mean_error(self, m: Array) -> Array:
+        """Return the bound of E|m - n| for the first len(m) samples, degC."""
+        lines = self.intercepts[: len(m)] + self.slopes * np.abs(m)[:, np.newaxis]
+        return np.asarray(lines.max(axis=1))
+
+    @property
+    def lengths(self) -> Array:
+        """Lengths of the pieces of |m| that make up the bound, shaped like `intercepts`.
+
+        Each piece has its slope, and ends at a corner between two lines.
+        """
+        ends = np.full(self.intercepts.shape, np.inf)
+        corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)
+        ends[:, :-1] = np.maximum.accumulate(corners, axis=1)
+        return np.diff(ends, axis=1, prepend=0.0)
+
+
+@dataclass(frozen=True)
 class Plan:
     """A solution of the linear program. All arrays have the shape (samples,)."""
 
@@ -41,21 +67,38 @@ class Plan:
     """The minimum of the objective over k = 1 to N, as no flow changes e(0); degC."""
 
 
+def equations(model: LinearModel, samples: int) -> tuple[Any, Any]:
+    """Return A and B of (28) without noise, A y = B u, for an episode from rest."""
+    lags = 1, int(model.numbers.delay) + 1
+    below, B = (
+        # Row k has coefficients[k, i] in column k - lag - i.
+        scipy.sparse.dia_array(
+            (each[:samples].T, lag + np.arange(each.shape[1])), shape=(samples, samples)
+        ).T.tocsr()
+        for each, lag in zip((model.alpha, model.beta), lags, strict=True)
+    )
+    return (scipy.sparse.eye_array(samples) - below).tocsr(), B
+
+
+def response(A: Any, B: Any) -> Array:
+    """Return G, which solves A G = B: 1 t/h at j adds G[k, j] to y(k)."""
+    return np.asarray(scipy.linalg.solve_triangular(A.toarray(), B.toarray(), lower=True))
+
+
 def plan(
-    model: TimeVaryingModel,
+    model: LinearModel,
     unknown: Unknown,
     setpoint: Array,
     *,
-    before: Plan | None = None,
-    start: int = 0,
+    past: ArrayLike = (),
     quiet: bool = False,
-    penalty: Array | None = None,
+    penalty: ArrayLike = 0.0,
 ) -> Plan:
     """Minimise the sum of the bounds of E|e(k)| over the mean flow.
 
     Take any controller, causal or not, and let y and u_a stand for their means over all noise,
     load and randomness of the controller. As (28) is linear, the means obey it without noise;
-    as u_a(k) always lies within [low, high], so does its mean; and as E|m - n| is convex in m,
+    as u_a(k) always lies within the limits, so does its mean; and as E|m - n| is convex in m,
     its mean over everything that may be known is at least its value at the mean of m, which is
     y_d - y (Jensen). So the controller's error is at least the minimum over all mean flows
     within the limits: a linear program, as each bound of E|m - n| is a maximum of lines.
@@ -64,123 +107,95 @@ def plan(
     the two sides of a limit: the mean of 0 and 5 t/h is 2.5 t/h, and the mean of what the noise
     requires may lie within limits that single demands exceed.
 
-    The model covers at least the samples of `setpoint`, y_d(k) in degC. Outputs up to sample
-    `start`, and flows before it, are those of the plan `before`; without one, the plant has
-    been at rest. The cost counts the samples from `start` on, with a `penalty` in degC for
-    each t/h of u_a(k), shape (samples,). A `quiet` plan is, of equally good ones, the one that
-    comes to the set point with the least travel. A RuntimeError is raised if all attempts
-    fail or take too long.
+    The model covers at least the samples of `setpoint`, y_d(k) in degC. The plant starts from
+    rest with the flows of the `past`, shape (start,). A `penalty` is in degC for each t/h of
+    u_a(k), shape (samples,). A `quiet` plan is, of equally good ones, the one that comes to the
+    set point with the least travel. A RuntimeError is raised if all attempts fail or take too
+    long.
     """
-    samples = len(setpoint)
-    penalty = np.zeros(samples) if penalty is None else penalty
-    output, flow = np.zeros(samples), np.zeros(samples)
-    if before is not None:
-        output[: start + 1], flow[:start] = before.output[: start + 1], before.flow[:start]
+    samples, start = len(setpoint), np.size(past)
+    price = np.broadcast_to(np.asarray(penalty, float), samples)
+    A, B = equations(model, samples)
+    flow = np.zeros(samples)
+    flow[:start] = past
+    idle = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
     n = samples - 1 - start  # outputs after `start`, and flows from it on
-    of_now = unknown.of(start, samples)
     if n:
-        output[start + 1 :], flow[start:-1] = _solve(
-            model, of_now, setpoint, output, flow, start, quiet, penalty
-        )
+        # The bound of E|m - n| may be level near 0, where a quiet plan needs a slope.
+        slopes = np.maximum(unknown.slopes, LEVEL if quiet else 0.0)
+        lengths = np.repeat(unknown.lengths[start + 1 : samples], 2, axis=1).T.ravel()
+        unknowns = [
+            _unknowns(n, 0.0, -np.inf, np.inf),
+            _unknowns(n, price[start:-1], *model.limits),
+            _unknowns(len(lengths), np.repeat(slopes, 2 * n), 0.0, lengths),
+            _unknowns(2 * n * quiet, SMOOTH, 0.0, np.inf),
+        ]
+        targets = np.zeros(n + n * quiet)
+        targets[:n] = (setpoint - idle)[start + 1 :]
+        targets[n : n + 1] = flow[start - 1]  # which the moves start from: 0 at the beginning
+        own = A[start + 1 :, start + 1 :], B[start + 1 :, start:-1]
+        flow[start:-1] = _solve(*own, targets, unknowns, np.roots(model.parameters.b))
     # The last flow affects no output; if it does not move, it costs nothing either.
     flow[-1] = flow[-2] if samples > 1 else 0.0
-    error = np.zeros(samples)
-    error[start:] = of_now.mean_error(setpoint[start:] - output[start:])
-    cost = error[1:].sum() + penalty[start:] @ flow[start:]
-    return Plan(error, output, flow, float(cost))
-
-
-def _solve(
-    model: TimeVaryingModel,
-    unknown: Unknown,
-    setpoint: Array,
-    output: Array,
-    flow: Array,
-    start: int,
-    quiet: bool,
-    penalty: Array,
-) -> tuple[Array, Array]:
-    """Return outputs after `start`, and flows from it on."""
-    samples = len(setpoint)
-    n = samples - 1 - start
-    # (28) without noise: A y = B u, rows from start + 1 on; the past goes to the right side.
-    A = scipy.sparse.eye_array(samples) - _lagged(model.alpha, samples, 1)
-    B = _lagged(model.beta, samples, model.delay + 1)
-    A, B = A.tocsr()[start + 1 :], B.tocsr()[start + 1 :]
-    past = B[:, :start] @ flow[:start] - A[:, : start + 1] @ output[: start + 1]
-    A, B = A[:, start + 1 :], B[:, start:-1]
-
-    # The unknowns are y, u, the pieces of E|m - n| for m above and below 0, and the moves up
-    # and down of a quiet plan.
-    # The bound of E|m - n| may be level near 0, where a quiet plan needs a slope.
-    slopes = np.maximum(unknown.slopes, LEVEL if quiet else 0.0)
-    eye = scipy.sparse.eye_array(n)
-    pieces = scipy.sparse.hstack([eye, -eye] * len(slopes))
-    lengths = np.repeat(unknown.lengths[1:], 2, axis=1).T.ravel()
-    columns = [
-        _unknowns(n, 0.0, -np.inf, np.inf),
-        _unknowns(n, penalty[start:-1], model.low, model.high),
-        _unknowns(len(lengths), np.repeat(slopes, 2 * n), 0.0, lengths),
-    ]
-    rows: list[list[Any]] = [[A, -B, None], [eye, None, pieces]]
-    right = [past, setpoint[start + 1 :]]
-    if quiet:
-        moves = eye - scipy.sparse.eye_array(n, k=-1)
-        rows = [[*row, None] for row in rows]
-        rows.append([None, moves, None, scipy.sparse.hstack([-eye, eye])])
-        right.append(np.zeros(n))
-        right[-1][0] = flow[start - 1] if start else 0.0
-        columns.append(_unknowns(2 * n, SMOOTH, 0.0, np.inf))
-
-    # With outputs among the unknowns the program is sparse, and fast where A is slow. But if
-    # a zero of B lies outside the unit circle, the flow that gives an output grows without
-    # bound: solvers that vary outputs freely fail, or end away from the optimum.
-    for_flows_alone = [False, True]
-    if np.any(np.abs(np.roots(model.beta[start])) > 1.0):
-        for_flows_alone.reverse()
-    attempts = list(itertools.product(for_flows_alone, SOLVERS))
-    for flows_alone, (method, presolve) in attempts:
-        blocks, targets, unknowns = rows, right, columns
-        if flows_alone:  # each output is the sum of the effects of the flows
-            idle = scipy.linalg.solve_triangular(A.toarray(), past, lower=True)
-            G = scipy.linalg.solve_triangular(A.toarray(), B.toarray(), lower=True)
-            G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
-            blocks = [[scipy.sparse.csr_array(G), *rows[1][2:]], *(row[1:] for row in rows[2:])]
-            targets, unknowns = [right[1] - idle, *right[2:]], columns[1:]
-        costs_and_ends = np.concatenate(unknowns)
-        solved = scipy.optimize.linprog(
-            costs_and_ends[:, 0],
-            A_eq=scipy.sparse.block_array(blocks).tocsc(),
-            b_eq=np.concatenate(targets),
-            bounds=costs_and_ends[:, 1:],
-            method=method,
-            options={"time_limit": TIME_LIMIT, "presolve": presolve},
-        )
-        if solved.success and flows_alone:
-            return idle + G @ solved.x[:n], solved.x[:n]
-        if solved.success:
-            return solved.x[:n], solved.x[n : 2 * n]
-    raise RuntimeError(
-        f"the linear program of {n} samples was not solved in any of {len(attempts)} ways: "
-        f"{solved.message}"
-    )
+    output = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
+    error = unknown.mean_error(setpoint - output)
+    return Plan(error, output, flow, float(error[1:].sum() + price @ flow))
 
 
 def _unknowns(count: int, cost: Any, low: Any, high: Any) -> Array:
     return np.column_stack([np.broadcast_to(each, count) for each in (cost, low, high)])
 
 
-def _lagged(coefficients: Array, samples: int, lag: int) -> scipy.sparse.sparray:
-    """Return the matrix that maps x to the sum over i of coefficients[k, i] x(k - lag - i)."""
-    inside = [i for i in range(coefficients.shape[1]) if lag + i < samples]
-    if not inside:
-        return scipy.sparse.csr_array((samples, samples))
-    diagonals = [coefficients[lag + i : samples, i] for i in inside]
-    offsets = [-(lag + i) for i in inside]
-    return scipy.sparse.diags_array(diagonals, offsets=offsets, shape=(samples, samples))
+def _solve(
+    A: Any, B: Any, targets: Array, unknowns: Sequence[Array], zeros: NDArray[Any]
+) -> Array:
+    """Return the flows of the least cost.
+
+    The unknowns, each with its cost and ends, are y, u, the pieces of E|m - n| for m above and
+    below 0, and the moves up and down of a quiet plan. `zeros` are those of B.
+    """
+    n, rows = A.shape[0], len(targets)
+    eye = scipy.sparse.eye_array(n)
+    pieces = scipy.sparse.hstack([eye, -eye] * (len(unknowns[2]) // (2 * n)))
+    if rows > n:
+        pieces = scipy.sparse.block_diag([pieces, scipy.sparse.hstack([-eye, eye])])
+    # The first n targets are y and its pieces, the others the moves of u and theirs.
+    of_output = scipy.sparse.eye_array(rows, n)
+    moves = eye - scipy.sparse.eye_array(n, k=-1)
+    of_flow = scipy.sparse.eye_array(rows, n, k=-n, format="csr") @ moves
+
+    # With outputs among the unknowns the program is sparse, and fast where A is slow. But if
+    # a zero of B lies outside the unit circle, the flow that gives an output grows without
+    # bound: solvers that vary outputs freely fail, or end away from the optimum.
+    orders = sorted([False, True], reverse=bool(np.any(np.abs(zeros) > 1.0)))
+    attempts = list(itertools.product(orders, SOLVERS))
+    for flows_alone, (method, presolve) in attempts:
+        blocks: Any = [[A, -B, None], [of_output, of_flow, pieces]]
+        right, columns = np.concatenate([np.zeros(n), targets]), unknowns
+        if flows_alone:  # each output is the sum of the effects of the flows
+            G = response(A, B)
+            G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
+            blocks = [[of_output @ scipy.sparse.csr_array(G) + of_flow, pieces]]
+            right, columns = targets, unknowns[1:]
+        costs_and_ends = np.concatenate(columns)
+        solved = scipy.optimize.linprog(
+            costs_and_ends[:, 0],
+            A_eq=scipy.sparse.block_array(blocks).tocsc(),
+            b_eq=right,
+            bounds=costs_and_ends[:, 1:],
+            method=method,
+            options={"time_limit": TIME_LIMIT, "presolve": presolve},
+        )
+        if solved.success:
+            flows: Array = solved.x[:n] if flows_alone else solved.x[n : 2 * n]
+            return flows
+    raise RuntimeError(
+        f"the linear program of {n} samples was not solved in any of {len(attempts)} ways: "
+        f"{solved.message}"
+    )
 
 
-def reference(model: TimeVaryingModel, unknown: Unknown, setpoint: Array) -> Plan:
+def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> Plan:
     """Return the best mean flow of a controller that never expects another change.
 
     Where set points have no law (a square wave, a list), the only bound is that with preview:
@@ -192,21 +207,19 @@ def reference(model: TimeVaryingModel, unknown: Unknown, setpoint: Array) -> Pla
 
     The model covers `model.lag + TAIL` samples more than `setpoint`.
     """
-    settled = SETTLED * (model.high - model.low)
-    error = np.zeros(len(setpoint))
-    found: Plan | None = None
+    low, high = model.limits
+    flow, error = np.zeros(0), np.zeros(len(setpoint))
     for start, stop in held(setpoint):
         last = stop == len(setpoint)
         beyond = np.full(0 if last else model.lag + TAIL, setpoint[start])
         ahead = np.concatenate([setpoint[:stop], beyond])
-        found = plan(model, unknown, ahead, before=found, start=start, quiet=True)
-        error[start:stop] = found.error[start:stop]
-        moving = found.flow[max(stop - model.lag - 1, start - 1, 0) : stop]
-        if not last and (stop - start < model.lag or np.ptp(moving) > settled):
+        found = plan(model, unknown, ahead, past=flow[:start], quiet=True)
+        flow, error[start:stop] = found.flow, found.error[start:stop]
+        moving = np.ptp(flow[max(stop - model.lag - 1, start - 1, 0) : stop])
+        if not last and (stop - start < model.lag or moving > SETTLED * (high - low)):
             raise ValueError(
                 "setpoint must be held until the plant has settled, or there is no reference; "
                 f"got a hold of {stop - start} samples"
             )
-    assert found is not None
-    travel = np.abs(np.diff(found.flow, prepend=0.0)).sum()
+    travel = np.abs(np.diff(flow, prepend=0.0)).sum()
     return replace(found, error=error, cost=float(error[1:].sum() + SMOOTH * travel))

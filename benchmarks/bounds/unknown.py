@@ -26,13 +26,12 @@ The bound is loose where the load jumps: by about 1 % on the preset "disturbed".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy  # loads its modules on first use
 from numpy.typing import NDArray
 
-from benchmarks.loop.linear import TimeVaryingModel
+from benchmarks.bounds.linear_program import Unknown, equations
+from benchmarks.loop.linear import LinearModel
 from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
@@ -40,51 +39,17 @@ Array = NDArray[np.float64]
 ATOMS = 128  # equally probable atoms that represent a distribution
 SLICES = 4  # slices of each uniform distribution that is added to the atoms
 # Numbers of atoms below the points where the tangents touch, for slopes from 0 to 1.
-BELOW = (64, 53, 42, 31, 22, 14, 8, 4, 1, 0)
+BELOW = np.array([64, 53, 42, 31, 22, 14, 8, 4, 1, 0])
 
 
-@dataclass(frozen=True)
-class Unknown:
-    """Lower bounds of E|m - n|: the highest of the lines intercept + slope * |m|."""
-
-    slopes: Array
-    """Ascending, from 0 to 1; or 1 alone if nothing is unknown. Shape (slopes,)."""
-    intercepts: Array
-    """degC, shape (samples, slopes)."""
-
-    def mean_error(self, m: Array) -> Array:
-        """Return the bound of E|m - n| for the last len(m) samples, degC."""
-        lines = self.intercepts[-len(m) :] + self.slopes * np.abs(m)[:, np.newaxis]
-        highest: Array = lines.max(axis=1)
-        return highest
-
-    @property
-    def lengths(self) -> Array:
-        """Lengths of the pieces of |m| that make up the bound, shaped like `intercepts`.
-
-        Each piece has its slope, and ends at a corner between two lines.
-        """
-        ends = np.full(self.intercepts.shape, np.inf)
-        corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)
-        ends[:, :-1] = np.maximum.accumulate(corners, axis=1)
-        return np.diff(ends, axis=1, prepend=0.0)
-
-    def of(self, start: int, stop: int) -> Unknown:
-        """Return the bounds of samples `start` to `stop` - 1."""
-        return Unknown(self.slopes, self.intercepts[start:stop])
-
-
-def unknown(model: TimeVaryingModel) -> Unknown:
+def unknown(model: LinearModel) -> Unknown:
     """Return the bounds from what remains unknown at each sample of an episode."""
     numbers, samples = model.numbers, len(model.load)
     deviation = np.sqrt(noise_variance(model))
     walk = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
     amplitude = numbers.disturbance_amplitude
-    # The changes of the load in a window, the latest first.
-    inside, weights = np.zeros((samples, 0), np.bool_), np.zeros((samples, 0))
-    if walk or amplitude:
-        inside, weights = _load_weights(model)
-    if not deviation.any() and not inside.any():
+    weights = _load_weights(model) if walk or amplitude else np.zeros((samples, 0))
+    if not deviation.any() and not weights.any():
         return Unknown(np.ones(1), np.zeros((samples, 1)))
 
     # Means of equally probable slices of the standard normal distribution.
@@ -92,21 +57,20 @@ def unknown(model: TimeVaryingModel) -> Unknown:
     ends = scipy.special.ndtri(np.linspace(0.0, 1.0, ATOMS + 1))
     edges = np.exp(-(ends**2) / 2.0) / np.sqrt(2.0 * np.pi)
     atoms = deviation[:, np.newaxis] * (-np.diff(edges) * ATOMS)
+    for weight in weights.T if walk else ():
+        atoms = _plus_uniform(atoms, walk * weight)
     jump = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval) if amplitude else 0.0
-    for place in range(weights.shape[1] if walk else 0):
-        atoms = _plus_uniform(atoms, walk * weights[:, place])
-    probability = np.ones(samples)  # probability that no later change was a jump
     intercepts = np.zeros((samples, len(BELOW)))
-    for place in range(weights.shape[1] if jump else 0):
-        jumped = _plus_uniform(atoms, amplitude * weights[:, place])
-        here = probability * jump * inside[:, place]
-        intercepts += here[:, np.newaxis] * _intercepts(jumped)
-        probability = probability - here
-    intercepts += probability[:, np.newaxis] * _intercepts(atoms)
-    return Unknown(1.0 - 2.0 * np.array(BELOW) / ATOMS, intercepts)
+    probability = 1.0  # that no later change was a jump
+    for weight in weights.T if jump else ():
+        jumped = _plus_uniform(atoms, amplitude * weight)
+        intercepts += probability * jump * _intercepts(jumped)
+        probability *= 1.0 - jump
+    intercepts += probability * _intercepts(atoms)
+    return Unknown(1.0 - 2.0 * BELOW / ATOMS, intercepts)
 
 
-def noise_variance(model: TimeVaryingModel) -> Array:
+def noise_variance(model: LinearModel) -> Array:
     """Return the variance of the noise in y(k) that is unknown at k - d - 1, degC^2, for all k.
 
     With a noisy transmitter it is that of the best prediction. Early in an episode, less noise
@@ -117,7 +81,7 @@ def noise_variance(model: TimeVaryingModel) -> Array:
     V = model.numbers.measurement_noise_variance
     if R == 0.0:
         return np.zeros(samples)
-    Phi, enters = model.state_space(model.c)
+    Phi, enters = model.state_space()
     Q = R * np.outer(enters, enters)
     known = np.zeros_like(Phi)  # covariance of the state, given all readings so far
     if V > 0.0:
@@ -139,32 +103,22 @@ def noise_variance(model: TimeVaryingModel) -> Array:
     return variance
 
 
-def _load_weights(model: TimeVaryingModel) -> tuple[NDArray[np.bool_], Array]:
-    """Return which changes of the load fall into the window of y(k), and their effects on it.
+def _load_weights(model: LinearModel) -> Array:
+    """Return what each change of the load that is unknown adds to y(k), per unit of the load.
 
-    Both have the shape (samples, most changes in a window), the latest change first: whether
-    there is one, and what it adds to y(k) per unit of the load.
+    The shape is (samples, most changes in d + 1 samples), the latest change first; 0 for none.
     """
-    samples, order = model.alpha.shape
-    lag = min(model.lag, samples)
-    changes = np.arange(LOAD_INTERVAL, samples, LOAD_INTERVAL)
-    # Responses to a unit step at each change, after 0, 1, ... samples.
-    answers = np.empty((lag, len(changes)))
-    for t in range(lag):
-        at = np.minimum(changes + t, samples - 1)
-        answers[t] = model.load[at]
-        for i in range(min(order, t)):
-            answers[t] += model.alpha[at, i] * answers[t - 1 - i]
-    k = np.arange(samples)
-    weights = np.zeros((samples, -(-lag // LOAD_INTERVAL)))
-    inside = np.zeros(weights.shape, np.bool_)
-    for place in range(weights.shape[1]):
-        change = k // LOAD_INTERVAL - place  # 1 is the first
-        after = k - change * LOAD_INTERVAL
-        there = (change >= 1) & (after < lag)
-        weights[there, place] = answers[after[there], change[there] - 1]
-        inside[:, place] = there
-    return inside, weights
+    samples = len(model.load)
+    A, _ = equations(model, samples)
+    k, changes = np.arange(samples), np.arange(0, samples, LOAD_INTERVAL)
+    after = k[:, np.newaxis] - changes
+    # Responses to a unit step at each change. There is none at k = 0.
+    steps = model.load[:, np.newaxis] * (after >= 0) * (changes > 0)
+    answers = scipy.sparse.linalg.spsolve_triangular(A, steps)
+    answers[after >= model.lag] = 0.0
+    latest = k // LOAD_INTERVAL
+    places = range(-(-min(model.lag, samples) // LOAD_INTERVAL))
+    return np.stack([answers[k, np.maximum(latest - place, 0)] for place in places], axis=1)
 
 
 def _plus_uniform(atoms: Array, half_width: Array) -> Array:
@@ -180,7 +134,6 @@ def _intercepts(atoms: Array) -> Array:
     """Return min over m of E|m - n| - s m for each slope s of `BELOW`, degC."""
     # A tangent touches where `BELOW` atoms lie below m, and all others above it.
     sums = np.cumsum(atoms, axis=1)
-    sums = np.hstack([np.zeros((len(atoms), 1)), sums])
-    below = sums[:, np.array(BELOW)]
+    below = np.where(BELOW > 0, sums[:, BELOW - 1], 0.0)
     intercepts: Array = (sums[:, -1:] - 2.0 * below) / ATOMS
     return intercepts

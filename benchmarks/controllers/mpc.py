@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import applied_flow, float32_action
-from benchmarks.loop.linear import Coefficients, coefficients
+from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
 from mptc_gym.plant import DRIFT_INTERVAL
@@ -59,7 +59,7 @@ class PredictiveController:
         lag = np.arange(len(parameters.b))
         self._shows = self._delay[:, np.newaxis, np.newaxis] + lag - ahead[:, np.newaxis] + 1
         self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON)
-        self._models: dict[int, tuple[Coefficients, Array, Array]] = {}  # by age, samples
+        self._models: dict[int, tuple[LinearModel, Array, Array]] = {}  # by age, samples
         self.reset()
 
     def reset(self) -> None:
@@ -122,12 +122,12 @@ class PredictiveController:
         self._state = x + gain * (output - x[:, 0])[:, np.newaxis]
         self._covariance = P - gain[:, :, np.newaxis] * P[:, np.newaxis, 0]
 
-    def _transition(self, k: int, model: Coefficients) -> tuple[Array, Array]:
+    def _transition(self, k: int, model: LinearModel) -> tuple[Array, Array]:
         """Return the state transition from k - 1 to k, and the process noise's covariance."""
         changes = k % LOAD_INTERVAL == 0
         F = np.zeros((self._num_envs, self._size, self._size))
         xi, steps, walk = np.zeros((3, self._num_envs, self._size))
-        F[:, :-2, :-2], xi[:, :-2] = model.state_space(self._p.c)
+        F[:, :-2, :-2], xi[:, :-2] = model.state_space()
         F[:, -2, -2] = self._stays if changes else 1.0
         F[:, -1, -1] = 1.0
         F[:, 0, -2:] = model.load[:, np.newaxis] * F[:, [-2, -1], [-2, -1]]
@@ -162,14 +162,14 @@ class PredictiveController:
             outputs.append(output)
         return np.stack(outputs[n_y:], axis=1)
 
-    def _model(self, k: int) -> tuple[Coefficients, Array, Array]:
+    def _model(self, k: int) -> tuple[LinearModel, Array, Array]:
         """Return the plants for the step to sample k; G, from planned inputs to outputs; G' G.
 
         The sum of squared errors of a plan u is u G' G u - 2 (target G) u, but for a constant.
         """
         age = k // DRIFT_INTERVAL * DRIFT_INTERVAL if self._drifts else 0
         if age not in self._models:
-            plants = coefficients(self._p, self._numbers, age)
+            plants = LinearModel(self._p, self._numbers, age)
             response = plants.impulse_response(HORIZON)
             G = np.zeros((self._num_envs, HORIZON, HORIZON))
             for j in range(HORIZON):

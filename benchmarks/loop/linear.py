@@ -10,8 +10,6 @@ where w is the load. Gain and time-constant factors and their drifts are part of
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,16 +25,29 @@ LEVELS = 0.283, 0.632  # of a step response, which time constant and delay are r
 SLOWEST = 1 - 1e-5  # pole of a plant that settles soon enough for a step test
 
 
-@dataclass(frozen=True)
-class Coefficients:
-    """Coefficients of (28) for one plant, for many plants, or for each sample of an episode."""
+class LinearModel:
+    """(28) and (29) in the step to sample k.
 
-    alpha: Array
-    """Shape (..., order of A)."""
-    beta: Array
-    """Shape (..., length of B)."""
-    load: Array
-    """A(1), shape (...)."""
+    The plant numbers are floats for one plant, or arrays for many; k is a single sample or, for
+    one plant, the samples of an episode. `alpha` and `beta` have the shapes (..., order of A)
+    and (..., length of B), and `load`, A(1), has the shape (...).
+    """
+
+    def __init__(
+        self, parameters: Parameters, numbers: PlantNumbers[Any], k: int | NDArray[np.int64]
+    ) -> None:
+        dynamics = Dynamics(parameters)
+        gain, time_constant = dynamics.factors(numbers, k // DRIFT_INTERVAL * DRIFT_INTERVAL)
+        alpha, scale, load = dynamics.coefficients(gain, time_constant)
+        shape = np.broadcast_shapes(np.shape(gain), np.shape(time_constant))
+        self.parameters, self.numbers = parameters, numbers
+        self.alpha = np.empty((*shape, len(alpha)))
+        for i, each in enumerate(alpha):
+            self.alpha[..., i] = each
+        self.beta: Array = np.broadcast_to(scale, shape)[..., np.newaxis] * np.array(
+            parameters.b
+        )
+        self.load = np.broadcast_to(load, shape)
 
     @property
     def gain(self) -> Array:
@@ -44,25 +55,37 @@ class Coefficients:
         with np.errstate(divide="ignore"):
             return np.asarray(self.beta.sum(axis=-1) / (1.0 - self.alpha.sum(axis=-1)))
 
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest flow of one plant, t/h, counting 0 if there is a dead zone."""
+        flows = [self.numbers.u_min, self.numbers.u_max]
+        flows += [0.0] if self.numbers.dead_zone > 0.0 else []
+        return min(flows), max(flows)
+
+    @property
+    def lag(self) -> int:
+        """Samples from a flow to the first output that it can affect."""
+        shows = np.flatnonzero([*self.parameters.b, 1.0])
+        return int(self.numbers.delay) + 1 + int(shows[0])
+
     def impulse_response(self, samples: int) -> Array:
         """Return the effect of 1 t/h at j on y(j + d + 1), ..., degC per t/h, (..., samples).
 
         The coefficients are held constant.
         """
         response = np.zeros((*self.load.shape, samples))
-        for k in range(samples):
-            if k < self.beta.shape[-1]:
-                response[..., k] = self.beta[..., k]
+        response[..., : self.beta.shape[-1]] = self.beta[..., :samples]
+        for k in range(1, samples):
             for i in range(min(self.alpha.shape[-1], k)):
                 response[..., k] += self.alpha[..., i] * response[..., k - 1 - i]
         return response
 
-    def state_space(self, c: Sequence[float]) -> tuple[Array, Array]:
+    def state_space(self) -> tuple[Array, Array]:
         """Return F, shape (..., size, size), and g, shape (size,): x(k) = F x(k-1) + g xi(k).
 
-        The state x is y(k), y(k-1), ..., xi(k), xi(k-1), ..., driven by noise alone. C has the
-        coefficients `c`, from z^0 on.
+        The state x is y(k), y(k-1), ..., xi(k), xi(k-1), ..., driven by noise alone.
         """
+        c = self.parameters.c
         order = max(self.alpha.shape[-1], 1)
         size = order + len(c) - 1
         F = np.zeros((*self.load.shape, size, size)) + np.eye(size, k=-1)
@@ -72,29 +95,10 @@ class Coefficients:
         return F, np.isin(np.arange(size), (0, order)).astype(float)
 
 
-def coefficients(
-    parameters: Parameters, numbers: PlantNumbers[Any], k: int | NDArray[np.int64]
-) -> Coefficients:
-    """Return the coefficients of the step to sample k.
-
-    The plant numbers are floats for one plant, or arrays for many; k is a single sample or, for
-    one plant, an array of samples.
-    """
-    dynamics = Dynamics(parameters)
-    gain, time_constant = dynamics.factors(numbers, k // DRIFT_INTERVAL * DRIFT_INTERVAL)
-    alpha, scale, load = dynamics.coefficients(gain, time_constant)
-    ones = np.ones(np.broadcast_shapes(np.shape(gain), np.shape(time_constant)))
-    return Coefficients(
-        np.stack([ones * a for a in alpha], axis=-1) if alpha else np.zeros((*ones.shape, 0)),
-        (ones * scale)[..., np.newaxis] * np.array(parameters.b),
-        ones * load,
-    )
-
-
-def nominal(parameters: Parameters) -> Coefficients:
-    """Return the coefficients of a plant: ranges at their midpoints, drifts at k = 0."""
+def nominal(parameters: Parameters) -> LinearModel:
+    """Return the model of a plant: ranges at their midpoints, drifts at k = 0."""
     middle = {name: sum(parameters.range_of(name)) / 2 for name in PLANT_NUMBERS}
-    return coefficients(parameters, PlantNumbers(**middle), 0)
+    return LinearModel(parameters, PlantNumbers(**middle), 0)
 
 
 def step_test(parameters: Parameters) -> dict[str, float]:
@@ -140,54 +144,3 @@ def step_test(parameters: Parameters) -> dict[str, float]:
         "delay": delay * interval,
         "sampling_interval": interval,
     }
-
-
-@dataclass(frozen=True)
-class TimeVaryingModel(Coefficients):
-    """(28) and (29) over an episode: the coefficients have one row per sample."""
-
-    c: tuple[float, ...]
-    """Coefficients of C, from z^0 on."""
-    delay: int
-    """d, samples."""
-    low: float
-    """Lowest flow that the actuator can apply, t/h, counting 0 if there is a dead zone."""
-    high: float
-    """Highest flow that the actuator can apply, t/h, counting 0 if there is a dead zone."""
-    numbers: PlantNumbers[float]
-    """Plant numbers of the episode."""
-
-    @property
-    def lag(self) -> int:
-        """Samples from a flow to the first output that it can affect."""
-        shows = np.flatnonzero(self.beta.any(axis=0))
-        return self.delay + 1 + int(shows[0]) if len(shows) else len(self.beta)
-
-    def flow_response(self) -> Array:
-        """Return G, shape (samples, samples): 1 t/h at j adds G[k, j] to y(k)."""
-        samples, order = self.alpha.shape
-        G = np.zeros((samples, samples))
-        for k in range(1, samples):
-            for i in range(min(order, k)):
-                G[k] += self.alpha[k, i] * G[k - 1 - i]
-            for i, beta in enumerate(self.beta[k]):
-                if k - self.delay - 1 - i >= 0:
-                    G[k, k - self.delay - 1 - i] += beta
-        return G
-
-
-def time_varying_model(
-    parameters: Parameters, numbers: PlantNumbers[float], samples: int
-) -> TimeVaryingModel:
-    """Return the model of an episode."""
-    flows = [numbers.u_min, numbers.u_max]
-    if numbers.dead_zone > 0.0:
-        flows.append(0.0)
-    return TimeVaryingModel(
-        **vars(coefficients(parameters, numbers, np.arange(samples))),
-        c=tuple(parameters.c),
-        delay=int(numbers.delay),
-        low=min(flows),
-        high=max(flows),
-        numbers=numbers,
-    )
