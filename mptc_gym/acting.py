@@ -33,8 +33,7 @@ def rollout(plants: Any, act: Act, samples: int, seeds: list[int]) -> Steps:
     Yield the infos at sample k, those at k + 1, and whether the episodes have ended.
 
     This is the one loop, for scores, benchmarks and tests. `plants` are a vector environment of
-    Gymnasium or a `FromVecEnv`, and `act` is a function of their observations. Actions of the
-    wrong shape, or not finite, are a ValueError.
+    Gymnasium or a `FromVecEnv`.
     """
     try:
         observations, infos = plants.reset(seed=seeds)

@@ -45,31 +45,25 @@ class Evaluation:
     ----------
     env : str
         The environment's id, or the name of its class.
-    mean_error : float
-        Mean of |e(k)| over k = 1 to N and over all episodes, degC.
-    travel : float
-        Mean distance that the valve moves in an episode, t/h.
-    errors : ndarray, shape (episodes,)
-        Mean of |e(k)| over k = 1 to N of each episode, degC.
-    travels : ndarray, shape (episodes,)
-        Distance that the valve moves in each episode, t/h.
+    mean_error, travel : float
+        Means of `errors` and `travels`.
+    errors, travels : ndarray, shape (episodes,)
+        Mean of |e(k)| over k = 1 to N, degC, and distance that the valve moves, t/h.
     seeds : range
         Seeds of the episodes.
     least_possible : float or None
-        Least possible mean error of these episodes, degC: see `benchmarks/bounds`. This and all
-        that follows from it are None where the package has no bound, as for arguments of no
-        preset; `python -m benchmarks.bounds` computes others.
+        Least possible mean error, degC: see `benchmarks/bounds`. This and all that follows are
+        None where the package has no bound, as for arguments of no preset;
+        `python -m benchmarks.bounds` computes others.
     multiple : float or None
         `mean_error / least_possible`.
     score : float or None
         0 for a valve that is left alone, 1 for the least possible error.
     interval : (float, float) or None
         95 % bootstrap interval of the score, from resampled episodes.
-    least : ndarray or None, shape (episodes,)
-        Least possible error of each episode, degC. Where only noise and load are drawn, all
-        elements equal its expectation over these.
-    scores : ndarray or None, shape (episodes,)
-        Score of each episode against its own bound.
+    least, scores : ndarray or None, shape (episodes,)
+        Least possible error of each episode, degC, and its score against it. Where only noise
+        and load are drawn, the error is its expectation over these.
     """
 
     env: str
@@ -115,23 +109,22 @@ def evaluate(
     Parameters
     ----------
     policy
-        A function of observations of shape (n, size), n plants side by side, that returns
-        actions of shape (n, 1); a `torch.nn.Module`, called with tensors, in evaluation mode;
-        or an object with `predict`, such as a model of Stable-Baselines3, or with `act`, such
-        as the controllers in `agents`. `predict` is given `state`, `episode_start` and
-        `deterministic=True` as far as it takes them, others the last where they name it. A
-        method `reset` is called before each round; what was learnt carries over.
+        A function of observations, shape (n, size), that returns actions, shape (n, 1); a
+        `torch.nn.Module`, called with tensors, in evaluation mode; or an object with `predict`,
+        such as a model of Stable-Baselines3, or with `act`, such as those in `agents`.
+        `predict` is given `state`, `episode_start` and `deterministic=True` as far as it takes
+        them, others the last where they name it. A method `reset` is called before each round;
+        what was learnt carries over.
     env
         An id, such as one of `IDS`, or an `EnvSpec`; a function that makes one environment; or
         environments: one, a vector environment of Gymnasium, or a `VecEnv` of
-        Stable-Baselines3, such as `model.get_env()`. These are not closed, their statistics are
-        frozen meanwhile, and they begin a new episode afterwards. If they are fewer than
-        `episodes`, they run several rounds.
-    episodes
-        Number of episodes, at least 2.
-    seed
-        Seed of the first episode. The default is that of all published scores. Bounds exist for
-        the 120 episodes from there on: to select a policy, use others than the first 100.
+        Stable-Baselines3, such as `model.get_env()`. These run several rounds if they are fewer
+        than `episodes`. They are not closed, their statistics are frozen meanwhile, and they
+        begin a new episode afterwards.
+    episodes, seed
+        Number of episodes, at least 2, and seed of the first. The default is that of all
+        published scores. Bounds exist for the 120 episodes from there on: to select a policy,
+        use others than the first 100.
     **arguments
         Further arguments for an id or a spec, as in `gymnasium.make`.
 
@@ -204,10 +197,9 @@ def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
 
 
 def native_batch(single: Env, n: int, **modes: Any) -> Any:
-    """Return n of an environment, to be stepped at once, in an `autoreset_mode` and so on.
+    """Return n of an environment in one batch, in an `autoreset_mode` and so on.
 
-    Return None if there is no such batch: for another class, or wrappers other than
-    `IncrementalAction`.
+    There is none, but None, for another class or wrappers other than `IncrementalAction`.
     """
     spec, plant = single.spec, single.unwrapped
     if spec is None or type(plant) is not MiddlePointEnv:
@@ -250,10 +242,9 @@ def _run(
 
 
 def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values | None:
-    """Return the least possible mean error of each episode, degC, from the package's bounds.
+    """Return the least possible mean error of each episode, degC, or None if it is not kept.
 
-    Return None if there is no bound for N = `samples` and these seeds. Where only noise and
-    load are drawn, one bound holds for all episodes and any seeds.
+    Where only noise and load are drawn, one bound holds for all episodes and any seeds.
     """
     least = _kept().get(case_of(parameters))
     if least is None or samples != SAMPLES:

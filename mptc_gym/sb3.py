@@ -59,12 +59,11 @@ class GymnasiumVecEnv(VecEnv):
     Parameters
     ----------
     batches
-        One or more vector environments of autoreset mode "SameStep" and with the same spaces;
-        their environments are numbered one batch after another.
-    spec
-        Spec of one environment with its wrappers, if all are alike.
-    group
-        Number of neighbouring environments that share a seed, and thus what is drawn.
+        Vector environments of autoreset mode "SameStep" and with the same spaces; their
+        environments are numbered one batch after another.
+    spec, group
+        Spec of one environment with its wrappers, if all are alike; and number of neighbours
+        that share a seed, and thus what is drawn.
     """
 
     def __init__(
@@ -216,13 +215,12 @@ def make_vec_env(
 
 
 def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any) -> EnvSpec:
-    """Return the spec of an environment with the windows and wrappers of a model's own.
+    """Return the spec of an id or spec with the windows and wrappers of a model's environments.
 
         evaluate(model, spec_of(model, "MiddlePointHard-v0"))
 
-    `env` is an id or an `EnvSpec`, and `arguments` are further arguments for it. Wrappers of
-    Stable-Baselines3, such as `VecNormalize`, are not in a spec. ValueError if the model's
-    environments cannot be made from theirs.
+    Wrappers of Stable-Baselines3, such as `VecNormalize`, are not in a spec. ValueError if the
+    model's environments cannot be made from theirs.
     """
     own, (plant, *_) = _spec(policy), natives(policy.get_env())
     windows = dict(zip(WINDOWS, plant.parameters.windows, strict=True))
@@ -253,11 +251,10 @@ def _spec(model: Any) -> EnvSpec:
 def save(model: BaseAlgorithm, path: str | Path) -> None:
     """Save a model atomically, with the spec of its environments.
 
-    The zip is that of `model.save` with one more member, `mptc_gym.json`; `.zip` is added to a
-    name without an ending. A `VecEnvWrapper`, such as `VecNormalize` or `VecFrameStack`, is no
-    part of a spec: a model in one is saved as Stable-Baselines3 does, by `model.save` and
-    `VecNormalize.save`. ValueError if the environments differ or cannot be made from their
-    spec, or the file cannot be written.
+    The zip is that of `model.save` with one more member; `.zip` is added to a name without an
+    ending. A `VecEnvWrapper`, such as `VecNormalize`, is no part of a spec: a model in one is
+    saved as Stable-Baselines3 does. ValueError if the environments differ or cannot be made
+    from their spec, or the file cannot be written.
     """
     path, spec = _zip_path(path), _spec(model)
     if isinstance(outermost := model.get_env(), VecEnvWrapper):
@@ -288,7 +285,7 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
 def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
     """Load a model that `save` wrote, with as many environments like its own.
 
-    Loading runs code from the zip and from the modules that it names: load only what you trust.
+    Loading runs code from the zip and the modules that it names: load only what you trust.
     `arguments` are those of the algorithm's own `load`, such as `device="cpu"`. A file that
     cannot be loaded is a ValueError.
     """
@@ -318,9 +315,9 @@ def _zip_path(path: str | Path) -> Path:
 class ScoreCallback(BaseCallback):
     """Score the policy during training, without exploration, and keep the best.
 
-    The default episodes of `mptc_gym.evaluate` stay free for the final score. Where nothing is
-    drawn, as in `MiddlePoint-v0`, all episodes are the same: select by another set point, such
-    as `setpoint_period=500`. The log gets `score/mean_error` and, with a bound, `score/score`.
+    The episodes differ from those of `mptc_gym.evaluate`. Where nothing is drawn, as in
+    `MiddlePoint-v0`, all are the same: select by another set point, `setpoint_period=500`. The
+    log gets `score/mean_error` and, with a bound, `score/score`.
 
     Parameters
     ----------
@@ -328,10 +325,9 @@ class ScoreCallback(BaseCallback):
         Where to score, as in `mptc_gym.evaluate`; never the environments of the training. An id
         or a spec takes the windows and wrappers of the training, see `spec_of`. A
         `VecNormalize` is given the statistics of the training before each score.
-    every
-        Samples of experience between scores; the end of training is scored, too.
-    episodes
-        Number of episodes per score. Where bounds differ by episode, there are only 20 of them.
+    every, episodes
+        Samples of experience between scores, the last at the end of training; and episodes per
+        score. Where bounds differ by episode, there are only 20 of them.
     path
         Zip in which to keep the policy with the least mean error, if any; see `save`.
     verbose

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import gymnasium
 import numpy as np
@@ -88,9 +89,10 @@ class TestEvaluate:
         np.testing.assert_array_equal(some.scores, whole.scores[100:])
         assert evaluate(PIController(), HARD, episodes=121).score is None
 
-    @pytest.mark.parametrize("field", dataclasses.fields(Evaluation), ids=lambda f: f.name)
-    def test_help_explains_each_field(self, field):
-        assert f"\n    {field.name} : " in Evaluation.__doc__
+    def test_help_explains_each_field(self):
+        explained = re.findall(r"\n    ([\w, ]+) : ", Evaluation.__doc__)
+        fields = {each.name for each in dataclasses.fields(Evaluation)}
+        assert {*", ".join(explained).split(", ")} == fields
 
     def test_its_text_is_one_line(self):
         found = evaluate(PIController(), HARD, episodes=4)
