@@ -56,7 +56,7 @@ REFUSED = {
         (["--agents"], "no controller"),
         (["--scenarios", "circle"], "no 'circle'"),
         (["--scenarios"], "--scenarios: none to run"),
-        (["--runs", "2.5"], "--runs must be a whole number, got '2.5'"),
+        (["--runs", "2.5"], 'for --runs: unable to convert "2.5" into int'),
         (["--preset", "paper", "--presets"], "--presets cannot be combined with --plant"),
         (["--preset", "paper", "--scenarios", "load"], "no 'load'; there are square, constant"),
         (["--rusn", "3"], "Unknown option: --rusn. Did you mean --runs"),
@@ -253,7 +253,7 @@ class TestEnds:
 @pytest.mark.parametrize("name", ["compare", "sweep"])
 def test_a_folder_that_cannot_be_written_to(name, refused):
     for out, complaint in {
-        "": "--out must name a folder, got ''",
+        "": '--out: unable to convert "" into',
         __file__: "cannot be written to: it is no folder",
         "/proc/here": "cannot be written to: No such file",
     }.items():

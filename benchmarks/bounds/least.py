@@ -116,11 +116,10 @@ def least_possible(
         task = partial(_least_possible, parameters, samples, kind, episodes, seed)
         if folder is None:
             return task()
-        with suppress(LookupError):
-            kept: LeastPossible = Kept(folder).load(task)
-            return kept
-        found = task()
-        Kept(folder).save(task, found)
+        found: LeastPossible | None = Kept(folder).load(task)
+        if found is None:
+            found = task()
+            Kept(folder).save(task, found)
         return found
 
     drawn = parameters.setpoint == "random"

@@ -19,7 +19,6 @@ import inspect
 import logging
 import math
 import os
-import re
 import signal
 import sys
 import threading
@@ -28,6 +27,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
@@ -40,6 +40,7 @@ EXTRAS = {
     "ray": "ray",
     "torch": "torch",
 }
+SIGNALS = signal.SIGINT, signal.SIGTERM
 FULL = errno.ENOSPC, errno.EDQUOT, errno.EPIPE  # a disk, or a reader that has gone
 
 
@@ -75,23 +76,17 @@ Group = TypeVar("Group")
 options: Callable[[type[Group]], type[Group]] = Parameter(name="*")
 
 
-def _integer(_type: object, tokens: Sequence[Any]) -> int:
-    """Read an integer, and reject 2.5, which cyclopts would round."""
-    try:
-        return int(tokens[0].value)
-    except ValueError as error:
-        raise ValueError(f"must be a whole number, got {tokens[0].value!r}") from error
-
-
-def _folder(_type: object, tokens: Sequence[Any]) -> Path:
-    """Read a folder, and reject "", which would be the current one."""
-    if not tokens[0].value:
-        raise ValueError("must name a folder, got ''")
-    return Path(tokens[0].value)
+def _strictly(kind: Callable[[str], Any], _type: object, tokens: Sequence[Any]) -> Any:
+    """Read 2.5 not as an integer, which cyclopts would round, and "" not as this folder."""
+    with suppress(ValueError):
+        if value := tokens[0].value:
+            return kind(value)
+    raise ValueError  # for which cyclopts has words
 
 
 def _integers(least: int, most: int) -> Parameter:
-    return Parameter(converter=_integer, n_tokens=1, validator=Number(gte=least, lte=most))
+    whole = partial(_strictly, int)
+    return Parameter(converter=whole, n_tokens=1, validator=Number(gte=least, lte=most))
 
 
 Count = Annotated[int, _integers(1, 1_000_000_000)]
@@ -100,7 +95,9 @@ Seed = Annotated[int, _integers(0, 2**63)]
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
 Repeated = tuple[str, ...]
-Folder = Annotated[Path, Parameter(help="Folder to write to.", converter=_folder, n_tokens=1)]
+Folder = Annotated[
+    Path, Parameter(help="Folder to write to.", converter=partial(_strictly, Path), n_tokens=1)
+]
 
 
 @contextmanager
@@ -128,10 +125,9 @@ def _typed(default: object) -> str | None:
 
 
 def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | None:
-    """Read a program's command line into a dataclass of options.
+    """Read a command line into options; with --help, print the help and return None.
 
-    With --help, the help is printed and None is returned. An invalid option raises
-    `UsageError`.
+    An invalid option is a `UsageError`.
     """
     app = App(
         name=program,
@@ -146,7 +142,6 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
         found = app(list(given), exit_on_error=False, print_error=False)
     except CycloptsError as error:
         text = " ".join(str(error).split())
-        text = re.sub(r"^Invalid value for (\S+): must", r"\1 must", text)
         if isinstance(error, MissingArgumentError) and error.argument:
             choices = ", ".join(error.argument.get_choices() or ())
             text = f"{error.argument.names[0].lstrip('-').upper()} is missing"
@@ -164,9 +159,7 @@ def command(
     """Return the `main` of the command `python -m benchmarks.NAME`.
 
     It takes the command line without the program's name, by default that of the process, and
-    returns the exit status: 0 for success; 1 if tasks failed, a file could not be written or
-    memory ran out; 130 after Ctrl-C and 143 after SIGTERM, with the message `interrupted`. An
-    invalid option or a missing package ends the program with 2.
+    returns the exit status of `finish`.
     """
     program = f"python -m benchmarks.{name}"
 
@@ -174,38 +167,57 @@ def command(
         if work.__module__ == "__main__" and (spec := sys.modules["__main__"].__spec__):
             # Other processes find tasks by the name of a module to be imported.
             return int(importlib.import_module(spec.name).main())
-        os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever the shell has set
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="replace")  # for "°C" on an ASCII terminal
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in SIGNALS:
             if arguments is None and signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, _interrupt)
-        try:
+
+        def whole() -> str:
             given = sys.argv[1:] if arguments is None else arguments
-            if (chosen := read(declared, program, given)) is not None:
-                said = work(chosen)
-                if arguments is None:  # the process ends: nothing is left to be interrupted
-                    _ignore_signals()
-                print(said, flush=True)
-        except KeyboardInterrupt as stopped:
-            print(f"\nInterrupted: {interrupted}", flush=True)
-            return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
-        except (UnfinishedError, MemoryError) as error:
-            print(str(error) or "There is not enough memory for so many runs or samples.")
-            return 1
-        except (UsageError, ImportError) as error:
-            stop(error, program)
-        except OSError as error:
-            return cut_off(error, program)
-        return 0
+            chosen = read(declared, program, given)
+            said = "" if chosen is None else work(chosen)
+            if arguments is None:  # the process ends: nothing is left to be interrupted
+                _ignore_signals()
+            return said
+
+        return finish(whole, program, interrupted)
 
     return main
 
 
+def finish(work: Callable[[], str], program: str, interrupted: str = "") -> int:
+    """Do work, print the line that it returns, and return the exit status.
+
+    This is 0 for success; 1 if tasks failed, a file could not be written or memory ran out; 130
+    after Ctrl-C and 143 after SIGTERM, with the message `interrupted`. An invalid option or a
+    missing package ends the program with 2.
+    """
+    try:
+        if said := work():
+            print(said, flush=True)
+    except KeyboardInterrupt as stopped:
+        print(f"\nInterrupted: {interrupted}", flush=True)
+        return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+    except (UnfinishedError, MemoryError) as error:
+        print(str(error) or "There is not enough memory for so many runs or samples.")
+        return 1
+    except (UsageError, ImportError) as error:
+        stop(error, program)
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        print(f"{program}: the output is cut off: {error.strerror}", file=sys.stderr)
+        # What is left is flushed at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return 0
+
+
 def _ignore_signals() -> None:
-    for each in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(each, signal.SIG_IGN)
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _interrupt(number: int, _frame: object) -> NoReturn:
@@ -214,15 +226,6 @@ def _interrupt(number: int, _frame: object) -> NoReturn:
     threading.excepthook = lambda _: None  # of joblib's threads, as its processes end
     warnings.simplefilter("ignore")
     raise KeyboardInterrupt(number)
-
-
-def cut_off(error: OSError, program: str) -> int:
-    """Say that the output cannot be written, and return 1; other errors are raised."""
-    if error.errno not in FULL:
-        raise error
-    print(f"{program}: the output is cut off: {error.strerror}", file=sys.stderr)
-    sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115 (what is left is flushed at exit)
-    return 1
 
 
 Task = Callable[[], Any]
@@ -248,33 +251,18 @@ class FanOut:
     ) -> Iterator[tuple[str, Any]]:
         """Run tasks, and yield the name and result of each as it finishes; on Ray, at the end.
 
-        Parameters
-        ----------
-        tasks
-            Functions without arguments, by name, such as a `functools.partial` of a function of
-            a module.
-        title
-            Label of the progress bar; "" for no bar.
-        kept
-            Where results are kept; those that are there already are yielded first.
-
-        Raises
-        ------
-        UnfinishedError
-            At the end, with the errors, if tasks raised an exception; or if a process was
-            killed, perhaps for lack of memory.
-        UsageError
-            If there is no cluster.
+        Tasks are functions without arguments, by name, such as a `functools.partial` of a
+        function of a module. Results that are kept already are yielded first. A progress bar
+        has the title, if there is one. `UnfinishedError`, at the end, says which tasks raised
+        an exception, or that a process was killed.
         """
         missing, errors = dict(tasks), {}
         with progress_bar(title, len(tasks)) as advance:
-            if kept:
-                for name, task in tasks.items():
-                    with suppress(LookupError):
-                        result = kept.load(task)
-                        del missing[name]
-                        advance()
-                        yield name, result
+            for name, task in tasks.items():
+                if kept and (result := kept.load(task)) is not None:
+                    del missing[name]
+                    advance()
+                    yield name, result
             for name, result, error in self._answers(missing):
                 advance()
                 if error:
@@ -355,8 +343,6 @@ def _connect() -> None:
     from ray.util.joblib import register_ray
 
     register_ray()
-    if ray.is_initialized():
-        return
     # `ray job submit` has uploaded the same code.
     os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
     stays = "/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py", "published", "*.md"
@@ -364,6 +350,7 @@ def _connect() -> None:
         ray.init(
             address=os.environ.get("RAY_ADDRESS", "auto"),
             runtime_env={"working_dir": str(ROOT), "excludes": [*stays]},
+            ignore_reinit_error=True,
             log_to_driver=False,
             logging_level=logging.ERROR,
         )

@@ -55,6 +55,14 @@ class Section:
     pictures: Mapping[str, str] = field(default_factory=dict)
     """Names of PNG files in the report's folder, and for each what it shows, in a sentence."""
 
+    def markdown(self, folder: Path) -> list[str]:
+        """Return the paragraphs, with the pictures that are in the folder."""
+        parts = [f"## {self.title}"] * bool(self.title) + [*self.text]
+        if self.table is not None:
+            parts.append(self.table.to_markdown(index=False, disable_numparse=True))
+        there = [name for name in self.pictures if (folder / name).exists()]
+        return parts + [f"![{self.pictures[name]}]({name})" for name in there]
+
 
 def write_report(
     folder: Path,
@@ -64,26 +72,30 @@ def write_report(
     origin: Mapping[str, Any],
     printed: int | None = None,
 ) -> None:
-    """Write `report.md` and `report.html`, with the pictures that there are.
+    """Write `report.md` and `report.html`, and print the first `printed` sections, or all.
 
     The last line is the time, the commit and the command of `benchmarks` that made it, the
-    first one what is `missing` of its tasks by the origin, if anything is. The first sections,
-    as many as `printed` or all, are printed, too, without their pictures.
+    first one what is `missing` of its tasks by the origin, if anything is.
     """
     import markdown
 
     called = sys.argv[1:] if command in sys.argv[0] else []
     line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])
     commit = origin["commit"]  # a hash of 40 digits, possibly with "-dirty"
-    made = f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}"
     if "missing" in origin:
         sections = [Section("", [f"**Unfinished: {origin['missing']}.**"]), *sections]
         printed = printed and printed + 1
-    page = _markdown(folder, title, sections, made)
+    parts = [part for section in sections for part in section.markdown(folder)]
+    made = f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}\n"
+    page = "\n\n".join([f"# {title}", *parts, made])
     write_text(folder / "report.md", page)
+
+    def embedded(found: re.Match[str]) -> str:
+        data = base64.b64encode((folder / found[1]).read_bytes()).decode()
+        return f'src="data:image/png;base64,{data}"'
+
     body = markdown.markdown(page, extensions=["tables", "toc"])
-    body = _INTERVAL.sub(r" <small>\1</small></td>", body)
-    body = _PICTURE.sub(lambda found: _embedded(folder / found[1]), body)
+    body = _PICTURE.sub(embedded, _INTERVAL.sub(r" <small>\1</small></td>", body))
     head = (
         '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style>"
@@ -96,11 +108,6 @@ def write_report(
             print(textwrap.fill(text, width))
         if section.table is not None:
             print(on_screen(section.table))
-
-
-def _embedded(picture: Path) -> str:
-    data = base64.b64encode(picture.read_bytes()).decode()
-    return f'src="data:image/png;base64,{data}"'
 
 
 def on_screen(table: pd.DataFrame) -> str:
@@ -116,22 +123,7 @@ def on_screen(table: pd.DataFrame) -> str:
         return cells.to_string(line_width=width - 2, max_rows=None)
 
 
-def _markdown(folder: Path, title: str, sections: Sequence[Section], made: str) -> str:
-    parts = [f"# {title}"]
-    for section in sections:
-        parts += [f"## {section.title}"] * bool(section.title)
-        parts += section.text
-        if section.table is not None:
-            parts.append(section.table.to_markdown(index=False, disable_numparse=True))
-        there = [name for name in section.pictures if (folder / name).exists()]
-        parts += [f"![{section.pictures[name]}]({name})" for name in there]
-    return "\n\n".join([*parts, made]) + "\n"
-
-
-# Okabe and Ito's palette for colour-blind readers, for lines that stand for no controller.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-WIDTH = 7.5  # of every figure, inches
-SHADES = 128  # colours of a picture, which make it small
+COLOURS = "#0072B2", "#D55E00"  # of lines that stand for no controller
 MULTIPLE = "multiple of the least possible\n(log scale of the excess over 1)"
 NEAREST = 1e-3  # excess over the least possible error at which a logarithmic axis begins
 EXCESSES = (0.001, 0.01, 0.1, 0.5, 1.0, 4.0, 9.0, 29.0)
@@ -164,7 +156,7 @@ def drawn(path: Path, height: float, title: str = "") -> Iterator[Figure]:
     from PIL import Image
 
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, height))
+        figure = Figure(figsize=(7.5, height))
         if title:
             lines = textwrap.fill(title[0].upper() + title[1:], 86)
             figure.suptitle(lines, x=0.01, ha="left", fontsize=10, weight="bold")
@@ -176,7 +168,7 @@ def drawn(path: Path, height: float, title: str = "") -> Iterator[Figure]:
             # Without dithering, areas stay even and the file small. The clustering keeps the
             # colours of small marks, which the usual way mixes, and that of the dead zone.
             most = Image.Quantize.MAXCOVERAGE
-            few = picture.quantize(SHADES, most, kmeans=3, dither=Image.Dither.NONE)
+            few = picture.quantize(128, most, kmeans=3, dither=Image.Dither.NONE)
             few.save(partial, optimize=True)
 
 

@@ -87,18 +87,12 @@ def share(happened: NDArray[np.bool_]) -> Estimate:
 def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
     """Estimate the mean over the runs of one or more tasks, by a percentile bootstrap.
 
-    Parameters
-    ----------
-    *tasks
-        Values of each task, all of the same shape: (runs,), or (members, runs) for several
-        trained controllers in the same runs. Members and runs are then resampled independently,
-        and a resample takes every crossing of the two. Members share the noise of a run, so
-        they do not count as separate runs, and the interval also covers training variability
-        (A. B. Owen, "The pigeonhole bootstrap", Annals of Applied Statistics 1, 2007, 386-411).
-        With only five members that differ far more than runs do, its coverage is 82 %. The
-        tasks themselves are not resampled.
-    seed
-        Seed of the resampling.
+    Tasks have the same shape: (runs,), or (members, runs) for several trained controllers in
+    the same runs. Members share the noise of a run, so they do not count as separate runs:
+    members and runs are resampled independently, and a resample takes every crossing of the two
+    (A. B. Owen, "The pigeonhole bootstrap", Annals of Applied Statistics 1, 2007, 386-411). The
+    interval also covers training variability; with only five members that differ far more than
+    runs do, its coverage is 82 %. The tasks themselves are not resampled.
     """
     tables = [np.atleast_2d(np.asarray(task, dtype=np.float64)) for task in tasks]
     together = np.concatenate([table.ravel() for table in tables])

@@ -95,25 +95,24 @@ class Kept:
     folder: Path
 
     def path(self, task: Callable[[], Any]) -> Path | None:
-        """Return the file of a task, named after its function and arguments."""
+        """Return the file of a task, named after its function and arguments.
+
+        There is none without a commit, at one that is dirty, and of what cannot be pickled.
+        """
         import joblib  # here: slow to import
 
-        name = commit()
-        # None without a commit, at one that is dirty, and of what cannot be pickled.
         with suppress(Exception):
-            return (
-                self.folder / name[:12] / f"{joblib.hash(task)}.pkl" if name.isalnum() else None
-            )
+            if (name := commit()).isalnum():
+                return self.folder / name[:12] / f"{joblib.hash(task)}.pkl"
         return None
 
     def load(self, task: Callable[[], Any]) -> Any:
-        """Return the result of a task; raise a `LookupError` if it is missing or damaged."""
+        """Return the result of a task; None if it is missing or damaged."""
         import joblib
 
-        try:
+        with suppress(Exception):  # whatever a damaged file raises
             return joblib.load(self.path(task))
-        except Exception as error:  # there is none, or whatever a damaged file raises
-            raise LookupError(str(error)) from error
+        return None
 
     def save(self, task: Callable[[], Any], result: Any) -> None:
         """Write the result of a task, completely or not at all."""
