@@ -84,10 +84,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             first reset must include all. Plants that are not reset return their last
             observation, and are False in the infos' masks, which may be one array.
 
-        Raises
-        ------
-        ValueError
-            If an argument is invalid. Nothing is then changed.
+        An argument that is invalid is a ValueError; nothing is then changed.
         """
         if options is not None and not isinstance(options, Mapping):
             reject("options", options, "a dict or None")
@@ -96,8 +93,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             raise ResetNeeded("reset all environments before some of them")
         self._prepare(mask, seed, options or {})
         self._was_reset = True
-        infos: Infos = {}
-        self._restart(mask, infos)
+        infos = self._restart(mask, {})
         return self._observations(), infos
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
@@ -105,13 +101,8 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
 
         Returns observations, shape (num_envs, size), then rewards, terminations,
         truncations and infos, shape (num_envs,). The masks of the infos may be one array.
-
-        Raises
-        ------
-        ValueError
-            If the actions have another shape, or one is not finite; nothing is then changed.
-        ResetNeeded
-            If plants have never been reset or, with autoreset disabled, have ended.
+        Actions of another shape or not finite are a ValueError; nothing is then changed. Plants
+        never reset or, with autoreset disabled, ended plants raise a `ResetNeeded`.
         """
         if not self._was_reset:
             raise ResetNeeded("call reset before step")
@@ -121,10 +112,8 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             raise ResetNeeded(f"episodes of environments {which} have ended: reset them")
         a = self._checked_actions(actions)
         if ended is not None and ended.all():
-            infos: Infos = {}
-            self._restart(ended, infos)
-            none = [self._flags(~ended) for _ in range(2)]
-            return self._observations(), self._zeros + 0, *none, infos
+            infos, nobody = self._restart(ended, {}), [self._flags(~ended) for _ in range(2)]
+            return self._observations(), self._zeros + 0, *nobody, infos
         self._clock += 1
         observations, rewards, terminations, truncations, infos = self._advance(a)
         if self._clock >= self._first_end:
@@ -150,8 +139,8 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         self._ended = ended if ended.any() else None
         return observations, rewards, self._flags(ended)
 
-    def _restart(self, mask: Mask, infos: Infos) -> None:
-        """Begin an episode of some plants, and insert their infos at k = 0."""
+    def _restart(self, mask: Mask, infos: Infos) -> Infos:
+        """Begin an episode of some plants, and return the infos with theirs at k = 0."""
         self._starts[mask] = self._clock
         self._first_end = int(self._starts.min()) + self._limit
         if self._ended is not None:
@@ -162,6 +151,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             values = first.get(name, self._zeros)
             infos[name] = self._where(flags, values, infos.get(name, 0))
             infos.setdefault(f"_{name}", flags)
+        return infos
 
     def _checked_mask(self, options: Mapping[str, Any]) -> Mask:
         """Return the mask of the plants to reset."""

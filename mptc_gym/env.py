@@ -265,12 +265,10 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         _, error_head, output_head, action_head, size = self._layout
         # One spare element at the end: see step.
         self._window = [0.0] * action_head + [rest_action] * (size - action_head + 1)
+        newest = {0: setpoint, error_head: setpoint, output_head: 0.0, action_head: rest_action}
+        for head, value in newest.items():  # of empty blocks, too, where the next one begins
+            self._window[head] = value
         self._ahead.clear()
-
-        self._window[0] = setpoint
-        self._window[error_head] = setpoint
-        self._window[output_head] = 0.0
-        self._window[action_head] = rest_action
         if self.render_mode is not None:
             self._record = Record(numbers, parameters.sampling_interval, setpoint)
         if self.render_mode == "human":
@@ -285,21 +283,20 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
         """Apply a normalised action a(k), shape (1,), for one sample.
 
-        Returns observation, reward, terminated, truncated and info at k+1.
-
-        Raises
-        ------
-        ValueError
-            If the action is not one finite number. The plant is then unchanged.
-        ResetNeeded
-            If the environment has never been reset.
+        Returns observation, reward, terminated, truncated and info at k+1. An action that is
+        not one finite number is a ValueError, which leaves the plant unchanged. Before the
+        first reset, a `ResetNeeded` is raised.
         """
         # This is the hot path: code that runs in every step avoids function calls.
         try:
             a = float(action.item() - 0.0)  # text is not a number, even if float() parses it
         except (AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
             a = one_action(action)
-        shown = a if -1.0 <= a <= 1.0 else _beyond_the_box(a)
+        shown = a
+        if not -1.0 <= a <= 1.0:
+            shown = _limited(a, 1.0)
+            if not math.isfinite(a):
+                one_action(a)  # which refuses it
         if not self._ahead:
             if self._streams is None:
                 raise ResetNeeded("call reset before step")
@@ -349,14 +346,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         """Draw the last minutes of the episode.
 
         Returns a picture, shape (540, 960, 3), for "rgb_array"; None for "human", which shows
-        it in a window, and, after a warning, without a mode.
-
-        Raises
-        ------
-        ResetNeeded
-            If the environment has never been reset.
-        DependencyNotInstalled
-            If pygame is not installed.
+        it in a window, and, after a warning, without a mode. Raises `ResetNeeded` before the
+        first reset, and `DependencyNotInstalled` without pygame.
         """
         if self.render_mode is None:
             logger.warn(NO_MODE)
@@ -391,9 +382,3 @@ MiddlePointEnv.__doc__ = insert_table(MiddlePointEnv.__doc__)
 
 def _limited(value: float, limit: float) -> float:
     return max(-limit, min(limit, value))  # in this order, NaN becomes a limit
-
-
-def _beyond_the_box(action: float) -> float:
-    if not math.isfinite(action):
-        one_action(action)  # refuses it, and would be slow for the others
-    return _limited(action, 1.0)

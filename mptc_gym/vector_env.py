@@ -206,14 +206,13 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         if self.render_mode is not None:
             for j, i in enumerate(which.tolist()):
                 own, interval = plant_numbers(numbers, j), parameters.sampling_interval
-                self._records[i] = Record(own, interval, float(setpoint[j]))
+                self._records[i] = Record(own, interval, setpoint[j].item())
 
         first = {"setpoint": setpoint, "error": setpoint}
         first |= numbers.chosen(self._ranges.names)
-        for name, factors in zip(self._factor_names, self._plants.factors, strict=False):
-            first[name] = factors[which]
-        of_all = {name: np.zeros(self.num_envs, each.dtype) for name, each in first.items()}
+        of_all = dict(zip(self._factor_names, self._plants.factors, strict=False))
         for name, values in first.items():
+            of_all[name] = np.zeros(self.num_envs, values.dtype)
             of_all[name][which] = values
         return of_all
 
@@ -230,14 +229,11 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return mask.copy()
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        n = self.num_envs
-        seeds = [*range(int(seed), int(seed) + n)] if is_count(seed) else plain(seed)
-        seeds = [None] * n if seed is None else seeds
-        if (
-            not isinstance(seeds, list | tuple)
-            or len(seeds) != n
-            or not all(each is None or is_count(each) for each in seeds)
-        ):
+        n, seeds = self.num_envs, plain(seed)
+        if seed is None or is_count(seed):
+            seeds = [None if seed is None else int(seed) + i for i in range(n)]
+        fits = isinstance(seeds, list | tuple) and len(seeds) == n
+        if not fits or not all(each is None or is_count(each) for each in seeds):
             reject("seed", seed, f"an integer of at least 0, or a list of {n} of them or None")
         for i in np.flatnonzero(mask).tolist():
             own = seeds[i]
@@ -260,11 +256,8 @@ class _Window:
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
         heads = np.cumsum([0, *windows[:-1]]).tolist()
-        # Index of the newest sample of each block; None where the block is empty.
-        self._newest = tuple(
-            np.s_[:, head] if window else None
-            for head, window in zip(heads, windows, strict=True)
-        )
+        # Of each block with samples: its number, and the place of the newest one.
+        self._newest = [(i, np.s_[:, heads[i]]) for i, window in enumerate(windows) if window]
         self._actions = np.s_[:, heads[-1] :]
         self._shape = num_envs, sum(windows)
         self._elements = num_envs * sum(windows)
@@ -278,26 +271,19 @@ class _Window:
     def reset(self, which: Indices, setpoint: Values, rest_action: Values) -> None:
         """Begin an episode of some plants at rest, with y_d(0) and the action of no flow."""
         rest = np.zeros((len(which), self._shape[1]), np.float32)
-        for newest in self._newest[:2]:
-            if newest is not None:
-                rest[newest] = setpoint
         rest[self._actions] = np.reshape(np.clip(rest_action, -1.0, 1.0), (-1, 1))
+        for i, newest in self._newest:
+            if i < 2:  # set points and errors
+                rest[newest] = setpoint
         self.present()[which] = rest
 
-    def add(self, setpoint: Values, error: Values, output: Values, a: Values) -> Observations:
-        """Add a sample, and return the observations."""
+    def add(self, *samples: Values) -> Observations:
+        """Add set points, errors, outputs and actions, and return the observations."""
         if self._place == 0:
             self._row[STEPS_PER_SHIFT:] = self._row[:-STEPS_PER_SHIFT]
             self._place = STEPS_PER_SHIFT
         self._place -= 1
-        window = self._row[self._place : self._place + self._elements].reshape(self._shape)
-        setpoints, errors, outputs, actions = self._newest
-        if setpoints is not None:
-            window[setpoints] = setpoint
-        if errors is not None:
-            window[errors] = error
-        if outputs is not None:
-            window[outputs] = output
-        if actions is not None:
-            window[actions] = a.clip(-1.0, 1.0)
+        window = self.present()
+        for i, newest in self._newest:
+            window[newest] = samples[i] if i < 3 else samples[i].clip(-1.0, 1.0)
         return window.copy()
