@@ -190,7 +190,7 @@ def test_plants_that_one_kind_alone_refuses():
 
 
 class TestDirectNN:
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=25, deadline=None)
     @given(
         n_inputs=st.integers(1, 12),
         n_hidden=st.integers(1, 8),
@@ -341,7 +341,7 @@ class TestPolicyNetwork:
         assert network.act([[0.0]]) == pytest.approx(0.5)
         assert network.command == pytest.approx(5.0)  # three quarters of the way up
 
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=30, deadline=None)
     @given(
         u_min=st.floats(-15, -0.5),
         u_max=st.floats(0.5, 15),

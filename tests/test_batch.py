@@ -247,7 +247,7 @@ class TestDraws:
             assert_mean(normal**power, moment)
         assert_mean(np.abs(normal) < 0.6745, 0.5)  # the quartiles of a normal distribution
 
-    @pytest.mark.parametrize("period", [600, 7, 1])
+    @pytest.mark.parametrize("period", [240, 7, 1])
     def test_set_points_have_their_levels_and_lengths(self, library, period):
         n, steps, size = 300, 40 * max(period // 6, 3), 4.0
         arguments = {"setpoint_period": period, "setpoint_amplitude": size, "delay": 25}
@@ -304,7 +304,7 @@ class TestDraws:
             assert_mean((delays - 18) * (gains - 1.125), 0.0)
 
     def test_resets_leave_the_distributions_as_they_are(self, library):
-        n, variance, walk, jump = 800, 2.0, 0.01, 0.3
+        n, variance, walk, jump = 400, 2.0, 0.01, 0.3
         env = library.make(
             n, noise_variance=variance, c=[1.0, 3.0], disturbance_walk_variance=walk,
             disturbance_amplitude=jump, disturbance_interval=10, setpoint="random",

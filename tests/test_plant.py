@@ -68,7 +68,7 @@ def exact(command, u_min, u_max, dead_zone):
 
 
 @pytest.mark.parametrize("scaled", [exact, float32_action, actuator.float32_action])
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     u_min=st.floats(-20, 5),
     reach=st.floats(0.01, 30),

@@ -148,7 +148,7 @@ def test_frames_of_a_batch_are_those_of_one_after_the_other(mode, rng):
     native, sync = native_and_sync(2, mode, 6, render_mode="rgb_array", **NOISY)
     for envs in (native, sync):
         envs.reset(seed=5)
-    for k in range(12):
+    for k in range(9):
         actions = rng.uniform(-1, 1, (2, 1)).astype(np.float32)
         _, _, _, ended, _ = native.step(actions)
         sync.step(actions)
@@ -202,7 +202,7 @@ def test_what_cannot_be_drawn_is_said(made, monkeypatch):
 anything = st.floats() | st.floats(-20, 20)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     samples=st.lists(st.tuples(anything, anything, anything, anything), max_size=12),
     delay=st.integers(0, 10) | st.sampled_from([10**3, 10**9]),

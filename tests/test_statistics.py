@@ -50,7 +50,7 @@ def test_share_by_hand():
 
 @pytest.mark.parametrize("how", ["upper", "share"])
 def test_intervals_hold_the_truth_as_often_as_they_promise(how, rng):
-    trials, held = 400, 0
+    trials, held = 250, 0
     for _ in range(trials):
         if how == "share":
             estimate, truth = share(rng.random(80) < 0.3), 0.3
@@ -82,7 +82,7 @@ class TestBootstrap:
         # What a run does to all members, what a member does in all runs, and what is left:
         # members that do the same in every run are no more runs than there were.
         monkeypatch.setattr(statistics, "RESAMPLES", 400)
-        runs, trials, held, widths = 60, 200, 0, []
+        runs, trials, held, widths = 60, 120, 0, []
         for _ in range(trials):
             values = rng.normal(size=(1, runs)) + of_members * rng.normal(size=(members, 1))
             estimate = bootstrap(values + of_cells * rng.normal(size=(members, runs)), seed=0)
