@@ -1,7 +1,6 @@
 """The roster: what holds for any controller, as every command runs it; and a user's own."""
 
 import copy
-import pickle
 import re
 
 import gymnasium
@@ -15,7 +14,7 @@ from benchmarks.compare.comparison import run_case
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.storage import UsageError
-from benchmarks.loop.rollout import IdleValve, mean_error
+from benchmarks.loop.rollout import mean_error
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
@@ -44,13 +43,13 @@ def test_it_is_told_the_plant_that_it_is_made_for(entry, member):
     assert entry.knows
     assert entry.searched
     plant = ACTUATOR if entry.name in UNTOLD else OTHER
-    found = run_case(Scenario("other", "", 900, plant), member, 2).runs["mae"].to_numpy()
+    found = run_case(Scenario("other", "", 600, plant), member, 2).runs["mae"].to_numpy()
     if entry.name == "nothing":
         np.testing.assert_allclose(found, IDLE)
         return
     assert (found < 0.7 * IDLE).all()
     if member.learns:  # in service it has learnt before, on this plant
-        learnt = member.run(plant, 900, 2, SEED, member.in_service(plant, 2, SEED))
+        learnt = member.run(plant, 600, 2, SEED, member.in_service(plant, 2, SEED))
         assert mean_error(learnt).mean() < 0.9 * found.mean()
 
 
@@ -60,8 +59,8 @@ def test_a_batch_is_its_members_again_and_mirrored(entry, member):
         limits = {"u_min": -6.0, "u_max": 10.0} if sign > 0 else {"u_min": -10.0, "u_max": 6.0}
         plant = {**limits, "b": [sign * b for b in Parameters().b], "noise_variance": 0.1}
         controller = controller or member(plant, runs, seed)
-        plant["setpoint_amplitude"] = 6.0
-        return controller, member.run(plant, 350, runs, seed, controller)
+        plant |= {"setpoint_amplitude": 6.0, "setpoint_period": 200}
+        return controller, member.run(plant, 160, runs, seed, controller)
 
     controller, batch = run(3, 5)
     # Where a network has learnt, its noise then was that of its place in the batch.
@@ -85,19 +84,6 @@ def test_a_batch_is_its_members_again_and_mirrored(entry, member):
 def test_it_asks_for_its_own_windows(member):
     windows = {"setpoint_window": 7, "error_window": 0}
     assert errors(member, 1, 60, **windows) == errors(member, 1, 60)
-
-
-def test_a_copy_goes_on_like_the_original_in_mid_episode(member, rng):
-    controller = member(ACTUATOR, 2, 5)
-    size = sum(Parameters(**ACTUATOR, **member.observation).windows)
-    before, after = np.float32(rng.uniform(-3, 3, (2, 30, 2, size)))
-    for observation in before:
-        controller.act(observation)
-    twins = copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))
-    ours = [controller.act(observation) for observation in after]
-    for twin in twins:
-        np.testing.assert_array_equal([twin.act(observation) for observation in after], ours)
-    assert len(np.unique(ours)) > 1 or isinstance(controller, IdleValve)
 
 
 @pytest.fixture
@@ -207,18 +193,18 @@ class TestSavedPolicies:
         assert "weights: 0 M samples a policy" in member.provenance["searched"]
         assert ("note" in member.provenance) == (name == "bare")  # which is told to the user
         controller = member(PRESETS[preset], 3, SEED)
-        found = errors(member, 3, 350, **PRESETS[preset])
+        found = errors(member, 3, 100, **PRESETS[preset])
         model = PPO.load(file, device="cpu")
         env = copy.deepcopy(gymnasium.spec(IDS[preset]))
         if name != "bare":  # the others say where they act
             model = load(file, device="cpu")
             env = spec_of(model, env)
-        env.max_episode_steps = 350
+        env.max_episode_steps = 100
         expected = evaluate(model, env, episodes=3)
         np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-12)
         # What it remembers, the flow, is forgotten at the beginning of an episode.
         first, again = (
-            member.run(PRESETS[preset], 50, 3, SEED, controller).applied for _ in range(2)
+            member.run(PRESETS[preset], 30, 3, SEED, controller).applied for _ in range(2)
         )
         np.testing.assert_array_equal(first, again)
 
@@ -233,10 +219,10 @@ class TestSavedPolicies:
             "    return lambda seen: -0.1 * seen[:, 3:4], make\n"
         )
         (member,) = members_of(written(code))
-        found = errors(member, 3, 600, **PRESETS["noisy"])
+        found = errors(member, 3, 100, **PRESETS["noisy"])
         expected = evaluate(
             lambda seen: -0.1 * seen[:, 3:4],
-            lambda: DelayObservation(gymnasium.make(IDS["noisy"], max_episode_steps=600), 2),
+            lambda: DelayObservation(gymnasium.make(IDS["noisy"], max_episode_steps=100), 2),
             episodes=3,
         )
         np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-9)
