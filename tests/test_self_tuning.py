@@ -37,7 +37,7 @@ def mean_error(trajectory, start=0):
 
 @pytest.mark.parametrize(
     ("delay", "gain", "time_constant", "noise"),
-    [(8, 1.5, 0.6, 0.0), (18, 1.0, 1.0, 0.1), (33, 0.8, 1.8, 0.0), (33, 0.8, 1.8, 0.1)],
+    [(8, 1.5, 0.6, 0.0), (18, 1.0, 1.0, 0.1), (33, 0.8, 1.8, 0.1)],
 )
 def test_it_finds_out_what_the_plant_is(delay, gain, time_constant, noise):
     controller = tuning()
@@ -96,7 +96,7 @@ def travel(run):
 
 @pytest.mark.parametrize(
     ("shown", "dead_zone", "setpoint"),
-    [(7.0, 7.0, 5.2), (5.0, 6.0, 4.4), (5.0, 7.5, 5.2)],
+    [(7.0, 7.0, 5.2), (5.0, 7.5, 5.2)],
 )
 def test_the_network_does_not_hunt_beside_a_dead_zone(shown, dead_zone, setpoint):
     controller = NeuralSelfTuningController(**{**STEP_TEST, "dead_zone": shown})
@@ -107,14 +107,14 @@ def test_the_network_does_not_hunt_beside_a_dead_zone(shown, dead_zone, setpoint
 def test_thousands_of_quiet_samples_teach_nothing():
     controller, estimates = tuning(), []
     setpoint = [0.0] + [5.0] * 300 + [-5.0] * 300 + [0.0]  # the last one is held
-    plants = make_plants(1, 4_000, setpoint=setpoint, delay=26, gain_factor=1.3)
+    plants = make_plants(1, 2_500, setpoint=setpoint, delay=26, gain_factor=1.3)
 
     def watch(k):
-        if k in (1500, 3_999):
+        if k in (1000, 2_499):
             estimates.append(controller.estimates)
 
-    trajectory = rollout(plants, controller, 4_000, 0, watch)
-    assert not trajectory.applied[1500:].any()
+    trajectory = rollout(plants, controller, 2_500, 0, watch)
+    assert not trajectory.applied[1000:].any()
     before, after = estimates
     assert before["delay"] == pytest.approx(8.0 * 27, abs=16.0)
     for name, values in after.items():
@@ -127,7 +127,7 @@ def test_neither_a_wrong_sign_nor_nonsense_leads_it_beyond_its_bounds(rng):
     assert (controller.estimates["gain"] <= 0.3 * -0.6825 + 1e-12).all()
     for controller in (tuning(), NeuralSelfTuningController(**STEP_TEST)):
         for scale in (1.0, 1e3, 1e6, 1.0):
-            for _ in range(200):
+            for _ in range(100):
                 controller.act(rng.normal(size=(3, 6)) * scale)
                 assert np.isfinite(controller.command).all()
         gain, delay = controller.estimates["gain"] / -0.6825, controller.estimates["delay"]

@@ -56,6 +56,7 @@ class TestCommand:
     @pytest.fixture
     def quick(self, monkeypatch):
         """Leave out what takes most of the time."""
+        monkeypatch.setattr(sweep, "SAMPLES", 350)
         monkeypatch.setattr(sweep, "report", Mock())
         monkeypatch.setattr(least, "least_possible", lambda **_: Mock(value=1.0))
 

@@ -29,7 +29,7 @@ RECIPE = replace(
     cases={"short": {"max_episode_steps": 20}},
     hidden=(8,),
     memory=40,
-    steps=1024,
+    steps=512,
 )
 
 
@@ -129,7 +129,7 @@ class TestGradient:
         assert analytic[-1, 0].item() == pytest.approx((at[0] - at[1]) / 2e-4, rel=0.05)
 
     def test_training_reduces_the_error(self):
-        training = replace(SMALL, steps=8, plants=8, choosing=16, adding=8)
+        training = replace(SMALL, steps=6, samples=40, plants=8, choosing=16, adding=8)
         torch.manual_seed(training.seed)
         before = validate(Net(training), training)
         after = train(training).provenance["validation"]
