@@ -91,7 +91,6 @@ class Controller(ABC):
     n_obs: int = field(init=False, repr=False)
     command: Values = field(init=False, repr=False)
 
-    _remembers = True  # past samples; if not, the batch size may change at any time
     _edge = 0.0  # of the dead zone, t/h; a command on it keeps its effect as an action
 
     def __post_init__(self) -> None:
@@ -109,20 +108,9 @@ class Controller(ABC):
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the controller was not made for: scores would be wrong in silence.
 
-        Parameters
-        ----------
-        parameters
-            The plants' arguments, by name as in `mptc_gym.Parameters`.
-        wrapped
-            Names of wrappers that change observations or actions; empty if there are none.
-        n
-            Number of plants.
-
-        Raises
-        ------
-        ValueError
-            If limits, places in the observation or the number of loops differ, or if the plants
-            are wrapped.
+        `parameters` are the arguments of all `n` plants, by name as in `mptc_gym.Parameters`,
+        and `wrapped` names wrappers that change observations or actions, if any. A ValueError
+        says what does not fit: limits, places in the observation, number of loops, wrappers.
         """
         # Where limits are drawn, the controller has the widest.
         limits = float(np.min(parameters.u_min)), float(np.max(parameters.u_max))
@@ -184,8 +172,7 @@ class Controller(ABC):
             )
         command = self._control(np.atleast_2d(values))
         self.command = command if len(now) else command[0]
-        if self._remembers:
-            self._loops_before = now
+        self._loops_before = now
         return float32_action(self.command, self.u_min, self.u_max, self._edge)[..., np.newaxis]
 
     @abstractmethod

@@ -121,29 +121,22 @@ class DirectNNController(Controller):
 
     def __post_init__(self) -> None:
         self._batch = () if self.num_envs is None else (self.num_envs,)  # the leading axis
+        self._own = slice(None) if self._batch else 0  # of arrays with such an axis
         super().__post_init__()
         self.n_obs = max(self.n_inputs, self.error_index + 1)
         if abs(self.direction) != 1.0:
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
         if self.num_envs is not None:
             check("num_envs", self.num_envs, Size)
-        self._shapes = {
-            "W": (self.n_hidden, self.n_inputs),
-            "theta_1": (self.n_hidden,),
-            "W_1": (self.n_hidden,),
-            "theta_2": (),
-        }
+        hidden, of_W = (self.n_hidden,), (self.n_hidden, self.n_inputs)
+        self._shapes = {"W": of_W, "theta_1": hidden, "W_1": hidden, "theta_2": ()}
         seeds, scale = range(self.seed, self.seed + (self.num_envs or 1)), self.weight_scale
         generators = [np.random.default_rng(seed) for seed in seeds]
-        drawn = {
-            name: [each.uniform(-scale, scale, shape) for each in generators]
-            for name, shape in self._shapes.items()
-        }
         self.weights = Weights(
-            **{
-                name: np.reshape(x, self._batch + self._shapes[name])
-                for name, x in drawn.items()
-            }
+            *(
+                np.array([each.uniform(-scale, scale, shape) for each in generators])[self._own]
+                for shape in self._shapes.values()
+            )
         )
 
     @property
@@ -157,8 +150,7 @@ class DirectNNController(Controller):
         ValueError
             If a shape does not fit or a value is not finite; the weights are then unchanged.
         """
-        which = 0 if self.num_envs is None else slice(None)
-        return Weights(*(np.array(array.T[which], order="C") for array in self._arrays))
+        return Weights(*(np.array(array.T[self._own], order="C") for array in self._arrays))
 
     @weights.setter
     def weights(self, weights: Weights) -> None:

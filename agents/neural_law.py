@@ -94,14 +94,8 @@ class Law:
     of a load mean on the newest samples count against it; the network tilts the weights to
     means of newer or of older samples. It also chooses a mean of the residual, the rate at
     which the model approaches the rest of the set point, and a small addition to the flow.
-
-    Parameters
-    ----------
-    prior
-        What is known of the plants.
-    aggressiveness
-        How much quicker the law is than the network asks for: it tilts the load means to newer
-        samples, and is added to the logit of the rate.
+    `aggressiveness`, how much quicker the law is than the network asks for, tilts the load
+    means to newer samples and is added to the logit of the rate.
     """
 
     # Those of the class and not of its objects, so that these can be copied and pickled.
@@ -130,14 +124,8 @@ class Law:
     def adopt(self, prior: Prior, ratio: Any, residual: Any) -> None:
         """Adopt new numbers of the plants, and convert the memory to them.
 
-        Parameters
-        ----------
-        prior
-            What is known of the plants from now on.
-        ratio
-            Ratio of the old authority to the new one.
-        residual
-            Change of the last residual, as a multiple of the new authority.
+        `ratio` is that of the old authority to the new one, and `residual` the change of the
+        last residual, as a multiple of the new authority.
         """
         units = ratio * prior.unit / self.prior.unit
         loads = self._means[:, :_LOADS] * units[:, None] + (prior.unit * residual)[:, None]
@@ -154,16 +142,10 @@ class Law:
     def flow(
         self, network: Network, setpoint: Any, residual: Any, load: Any, state: Any
     ) -> Any:
-        """Return the wanted flow, before the actuator, shape (n,).
+        """Return the wanted flow, before the actuator, shape (n,), like all that is given.
 
-        Parameters
-        ----------
-        network
-            The two networks.
-        setpoint, residual, load
-            y_d(k), r(k) and A(z^-1) r(k), which is A(1) times the load; each of shape (n,).
-        state
-            The model's undelayed output, the one before it, and the last flow that passed.
+        This is y_d(k), r(k), A(z^-1) r(k), which is A(1) times the load, and in `state` the
+        model's undelayed output, the one before it, and the last flow that passed.
         """
         xp = self._xp
         noise, misses, evidence = self._judge(load)
@@ -344,27 +326,27 @@ class NeuralSmithPredictor(ModelBasedController):
     def reset(self) -> None:
         """Forget the episode, and return the model to rest."""
         super().reset()
-        self._law: Law | None = None
+        self._k = 0
 
     def _control(self, rows: Array) -> Array:
-        if self._law is None:
-            self._law = self._start(len(rows))
+        if self._k == 0:
+            self._start(len(rows))
         if self._k % self._every == 0:
-            self._last = self._decide(self._law, rows)
+            self._last = self._decide(rows)
         self._k += 1
         return self._last
 
-    def _start(self, loops: int) -> Law:
-        """Set the model to rest, and return the law."""
+    def _start(self, loops: int) -> None:
+        """Set the model and the law to rest."""
         # Undelayed outputs of the model, what it misses, residuals, newest first, and the flow
         # that passed last.
         self._model = np.zeros((self._delay + 3, loops))
         self._off, self._residual = np.zeros((2, 2, loops))
         self._passed = np.zeros(loops)
-        self._k = 0
-        return Law(Prior(**{name: np.full(loops, x) for name, x in vars(self._about).items()}))
+        about = {name: np.full(loops, x) for name, x in vars(self._about).items()}
+        self._law = Law(Prior(**about))
 
-    def _decide(self, law: Law, rows: Array) -> Array:
+    def _decide(self, rows: Array) -> Array:
         """Return commands, t/h, shape (loops,), for observations."""
         setpoint = rows[:, self.setpoint_index] / self._authority
         output = setpoint - rows[:, self.error_index] / self._authority
@@ -373,8 +355,8 @@ class NeuralSmithPredictor(ModelBasedController):
         # First-order models miss fast dynamics, which the average of two samples reduces.
         residual = self._residual = _shifted(self._residual, (off[0] + off[1]) / 2.0)
         state, load = (model[0], model[1], self._passed), residual[0] - self._pole * residual[1]
-        wanted = law.flow(self.network, setpoint, residual[0], load, state)
-        wanted, self._passed = law.applied(wanted)
+        wanted = self._law.flow(self.network, setpoint, residual[0], load, state)
+        wanted, self._passed = self._law.applied(wanted)
         new = (1.0 - self._pole) * self._passed + self._pole * model[0]
         self._model = _shifted(model, new)
         command: Array = self._flow * wanted

@@ -58,12 +58,6 @@ class NeuralSelfTuningController(SelfTuningController):
         super().__post_init__()
         self._half = (self.u_max - self.u_min) / 2.0
         self._flow = self._half * np.sign(self.gain)  # t/h at a flow of 1
-        self._authority: Array  # of the bank's model, degC
-
-    def reset(self) -> None:
-        """Forget the episode and what was learnt: the next plant may be different."""
-        super().reset()
-        self._rule: Law | None = None
 
     def _informed(self, before: Array) -> Law:
         """Return the law, updated with the bank's estimates."""
@@ -80,13 +74,12 @@ class NeuralSelfTuningController(SelfTuningController):
             centre=np.full(self._loops, (self.u_max + self.u_min) / 2.0 / self._flow),
             uncertainty=np.minimum(self._spread(delay), MOST_UNCERTAIN),
         )
-        if self._rule is None:
+        if self._samples == 1:
             self._rule = Law(prior, aggressiveness=self.aggressiveness)
         else:
-            self._rule.adopt(
-                prior, self._authority / authority, (before - self._residual) / authority
-            )
-        self._authority = authority
+            missed = (before - self._residual) / authority
+            self._rule.adopt(prior, self._authority / authority, missed)
+        self._authority: Array = authority  # of the bank's model, degC
         return self._rule
 
     def _spread(self, delay: Array) -> Array:

@@ -39,20 +39,19 @@ class SelfTuningController(ModelBasedController):
     """A predictive controller that identifies the plant while controlling it.
 
     *Identification.* A bank holds one model `y(k) = g s(k - d)` for each combination of a delay
-    d, a time constant and a dead zone. Here s is the response of a first-order plant, with gain
-    1 and no delay, to the flow that this dead zone and the limits let pass. The gains g are
+    d, a time constant and a dead zone; s is the response of a first-order plant, with gain 1
+    and no delay, to the flow that this dead zone and the limits let pass. The gains g are
     estimated by recursive least squares with exponential forgetting, on prefiltered signals. A
     model's probability depends on how well it fits and how close it is to the step test. The
     controller uses the average of all models (D. T. Magill, "Optimal adaptive estimation of
     sampled stochastic processes", IEEE Transactions on Automatic Control 10, 1965, 434-439).
 
     *Control.* As in a Smith predictor, the model predicts the output at the end of the delay.
-    The disturbance, which is the difference between the output and the model, is added. It
-    decays over the delay like the plant's own response, except for its slow mean: the offset
-    that a steady load leaves fades with about 200 samples. The command is
-    `u = s + K (y_d - predicted output)`, where K makes the error decay with the requested time
-    constant. The response s to the flow after the actuator takes the place of an integral, so
-    nothing winds up.
+    What it misses now, the disturbance, is added. It decays over the delay like the plant's own
+    response, except for its slow mean: the offset that a steady load leaves fades with about
+    200 samples. The command is `u = s + K (y_d - predicted output)`, where K makes the error
+    decay with the requested time constant. The flow after the actuator moves s, which replaces
+    an integral, so nothing winds up.
 
     *Safeguards* (K. J. Astrom and B. Wittenmark, "Adaptive Control", 2nd edition, 1995,
     chapter 11). The step test's gain is a prior that is never forgotten: without new
@@ -132,8 +131,6 @@ class SelfTuningController(ModelBasedController):
         off = np.square(off_delay)[:, np.newaxis] + np.square(off_constant) + off_zone**2
         # Log-probabilities, up to a constant.
         self._prior = -0.5 * off.ravel().astype(self._precision)
-        self._gain_range = sorted(self.gain * multiple for multiple in GAINS)
-        self._excited = EXCITED * (self.u_max - self.u_min) / 2.0
         self._history = most - 1 + max(MEMORY, self._every) + 2
 
     @property
@@ -187,7 +184,7 @@ class SelfTuningController(ModelBasedController):
         """Add the last samples to the sums of the loops whose flow has moved."""
         interval = self._every
         flows = self._flows[:, self._now - self._history : self._now]
-        moved = flows.max(1) - flows.min(1) > self._excited
+        moved = flows.max(1) - flows.min(1) > EXCITED * (self.u_max - self.u_min) / 2.0
         gate = moved.astype(self._precision)[:, np.newaxis]
         for total in (self._information, self._products, self._energy, self._seen):
             total *= 1.0 - gate * (1.0 - self.forgetting**interval)
@@ -222,7 +219,7 @@ class SelfTuningController(ModelBasedController):
         least = np.maximum(left, LEAST_NOISE**2 * self._seen)
         self._variance = (least + NOISE_SAMPLES * self._noise**2) / (self._seen + NOISE_SAMPLES)
 
-        np.clip(gains, *self._gain_range, out=gains)
+        np.clip(gains, *sorted(self.gain * multiple for multiple in GAINS), out=gains)
         weighted = weights * gains
         squares = _dot(weighted, gains) + _dot(weights, self._variance / information)
         # Variance over all gains, as a share of the square of their mean.
@@ -252,8 +249,8 @@ class SelfTuningController(ModelBasedController):
         output = setpoint - rows[:, self.error_index]
         filtered = self._filter(self._filtered_outputs[:, -1], output, self._outputs[:, 0])
         self._outputs = np.column_stack([output, self._outputs[:, :-1]])
-        self._filtered_outputs[:, :-1] = self._filtered_outputs[:, 1:].copy()
-        self._filtered_outputs[:, -1] = filtered
+        latest = [self._filtered_outputs[:, 1:], filtered.astype(self._precision)]
+        self._filtered_outputs = np.column_stack(latest)
         self._samples += 1
         if self._samples % self._every == 0:
             self._learn()
@@ -286,19 +283,17 @@ class SelfTuningController(ModelBasedController):
 
     def _apply(self, command: Array) -> None:
         """Update the undelayed responses with a command."""
-        column = command[:, np.newaxis]
-        applied = applied_flow(column, self._dead_zones, self.u_min, self.u_max)
-        now = self._now
-        units = self._poles * self._units[:, now] + (1.0 - self._poles) * applied
-        filtered = self._filter(self._filtered[:, now], units, self._units[:, now])
-        self._flows[:, now] = np.clip(command, self.u_min, self.u_max)
+        now, column = self._now, command[:, np.newaxis]
         if now + 1 == self._units.shape[1]:
             for history in (self._units, self._filtered, self._flows):
-                history[:, : self._history] = history[:, _ROOM + 1 :].copy()
-            now = self._history - 1
-        self._now = now = now + 1
-        self._units[:, now] = units
-        self._filtered[:, now] = filtered
+                history[:, :-_ROOM] = history[:, _ROOM:].copy()
+            now -= _ROOM
+        before, self._now = self._units[:, now], now + 1
+        self._flows[:, now] = np.clip(command, self.u_min, self.u_max)
+        applied = applied_flow(column, self._dead_zones, self.u_min, self.u_max)
+        units = self._poles * before + (1.0 - self._poles) * applied
+        self._units[:, now + 1] = units
+        self._filtered[:, now + 1] = self._filter(self._filtered[:, now], units, before)
 
     def _filter(self, filtered: Array, new: Array, before: Array) -> Array:
         """Return the next sample of the prefilter."""
