@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -81,8 +82,7 @@ class Options:
     """
 
     design: Literal["grid", "random"] = "grid"
-    """grid: 20 delays by 10 gains; random: plants that differ in everything, half of which
-    drift."""
+    """20 delays by 10 gains, or plants that differ in everything, half of which drift."""
     plants: Runs | None = None
     """Plants of a random design (default: 200)."""
     design_seed: Seed | None = None
@@ -102,8 +102,8 @@ class Options:
 
 def work(options: Options) -> str:
     """Run the sweep and write its results, also after an error: of what has finished."""
-    controllers = chosen(options.agents, options.controllers.agent).items()
-    members = {name: each.members() for name, each in controllers}
+    made_by = chosen(options.agents, options.controllers.agent)
+    members = {name: each.members() for name, each in made_by.items()}
     nominal = options.plant.arguments()
     plants = design(options, nominal)
     made, out = origin(), out_folder(options.out or Path(f"results/sweep-{options.design}"))
@@ -114,8 +114,8 @@ def work(options: Options) -> str:
         told = case if options.told == "each" else {**nominal, **SETPOINT}
         for name, of in members.items():
             # The plants take the members in turn, so that the maps show how much they differ.
-            task = partial(run_agent, of[i % len(of)], told, case, options.runs)
-            tasks[f"plant {i}, {name}"] = task
+            member = of[i % len(of)]
+            tasks[f"plant {i}, {name}"] = partial(run_agent, member, told, case, options.runs)
     found: dict[str, Any] = {}
     try:
         # The code of a user's own may change without a new commit.
@@ -152,11 +152,7 @@ def design(options: Options, nominal: Arguments) -> list[Arguments]:
 def run_agent(
     controller: Controller, told: Arguments, case: Arguments, runs: int
 ) -> dict[str, Any]:
-    """Run a controller that is made for the plant it is `told` on another plant.
-
-    Run i has the noise and the initial weights of seed `SEED + i`. Returned are, for each run,
-    its number, all that `measure` returns, and `swing`.
-    """
+    """Run a controller that is made for the plant it is `told` on another one; measure it."""
     agent = controller.in_service(told, runs, SEED)
     trajectory = controller.run(case, SAMPLES, runs, SEED, agent)
     measures = measure(trajectory, Parameters(**case))
@@ -164,73 +160,54 @@ def run_agent(
 
 
 def scale_of(case: Arguments, runs: int) -> dict[str, Any]:
-    """Run no control on a plant, and add the `limit` of others' mean |e|, degC.
-
-    This is the least possible error if each change of the set point finds the plant settled
-    and is not foreseen, see `benchmarks.bounds`; NaN if the plant does not settle.
-    """
+    """Run no control on a plant; add the reference (`limit`), NaN if it does not settle."""
     from benchmarks.bounds.least import least_possible
 
-    try:
+    found = {**run_agent(ROSTER["nothing"], case, case, runs), "limit": math.nan}
+    with suppress(ValueError):
         least = least_possible(samples=SAMPLES, kind="reference", folder=None, **case)
-        limit = least.value
-    except ValueError:
-        limit = math.nan
-    return {**run_agent(ROSTER["nothing"], case, case, runs), "limit": limit}
+        found["limit"] = least.value
+    return found
 
 
 def swing(trajectory: Trajectory) -> NDArray[np.float64]:
-    """Return the swing of the error while a set point is held, degC, shape (runs,).
-
-    This is the root mean square of the standard deviations in the second half of each hold.
-    """
+    """Return the rms of the error's deviations in the second half of each hold, (runs,)."""
     error = trajectory.setpoint - trajectory.output
-    halves = [((start + stop) // 2, stop) for start, stop in held(trajectory.setpoint[:, 0])]
-    variances = [error[middle:stop].var(axis=0) for middle, stop in halves]
+    holds = held(trajectory.setpoint[:, 0])
+    variances = [error[(start + stop) // 2 : stop].var(axis=0) for start, stop in holds]
     return np.asarray(np.sqrt(np.mean(variances, axis=0)))
 
 
 def table(
     plants: Sequence[Arguments], agents: Sequence[str], found: Mapping[str, Any]
 ) -> pd.DataFrame:
-    """Return one row for each run: its plant, its measures, and how they compare.
-
-    Found are, by the names of the tasks, the scale of each plant and the measures of each
-    controller on it. What is missing, as its task has failed, has no row.
-    """
+    """Return one row for each run that there is: its plant, its measures, its comparisons."""
     import pandas as pd
 
     rows = [pd.DataFrame()]
     for (i, plant), agent in itertools.product(enumerate(plants), agents):
-        scale, of_agent = found.get(f"plant {i}"), found.get(f"plant {i}, {agent}")
-        if scale is None or of_agent is None:
-            continue
-        about = {"plant": i, "agent": agent, **of_agent, "limit": scale["limit"]}
-        # By no control in the same noise.
-        compared = {
-            "ratio": of_agent["mae"] / scale["limit"],
-            "oscillates": of_agent["swing"] > scale["swing"] + OSCILLATES,
-            "useless": of_agent["mae"] >= scale["mae"],
-        }
-        rows.append(pd.DataFrame({**about, **compared, **plant}))
+        idle, of = found.get(f"plant {i}"), found.get(f"plant {i}, {agent}")
+        if idle and of:
+            compared = {  # with no control in the same noise
+                "limit": idle["limit"],
+                "ratio": of["mae"] / idle["limit"],
+                "oscillates": of["swing"] > idle["swing"] + OSCILLATES,
+                "useless": of["mae"] >= idle["mae"],
+            }
+            row = {"plant": i, "agent": agent, **of, **compared, **plant}
+            rows.append(pd.DataFrame(row))
     return pd.concat(rows, ignore_index=True)
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row of numbers for each controller; see `TEXT`."""
-    import pandas as pd
-
     of = runs.groupby("agent", sort=False)
-    ratios = runs.groupby(["agent", "plant"], sort=False)["ratio"].median()
-    multiples = ratios.groupby("agent", sort=False)
-    columns = {
-        "multiple": multiples.median(),
-        "multiple_p90": multiples.quantile(0.9),
-        "travel": of["total_variation"].median(),
-        "oscillates": 100.0 * of["oscillates"].mean(),
-        "useless": 100.0 * of["useless"].mean(),
-    }
-    return pd.DataFrame(columns).reset_index(names="agent")
+    found = 100.0 * of[["oscillates", "useless"]].mean()
+    found.insert(0, "travel", of["total_variation"].median())
+    ratios = runs.groupby(["agent", "plant"], sort=False)["ratio"].median().groupby("agent")
+    found.insert(0, "multiple_p90", ratios.quantile(0.9))
+    found.insert(0, "multiple", ratios.median())
+    return found.reset_index()
 
 
 def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) -> None:
@@ -254,26 +231,22 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) 
 
 
 def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:
-    """Return differences: a row for each group of two plants and more, a column a pair.
-
-    Plants on which one of the controllers has failed do not count.
-    """
+    """Return a row for each group of two plants and more on which none failed."""
     import pandas as pd
 
     from benchmarks.lib.statistics import bootstrap
 
-    rows, agents = [], {agent for pair in pairs for agent in pair}
-    runs = runs[runs["agent"].isin(agents)]
-    runs = runs[runs.groupby("plant")["agent"].transform("nunique") == len(agents)]
+    agents = list({agent for pair in pairs for agent in pair})
+    errors = runs.pivot(index="plant", columns=["agent", "run"], values="mae")[agents].dropna()
+    plants = runs.drop_duplicates("plant").set_index("plant").loc[errors.index]
+    rows = []
     for name, which in GROUPS.items():
-        cells = runs.query(which)
-        errors = cells.pivot_table(index="plant", columns=["agent", "run"], values="mae")
-        if len(errors) > 1:
-            rows.append({"plants": name, "number": str(len(errors))})
+        of = errors.loc[plants.query(which).index]
+        if len(of) > 1:
+            rows.append({"plants": name, "number": str(len(of))})
             for ours, theirs in pairs:
-                difference = errors[ours].to_numpy() - errors[theirs].to_numpy()
-                column = f"{label(ours)} - {label(theirs)}"
-                rows[-1][column] = f"{bootstrap(difference, seed=SEED):+.3f}"
+                difference = bootstrap((of[ours] - of[theirs]).to_numpy(), seed=SEED)
+                rows[-1][f"{label(ours)} - {label(theirs)}"] = f"{difference:+.3f}"
     return pd.DataFrame(rows)
 
 
