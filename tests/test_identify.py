@@ -53,9 +53,10 @@ def recorded(samples=1200, seed=700, **plant):
 def good():
     """Return what is found in a log with gaps of the paper's plant, not around 0."""
     log = recorded()
-    log = replace(log, flow=log.flow + 480.0, temperature=log.temperature + 385.0)
+    log = Log(log.flow + 480.0, log.temperature + 385.0, 8.0,
+              given=Options(EXAMPLE, operating_flow=480.0))  # fmt: skip
     log.temperature[[200, 201, 500, 777]] = np.nan
-    return identify(log, operating_flow=480.0)
+    return identify(log)
 
 
 class TestFit:
@@ -284,8 +285,8 @@ class TestFound:
             plants(model)
 
     def test_units_are_those_of_the_log(self):
-        log = replace(good().log, flow_unit="%", temperature_unit="K")
-        model = replace(good(), log=log)
+        given = Options(EXAMPLE, flow_unit="%", temperature_unit="K")
+        model = replace(good(), log=replace(good().log, given=given))
         text = str([section.text for section in report(model, controllers(model))])
         assert "t/h" not in text
         assert "°C" not in text
@@ -335,8 +336,9 @@ class TestGuards:
 
     def test_flow_behind_the_valve_needs_no_test_of_it(self):
         flow = 10.0 * np.sign(recorded(800).flow)
-        log = Log(flow, answer(flow, np.random.default_rng(705)), 8.0)
-        assert identify(log, applied=True).warnings == []
+        measured = answer(flow, np.random.default_rng(705))
+        log = Log(flow, measured, 8.0, given=Options(EXAMPLE, applied=True))
+        assert identify(log).warnings == []
 
 
 def table(**columns):

@@ -63,13 +63,7 @@ def work(options: Options) -> str:
 
     made, began, out = origin(), time.process_time(), out_folder(options.out)
     try:
-        model = identify(
-            read_log(options),
-            applied=options.applied,
-            operating_flow=options.operating_flow,
-            u_min=options.u_min,
-            u_max=options.u_max,
-        )
+        model = identify(read_log(options))
         plant, ranges = plants(model)
     except ValueError as error:
         raise UsageError(str(error)) from error

@@ -88,7 +88,7 @@ def controllers(model: Model) -> dict[str, Any]:
         return {"recommended": [], "warnings": model.warnings or [none]}
     (pi, sensitivity, slower), (lag, delay) = found, model.plant.first_order()
     h, rest = model.log.sampling_interval, model.operating_flow
-    flow, degree = model.log.flow_unit, model.log.temperature_unit
+    flow, degree = model.log.given.flow_unit, model.log.given.temperature_unit
     entry = {
         "controller": "pi-simc",
         "kp": -pi.kp,

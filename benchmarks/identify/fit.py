@@ -22,12 +22,9 @@ ORDER = 8  # of the autoregressive model of the noise, in blocks
 class Plant:
     """Lags side by side behind one delay: exp(-delay s) times the sum of gain / (1 + lag s)."""
 
-    delay: float
-    """s."""
-    lags: Complex
-    """Time constants, s; those of a plant that oscillates are complex."""
-    gains: Complex
-    """degC per t/h, one for each lag."""
+    delay: float  # s
+    lags: Complex  # time constants, s; those of a plant that oscillates are complex
+    gains: Complex  # degC per t/h, one for each lag
 
     @property
     def gain(self) -> float:
@@ -90,38 +87,27 @@ class Solution(NamedTuple):
     """The best coefficients, those of the plants first, and what they leave."""
 
     c: Array
-    errors: Array
-    """Of the blocks, weighted: white noise if all is right."""
-    weighted: Array
-    """The columns that the coefficients multiply, weighted."""
+    errors: Array  # of the blocks, weighted: white noise if all is right
+    weighted: Array  # the columns that the coefficients multiply, weighted
 
 
 @dataclass(frozen=True)
 class Fit:
     """A log, what is known so far of its valve, noise and loads, and a plant for it."""
 
-    flow: Array
-    """Flow behind the valve, row by row, t/h from where it was at first."""
-    temperature: Array
-    """Means of blocks of rows, degC from the mean; NaN where unknown."""
-    h: float
-    """Sampling interval of the rows, s."""
-    known: tuple[Array, ...] = ()
-    """Measured disturbances, row by row."""
-    rows: int = 1
-    """Rows in a block."""
-    scale: float = 1.0
-    """Sum of delay and lag, s, roughly: the unit of the delay among the parameters."""
+    flow: Array  # behind the valve, row by row, t/h from where it was at first
+    temperature: Array  # means of blocks of rows, degC from the mean; NaN where unknown
+    h: float  # sampling interval of the rows, s
+    known: tuple[Array, ...] = ()  # measured disturbances, row by row
+    rows: int = 1  # in a block
+    scale: float = 1.0  # delay and lag, s, roughly: the unit of the delay among the parameters
+    # The polynomial that makes the noise of the blocks white.
     weights: Array = field(default_factory=lambda: np.array([1.0, -0.8]))
-    """Polynomial that makes the noise of the blocks white."""
-    loads: tuple[float, ...] = ()
-    """Times of steps of an unmeasured load, s."""
-    extra: tuple[Array, ...] = ()
-    """Further inputs of the plant, with gains of their own."""
-    shape: str = "one lag"
-    """Of the plant."""
+    loads: tuple[float, ...] = ()  # times of steps of an unmeasured load, s
+    extra: tuple[Array, ...] = ()  # further inputs of the plant, with gains of their own
+    shape: str = "one lag"  # of the plant
+    # The delay, the logarithm of the first lag, and one more.
     p: Array = field(default_factory=lambda: np.zeros(2))
-    """Parameters of the plant: the delay, the logarithm of the first lag, and one more."""
 
     def at(self, p: Array) -> Fit:
         """Return the fit of other parameters."""

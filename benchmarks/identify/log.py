@@ -6,16 +6,13 @@ import io
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from benchmarks.identify.__main__ import Options
-
-Array = NDArray[np.float64]
+from benchmarks.identify.__main__ import Options
+from benchmarks.identify.fit import Array
 
 FEWEST, MOST = 100, 20_000  # rows; of a longer log, the last ones are used
 LONGEST_GAP = 20  # rows
@@ -26,18 +23,13 @@ SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}
 class Log:
     """A recorded log with one row a sample."""
 
-    flow: Array
-    """The flow from the time of its row on."""
-    temperature: Array
-    """The temperature at the time of its row; NaN where it is unknown."""
-    sampling_interval: float
-    """s."""
-    disturbances: dict[str, Array] = field(default_factory=dict)
-    """Other measured inputs, by column."""
-    flow_unit: str = "t/h"
-    temperature_unit: str = "°C"
-    notes: tuple[str, ...] = ()
-    """What was read, and what was done about numbers that are missing."""
+    flow: Array  # from the time of its row on
+    temperature: Array  # at the time of its row; NaN where it is unknown
+    sampling_interval: float  # s
+    disturbances: dict[str, Array] = field(default_factory=dict)  # by column
+    notes: tuple[str, ...] = ()  # what was read, and what was done where numbers are missing
+    # Columns, units and prior knowledge.
+    given: Options = field(default_factory=lambda: Options(Path()))
 
 
 def read_log(given: Options) -> Log:
@@ -62,7 +54,7 @@ def read_log(given: Options) -> Log:
             )
     interval, places = _sampled(_times(table[given.time], SECONDS[given.time_unit]))
     numbers = table[names[1:]].apply(_numbers)
-    kept = numbers.set_index(places).reindex(range(places[-1] + 1))[-MOST:]
+    kept = numbers.set_index(places).reindex(np.arange(places[-1] + 1.0))[-MOST:]
     notes = [f"Read {len(table):,} rows, one every {interval:g} s; {len(kept):,} are used."]
     for column, count in kept.isna().sum().items():
         done = "are left out of the fit" if column == temperature else "are the values before"
@@ -71,34 +63,25 @@ def read_log(given: Options) -> Log:
             raise ValueError(
                 f"{count} of {len(kept)} values of {column!r} are missing: too many"
             )
-    held = kept.ffill().bfill()
-    return Log(
-        held[given.flow].to_numpy(),
-        kept[temperature].to_numpy(),
-        interval,
-        {name: held[name].to_numpy() for name in given.disturbance},
-        given.flow_unit,
-        given.temperature_unit,
-        tuple(notes),
-    )
+    held = {name: column.to_numpy() for name, column in kept.ffill().bfill().items()}
+    flow, others = held[given.flow], {name: held[name] for name in given.disturbance}
+    return Log(flow, kept[temperature].to_numpy(), interval, others, tuple(notes), given)
 
 
 def _table(path: Path) -> pd.DataFrame:
     """Return a file's table of texts."""
     try:
         text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    heading = text.partition("\n")[0]
-    separator = next((mark for mark in ";\t" if mark in heading), ",")
-    try:
+        heading = text.partition("\n")[0]
+        separator = next((mark for mark in ";\t" if mark in heading), ",")
         with warnings.catch_warnings():
-            # Of more cells than headings.
-            warnings.simplefilter("error", pd.errors.ParserWarning)
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # of too many cells
             table = pd.read_csv(
                 io.StringIO(text), sep=separator, dtype=str, skipinitialspace=True,
                 skip_blank_lines=False, index_col=False,
             )  # fmt: skip
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
     except (pd.errors.EmptyDataError, pd.errors.ParserError, pd.errors.ParserWarning) as error:
         raise ValueError(
             f"{path} is not a table: {str(error).strip()}. With decimal commas, the separator "
@@ -141,7 +124,7 @@ def _check(column: pd.Series[str], bad: pd.Series[bool], needed: str) -> None:
         )
 
 
-def _sampled(times: Array) -> tuple[float, NDArray[np.intp]]:
+def _sampled(times: Array) -> tuple[float, Array]:
     """Return the sampling interval, and the number of the sample of each row."""
     steps = np.diff(times)
     usual = float(np.median(steps))
@@ -159,4 +142,4 @@ def _sampled(times: Array) -> tuple[float, NDArray[np.intp]]:
         if bad.any():
             row = int(np.argmax(bad))
             raise ValueError(f"line {row + 3}: a time step of {steps[row]:g} s: {what}")
-    return interval, np.r_[0, np.cumsum(whole)].astype(np.intp)
+    return interval, np.r_[0.0, np.cumsum(whole)]

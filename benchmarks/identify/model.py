@@ -10,8 +10,7 @@ import numpy as np
 
 from benchmarks.identify.fit import Array, Fit, Plant
 from benchmarks.identify.log import Log
-from benchmarks.identify.search import FAULT, Found, draws, possible_zones, search
-from benchmarks.identify.valve import HYSTERESES, VALVES
+from benchmarks.identify.search import FAULT, HYSTERESES, VALVES, Found, draws, search
 
 LAGS = 30  # of the autocorrelation of the errors, blocks
 COMMANDS = 5  # distinct ones, at least, that test a valve
@@ -37,25 +36,17 @@ class Model:
 
     log: Log
     found: Found
-    possible: list[Plant]
-    """Plants drawn from all that the log leaves possible."""
-    tested: bool
-    """Whether the log tells what the valve does."""
+    possible: list[Plant]  # drawn from all that the log leaves possible
+    tested: bool  # whether the log tells what the valve does
+    # `delay` (samples), `dead_zone` (t/h), `gain` (degC per t/h) and `time_constant` (s, of the
+    # slowest lag).
     estimates: dict[str, Interval]
-    """`delay` (samples), `dead_zone` (t/h), `gain` (degC per t/h) and `time_constant` (s, of
-    the slowest lag)."""
-    operating_flow: float
-    """t/h, where u is 0."""
-    operating_temperature: float
-    """degC, where y is 0."""
-    u_min: float
-    """Smallest flow, t/h from the operating point."""
-    u_max: float
-    """Largest flow."""
-    simulated: Array
-    """Temperatures without noise, degC, one a row."""
-    explained: tuple[float, float]
-    """What a fit to the first two thirds explains of the last third; see `held_out`."""
+    operating_flow: float  # t/h, where u is 0
+    operating_temperature: float  # degC, where y is 0
+    u_min: float  # smallest flow, t/h from the operating point
+    u_max: float  # largest one
+    simulated: Array  # temperatures without noise, degC, one a row
+    explained: tuple[float, float]  # of the last third by a fit to the others; see `held_out`
 
     @property
     def plant(self) -> Plant:
@@ -66,7 +57,7 @@ class Model:
     def notes(self) -> list[str]:
         """What a user should know of the log and the fit."""
         best, valve, log = self.found.best, self.found.valve, self.log
-        size, unit = valve.size, log.flow_unit
+        size, unit, degree = valve.size, log.given.flow_unit, log.given.temperature_unit
         times = ", ".join(f"{at / 60.0:.0f}" for at in sorted(best.loads))
         remarks = {
             f"The valve seems to move by {size / best.h:.3g} {unit} a second at most, which "
@@ -81,8 +72,8 @@ class Model:
         }  # fmt: skip
         gains = best.solution.c[len(best.units) :][: 3 * len(best.known)].reshape(-1, 3)
         known = [
-            f"{name} is a known disturbance with a gain of {gain:.4g} {log.temperature_unit} a "
-            "unit, which plant.json cannot hold."
+            f"{name} is a known disturbance with a gain of {gain:.4g} {degree} a unit, "
+            "which plant.json cannot hold."
             for name, gain in zip(log.disturbances, gains.sum(axis=1), strict=True)
         ]
         return [*log.notes, *(each for each, holds in remarks.items() if holds), *known]
@@ -100,7 +91,7 @@ class Model:
             "The log does not test the valve, as the flow had so few values, and nothing is "
             "known of its dead zone. Record a log with a dozen flows, or the flow behind the "
             "valve (--applied).": not self.tested,
-            said_of_fault(found, self.log.flow_unit): found.fault is not None,
+            said_of_fault(found, self.log.given.flow_unit): found.faults[0].drop > FAULT,
             "Valves of two kinds explain the log alike, and the plants behind them differ. "
             + TEST: max(rivals, default=1.0) > RIVAL * min(rivals, default=1.0),
             "Not even the direction is known in which the temperature answers the flow. Move "
@@ -135,17 +126,8 @@ def said_of_fault(found: Found, unit: str) -> str:
     )
 
 
-def identify(
-    log: Log,
-    *,
-    applied: bool = False,
-    operating_flow: float | None = None,
-    u_min: float | None = None,
-    u_max: float | None = None,
-) -> Model:
+def identify(log: Log) -> Model:
     """Return the plant of a log, with warnings of what speaks against it.
-
-    The prior knowledge is that of the command's options.
 
     Raises
     ------
@@ -153,11 +135,11 @@ def identify(
         If the log does not show a plant at all; the message says why.
     """
     _check(log)
-    h, level = log.sampling_interval, float(np.nanmean(log.temperature))
-    rest = resting_flow(log.flow, operating_flow)
+    h, given, level = log.sampling_interval, log.given, float(np.nanmean(log.temperature))
+    rest = resting_flow(log.flow, given.operating_flow)
     command, moved = log.flow - rest, log.temperature - level
     known = tuple(each - each[0] for each in log.disturbances.values())
-    found = search(Fit(command - command[0], moved, h, known), command, applied=applied)
+    found = search(Fit(command - command[0], moved, h, known), command, applied=given.applied)
     best, plant, valve = found.best, found.best.plant, found.valve
     if plant.slowest > len(command) * h / 5.0:
         raise ValueError(
@@ -166,8 +148,9 @@ def identify(
         )
     # Of flows that differ by noise alone, one counts.
     flows = np.unique(np.round(log.flow / (0.02 * np.ptp(log.flow))))
-    tested = applied or len(flows) >= COMMANDS
-    possible, zone = _possible(found, command)
+    tested = given.applied or len(flows) >= COMMANDS
+    possible, ends = draws(found, command)
+    zone = _interval(valve.size if valve.name.endswith("dead zone") else 0.0, ends)
     delay = _interval(plant.delay / h, [each.delay / h for each in possible])
     estimates = {
         "delay": Interval(delay.value, max(delay.low - 0.5, 0.0), delay.high + 0.5),
@@ -181,19 +164,11 @@ def identify(
     return Model(
         log, found, possible, tested, estimates, rest,
         operating_temperature=float(level + c[-1] - plant.gain * start),
-        u_min=max(float(command.min()), -end) if u_min is None else u_min,
-        u_max=min(float(command.max()), end) if u_max is None else u_max,
+        u_min=max(float(command.min()), -end) if given.u_min is None else given.u_min,
+        u_max=min(float(command.max()), end) if given.u_max is None else given.u_max,
         simulated=level + replace(best, rows=1, temperature=moved).columns[0] @ c,
         explained=held_out(best),
     )  # fmt: skip
-
-
-def _possible(found: Found, command: Array) -> tuple[list[Plant], Interval]:
-    """Return plants that the log leaves possible, and the dead zone."""
-    zones, valve = possible_zones(found, command), found.valve
-    plants, drawn = zip(*draws(found.fits, zones, np.random.default_rng(0)), strict=True)
-    size, at = valve.size if valve.name.endswith("dead zone") else 0.0, list(drawn)
-    return list(plants), _interval(size, [*zones.low[at], *zones.high[at]])
 
 
 def resting_flow(flow: Array, given: float | None = None) -> float:

@@ -29,7 +29,7 @@ HOW = (
 
 def report(model: Model, advised: dict[str, Any]) -> list[Section]:
     """Return the sections of the report; `advised` is the content of `controllers.json`."""
-    flow, degree = model.log.flow_unit, model.log.temperature_unit
+    flow, degree = model.log.given.flow_unit, model.log.given.temperature_unit
     rest = model.operating_flow
     units = {"delay": "samples", "dead_zone": flow, "gain": f"{degree} per {flow}"}
     rows = [
@@ -69,7 +69,7 @@ def report(model: Model, advised: dict[str, Any]) -> list[Section]:
 def draw(model: Model, path: Path) -> None:
     """Draw the log with the model's simulation of it, and the step response with its band."""
     log, shown, h = model.log, slice(-SHOWN, None), model.log.sampling_interval
-    flow, degree = log.flow_unit, log.temperature_unit
+    flow, degree = log.given.flow_unit, log.given.temperature_unit
     minutes = (np.arange(len(log.flow)) * h / 60.0)[shown]
     title = "The log as recorded and as the model simulates it, and its response to a step"
     with drawn(path, 5, title) as figure:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import accumulate
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.identify.fit import BLOCKS, Array, Fit, Plant
-from benchmarks.identify.valve import (
-    HYSTERESES,
-    VALVES,
-    Hypothesis,
-    with_changes,
-    with_valves,
-)
+from benchmarks.identify.fit import BLOCKS, Array, Fit, Plant, in_series
 
 LOAD, MOST_LOADS = 25.0, 4  # deviance that a load must explain, and how many there may be
 FAULT = 12.0  # deviance from which a valve or a change is evident
@@ -29,35 +25,128 @@ SHAPES = {
     "a pair": (-0.7, 0.8),
 }
 
+Passed = Callable[[Array, float], Array]
+by_deviance, by_price = attrgetter("deviance"), attrgetter("price")
+
+
+def following(rule: Callable[[float, float, float], float]) -> Passed:
+    """Return a valve that moves from its position by `rule(position, command, size)`."""
+    return lambda flow, size: np.array(
+        [*accumulate(flow.tolist(), lambda position, u: rule(position, u, size))]
+    )
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What may lie between a command and its effect."""
+
+    passed: Passed  # the flow behind it, of a flow from the operating point and a size
+    # Sizes to try, as shares of the largest flow; of a rate, in a delay and a lag.
+    sizes: tuple[float, ...] = (0.1, 0.16, 0.24, 0.34, 0.46)
+    # Shares of the delay to try: some valves look like a part of it.
+    delays: tuple[float, ...] = (1.0,)
+
+
+# A linear controller can be tuned for the plant behind these.
+VALVES = {
+    "none": Kind(lambda u, _: u, (0.0,)),
+    "dead zone": Kind(lambda u, size: np.where(np.abs(u) < size, 0.0, u)),
+    "subtractive dead zone": Kind(
+        lambda u, size: np.sign(u) * np.maximum(np.abs(u) - size, 0.0)
+    ),
+    "saturation": Kind(lambda u, size: np.clip(u, -size, size), (0.4, 0.55, 0.7, 0.85)),
+    "rate limit": Kind(
+        following(lambda p, u, size: p + min(max(u - p, -size), size)),
+        (10.0, 3.3, 1.6, 1.0, 0.6), (1.0, 0.7, 0.4),
+    ),
+}  # fmt: skip
+# With these a loop cycles.
+HYSTERESES = {
+    "backlash": Kind(
+        following(lambda p, u, size: min(max(p, u - size / 2), u + size / 2)),
+        (0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.1), (1.0, 0.7),
+    ),
+    "stiction": Kind(
+        following(lambda p, u, size: u if abs(u - p) > size else p),
+        (0.1, 0.2, 0.3, 0.4, 0.6), (1.0, 0.7),
+    ),
+}  # fmt: skip
+FINER = (0.75, 0.87, 1.0, 1.15, 1.33), (0.93, 1.0, 1.07), ()  # sizes around the best one
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A valve or a change of the plant, with the best plant for it."""
+
+    name: str
+    size: float  # t/h, of a rate t/h a row; of a change its share of the gain
+    drop: float  # what it takes from the deviance
+    fit: Fit
+
+
+def with_valves(
+    fit: Fit, command: Array, kinds: dict[str, Kind], plain: Fit | None = None
+) -> list[Hypothesis]:
+    """Return kinds of valves, each with its best size and plant, the likeliest first.
+
+    `command` is the flow commanded, from the operating point. What they explain is that beyond
+    a plain fit, by default that of the first kind.
+    """
+    found, largest = [], float(np.abs(command).max())
+    for name, kind in kinds.items():
+        unit = largest * (fit.h / fit.scale if name == "rate limit" else 1.0)
+        places = [fit.at(np.r_[share * fit.p[0], fit.p[1:]]) for share in kind.delays]
+        sizes = [unit * share for share in kind.sizes]
+        # A size at a place, and the place at that size, in turns. The plant that was found
+        # without hysteresis is too slow for one: there each size has its own place.
+        for finer in FINER:
+            tried = []
+            for size in sizes:
+                passed = kind.passed(command, size)
+                nearest = min((each.behind(passed) for each in places), key=by_deviance)
+                tried.append((size, nearest.refined(8) if name in HYSTERESES else nearest))
+            size, best = min(tried, key=lambda each: each[1].deviance)
+            if name not in HYSTERESES:
+                best = best.refined(12)
+            places, sizes = [best], [size * factor for factor in finer]
+        if name in HYSTERESES:  # nor is the noise what that plant left
+            best = best.reweighted().refined(12)
+        plain = plain or best
+        found.append(Hypothesis(name, size, plain.deviance - best.deviance, best))
+    return sorted(found, key=lambda each: -round(each.drop))
+
+
+def with_changes(fit: Fit) -> list[Hypothesis]:
+    """Return what changes a plant's gain or speed, each as one more input of the plant."""
+    flow, plain, found = fit.flow, fit.refined(12).deviance, []
+    answer = in_series([fit.units[0].slowest]).simulated(flow, fit.h)
+    inputs = {
+        "gain by level": flow**2 / np.abs(flow).max(),
+        "gain by time": flow * np.linspace(-1.0, 1.0, len(flow)),
+        "speed by direction": np.abs(np.gradient(answer, fit.h)) * fit.scale,
+    }
+    for name, each in inputs.items():
+        more = replace(fit, extra=(each,)).refined(16)
+        size = float(more.solution.c[len(more.units)]) / more.plant.gain
+        found.append(Hypothesis(name, size, plain - more.deviance, more))
+    return found
+
 
 @dataclass(frozen=True)
 class Found:
     """The most likely plant of a log, and its rivals."""
 
-    fits: list[Fit]
-    """The best one of each shape."""
-    valve: Hypothesis
-    """A sound valve, a dead zone or a limit, which the fits take into account."""
-    rivals: list[Hypothesis]
-    """All such valves that were tried."""
+    fits: list[Fit]  # the best one of each shape
+    valve: Hypothesis  # a sound one, a dead zone or a limit, which the fits take into account
+    rivals: list[Hypothesis]  # all such valves that were tried
+    # What no controller should be tuned for, the likeliest first, and what each explains beyond
+    # the valve that was found.
     faults: list[Hypothesis]
-    """What no controller should be tuned for, the likeliest first: what each explains beyond
-    the valve that was found."""
 
     @property
     def best(self) -> Fit:
         """The best fit."""
-        return cheapest(self.fits)
-
-    @property
-    def fault(self) -> Hypothesis | None:
-        """The likeliest fault, if it is evident."""
-        return self.faults[0] if self.faults[0].drop > FAULT else None
-
-
-def cheapest(fits: list[Fit]) -> Fit:
-    """Return the likeliest fit by Akaike's criterion."""
-    return min(fits, key=lambda each: each.price)
+        return min(self.fits, key=by_price)
 
 
 def search(fit: Fit, command: Array, *, applied: bool) -> Found:
@@ -72,14 +161,14 @@ def search(fit: Fit, command: Array, *, applied: bool) -> Found:
         for shape, (more, third) in SHAPES.items() for share in (0.8, 0.3)
     )])  # fmt: skip
     for _ in range(2):
-        fits = _refined(cheapest(fits), fits)
+        fits = _refined(min(fits, key=by_price), fits)
     kinds = {"none": VALVES["none"]} if applied else VALVES
     for _ in range(2):
-        rivals = with_valves(cheapest(fits), command, kinds)
+        rivals = with_valves(min(fits, key=by_price), command, kinds)
         # Of those that differ by rounding alone, the first.
         valve = max(rivals, key=lambda each: round(each.drop) - FAULT * (each.name != "none"))
         fits = _refined(_with_loads(valve.fit), fits)
-    best = cheapest(fits)
+    best = min(fits, key=by_price)
     faults = with_changes(best)
     if not applied:
         faults += with_valves(best, command, HYSTERESES, best.reweighted().refined(12))
@@ -97,8 +186,8 @@ def _coarse(fit: Fit, command: Array, zones: tuple[float, ...]) -> Fit:
         rough.behind(flow).at(np.array([delay, lag]))
         for flow in passed for lag in lags for delay in delays
     ]  # fmt: skip
-    grid.sort(key=lambda each: each.deviance)
-    best = min((grid[i].refined() for i in (0, 5)), key=lambda each: each.deviance)
+    grid.sort(key=by_deviance)
+    best = min((grid[i].refined() for i in (0, 5)), key=by_deviance)
     (plant,) = best.units
     scale = plant.delay + plant.slowest
     p = np.array([plant.delay / scale, np.log(plant.slowest)])
@@ -127,7 +216,7 @@ def _with_loads(fit: Fit) -> Fit:
     for _ in range(MOST_LOADS - len(fit.loads)):
         times = np.arange(spacing, end, spacing).tolist()
         more = [replace(fit, loads=(*fit.loads, at)) for at in times]
-        likeliest = min(more, key=lambda each: each.deviance)
+        likeliest = min(more, key=by_deviance)
         if likeliest.deviance > fit.deviance - LOAD:
             break
         fit = likeliest
@@ -140,11 +229,10 @@ class Zones(NamedTuple):
     low: Array
     high: Array
     weight: Array
-    fits: list[Fit]
-    """The best plant behind each."""
+    fits: list[Fit]  # the best plant behind each
 
 
-def possible_zones(found: Found, command: Array) -> Zones:
+def _possible_zones(found: Found, command: Array) -> Zones:
     """Return the ranges between distinct commands in which the dead zone may end."""
     best, name = found.best, found.valve.name
     if name not in ("none", "dead zone", "subtractive dead zone") or len(found.rivals) == 1:
@@ -174,18 +262,18 @@ def possible_zones(found: Found, command: Array) -> Zones:
     return Zones(low[keep], high[keep], weight, [behind[i] for i in keep])
 
 
-def draws(
-    fits: list[Fit], zones: Zones, generator: np.random.Generator
-) -> list[tuple[Plant, int]]:
-    """Return plants with ranges of dead zones from the posterior over all that is not known."""
+def draws(found: Found, command: Array) -> tuple[list[Plant], list[float]]:
+    """Return plants from the posterior over all that is not known, and ends of dead zones."""
+    zones, generator = _possible_zones(found, command), np.random.default_rng(0)
     # A better shape by chance is common: the weights are milder than Akaike's.
-    weights = [np.exp((cheapest(fits).price - each.price) / 4.0) for each in fits]
+    weights = [np.exp((found.best.price - each.price) / 4.0) for each in found.fits]
     drawn = []
-    for fit, weight in zip(fits, weights, strict=True):
+    for fit, weight in zip(found.fits, weights, strict=True):
         count = round(DRAWS * weight / sum(weights))
         if count >= 4:
             drawn += _walk(fit, zones, count, generator)
-    return drawn
+    plants, at = [each for each, _ in drawn], [i for _, i in drawn]
+    return plants, [*zones.low[at], *zones.high[at]]
 
 
 def _walk(

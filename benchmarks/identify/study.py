@@ -8,12 +8,14 @@ from __future__ import annotations
 import math
 import sys
 from contextlib import suppress
+from pathlib import Path
 from types import SimpleNamespace as Plant
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from benchmarks.identify.__main__ import Options
 from benchmarks.identify.advice import controllers
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import identify
@@ -108,7 +110,7 @@ def tried(seed: int, fault: str) -> dict[str, Any]:
     )
     found: dict[str, Any] = {"fault": fault, "logs": 1, "recommended": 0, "unsafe": 0}
     with suppress(ValueError):  # refused
-        model = identify(Log(flow, temperature, h), operating_flow=0.0)
+        model = identify(Log(flow, temperature, h, given=Options(Path(), operating_flow=0.0)))
         for name, true in {"delay": delay / h, "gain": gain, "dead_zone": zone}.items():
             _, low, high = model.estimates[name]
             found[name] = 100.0 * (low - 1e-9 <= true <= high + 1e-9)
