@@ -33,6 +33,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
     """n plants that advance together, without what depends on the array library."""
 
     _where: Any  # numpy.where or torch.where
+    _shown: Any  # the observations: `present()` returns them, and the caller may overwrite them
     _zeros: Array  # one per plant, read-only
 
     def __init__(
@@ -94,7 +95,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         self._prepare(mask, seed, options or {})
         self._was_reset = True
         infos = self._restart(mask, {})
-        return self._observations(), infos
+        return self._shown.present(), infos
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
         """Apply normalised actions, shape (num_envs, 1), for one sample.
@@ -113,7 +114,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         a = self._checked_actions(actions)
         if ended is not None and ended.all():
             infos, nobody = self._restart(ended, {}), [self._flags(~ended) for _ in range(2)]
-            return self._observations(), self._zeros + 0, *nobody, infos
+            return self._shown.present(), self._zeros + 0, *nobody, infos
         self._clock += 1
         observations, rewards, terminations, truncations, infos = self._advance(a)
         if self._clock >= self._first_end:
@@ -130,11 +131,11 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             infos |= {"final_info": final, "final_obs": self._final(ended, observations)}
             infos |= {"_final_info": flags, "_final_obs": flags}
             self._restart(ended, infos)
-            return self._observations(), rewards, self._flags(ended)
+            return self._shown.present(), rewards, self._flags(ended)
         if self._ended is not None:  # at the previous step
             rewards = self._where(self._flags(self._ended), 0, rewards)
             self._restart(self._ended, infos)
-            observations = self._observations()
+            observations = self._shown.present()
             ended = self._clock - self._starts >= self._limit
         self._ended = ended if ended.any() else None
         return observations, rewards, self._flags(ended)
@@ -158,7 +159,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         if "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)
         given = options["reset_mask"]
-        mask = self._on_host(given)
+        mask = given.cpu().numpy() if hasattr(given, "cpu") else given  # of tensors
         if (
             not isinstance(mask, np.ndarray)
             or mask.dtype != np.bool_
@@ -168,10 +169,6 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             allowed = f"an array of bool, shape ({self.num_envs},), at least one of them True"
             reject("options['reset_mask']", given, allowed)
         return mask.copy()
-
-    def _on_host(self, mask: Any) -> Any:
-        """Return a mask as a NumPy array if it is an array of the environment's library."""
-        return mask
 
     @abstractmethod
     def _flags(self, mask: Mask) -> Array:
@@ -192,10 +189,6 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
     @abstractmethod
     def _advance(self, a: Array) -> tuple[Array, Array, Array, Array, Infos]:
         """Move all plants by one sample; return what `step` returns if no episode ends."""
-
-    @abstractmethod
-    def _observations(self) -> Array:
-        """Return the current observations, which the caller may overwrite."""
 
     @abstractmethod
     def _final(self, ended: Mask, observations: Array) -> Array:

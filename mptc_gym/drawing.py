@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from itertools import chain, pairwise
 
 import numpy as np
@@ -36,6 +35,7 @@ _GRID: Colour = (236, 237, 240)
 _INK: Colour = (60, 64, 70)
 _PAPER: Colour = (255, 255, 255)
 TEMPERATURES, FLOWS = (72, 44, 864, 214), (72, 324, 864, 182)  # places of the panels
+clock = pygame.time.Clock()  # limits the frame rate
 
 
 class Panel:
@@ -166,19 +166,13 @@ def show(record: Record, fps: float) -> None:
         pygame.display.set_caption("MiddlePoint-v0")
     screen.blit(draw(record), (0, 0))
     pygame.event.pump()
-    clock().tick(fps)
+    clock.tick(fps)
     pygame.display.flip()
 
 
 def close() -> None:
     """Close the window."""
     pygame.display.quit()
-
-
-@cache
-def clock() -> pygame.time.Clock:
-    """Return the clock that limits the frame rate."""
-    return pygame.time.Clock()
 
 
 def ticks(low: float, high: float) -> list[float]:

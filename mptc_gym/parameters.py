@@ -9,7 +9,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -19,8 +19,7 @@ from mptc_gym.checks import Number, reject
 Value = TypeVar("Value")  # of a plant number: float, an array for many plants, or `Number`
 
 
-@dataclass(frozen=True)
-class Argument:
+class Argument(NamedTuple):
     """Declaration of an argument of the environment, apart from its name and type."""
 
     default: Any
@@ -36,8 +35,9 @@ class Argument:
 
 def _arg(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
     """Declare an argument: a dataclass field that carries an `Argument`."""
-    argument = Argument(default, check, unit, meaning)
-    return field(default=default, metadata={"argument": argument})
+    return field(
+        default=default, metadata={"argument": Argument(default, check, unit, meaning)}
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,9 +200,7 @@ class Parameters(PlantNumbers[Number]):
         # The least of max(|u_min|, |u_max|) over all draws.
         reach = max(lowest, -low, high, -highest, 0.0)
         if self.range_of("dead_zone")[1] > reach:
-            allowed = (
-                "small enough to leave some command effective, at most max(|u_min|, |u_max|)"
-            )
+            allowed = "small enough for some command to pass, at most max(|u_min|, |u_max|)"
             reject("dead_zone", self.dead_zone, f"{allowed} = {reach:g}")
 
     def _check_time_constant(self) -> None:

@@ -36,10 +36,8 @@ def least_effective(dead_zone: Any, u_min: Any, u_max: Any, rounding: float = 2.
 def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
     """Scale commands (t/h) to the float32 actions that an agent passes to the environment.
 
-    Rounding to float32 can move a command from the edge of the dead zone into it, where nothing
-    is applied: float32(0.7) stands for 6.99999988 t/h. Such an action is moved outwards by the
-    float32 spacing near 1, so that the actuator passes every command that it would pass
-    unrounded. All arguments are in t/h and broadcast.
+    Rounding to float32 can move a command from the edge of the dead zone into it: float32(0.7)
+    stands for 6.99999988 t/h. Such an action is moved outwards by the float32 spacing near 1.
     """
     command, half_range = np.asarray(command, float), (u_max - u_min) / 2.0
     action = np.asarray(action_from_command(command, u_min, u_max)).astype(np.float32)
@@ -52,12 +50,9 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 class Dynamics:
     """A and B of (28) as functions of the steady-state gain and the dominant time constant.
 
-    With p the slowest pole, A = (1 - p z^-1) Q(z^-1). The time constant of p is 1 / (1 - p)
-    samples: the area above the step response of 1 / (1 - p z^-1), scaled to end at 1. With t
-    times the time constant, 1 - p is divided by t, and Q stays. As A(1) = (1 - p) Q(1) is then
-    divided by t as well, the steady-state gain B(1) / A(1) is g times the given one if B is
-    multiplied by g / t. Drifts move g and t linearly over `drift_samples`, from their factors
-    to `gain_drift` and `time_constant_drift` times these.
+    The environment's docstring says how. The time constant 1 / (1 - p) is the area above the
+    step response of 1 / (1 - p z^-1), scaled to end at 1. As A(1) = (1 - p) Q(1) is divided by
+    t, too, B is multiplied by g / t for g times the steady-state gain B(1) / A(1).
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -105,10 +100,9 @@ class Dynamics:
 class Plant:
     """Command scaling, actuator (29) and middle-point temperature (28), initially at rest.
 
-    The scaling is the last formula of Section 4, for actions from -1 to 1 in place of network
-    outputs from 0 to 1. As printed, (29) compares the magnitude of u with U_min in one of its
-    cases. The intended meaning is: a command inside the dead zone has no effect, and any other
-    is limited to [U_min, U_max]. A command on the edge of the dead zone passes.
+    As printed, (29) compares the magnitude of u with U_min in one of its cases. The intended
+    meaning is: a command inside the dead zone has no effect, and any other, also one on its
+    edge, is limited to [U_min, U_max].
 
     `factors` are gain and time constant, as multiples of those of A and B.
     """
@@ -130,28 +124,17 @@ class Plant:
         self._inputs = deque([0.0] * (delay + len(self._beta)), delay + len(self._beta))
 
     def step(self, action: float, noise: float, load: float) -> tuple[float, float, float]:
-        """Move from sample k to k+1.
+        """Move from sample k to k+1, given a(k), n(k+1) and the load w(k+1).
 
-        Parameters
-        ----------
-        action
-            a(k), normalised: -1 at U_min and 1 at U_max, and linear beyond these.
-        noise
-            n(k+1), degC.
-        load
-            w(k+1), the load disturbance, degC: what it adds to y in the steady state.
-
-        Returns
-        -------
-        command, applied, output
-            u(k) and u_a(k), t/h, and y(k+1), degC.
+        Returns u(k) and u_a(k), t/h, and y(k+1), degC.
         """
         if self._drifts:
             self._age += 1
             if self._age % DRIFT_INTERVAL == 0:
                 self._update_dynamics()
         edge, u_min, u_max, half_range = self._actuator
-        command = u_min + (action + 1.0) * half_range  # Section 4, last formula
+        # Section 4, last formula, for actions from -1 to 1 in place of outputs from 0 to 1.
+        command = u_min + (action + 1.0) * half_range
         applied = command  # (29) from here on
         if -edge < command < edge:
             applied = 0.0

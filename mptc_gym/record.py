@@ -32,10 +32,9 @@ class Record:
         """Add a step: y_d(k+1) and y(k+1), degC, and u(k) and u_a(k), t/h."""
         self.k += 1
         self.samples.append((setpoint, output, command, applied))
-        for temperature in (setpoint, output):
-            bounded = max(-FARTHEST, min(FARTHEST, temperature))
-            self._lowest = min(self._lowest, bounded)
-            self._highest = max(self._highest, bounded)
+        bounded = [max(-FARTHEST, min(FARTHEST, each)) for each in (setpoint, output)]
+        self._lowest = min(self._lowest, *bounded)
+        self._highest = max(self._highest, *bounded)
 
     @property
     def first(self) -> int:

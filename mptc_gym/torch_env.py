@@ -253,14 +253,8 @@ class MiddlePointTorchEnv(BatchEnv):
         first |= {"setpoint": setpoint, "error": setpoint}
         return first | {name: self._zeros + numbers[name] for name in self._factor_names}
 
-    def _observations(self) -> Tensor:
-        return self._shown.present()
-
     def _final(self, ended: Mask, observations: Tensor) -> Tensor:
         return torch.where(self._flags(ended)[:, None], observations, 0)
-
-    def _on_host(self, mask: Any) -> Any:
-        return mask.cpu().numpy() if isinstance(mask, Tensor) else mask
 
     def _flags(self, mask: Mask) -> Tensor:
         flags = torch.empty(self.num_envs, dtype=torch.bool, device=self.device)

@@ -216,9 +216,6 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             of_all[name][which] = values
         return of_all
 
-    def _observations(self) -> Observations:
-        return self._shown.present().copy()
-
     def _final(self, ended: Mask, observations: Observations) -> NDArray[np.object_]:
         final = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(ended):
@@ -265,7 +262,10 @@ class _Window:
         self._place = STEPS_PER_SHIFT
 
     def present(self) -> Observations:
-        """Return a view of the current observations."""
+        """Return the current observations."""
+        return self._view().copy()
+
+    def _view(self) -> Observations:
         return self._row[self._place : self._place + self._elements].reshape(self._shape)
 
     def reset(self, which: Indices, setpoint: Values, rest_action: Values) -> None:
@@ -275,7 +275,7 @@ class _Window:
         for i, newest in self._newest:
             if i < 2:  # set points and errors
                 rest[newest] = setpoint
-        self.present()[which] = rest
+        self._view()[which] = rest
 
     def add(self, *samples: Values) -> Observations:
         """Add set points, errors, outputs and actions, and return the observations."""
@@ -283,7 +283,7 @@ class _Window:
             self._row[STEPS_PER_SHIFT:] = self._row[:-STEPS_PER_SHIFT]
             self._place = STEPS_PER_SHIFT
         self._place -= 1
-        window = self.present()
+        window = self._view()
         for i, newest in self._newest:
             window[newest] = samples[i] if i < 3 else samples[i].clip(-1.0, 1.0)
         return window.copy()

@@ -172,7 +172,7 @@ def test_a_window_shows_what_a_frame_does_in_time_and_nothing_else_changes(monke
         shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
         np.testing.assert_array_equal(shown, envs[1].render())
         returned = [each.step(action) for each in envs]
-    assert clock().tick.mock_calls == [call(30)] * 7
+    assert clock.tick.mock_calls == [call(30)] * 7
     assert envs[0].render() is None
     for other in (envs[1], *(MiddlePointEnv(render_mode=mode) for mode in modes)):
         other.close()  # has no window

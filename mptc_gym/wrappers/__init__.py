@@ -19,8 +19,6 @@ from mptc_gym.checks import is_number, one_action, reject
 from mptc_gym.parameters import Parameters
 from mptc_gym.plant import action_from_command, float32_action
 
-__all__ = ["IncrementalAction"]
-
 NUMBERS = "dead_zone", "u_min", "u_max"  # parameters of an actuator
 
 

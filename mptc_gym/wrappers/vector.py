@@ -15,8 +15,6 @@ from mptc_gym.acting import natives
 from mptc_gym.checks import many_actions, reject
 from mptc_gym.wrappers import NUMBERS, Actuator
 
-__all__ = ["IncrementalAction"]
-
 
 class IncrementalAction(VectorActionWrapper):
     """The action changes the flow: `mptc_gym.wrappers.IncrementalAction` for many plants.
