@@ -12,12 +12,7 @@ from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Folder, Names, Parameter, Runs, command, known, options
 from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
-from benchmarks.loop.scenarios import (
-    PRESET_SCENARIOS,
-    SCENARIOS,
-    SETPOINTS,
-    PlantOptions,
-)
+from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, SETPOINTS, PlantOptions
 from mptc_gym.evaluation import SEED
 
 COMPARED = tuple(name for name, controller in ROSTER.items() if controller.compared)
@@ -70,28 +65,29 @@ def work(options: Options) -> str:
     if options != whole:
         place = "results/compare-other"
     folder, made = out_folder(options.out or Path(place)), origin()
-    # Short tasks last, so that no core waits long at the end; the bounds of drawn plants are
-    # the longest of all.
-    by_length = sorted(scenarios, key=lambda each: -each.samples)
-    tasks: dict[str, Any] = {
-        f"bounds of {each.name}": partial(scale_of, each, options.runs)
-        for each in sorted(by_length, key=lambda each: not each.parameters.ranges)
-    } | {
-        f"{controller.name}, {each.name}": partial(run_case, each, controller, options.runs)
-        for controller, each in itertools.product(controllers.values(), by_length)
+    runs = options.runs
+    bounds = {f"bounds of {each.name}": partial(scale_of, each, runs) for each in scenarios}
+    cells = {
+        f"{name}, {each.name}": partial(run_case, each, controller, runs)
+        for (name, controller), each in itertools.product(controllers.items(), scenarios)
     }
+    tasks: dict[str, Any] = {**bounds, **cells}
+
+    def length(name: str) -> tuple[bool, bool, int]:
+        case = tasks[name].args[0]
+        return name in bounds, bool(case.parameters.ranges), case.samples
+
     found: dict[str, Any] = {}
     try:
-        found.update(fan_out.stream(tasks, "compare"))
+        # Short tasks last, so that no core waits long at the end.
+        longest_first = {name: tasks[name] for name in sorted(tasks, key=length, reverse=True)}
+        found.update(fan_out.stream(longest_first, "compare"))
     finally:
-        scales = [found.get(f"bounds of {each.name}") for each in scenarios]
-        of_runs = itertools.product(controllers, scenarios)
-        cases = [found.get(f"{agent}, {each.name}") for agent, each in of_runs]
         if missing := len(tasks) - len(found):
             made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
-        if finished := [case for case in cases if case]:
+        if finished := [found[name] for name in cells if name in found]:
             about = {
-                "complete": len(found) == len(tasks),
+                "complete": not missing,
                 **made,
                 "options": {**asdict(options), "agents": [*controllers]},
                 "seeds": [*range(SEED, SEED + options.runs)],
@@ -102,7 +98,8 @@ def work(options: Options) -> str:
                 "policies": {each.agent: each.policies for each in finished if each.policies},
             }
             write_json(folder / "provenance.json", about)
-            write(finished, [*filter(None, scales)], controllers, folder, made)
+            scales = [found[name] for name in bounds if name in found]
+            write(finished, scales, controllers, folder, made)
     return f"The report, tables, data and plots are in {folder}/"
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,9 +20,6 @@ from benchmarks.lib.storage import write_csv
 from benchmarks.loop.rollout import CHANGE, START, Trajectory, is_random, measure
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES, SEED
-
-if TYPE_CHECKING:
-    from benchmarks.compare.plots import Score
 
 Array = NDArray[np.float64]
 BOOTSTRAP = 0  # seed of the bootstraps
@@ -69,12 +65,11 @@ def run_case(scenario: Scenario, controller: Controller, runs: int) -> Case:
     began = time.process_time()
     members = controller.members()
     alike = not (controller.random or is_random(scenario.parameters))
-    trajectories, tables = [], []
-    for number, member in enumerate(members):
-        of_member = scenario.arguments, scenario.samples, 1 if alike else runs, SEED
-        trajectories.append(member.run(*of_member))
-        measures = measure(trajectories[-1], scenario.parameters)
+    case = scenario.arguments, scenario.samples, 1 if alike else runs, SEED
+    trajectories, tables = [member.run(*case) for member in members], []
+    for number, trajectory in enumerate(trajectories):
         about = {"scenario": scenario.name, "agent": controller.name, "policy": number}
+        measures = measure(trajectory, scenario.parameters)
         rows = {name: np.broadcast_to(values, runs) for name, values in measures.items()}
         tables.append(pd.DataFrame({**about, "seed": range(SEED, SEED + runs), **rows}))
     return Case(
@@ -127,54 +122,52 @@ def scale_of(scenario: Scenario, runs: int) -> Scale:
     return Scale(scenario, least, preview.value)
 
 
-def estimate(runs: pd.DataFrame, scale: Scale, reference: str) -> pd.DataFrame:
-    """Return estimates for a case with 95 % intervals, one row for each agent.
+def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
+    """Return estimates with 95 % intervals, one row for each case and agent.
 
     They are the `mean` of |e|, degC; `ratio`, the mean as a multiple of `limit`, the least
-    possible error that applies; `difference`, the mean paired difference from the reference
-    agent; and `improvement`, the probability of doing better than that agent, where ties count
-    half. `preview` is the least possible error of any controller. Ends are infinite if runs
-    differ but there is only one.
+    possible error that applies; `difference`, the mean paired difference from the first agent;
+    and `improvement`, the probability of doing better than that agent, where ties count half.
+    `preview` is the least possible error of any controller. Ends are infinite if runs differ
+    but there is only one.
+
+    `scores` are those of the runs, as an array: 0 for the mean error without control, and 1 for
+    the least possible error. Their mean is the score of `mptc_gym.evaluate`.
     """
-    errors = {agent: _errors(rows) for agent, rows in runs.groupby("agent", sort=False)}
-    base = errors[reference].mean(axis=0) if reference in errors else None
-    about = {"scenario": scale.scenario.name}
-    limits = {"limit": scale.least.value, "preview": scale.preview}
-    rows: list[dict[str, Any]] = []
-    for agent, values in errors.items():
-        mean = bootstrap(values, seed=BOOTSTRAP)
-        draws = str(agent) in ROSTER and ROSTER[str(agent)].random
-        if values.size == 1 and (draws or is_random(scale.scenario.parameters)):
-            mean = replace(mean, low=-math.inf, high=math.inf)
-        ratio = mean.scaled(1 / scale.least.value)
-        rows.append({**about, "agent": agent, **limits, "mean": mean, "ratio": ratio})
-        if base is not None and agent != reference:
-            rows[-1]["difference"] = bootstrap(values - base, seed=BOOTSTRAP)
-            better = (values < base) + 0.5 * (values == base)
-            rows[-1]["improvement"] = bootstrap(better, seed=BOOTSTRAP)
+    reference, rows = runs["agent"].iloc[0], []
+    for name, scale in scales.items():
+        tables = {
+            str(agent): own.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
+            for agent, own in runs[runs["scenario"] == name].groupby("agent", sort=False)
+        }
+        base = tables[reference].mean(axis=0) if reference in tables else None
+        limit, drawn = scale.least.value, is_random(scale.scenario.parameters)
+        for agent, errors in tables.items():
+            mean = bootstrap(errors, seed=BOOTSTRAP)
+            if errors.size == 1 and (drawn or (agent in ROSTER and ROSTER[agent].random)):
+                mean = replace(mean, low=-math.inf, high=math.inf)
+            row = {"scenario": name, "agent": agent, "limit": limit, "preview": scale.preview}
+            row |= {"mean": mean, "ratio": mean.scaled(1 / limit)}
+            row["scores"] = scale.least.score(errors)
+            if base is not None and agent != reference:
+                row["difference"] = bootstrap(errors - base, seed=BOOTSTRAP)
+                better = (errors < base) + 0.5 * (errors == base)
+                row["improvement"] = bootstrap(better, seed=BOOTSTRAP)
+            rows.append(row)
     return pd.DataFrame(rows)
 
 
-def ranked(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> dict[str, Score]:
-    """Return the scores of all agents, the best first: overall, and in each case.
+def ranked(estimates: pd.DataFrame) -> dict[str, Estimate]:
+    """Return the overall scores of all agents, the best first.
 
-    A run scores 0 for the mean error without control and 1 for the least possible error. The
-    score of a case is the mean over its runs, which is the score of `mptc_gym.evaluate`; the
-    overall score is the mean over the cases, however hard they are. Its 95 % interval resamples
-    policies and runs within each case.
+    They are means over the cases, however hard these are. The 95 % intervals resample policies
+    and runs within each case.
     """
-    found: dict[str, Score] = {}
-    for agent, of_agent in runs.groupby("agent", sort=False):
-        tables = {
-            str(name): scales[str(name)].least.score(_errors(rows))
-            for name, rows in of_agent.groupby("scenario", sort=False)
-        }
-        overall = bootstrap(*tables.values(), seed=BOOTSTRAP)
-        found[str(agent)] = (
-            overall,
-            {name: float(table.mean()) for name, table in tables.items()},
-        )
-    return dict(sorted(found.items(), key=lambda each: -each[1][0].value))
+    scores = {
+        str(agent): bootstrap(*tables, seed=BOOTSTRAP)
+        for agent, tables in estimates.groupby("agent", sort=False)["scores"]
+    }
+    return dict(sorted(scores.items(), key=lambda each: -each[1].value))
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
@@ -190,11 +183,6 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def _errors(runs: pd.DataFrame) -> Array:
-    """Return the errors of a controller's runs, shape (policies, seeds)."""
-    return runs.pivot_table(index="policy", columns="seed", values="mae").to_numpy()
-
-
 def write(
     cases: Sequence[Case],
     found: Sequence[Scale],
@@ -207,90 +195,31 @@ def write(
     A case without a scale, as its bounds have failed, is in the numbers only.
     """
     runs = pd.concat([case.runs for case in cases], ignore_index=True)
-    summary = summarise(runs)
-    write_numbers(folder / "runs.csv", runs)
-    write_numbers(folder / "summary.csv", summary)
     responses = {
         name: pd.concat([each.responses for each in cases if each.scenario == name])
-        for name in summary["scenario"].unique()
+        for name in runs["scenario"].unique()
     }
-    for name, rows in responses.items():
-        write_numbers(folder / f"{name}.csv", rows)
+    for name, table in {"runs": runs, "summary": summarise(runs), **responses}.items():
+        write_numbers(folder / f"{name}.csv", table)
+    pictures = [f"{name}.png" for name in ("scores", "travel", *responses)]
+    for name in ("estimates.csv", "report.md", "report.html", *pictures):  # of an earlier run
+        (folder / name).unlink(missing_ok=True)
     scales = {each.scenario.name: each for each in found if each.scenario.name in responses}
     runs = runs[runs["scenario"].isin([*scales])]
     if runs.empty:
-        for name in ("report.md", "report.html", "estimates.csv"):  # of an earlier run
-            (folder / name).unlink(missing_ok=True)
         return
-    reference = str(runs["agent"].iloc[0])
-    of_cases = [
-        estimate(runs[runs["scenario"] == name], scales[name], reference) for name in scales
-    ]
-    estimates = pd.concat(of_cases, ignore_index=True)
-    write_numbers(folder / "estimates.csv", estimates)
-    scores = ranked(runs, scales)
-    titles = {name: scale.scenario.title for name, scale in scales.items()}
-    members = [each for case in cases for each in case.policies]
-    notes = dict.fromkeys(f"{each['note']}." for each in members if "note" in each)
-    paired = pd.DataFrame()
-    if "difference" in estimates:
-        others = estimates.dropna(subset=["difference"])
-        pairs = zip(others["difference"], others["improvement"], strict=True)
-        cells = [f"{mean:+.3f}; {100 * better.value:.0f} %" for mean, better in pairs]
-        paired = _by_agent(others, cells, [*others["agent"].unique()])
-    parts = runs[runs["scenario"] == "hard"].groupby("agent")[[*PARTS]].mean()
-    parts = parts.sort_values("mae").map("{:.3f}".format).rename(index=label, columns=PARTS)
-    sections = [
-        Section(
-            "Score: 0 without control, 1 at the least possible error",
-            [SCORE, *notes],
-            score_table(runs, scores, [*scales]),
-            {"scores.png": "The score of each controller, and a tick for each case"},
-        ),
-        Section(
-            "Mean error as a multiple of the least possible, with its 95 % interval",
-            [BOUND],
-            ratio_table(estimates, scales, [*scores]),
-            {"bounds.png": "The mean error of each controller in each case"},
-        ),
-        Section(
-            "Error against valve travel",
-            ["Down and left is better."],
-            pictures={"travel.png": "The mean error over valve travel, a panel for each case"},
-        ),
-        Section(
-            f"Difference to {label(reference)} (°C), 95 % interval",
-            [PAIRED],
-            paired,
-        ),
-        Section(
-            "Where the error arises: `hard`",
-            ["Contributions to the mean error, °C: means of all runs."],
-            parts.rename_axis("controller").reset_index(),
-        ),
-        Section("What each controller costs", [COSTS], costs_table(cases, controllers)),
-        Section(
-            "Cases",
-            table=pd.DataFrame(titles.items(), columns=["case", "what it is"]),
-            pictures={f"{name}.png": f"Responses: {title}" for name, title in titles.items()},
-        ),
-    ]
-    sections = [each for each in sections if each.table is None or len(each.table)]
-    for picture in itertools.chain.from_iterable(each.pictures for each in sections):
-        (folder / picture).unlink(missing_ok=True)  # of an earlier run
+    estimates = estimate(runs, scales)
+    scores = ranked(estimates)
+    write_numbers(folder / "estimates.csv", estimates.drop(columns="scores"))
     drawn = [name for name, each in controllers.items() if each.drawn]
-    shown = []
-    for name, scale in scales.items():
-        rows = responses[name]
-        few = rows[rows["agent"].isin(drawn)]
-        shown.append((scale.scenario, rows if few.empty else few))
+    shown = [(scale.scenario, responses[name]) for name, scale in scales.items()]
     from benchmarks.compare import plots  # here: processes that run cases do without
 
     try:
-        plots.draw(folder, runs, shown, estimates, scores)
+        plots.draw(folder, runs, shown, drawn, estimates, scores)
     finally:  # with the pictures that there are
-        title = "Comparison of controllers"
-        write_report(folder, title, sections, "compare", made, printed=2)
+        sections = report(runs, estimates, scores, scales, cases, controllers)
+        write_report(folder, "Comparison of controllers", sections, "compare", made, printed=2)
 
 
 def write_numbers(path: Path, table: pd.DataFrame) -> None:
@@ -310,21 +239,65 @@ def write_numbers(path: Path, table: pd.DataFrame) -> None:
     write_csv(path, flat.astype(object).where(flat != math.inf, "not settled"))
 
 
+def report(
+    runs: pd.DataFrame,
+    estimates: pd.DataFrame,
+    scores: Mapping[str, Estimate],
+    scales: Mapping[str, Scale],
+    cases: Sequence[Case],
+    controllers: Mapping[str, Controller],
+) -> list[Section]:
+    """Return the sections of the report that have anything to show."""
+    reference = str(runs["agent"].iloc[0])
+    members = [each for case in cases for each in case.policies]
+    notes = dict.fromkeys(f"{each['note']}." for each in members if "note" in each)
+    paired = difference_table(estimates)
+    parts = runs[runs["scenario"] == "hard"].groupby("agent")[[*PARTS]].mean()
+    parts = parts.sort_values("mae").map("{:.3f}".format).rename(index=label, columns=PARTS)
+    titles = {name: scale.scenario.title for name, scale in scales.items()}
+    sections = [
+        Section(
+            "Score: 0 without control, 1 at the least possible error",
+            [SCORE, *notes],
+            score_table(runs, estimates, scores),
+            {"scores.png": "The score of each controller, and a tick for each case"},
+        ),
+        Section(
+            "Mean error as a multiple of the least possible, with its 95 % interval",
+            [BOUND],
+            ratio_table(estimates, scales, [*scores]),
+        ),
+        Section(
+            "Error against valve travel",
+            ["Down and left is better."],
+            pictures={"travel.png": "The mean error over valve travel, a panel for each case"},
+        ),
+        Section(f"Difference to {label(reference)} (°C), 95 % interval", [PAIRED], paired),
+        Section(
+            "Where the error arises: `hard`",
+            ["Contributions to the mean error, °C: means of all runs."],
+            parts.rename_axis("controller").reset_index(),
+        ),
+        Section("What each controller costs", [COSTS], costs_table(cases, controllers)),
+        Section(
+            "Cases",
+            table=pd.DataFrame(titles.items(), columns=["case", "what it is"]),
+            pictures={f"{name}.png": f"Responses: {title}" for name, title in titles.items()},
+        ),
+    ]
+    return [each for each in sections if each.table is None or len(each.table)]
+
+
 def score_table(
-    runs: pd.DataFrame, scores: Mapping[str, Score], names: Sequence[str]
+    runs: pd.DataFrame, estimates: pd.DataFrame, scores: Mapping[str, Estimate]
 ) -> pd.DataFrame:
     """Return the scores and the mean travel of the median runs, the best in bold."""
+    cells = estimates["scores"].map(lambda each: written(each.mean(), ".2f"))
+    table = _by_agent(estimates, cells, [*scores])
     travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
-    rows = [
-        {
-            "controller": label(agent),
-            "score": f"{overall:.3f}",
-            "travel (t/h)": f"{travels[agent].mean():,.0f}",
-            **{name: written(by_case[name], ".2f") for name in names if name in by_case},
-        }
-        for agent, (overall, by_case) in scores.items()
-    ]
-    table = pd.DataFrame(rows).fillna("")  # after an interruption, with gaps
+    of_agents = [f"{travels[agent].mean():,.0f}" for agent in scores]
+    table.insert(1, "score", [f"{score:.3f}" for score in scores.values()])
+    table.insert(2, "travel (t/h)", of_agents)
     table.iloc[0] = table.iloc[0].map(lambda cell: cell and f"**{cell}**")
     return table
 
@@ -339,11 +312,20 @@ def ratio_table(
         bounds[name] = [f"{scale.least.value:.3f}{mark}", f"{scale.preview:.3f}"]
     values = estimates["ratio"].map(lambda ratio: ratio.value)
     least = values == values.groupby(estimates["scenario"]).transform("min")
-    cells = (
-        estimates["ratio"].map("{:.2f}".format).where(~least, lambda all_: "**" + all_ + "**")
-    )
+    cells = estimates["ratio"].map("{:.2f}".format)
+    cells = cells.where(~least, "**" + cells + "**")
     table = _by_agent(estimates, cells, agents)
     return pd.concat([bounds, table], ignore_index=True)
+
+
+def difference_table(estimates: pd.DataFrame) -> pd.DataFrame:
+    """Return the paired differences, and the shares of runs that are better."""
+    if "difference" not in estimates:
+        return pd.DataFrame()
+    others = estimates.dropna(subset=["difference"])
+    pairs = zip(others["difference"], others["improvement"], strict=True)
+    cells = [f"{mean:+.3f}; {100 * better.value:.0f} %" for mean, better in pairs]
+    return _by_agent(others, cells, [*others["agent"].unique()])
 
 
 def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
@@ -360,7 +342,7 @@ def costs_table(cases: Sequence[Case], controllers: Mapping[str, Controller]) ->
     for name, controller in controllers.items():
         own = [case for case in cases if case.agent == name]
         # The roster says it in a record, a user's own controller itself.
-        said = dict(own[0].policies[0]) if own and own[0].policies else {}
+        said = next((dict(policy) for case in own for policy in case.policies), {})
         rows.append(
             {
                 "controller": label(name),

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,43 +24,45 @@ from benchmarks.lib.report import (
 from benchmarks.lib.statistics import Estimate, written
 from benchmarks.loop.scenarios import Scenario
 
-Score = tuple[Estimate, dict[str, float]]  # overall, and by case
-
 FARTHEST = 1.5  # distance of a score from 1 at which the axis ends
 HELD = 15  # minutes that are shown of a held set point without load
-GREY: Any = {"color": "0.4"}
-EDGE = "at the edge or beyond"
 
 
 def draw(
     folder: Path,
     runs: pd.DataFrame,
     responses: Sequence[tuple[Scenario, pd.DataFrame]],
+    few: Sequence[str],
     estimates: pd.DataFrame,
-    scores: Mapping[str, Score],
+    scores: Mapping[str, Estimate],
 ) -> None:
-    """Draw all pictures: of scores, errors and travel, and of the responses in each case."""
-    errors = runs.groupby(["scenario", "agent"])["mae"]
-    plot_scores(scores, folder / "scores.png")
-    plot_bounds(estimates, errors.max(), [*scores], folder / "bounds.png")
+    """Draw all pictures: of scores, of errors and travel, and of responses in each case.
+
+    These are of a few agents, or of all where none of them has finished.
+    """
+    errors = runs.groupby(["scenario", "agent"])["mae"].mean()
+    plot_scores(scores, estimates, folder / "scores.png")
     plot_travel(runs, estimates, [*scores], folder / "travel.png")
     for case, rows in responses:
-        plot_responses(rows, errors.mean()[case.name], case, folder / f"{case.name}.png")
+        shown = rows[rows["agent"].isin(few)]
+        shown = rows if shown.empty else shown
+        plot_responses(shown, errors[case.name], case, folder / f"{case.name}.png")
 
 
-def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
+def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: Path) -> None:
     """Draw the score of every controller, sorted, and small marks for its cases."""
     style = looks([*scores])
     with drawn(path, 1.2 + 0.3 * len(scores), "Scores, the best first") as figure:
         axes = figure.subplots()
-        for place, (agent, (overall, by_case)) in enumerate(scores.items()):
-            away = 1.0 - np.array([overall.value, *by_case.values()])
-            mean, *cases = np.clip(away, NEAREST, FARTHEST)
+        for place, (agent, score) in enumerate(scores.items()):
+            of_cases = estimates.loc[estimates["agent"] == agent, "scores"].map(np.mean)
+            mean, *cases = np.clip(1.0 - np.array([score.value, *of_cases]), NEAREST, FARTHEST)
             axes.plot(cases, [place] * len(cases), "|", color=style[agent][0], alpha=0.5)
-            _mark(axes, mean, place, style[agent], mean == away[0])
-            text = written(overall.value, ".3f")
+            _mark(axes, mean, place, style[agent], mean == 1.0 - score.value)
+            text = written(score.value, ".3f")
             axes.annotate(text, (1.01, place), xycoords=("axes fraction", "data"), va="center")
-        _list_controllers(axes, [*scores])
+        axes.set_yticks(range(len(scores)), [label(agent) for agent in scores])
+        axes.set_ylim(len(scores) - 0.5, -0.5)
         axes.set_xscale("log")
         axes.set_xlim(1.1 * FARTHEST, NEAREST / 1.3)
         shown = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, NEAREST)
@@ -70,7 +70,7 @@ def plot_scores(scores: Mapping[str, Score], path: Path) -> None:
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_xlabel(
             "score: 0 without control, 1 at the least possible error (log scale of 1 - score)\n"
-            f"a tick is one case; hollow: {EDGE}"
+            "a tick is one case; hollow: at the edge or beyond"
         )
 
 
@@ -78,47 +78,6 @@ def _mark(axes: Axes, x: float, y: float, look: tuple[str, str], inside: bool) -
     """Draw a marker, hollow where it stands at an edge for what is beyond."""
     face = look[0] if inside else "white"
     axes.plot(x, y, look[1], color=look[0], markerfacecolor=face, markersize=5)
-
-
-def _list_controllers(axes: Axes, agents: Sequence[str]) -> None:
-    axes.set_yticks(range(len(agents)), [label(agent) for agent in agents])
-    axes.set_ylim(len(agents) - 0.5, -0.5)
-
-
-def plot_bounds(
-    estimates: pd.DataFrame,
-    worst: pd.Series[float],
-    agents: Sequence[str],
-    path: Path,
-) -> None:
-    """Draw mean errors as multiples of the least possible, with intervals and worst runs."""
-    style, cases = looks(agents), [*estimates["scenario"].unique()]
-    height, title = 0.8 + 0.17 * len(agents), "Mean errors, the best score first"
-    with panels(path, cases, height, 2, title) as (figure, found):
-        for i, (axes, case) in enumerate(zip(found, cases, strict=True)):
-            farthest = NEAREST
-            for row in estimates[estimates["scenario"] == case].to_dict("records"):
-                place, look = agents.index(row["agent"]), style[row["agent"]]
-                ratio, end = row["ratio"], worst[case, row["agent"]] / row["limit"]
-                ends = ratio.value, ratio.low, ratio.high, end
-                mean, low, high, end = (max(each - 1.0, NEAREST) for each in ends)
-                axes.plot([mean, end], [place] * 2, color=look[0], alpha=0.4, linewidth=1)
-                if math.isfinite(high):
-                    axes.plot([low, high], [place] * 2, color=look[0], linewidth=3)
-                _mark(axes, mean, place, look, mean == ratio.value - 1.0)
-                farthest = max(farthest, end)
-            _list_controllers(axes, agents)
-            axes.tick_params(labelleft=i % 2 == 0)
-            scale_by_excess(axes, "x", NEAREST, farthest)
-        for axes in found[-2:]:  # the lowest of each column
-            axes.set_xlabel(MULTIPLE)
-        entries = {
-            "mean error of all runs": Line2D([], [], marker="o", linestyle="", **GREY),
-            EDGE: Line2D([], [], marker="o", linestyle="", markerfacecolor="white", **GREY),
-            "95 % interval of the mean": Line2D([], [], linewidth=3, **GREY),
-            "to the worst run": Line2D([], [], linewidth=1, alpha=0.4, **GREY),
-        }
-        draw_legend(figure, entries)
 
 
 def plot_travel(
@@ -175,7 +134,7 @@ def plot_responses(
         outputs = [f"output_{name}" for name in ("median", "p10", "p90")]
         below = responses[outputs].rsub(responses["setpoint"], axis="index")
         responses = responses.assign(setpoint=0.0, **below)
-    height = 1.0 + 1.05 * len(agents)
+    height, style = 1.0 + 1.05 * len(agents), looks(agents)
     with drawn(path, height, scenario.title) as figure:
         figure.set_layout_engine("none")  # which would take most of the time
         place = {"left": 0.09, "right": 0.98, "wspace": 0.14, "hspace": 0.5}
@@ -184,7 +143,7 @@ def plot_responses(
             len(agents), 2, sharex=True, sharey="col", squeeze=False, gridspec_kw=place
         )
         for (left, right), agent in zip(rows_of, agents, strict=True):
-            rows, (colour, _) = responses[responses["agent"] == agent], looks(agents)[agent]
+            rows, (colour, _) = responses[responses["agent"] == agent], style[agent]
             minutes = rows["time_s"] / 60
             left.step(minutes, rows["setpoint"], "k--", linewidth=0.8, where="post")
             band = minutes, rows["output_p10"], rows["output_p90"]
