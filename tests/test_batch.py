@@ -304,7 +304,7 @@ class TestDraws:
             assert_mean((delays - 18) * (gains - 1.125), 0.0)
 
     def test_resets_leave_the_distributions_as_they_are(self, library):
-        n, variance, walk, jump = 400, 2.0, 0.01, 0.3
+        n, variance, walk, jump = 800, 2.0, 0.01, 0.3
         env = library.make(
             n, noise_variance=variance, c=[1.0, 3.0], disturbance_walk_variance=walk,
             disturbance_amplitude=jump, disturbance_interval=10, setpoint="random",

@@ -69,20 +69,6 @@ def test_plant_of_first_order_shows_its_own_numbers(gain, time_constant, delay):
     assert found["delay"] == 8.0 * delay
 
 
-def test_model_is_close_to_the_response_of_a_plant_of_higher_order():
-    a = np.poly([0.95, 0.9, 0.8])
-    plant = Parameters(a=a.tolist(), b=[0.001, 0.0005], delay=10)
-    found = step_test(plant)
-    times = 8.0 * np.arange(300)
-    model = found["gain"] * -np.expm1(
-        -np.maximum(times - found["delay"] + 8.0, 0) / found["time_constant"]
-    )
-    model[times < found["delay"]] = 0.0
-    assert (
-        np.abs(model - response(nominal(plant), np.ones(300), 10)).max() < 0.1 * found["gain"]
-    )
-
-
 def test_plant_without_a_new_steady_state_is_refused():
     for name, values in (("a", [1.0, -1.0]), ("a", [1.0, -1.1]), ("b", [0.1, -0.1])):
         with pytest.raises(ValueError, match=f"^{name} must"):
