@@ -132,7 +132,7 @@ class TestGradient:
         training = replace(SMALL, steps=6, samples=40, plants=8, choosing=16, adding=8)
         torch.manual_seed(training.seed)
         before = validate(Net(training), training)
-        after = train(training).provenance["validation"]
+        after = train(training, training.seed).provenance["validation"]
         assert after["all"] < before["all"]
 
 
@@ -156,7 +156,7 @@ def test_the_one_of_the_project_is_that_of_the_defaults():
 def test_the_command_lists_trainings_by_their_seeds(
     network, steps, files, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(through_plant, "TRAINING", SMALL)
+    monkeypatch.setitem(through_plant.RECIPES, "nn-smith", SMALL)
     short = {"plants": ((64, {}),), "cases": {"short": {"max_episode_steps": 20}}}
     monkeypatch.setitem(ppo.RECIPES, "ppo", replace(ppo.RECIPES["ppo"], **short))
     arguments = [network, "--networks", "2", "--steps", str(steps), "--jobs", "1"]

@@ -16,17 +16,13 @@ from torch import Tensor, nn
 from mptc_gym import Evaluation, evaluate
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
-WINDOWS: dict[str, Any] = {
+WINDOWS: Any = {
     "setpoint_window": 1,
     "error_window": 0,
     "output_window": 24,
     "action_window": 24,
 }
-SETPOINTS: dict[str, Any] = {
-    "setpoint": "random",
-    "setpoint_amplitude": 6.0,
-    "setpoint_period": 400,
-}
+SETPOINTS: Any = {"setpoint": "random", "setpoint_amplitude": 6.0, "setpoint_period": 400}
 HOLDS = -0.1465  # steady-state action per degC: the plant's gain is -0.6825 degC per t/h
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from benchmarks.lib.command import Count, FanOut, Folder, Parameter, command, options
 from benchmarks.lib.storage import Kept, out_folder, replacing
 
 SEED = 10_000  # of the first network; the others follow
-NETWORKS = {"nn-smith": 1, "ppo": 5, "ppo-hard": 5}  # and how many are trained by default
+# Modules with the recipes, and how many networks are trained by default.
+NETWORKS = {"nn-smith": ("through_plant", 1), "ppo": ("ppo", 5), "ppo-hard": ("ppo", 5)}
 
 
 @options
@@ -41,13 +43,19 @@ def work(options: Options) -> str:
     from benchmarks.lib.report import on_screen
 
     out, name = out_folder(options.out), options.network
-    seeds = range(SEED, SEED + (options.networks or NETWORKS[name]))
-    tasks = {f"seed {seed}": task_of(options, seed) for seed in seeds}
+    module_name, usual = NETWORKS[name]
+    module = importlib.import_module(f"benchmarks.train.{module_name}")
+    recipe = module.RECIPES[name]
+    recipe = replace(recipe, steps=options.steps or recipe.steps)
+    seeds = range(SEED, SEED + (options.networks or usual))
+    tasks = {f"seed {seed}": partial(module.train, recipe, seed) for seed in seeds}
     trained = dict(options.fan_out.stream(tasks, "training", Kept(out / "tasks")))
     networks = {seed: trained[f"seed {seed}"] for seed in seeds}
-    rows = {seed: dict(network.provenance["validation"]) for seed, network in networks.items()}
-    for seed, network in networks.items():
-        rows[seed]["CPU (s)"] = network.provenance["cpu_seconds"]
+    about = {seed: network.provenance for seed, network in networks.items()}
+    rows = {
+        seed: {**each["validation"], "CPU (s)": each["cpu_seconds"]}
+        for seed, each in about.items()
+    }
     shown = pd.DataFrame.from_dict(rows, "index").map("{:.4g}".format)
     print(on_screen(shown.reset_index(names="seed")))
     files = {f"{name}-{seed}": network for seed, network in networks.items()}
@@ -59,20 +67,6 @@ def work(options: Options) -> str:
         with replacing(out / f"{stem}.npz") as file:
             network.save(file)
     return f"Written to {out}: {', '.join(files)}"
-
-
-def task_of(options: Options, seed: int) -> Any:
-    """Return the training of one network, a function without arguments."""
-    if options.network == "nn-smith":
-        from benchmarks.train import through_plant
-
-        training = replace(through_plant.TRAINING, seed=seed)
-        steps = options.steps or training.steps
-        return partial(through_plant.train, replace(training, steps=steps))
-    from benchmarks.train import ppo
-
-    recipe = ppo.RECIPES[options.network]
-    return partial(ppo.train, replace(recipe, steps=options.steps or recipe.steps), seed)
 
 
 main = command("train", Options, work)

@@ -74,11 +74,10 @@ class Draw:
             "disturbance_interval": self.uniform(100.0, 300.0),
             "disturbance_walk_variance": self.some(0.4, 0.0, 0.001) * noisy,
             "small": small,
+            "gain_drift": torch.where(drifts, self.uniform(0.75, 1.33), one),
+            "time_constant_drift": torch.where(drifts, self.uniform(0.75, 1.33), one),
         }
-        for name in ("gain_drift", "time_constant_drift"):
-            numbers[name] = torch.where(drifts, self.uniform(0.75, 1.33), one)
-        numbers["setpoint"] = self.levels(numbers)
-        return numbers
+        return {**numbers, "setpoint": self.levels(numbers)}
 
     def levels(self, numbers: Numbers) -> Tensor:
         """Draw set points for k = 0 to `samples`: levels held for a while, or a square wave."""
@@ -117,22 +116,23 @@ def environment(
     n: int, samples: int, dtype: torch.dtype = torch.float32
 ) -> MiddlePointTorchEnv:
     """Return plants that take all numbers that differ between them as signals at each reset."""
+    seen: Any = {
+        "setpoint_window": 1,
+        "error_window": 0,
+        "output_window": 1,
+        "action_window": 0,
+    }
+    options: Any = {"max_episode_steps": samples, "dtype": dtype, "differentiable": True}
+    factors = "gain_factor", "gain_drift", "time_constant_drift"
+    options |= dict.fromkeys(factors, (0.3, 3.0))
     return MiddlePointTorchEnv(
         n,
-        max_episode_steps=samples,
-        dtype=dtype,
-        differentiable=True,
-        setpoint_window=1,
-        error_window=0,
-        output_window=1,
-        action_window=0,
+        **options,
+        **seen,
+        time_constant_factor=(0.2, 5.0),
         drift_samples=1200,
         delay=(4, 60),
         dead_zone=(0.0, 8.5),
-        gain_factor=(0.3, 3.0),
-        time_constant_factor=(0.2, 5.0),
-        gain_drift=(0.3, 3.0),
-        time_constant_drift=(0.3, 3.0),
         noise_variance=(0.0, 1.0),
         measurement_noise_variance=(0.0, 0.2),
         disturbance_amplitude=(0.0, 3.0),

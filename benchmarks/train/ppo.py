@@ -40,23 +40,17 @@ MAX_MOVE = 2.0  # change of the flow at an action of 1, as a share of half its r
 class Recipe:
     """The settings of a training."""
 
-    plants: tuple[tuple[int, Mapping[str, Any]], ...]
-    """Numbers of training plants and their arguments."""
-    cases: Mapping[str, Mapping[str, Any]]
-    """Arguments of the validation cases, by name. No published result uses them."""
+    plants: tuple[tuple[int, Mapping[str, Any]], ...]  # how many, and their arguments
+    cases: Mapping[str, Mapping[str, Any]]  # of the validation, which no published result uses
+    # Half width that is compensated between policy and plant, t/h. If it is above 0, a
+    # comparison compensates that of the plant it runs.
     dead_zone: float
-    """Half width of the dead zone that is compensated between policy and plant, t/h. If it is
-    above 0, a comparison compensates that of the plant it runs."""
-    levels: bool
-    """Whether the policy also sees the set point and the flow."""
-    hidden: tuple[int, ...]
-    """Nodes of the policy's hidden layers; without any, it is linear."""
-    memory: int
-    """Past temperatures and past flows in the observation."""
-    steps: int
-    """Samples of experience, summed over all plants."""
+    levels: bool  # whether the policy also sees the set point and the flow
+    hidden: tuple[int, ...]  # nodes of the policy's layers; without any, it is linear
+    memory: int  # past temperatures and past flows in the observation
+    steps: int  # samples of experience, summed over all plants
+    # Logarithm of the action's standard deviation, at the start and at the end.
     log_std: tuple[float, float] = (-1.2, -3.5)
-    """Logarithm of the action's standard deviation, at the start and at the end."""
 
     @property
     def windows(self) -> dict[str, Any]:
@@ -73,10 +67,7 @@ _SLOWER = {"setpoint_amplitude": 5.4, "setpoint_period": 500}
 RECIPES = {
     "ppo": Recipe(
         plants=((152, _RANDOM), (360, {**_RANDOM, "noise_variance": 0.6})),
-        cases={
-            "calm": _SLOWER,
-            "noise": {**_SLOWER, "noise_variance": 0.4},
-        },
+        cases={"calm": _SLOWER, "noise": {**_SLOWER, "noise_variance": 0.4}},
         dead_zone=5.0,
         levels=False,
         hidden=(),
@@ -97,19 +88,13 @@ RECIPES = {
 
 
 def train(recipe: Recipe, seed: int) -> PolicyNetwork:
-    """Train a policy, and return it with the results of its validation.
-
-    The seed is that of the initial weights, the exploration and the training plants.
-    """
-    began = time.process_time()
-    model = begin(recipe, seed)
+    """Train a policy, and return it with the results of its validation."""
+    began, model = time.process_time(), begin(recipe, seed)
     model.learn(recipe.steps, callback=Exploration(*recipe.log_std))
     seconds = time.process_time() - began
     policy = export(model, recipe)
     validation = {
-        name: evaluate(
-            policy, episodes=100, seed=VALIDATION_SEED, **recipe.windows, **case
-        ).mean_error
+        name: evaluate(policy, seed=VALIDATION_SEED, **recipe.windows, **case).mean_error
         for name, case in recipe.cases.items()
     }
     policy.provenance = {
@@ -139,16 +124,12 @@ class Plants(GymnasiumVecEnv):
 
     def __init__(self, recipe: Recipe) -> None:
         moves = {"max_move": MAX_MOVE, "compensate_dead_zone": recipe.dead_zone}
-        given = {**recipe.windows, "autoreset_mode": "SameStep"}
-        super().__init__(
-            *(
-                IncrementalAction(
-                    gymnasium.make_vec("MiddlePoint-v0", number, **given, **arguments), **moves
-                )
-                for number, arguments in recipe.plants
-            ),
-            group=GROUP,
+        same = {**recipe.windows, "autoreset_mode": "SameStep"}
+        batches = (
+            gymnasium.make_vec("MiddlePoint-v0", number, **same, **arguments)
+            for number, arguments in recipe.plants
         )
+        super().__init__(*(IncrementalAction(each, **moves) for each in batches), group=GROUP)
         self._features = features(recipe).T.astype(np.float32)
         self.observation_space = Box(-np.inf, np.inf, self._features.shape[1:])
 
@@ -170,16 +151,11 @@ class Plants(GymnasiumVecEnv):
 
 
 def features(recipe: Recipe) -> Array:
-    """Return the matrix that turns an observation into the inputs of the networks.
-
-    With levels, the inputs end with the set point and the flow. The matrix has the shape
-    (inputs, observation size).
-    """
+    """Return the matrix of an observation's inputs of the networks, (inputs, its size)."""
     one = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
     seen = inputs(one, recipe.windows)
-    if recipe.levels:
-        flow = -recipe.memory  # of the newest sample
-        seen = torch.hstack([seen, 0.2 * one[:, :1], one[:, flow, None]])
+    if recipe.levels:  # the set point and the flow
+        seen = torch.hstack([seen, 0.2 * one[:, :1], one[:, -recipe.memory, None]])
     return cast("Array", seen.numpy().T)
 
 

@@ -13,7 +13,7 @@ import copy
 import math
 import statistics
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
 
 import torch
@@ -22,7 +22,6 @@ from torch import Tensor, nn
 from agents.neural_law import INPUTS, MOST_ADDED, OUTPUTS, LawNetwork
 from benchmarks.lib.storage import versions
 from benchmarks.train.loops import Draw, Loops, environment
-from mptc_gym.torch_env import MiddlePointTorchEnv
 
 VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED = 64, 600, 3_000_000
 # Kinds of validation plants, with the ranges drawn from: low, high, and the power of `small`.
@@ -48,33 +47,21 @@ KINDS: dict[str, dict[str, tuple[float, float, int]]] = {
 class Training:
     """Everything that shapes the network, except versions and code."""
 
-    seed: int = 10_000
-    """Seed of the initial weights, the plants and their episodes."""
-    steps: int = 600
-    """Steps of the optimiser."""
-    plants: int = 256
-    """Plants per step."""
-    samples: int = 300
-    """Samples that a step runs and differentiates through."""
-    stretches: int = 4
-    """Steps on the same plants before new ones are drawn."""
-    choosing: int = 64
-    """Nodes of each hidden layer in the network that chooses."""
-    adding: int = 24
-    """Nodes of each hidden layer in the network that adds to the flow."""
-    learning_rate: float = 2e-3
-    """Initial learning rate of Adam; it falls linearly to a hundredth."""
-    move_price: float = 0.007
-    """Price of valve travel by half the range per sample, as a multiple of the authority."""
-    tolerance: float = 0.003
-    """Error below which the loss is quadratic (Huber), as a share of the authority."""
-    spread: float = 0.4
-    """Largest uncertainty of the nominal models."""
-    averaging: float = 0.98
-    """Factor of the exponential mean of the weights over past steps; the mean is kept."""
+    seed: int = 10_000  # of the initial weights, the plants and their episodes
+    steps: int = 600  # of the optimiser
+    plants: int = 256  # of a step
+    samples: int = 300  # that a step runs and differentiates through
+    stretches: int = 4  # steps on the same plants before new ones are drawn
+    choosing: int = 64  # nodes of each hidden layer in the network that chooses
+    adding: int = 24  # and in the network that adds to the flow
+    learning_rate: float = 2e-3  # of Adam at first; it falls linearly to a hundredth
+    move_price: float = 0.007  # of travel by half the range a sample, of the authority
+    tolerance: float = 0.003  # error below which the loss is quadratic, of the authority
+    spread: float = 0.4  # largest uncertainty of the nominal models
+    averaging: float = 0.98  # factor of the exponential mean of the weights, which is kept
 
 
-TRAINING = Training()  # as published
+RECIPES = {"nn-smith": Training()}  # as published
 
 
 class Net(nn.Module):
@@ -135,10 +122,8 @@ def validate(net: Net, training: Training) -> dict[str, float]:
         draw = Draw(n, samples, training.spread, VALIDATION_SEED, i)
         numbers = draw.plants()
         for name in numbers:
-            if "disturbance" in name or "noise" in name:
-                numbers[name] = torch.zeros(n)
-            if name.endswith("_drift"):
-                numbers[name] = torch.ones(n)
+            if any(each in name for each in ("disturbance", "noise", "drift")):
+                numbers[name] = torch.full((n,), float("drift" in name))
         numbers["disturbance_interval"] = torch.full((n,), 200.0)
         for name, (low, high, power) in drawn.items():
             numbers[name] = draw.uniform(low, high) * numbers["small"] ** power
@@ -149,17 +134,34 @@ def validate(net: Net, training: Training) -> dict[str, float]:
     return {**found, "all": statistics.geometric_mean(found.values())}
 
 
-def train(training: Training) -> LawNetwork:
+def train(training: Training, seed: int) -> LawNetwork:
     """Train and return the network."""
+    training = replace(training, seed=seed)
     torch.set_num_threads(1)  # the network is too small for more
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(training.seed)
+        torch.manual_seed(seed)
         net = Net(training)
     mean, optimiser = copy.deepcopy(net), torch.optim.Adam(net.parameters())
     began = time.process_time()
-    plants = environment(training.plants, training.stretches * training.samples)
-    for step in range(0, training.steps, training.stretches):
-        _advance(net, mean, optimiser, plants, training, step)
+    length = training.stretches * training.samples
+    plants = environment(training.plants, length)
+    for step in range(training.steps):
+        if step % training.stretches == 0:
+            draw = Draw(training.plants, length, training.spread, seed, step)
+            numbers = draw.plants()
+            loops = Loops(plants, numbers, draw.models(numbers), step)
+        left = max(1.0 - step / training.steps, 0.01)
+        optimiser.param_groups[0]["lr"] = training.learning_rate * left
+        loss = loss_of(*loops.run(net, training.samples), numbers["small"], training)
+        optimiser.zero_grad()
+        loss.backward()
+        if math.isfinite(nn.utils.clip_grad_norm_(net.parameters(), 1.0)):
+            optimiser.step()
+        # At first the mean forgets faster, so that the initial weights have no influence.
+        share = 1.0 - min(training.averaging, (step + 1) / (step + 11))
+        with torch.no_grad():
+            for slow, new in zip(mean.parameters(), net.parameters(), strict=True):
+                slow.lerp_(new, share)
     seconds = time.process_time() - began
     return mean.export(
         training=asdict(training),
@@ -167,32 +169,3 @@ def train(training: Training) -> LawNetwork:
         cpu_seconds=round(seconds, 1),
         versions=versions(),
     )
-
-
-def _advance(
-    net: Net,
-    mean: Net,
-    optimiser: torch.optim.Adam,
-    plants: MiddlePointTorchEnv,
-    training: Training,
-    step: int,
-) -> None:
-    """Take up to `stretches` steps of the optimiser on new plants."""
-    length = training.stretches * training.samples
-    draw = Draw(training.plants, length, training.spread, training.seed, step)
-    numbers = draw.plants()
-    loops = Loops(plants, numbers, draw.models(numbers), step)
-    for now in range(step, min(step + training.stretches, training.steps)):
-        left = max(1.0 - now / training.steps, 0.01)
-        optimiser.param_groups[0]["lr"] = training.learning_rate * left
-        errors, applied = loops.run(net, training.samples)
-        loss = loss_of(errors, applied, numbers["small"], training)
-        optimiser.zero_grad()
-        loss.backward()
-        if math.isfinite(nn.utils.clip_grad_norm_(net.parameters(), 1.0)):
-            optimiser.step()
-        # At first the mean forgets faster, so that the initial weights have no influence.
-        share = 1.0 - min(training.averaging, (now + 1) / (now + 11))
-        with torch.no_grad():
-            for slow, new in zip(mean.parameters(), net.parameters(), strict=True):
-                slow.lerp_(new, share)
