@@ -54,26 +54,21 @@ class Options:
 
 def work(options: Options) -> str:
     """Identify a plant from a log and write the results."""
-    # These are slow to import.
-    from benchmarks.identify.advice import controllers, plants
-    from benchmarks.identify.log import read_log
-    from benchmarks.identify.model import identify
-    from benchmarks.identify.report import draw, report
+    from benchmarks.identify import advice, log, model, report  # slow to import
     from benchmarks.lib.report import write_report
 
     made, began, out = origin(), time.process_time(), out_folder(options.out)
     try:
-        model = identify(read_log(options))
-        plant, ranges = plants(model)
+        found = model.identify(log.read_log(options))
+        plant, ranges = advice.plants(found)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    advised = controllers(model)
-    draw(model, out / "identify.png")
-    written = {"plant": plant, "ranges": ranges, "controllers": advised}
-    for name, content in written.items():
+    advised = advice.controllers(found)
+    report.draw(found, out / "identify.png")
+    for name, content in {"plant": plant, "ranges": ranges, "controllers": advised}.items():
         write_json(out / f"{name}.json", content)
     title = f"The plant of {options.log.name}"
-    write_report(out, title, report(model, advised), "identify", made)
+    write_report(out, title, report.report(found, advised), "identify", made)
     seconds = time.process_time() - began
     return f"{seconds:.1f} s of processor time. The plant and the report are in {out}/"
 

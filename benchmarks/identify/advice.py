@@ -189,9 +189,8 @@ def _ranges(model: Model, arguments: dict[str, Any]) -> dict[str, list[float]]:
     pole = complex(slowest_pole(arguments["a"]) or 0.0)
     if pole.imag == 0.0 and 0.0 < pole.real < 1.0:
         # The environment's time constant is 1 / (1 - pole) samples, at least 1.
-        rate, times = 1.0 - pole.real, np.maximum([constant.low, constant.high], 1e-9)
-        rates = np.maximum(-np.expm1(-model.log.sampling_interval / times), 1e-12)
-        fast, slow = (rate / rates).tolist()
+        rate, times = 1.0 - pole.real, np.array([constant.low, constant.high])
+        fast, slow = (-rate / np.expm1(-model.log.sampling_interval / times)).tolist()
         low = min(max(fast, 1.000001 * rate), 1.0)
         ranges["time_constant_factor"] = [low, max(min(slow, 10.0), 1.0)]
     return {name: x for name, x in ranges.items() if x[0] < x[1]}

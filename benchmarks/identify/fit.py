@@ -151,11 +151,8 @@ class Fit:
         The plants come first, then extra inputs, the measured disturbances, what is left of
         the time before the log, the loads and the base line.
         """
-        times, units, lag = (
-            np.arange(len(self.flow)) * self.h,
-            self.units,
-            self.units[0].slowest,
-        )
+        times, units = np.arange(len(self.flow)) * self.h, self.units
+        lag = units[0].slowest
         late, now = in_series([lag], units[0].delay), in_series([lag])
         # A disturbance has lags of its own: three fixed ones make any slow response.
         wide = [in_series([ratio * lag]) for ratio in (0.3, 1.0, 3.0)]

@@ -82,7 +82,8 @@ class Model:
     def warnings(self) -> list[str]:
         """Why no controller should be tuned on the model; empty if it may be used."""
         found, gain = self.found, self.estimates["gain"]
-        errors = found.best.solution.errors
+        errors, fault = found.best.solution.errors, found.faults[0]
+        evident = fault.drop > FAULT
         alike = np.correlate(errors, errors, "full")[len(errors) :][:LAGS] / (errors @ errors)
         large = float(np.mean(np.abs(alike) > max(0.1, 2.5 / np.sqrt(len(errors)))))
         bar = max(found.valve.drop - FAVOUR, FAULT)
@@ -91,7 +92,12 @@ class Model:
             "The log does not test the valve, as the flow had so few values, and nothing is "
             "known of its dead zone. Record a log with a dozen flows, or the flow behind the "
             "valve (--applied).": not self.tested,
-            said_of_fault(found, self.log.given.flow_unit): found.faults[0].drop > FAULT,
+            f"The valve does not seem to pass what it is told: {fault.name} of "
+            f"{fault.size:.2g} {self.log.given.flow_unit}, or another fault of the valve. "
+            f"{TEST} If the temperature follows alike, the plant is not of the model's form.":
+            evident and fault.name in HYSTERESES,
+            f"The plant seems to change: {fault.name}. Identify each level, time or direction "
+            "from a log of its own.": evident and fault.name not in HYSTERESES,
             "Valves of two kinds explain the log alike, and the plants behind them differ. "
             + TEST: max(rivals, default=1.0) > RIVAL * min(rivals, default=1.0),
             "Not even the direction is known in which the temperature answers the flow. Move "
@@ -107,23 +113,6 @@ class Model:
             "model's form.": large > 0.25,
         }  # fmt: skip
         return [sentence for sentence, holds in doubts.items() if holds]
-
-
-def said_of_fault(found: Found, unit: str) -> str:
-    """Return what seems to be wrong with the valve or the plant, and the test that tells."""
-    fault, *others = found.faults
-    if fault.name not in HYSTERESES:
-        return (
-            f"The plant seems to change: {fault.name}. Identify each level, time or direction "
-            "from a log of its own."
-        )
-    rivals = [each for each in others if each.drop >= fault.drop - FAULT]
-    alike = any(each.name in HYSTERESES for each in rivals)
-    return (
-        f"The valve does not seem to pass what it is told: {fault.name} of {fault.size:.2g} "
-        f"{unit}{', or another fault of the valve' if alike else ''}. {TEST} If the "
-        "temperature follows alike, the plant is not of the model's form."
-    )
 
 
 def identify(log: Log) -> Model:

@@ -16,15 +16,6 @@ LOAD, MOST_LOADS = 25.0, 4  # deviance that a load must explain, and how many th
 FAULT = 12.0  # deviance from which a valve or a change is evident
 DRAWS, THIN = 200, 3  # plants that are drawn, and steps of the walk between them
 SPREAD = 1.4  # draws are that much wider than the likelihood says, as no model is right
-# Where to look for plants of more than one lag: what is added to the logarithm of the lag that
-# one alone has, and the third parameter.
-SHAPES = {
-    "two lags": (0.0, -1.0),
-    "three lags": (0.0, -1.2),
-    "a zero": (0.0, -0.8),
-    "a pair": (-0.7, 0.8),
-}
-
 Passed = Callable[[Array, float], Array]
 by_deviance, by_price = attrgetter("deviance"), attrgetter("price")
 
@@ -51,9 +42,7 @@ class Kind:
 VALVES = {
     "none": Kind(lambda u, _: u, (0.0,)),
     "dead zone": Kind(lambda u, size: np.where(np.abs(u) < size, 0.0, u)),
-    "subtractive dead zone": Kind(
-        lambda u, size: np.sign(u) * np.maximum(np.abs(u) - size, 0.0)
-    ),
+    "subtractive dead zone": Kind(lambda u, size: np.sign(u) * (np.abs(u) - size).clip(0.0)),
     "saturation": Kind(lambda u, size: np.clip(u, -size, size), (0.4, 0.55, 0.7, 0.85)),
     "rate limit": Kind(
         following(lambda p, u, size: p + min(max(u - p, -size), size)),
@@ -157,8 +146,11 @@ def search(fit: Fit, command: Array, *, applied: bool) -> Found:
     start = _coarse(fit, command, (0.0,) if applied else (0.0, 0.25, 0.45))
     delay, lag = start.p
     fits = _refined(start, [start, *(
-        replace(start, shape=shape, p=np.array([share * delay, lag + more, third]))
-        for shape, (more, third) in SHAPES.items() for share in (0.8, 0.3)
+        replace(start, shape=shape, p=np.array([share * delay, lag + longer, third]))
+        # What is added to the logarithm of the lag, and the third parameter.
+        for shape, longer, third in (("two lags", 0.0, -1.0), ("three lags", 0.0, -1.2),
+                                     ("a zero", 0.0, -0.8), ("a pair", -0.7, 0.8))
+        for share in (0.8, 0.3)
     )])  # fmt: skip
     for _ in range(2):
         fits = _refined(min(fits, key=by_price), fits)

@@ -102,12 +102,12 @@ def tried(seed: int, fault: str) -> dict[str, Any]:
     half = sum(lags[1:2]) / 2  # SIMC's half rule, for the true plant
     late = delay + h / 2 + half + sum(lags[2:]) - plant.lead
     simc = (lag + half) / gain / 2 / late, min(lag + half, 8 * late)
-    two = fault.startswith("two levels")
-    flow, temperature = (
-        simulate(plant, 0.7 * gain * held, noise, 0.6 * simc[0], simc[1])
-        if kind == 2 and not two
-        else simulate(plant, np.sign(held) if two else held, noise)
-    )
+    if fault.startswith("two levels"):
+        flow, temperature = simulate(plant, np.sign(held), noise)
+    elif kind == 2:
+        flow, temperature = simulate(plant, 0.7 * gain * held, noise, 0.6 * simc[0], simc[1])
+    else:
+        flow, temperature = simulate(plant, held, noise)
     found: dict[str, Any] = {"fault": fault, "logs": 1, "recommended": 0, "unsafe": 0}
     with suppress(ValueError):  # refused
         model = identify(Log(flow, temperature, h, given=Options(Path(), operating_flow=0.0)))
