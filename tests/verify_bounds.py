@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.bounds.least import least_possible
-from benchmarks.controllers.roster import ROSTER, Controller, everything
+from benchmarks.controllers.roster import EVERYTHING, ROSTER, Controller
 from benchmarks.lib.report import on_screen
 from benchmarks.lib.statistics import student
 from benchmarks.loop.linear import nominal
@@ -59,7 +59,7 @@ class Counting:
 
 def controllers():
     """Return the roster's controllers by name, of trained ones the first, and `Counting`."""
-    counting = Controller("counting", "counting", ("", ""), Counting, told=everything)
+    counting = Controller("counting", "counting", ("", ""), Counting, told=EVERYTHING)
     return {
         **{name: entry.members()[0] for name, entry in ROSTER.items()},
         "counting": counting,

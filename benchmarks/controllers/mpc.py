@@ -25,16 +25,13 @@ TINY = 1e-9  # degC^2, added to the variance of xi so that the filter trusts the
 class PredictiveController:
     """Plan, at each sample, the inputs that bring the expected output to the set point.
 
-    The controller knows A, B, C and d of the plant (28), even where they are drawn, and the
-    course of their drift. A Kalman filter estimates the output, xi and the load from the
-    transmitter's readings; for the jumps of the load, which are not normal, it is the best
-    linear filter. The output expected without further commands follows from these estimates.
-    The plan minimises the sum of squared errors over the samples that its commands reach first,
-    for a constant set point and inputs within the limits. A first input inside the dead zone is
-    replaced by 0 or by the input at a command on the edge, whichever gives the better plan.
-
-    Where plant numbers are ranges, the controller knows those that loop i draws with seed
-    `seed + i` in its first episode.
+    The controller knows A, B, C and d of the plant (28), even where loop i draws them with seed
+    `seed + i`, and the course of their drift. A Kalman filter estimates the output, xi and the
+    load from the transmitter's readings; for the jumps of the load, which are not normal, it is
+    the best linear filter. The plan minimises the sum of squared errors over the samples that
+    its commands reach first, for a constant set point and inputs within the limits. A first
+    input inside the dead zone is replaced by 0 or by the input at a command on the edge,
+    whichever gives the better plan.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int, seed: int = 0) -> None:

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 from agents.controller import PAPER_WINDOWS
 from agents.networks import WINDOWS
-from benchmarks.controllers.roster import OWN, ROSTER, Controller, everything, limits
+from benchmarks.controllers.roster import EVERYTHING, LIMITS, OWN, ROSTER, Controller
 from benchmarks.lib.command import FanOut, Names, Parameter, blame, options
 from benchmarks.lib.storage import UsageError
 from mptc_gym import IDS, Parameters
@@ -54,12 +54,10 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
                 "--agent must be NEW_NAME=MODULE:FACTORY or NEW_NAME=PPO:FILE.zip"
                 f"{taken}, got {text!r}"
             )
-        before, _, after = location.partition(":")
-        if not (
-            Path(after).is_file()
-            if location.endswith(".zip")
-            else importlib.util.find_spec(before.partition(".")[0] or "-")
-        ):
+        module, _, file = location.partition(":")
+        is_zip = location.endswith(".zip")
+        package = module.partition(".")[0] or "-"
+        if not (Path(file).is_file() if is_zip else importlib.util.find_spec(package)):
             raise UsageError(
                 f"--agent: {location!r} must be such as PPO:model.zip, a file that is there, "
                 "or MODULE:FACTORY, of a module that is there"
@@ -67,9 +65,9 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
         locations[name] = *locations.get(name, ()), location
     if not (names or own):
         raise UsageError("--agents, --agent: no controller to run")
-    draws: Any = {"random": True, "drawn": True, "told": everything}
+    about: Any = {"told": (*EVERYTHING, *LIMITS), "random": True, "drawn": True}
     return {name: ROSTER[name] for name in names} | {
-        name: Controller(name, name, OWN[0], _make, networks=partial(_found, each), **draws)
+        name: Controller(name, name, OWN[0], _make, networks=partial(_found, each), **about)
         for name, each in locations.items()
     }
 
@@ -78,9 +76,8 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
 class Own:
     """What is found at a location."""
 
-    make: Callable[..., Any]
-    """Function of the arguments that `_make` offers, as far as it takes them by name; it
-    returns a policy, or a policy and the environment that it acts in."""
+    factory: Callable[..., Any]
+    """Returns a policy, or a policy and the environment that it acts in."""
     observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
@@ -88,46 +85,41 @@ class Own:
 def _found(locations: Sequence[str]) -> dict[str, Own]:
     with blame("--agent"):
         return {
-            each: _saved(each) if each.endswith(".zip") else _function(each)
+            each: _saved(*each.split(":", 1)) if each.endswith(".zip") else _imported(each)
             for each in locations
         }
 
 
-def _function(location: str) -> Own:
-    """Import a user's factory, `module:factory`; a ValueError says what is expected.
-
-    The README of `benchmarks.compare` lists the arguments and attributes it may have.
-    """
+def _imported(location: str) -> Own:
+    """Import a user's factory; the README of `benchmarks.compare` says what it may have."""
     try:
-        made_by: Any = pkgutil.resolve_name(location)
+        factory: Any = pkgutil.resolve_name(location)
     except (Exception, SystemExit) as error:  # whatever the code of a user raises
         text = f"{type(error).__name__}: {error}"
         raise ValueError(f"{location!r} cannot be imported: {text}") from error
-    if not callable(made_by):
-        raise ValueError(f"{location!r} must be MODULE:FACTORY, got {made_by!r}")
-    observation = getattr(made_by, "observation", PAPER_WINDOWS)
+    if not callable(factory):
+        raise ValueError(f"{location!r} must be MODULE:FACTORY, got {factory!r}")
+    observation = getattr(factory, "observation", PAPER_WINDOWS)
     if not (isinstance(observation, Mapping) and set(observation) <= set(WINDOWS)):
+        allowed = ", ".join(WINDOWS)
         raise ValueError(
-            f"observation of {made_by!r} must be a dict with names out of "
-            f"{', '.join(WINDOWS)}, got {observation!r}"
+            f"observation of {factory!r} must be a dict with names out of {allowed}, "
+            f"got {observation!r}"
         )
-    about = {name: str(getattr(made_by, name, "")) for name in ("knows", "searched")}
-    return Own(made_by, dict(observation), about)
+    about = {name: str(getattr(factory, name, "")) for name in ("knows", "searched")}
+    return Own(factory, dict(observation), about)
 
 
-def _saved(location: str) -> Own:
+def _saved(algorithm: str, file: str) -> Own:
     """Load a model, which acts as its file says, or else in the plain environment."""
-    import stable_baselines3  # here: PyTorch takes seconds to load
+    from mptc_gym.sb3 import load  # here: PyTorch takes seconds to load
 
-    from mptc_gym.sb3 import load
-
-    algorithm, _, file = location.partition(":")
-    kind = getattr(stable_baselines3, algorithm, None)
-    if kind is None:
+    kind: Any = None
+    for package in ("stable_baselines3", "sb3_contrib"):
         with suppress(ImportError):
-            kind = getattr(importlib.import_module("sb3_contrib"), algorithm, None)
+            kind = kind or getattr(importlib.import_module(package), algorithm, None)
     if kind is None:
-        raise ValueError(f"{location!r} must begin with an algorithm, such as PPO:model.zip")
+        raise ValueError(f"{algorithm}:{file} must begin with an algorithm, such as PPO:{file}")
     about = {}
     try:
         model = load(file, device="cpu")
@@ -136,7 +128,7 @@ def _saved(location: str) -> Own:
             model = kind.load(file, device="cpu")
         except Exception as error:  # whatever a file of another algorithm raises
             text = f"{type(error).__name__}: {error}"
-            raise ValueError(f"{location!r} cannot be loaded: {text}") from error
+            raise ValueError(f"'{algorithm}:{file}' cannot be loaded: {text}") from error
         about["note"] = f"{file} names no environment: run in the plain one, without wrappers"
     weights = sum(weight.numel() for weight in model.policy.parameters())
     samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
@@ -146,11 +138,11 @@ def _saved(location: str) -> Own:
 
 def _make(*, network: Own, **told: Any) -> Any:
     """Call a user's factory with the arguments that it accepts, by name."""
-    offered = {**told, **limits(told["parameters"])}
-    accepted = inspect.signature(network.make).parameters
-    if not any(each.kind is each.VAR_KEYWORD for each in accepted.values()):
-        offered = {name: offered[name] for name in offered if name in accepted}
-    made = network.make(**offered)
+    accepted = inspect.signature(network.factory).parameters
+    takes_all = any(each.kind is each.VAR_KEYWORD for each in accepted.values())
+    made = network.factory(
+        **{name: told[name] for name in told if takes_all or name in accepted}
+    )
     if hasattr(made, "reset") and hasattr(made, "act"):
         return made
     policy, env = made if isinstance(made, tuple) else (made, None)
@@ -169,16 +161,22 @@ class Policy:
 
     def reset(self) -> None:
         """Start an episode."""
-        self._act = start(self.policy, self.runs)
-
-    def act(self, observation: Any) -> Any:
-        """Return actions, shape (runs, 1)."""
-        return self._act(observation)
+        self.act = start(self.policy, self.runs)
 
     @contextmanager
     def opened(self, samples: int, **arguments: Any) -> Iterator[Any]:
         """Yield the plants that it acts in, with these arguments or refused."""
-        env = self._own(samples, arguments) if self.env is None else self.env
+        env: Any = self.env
+        if env is None:
+            made_by: Any = IDS["paper"]
+            more = {**arguments, "max_episode_steps": samples}
+            if getattr(self.policy, "get_env", lambda: None)() is not None:
+                from mptc_gym.sb3 import spec_of
+
+                plant = {each: more[each] for each in more if each not in WINDOWS}
+                made_by, more = spec_of(self.policy, **plant), {}
+            make = partial(make_one, made_by, more)
+            env = native_batch(make(), self.runs) or make
         with opened(env, self.runs) as given:
             with blame("--agent"):
                 case = case_of(Parameters(**arguments))
@@ -186,15 +184,3 @@ class Policy:
                     raise ValueError("the environment must have the parameters of the case")
                 check_fit(self.policy, given)
             yield given
-
-    def _own(self, samples: int, arguments: Mapping[str, Any]) -> Any:
-        """Return the environments of a saved model, or plain ones, for these arguments."""
-        made_by: Any = IDS["paper"]
-        more = {**arguments, "max_episode_steps": samples}
-        if getattr(self.policy, "get_env", lambda: None)() is not None:
-            from mptc_gym.sb3 import spec_of
-
-            plant = {each: more[each] for each in more if each not in WINDOWS}
-            made_by, more = spec_of(self.policy, **plant), {}
-        make = partial(make_one, made_by, more)
-        return native_batch(make(), self.runs) or make

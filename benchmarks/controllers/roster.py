@@ -35,38 +35,30 @@ LEARNING = 1200  # samples of the square wave on which a network is commissioned
 COMMISSIONING_SEED = 3_000_000  # of plants and noise during commissioning
 OWN = (("#5B3FA6", "P"), ("#A08CDB", "X"), ("#B22222", "P"), ("#F08080", "X"))
 
-
-def limits(plant: Parameters, *_: int) -> dict[str, Any]:
-    """Return the limits of the flow, the widest possible if they are drawn."""
-    return {"u_min": plant.range_of("u_min")[0], "u_max": plant.range_of("u_max")[1]}
-
-
-def tested(plant: Parameters, *_: int) -> dict[str, Any]:
-    """Return a step test and the limits."""
-    return {**step_test(plant), **limits(plant)}
+# What a controller may be told, by the arguments of its `make`.
+LIMITS = "u_min", "u_max"
+DIRECTION = *LIMITS, "direction", "num_envs", "seed"
+STEP_TEST = *LIMITS, "gain", "time_constant", "delay", "sampling_interval"
+DATA_SHEET = *STEP_TEST, "dead_zone"
+EVERYTHING = "parameters", "num_envs", "seed"
 
 
-def data_sheet(plant: Parameters, *_: int) -> dict[str, Any]:
-    """Return a step test and the actuator's data sheet, the middle of a drawn dead zone."""
-    return {**tested(plant), "dead_zone": sum(plant.range_of("dead_zone")) / 2}
+def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> dict[str, Any]:
+    """Return what a controller is told of a plant, for a number of runs and a seed.
 
-
-def smith(plant: Parameters, *_: int) -> dict[str, Any]:
-    """Return the data sheet, and a closed loop with half the plant's time constant."""
-    known = data_sheet(plant)
-    half = float(f"{known['time_constant'] / 2:.2g}")
-    return {**known, "closed_loop_time_constant": half}
-
-
-def direction(plant: Parameters, runs: int, seed: int) -> dict[str, Any]:
-    """Return the direction of the plant's response, and the limits."""
-    sign = 1 if nominal(plant).gain > 0.0 else -1
-    return {"direction": sign, "num_envs": runs, "seed": seed, **limits(plant)}
-
-
-def everything(plant: Parameters, runs: int, seed: int) -> dict[str, Any]:
-    """Return all arguments of the environment."""
-    return {"parameters": plant, "num_envs": runs, "seed": seed}
+    Run i uses `seed + i`. Of what is drawn from ranges these are the widest limits, the middle
+    of the dead zone and the step test of the plant in the middle.
+    """
+    told: dict[str, Any] = {"parameters": plant, "num_envs": runs, "seed": seed}
+    told |= {"u_min": plant.range_of("u_min")[0], "u_max": plant.range_of("u_max")[1]}
+    told["dead_zone"] = sum(plant.range_of("dead_zone")) / 2
+    if "direction" in names:
+        told["direction"] = 1 if nominal(plant).gain > 0.0 else -1
+    if "gain" in names:
+        told |= step_test(plant)
+        half = told["time_constant"] / 2  # that of the closed loop
+        told["closed_loop_time_constant"] = float(f"{half:.2g}")
+    return {name: told[name] for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,9 +73,8 @@ class Controller:
     """Colour and marker in pictures; relatives have shades of one hue and the same marker."""
     make: Callable[..., Agent] = field(kw_only=False)
     """Makes it from what it is told, searched gains by name, and a `network` of its own."""
-    told: Callable[[Parameters, int, int], Mapping[str, Any]] = limits
-    """Arguments of `make`: what it is told of the plant, for a number of runs and a seed; run i
-    uses `seed + i`."""
+    told: Sequence[str] = LIMITS
+    """Arguments of `make`, as `knowledge` returns them."""
     knows: str = ""
     """Prior knowledge: what it is told about the plant."""
     searched: str = ""
@@ -124,7 +115,7 @@ class Controller:
     def __call__(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
         """Return a controller for `runs` plants, made for the plant with these arguments."""
         parameters = Parameters(**{**plant, **self.observation})
-        return self.make(**self.told(parameters, runs, seed))
+        return self.make(**knowledge(self.told, parameters, runs, seed))
 
     def run(
         self,
@@ -163,7 +154,7 @@ def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
     return controller  # type: ignore[no-any-return]
 
 
-def with_policy(parameters: Parameters, network: PolicyNetwork, **_: int) -> PolicyNetwork:
+def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -> Agent:
     """Return a trained policy for the actuator's limits.
 
     If it compensates a dead zone, that is the plant's, where it is a number.
@@ -171,17 +162,12 @@ def with_policy(parameters: Parameters, network: PolicyNetwork, **_: int) -> Pol
     increments, zone = network.increments, parameters.dead_zone
     if increments and increments.dead_zone and not isinstance(zone, Sequence):
         increments = replace(increments, dead_zone=zone)
-    return replace(network, increments=increments, **limits(parameters))
+    return replace(network, increments=increments, **limits)
 
 
-def policies(files: str) -> Mapping[str, PolicyNetwork]:
-    """Return the networks in `agents/pretrained` that match a pattern, from any learner."""
-    return {file.name: PolicyNetwork.load(file) for file in PRETRAINED.glob(files)}
-
-
-def law() -> Mapping[str, LawNetwork]:
-    """Return the network of the law, by its file."""
-    return {"nn-smith.npz": LawNetwork.load()}
+def trained(kind: type[PolicyNetwork | LawNetwork], files: str) -> Mapping[str, Any]:
+    """Return the networks in `agents/pretrained` that match a pattern, by file."""
+    return {file.name: kind.load(file) for file in PRETRAINED.glob(files)}
 
 
 _STEP_TEST = "gain, time constant, delay"
@@ -192,6 +178,7 @@ _LAW = (
     "by hand"
 )
 _RULE = "nothing: one step test, a rule"
+_NETWORK = partial(trained, LawNetwork, "nn-smith.npz")
 
 _CONTROLLERS = (
     Controller(
@@ -199,7 +186,7 @@ _CONTROLLERS = (
         knows="nothing", searched="nothing", observation={}, compared=False, swept=False,
     ),
     Controller(
-        "nn", "NN (1992)", ("#D55E00", "o"), DirectNNController, told=direction,
+        "nn", "NN (1992)", ("#D55E00", "o"), DirectNNController, told=DIRECTION,
         knows="direction", searched=_NN, random=True, learns=True, drawn=True,
         gains={
             "eta": (1e-3, 10.0),
@@ -211,7 +198,7 @@ _CONTROLLERS = (
         },
     ),
     Controller(
-        "nn-frozen", "NN (1992), frozen", ("#7A3600", "o"), frozen_nn, told=everything,
+        "nn-frozen", "NN (1992), frozen", ("#7A3600", "o"), frozen_nn, told=EVERYTHING,
         knows="direction", searched=f"{_NN}; 1,200 samples before", random=True, compared=False,
     ),
     Controller(
@@ -220,7 +207,7 @@ _CONTROLLERS = (
         gains={"kp": (0.1, 10.0), "ki": (1e-3, 1.0)},
     ),
     Controller(
-        "pi-simc", "PI (SIMC)", ("#8E3B6B", "s"), PIController.simc, told=tested,
+        "pi-simc", "PI (SIMC)", ("#8E3B6B", "s"), PIController.simc, told=STEP_TEST,
         knows=_STEP_TEST, searched=_RULE,
     ),
     Controller(
@@ -230,42 +217,43 @@ _CONTROLLERS = (
         searched="2 gains by 800 trials: 566 M samples, 3 min", swept=False,
     ),
     Controller(
-        "smith", "Smith", ("#56B4E9", "^"), SmithPredictor, told=smith,
+        "smith", "Smith", ("#56B4E9", "^"), SmithPredictor,
+        told=(*DATA_SHEET, "closed_loop_time_constant"),
         knows=_DATA_SHEET, searched=_RULE,
     ),
     Controller(
         "self-tuning", "self-tuning", ("#00B98A", "v"),
-        SelfTuningController, told=data_sheet, knows=f"{_DATA_SHEET}; delay range",
+        SelfTuningController, told=DATA_SHEET, knows=f"{_DATA_SHEET}; delay range",
         searched="30 settings by hand, not counted; one step test",
     ),
     Controller(
-        "mpc", "MPC", ("#000000", "*"), PredictiveController, told=everything,
+        "mpc", "MPC", ("#000000", "*"), PredictiveController, told=EVERYTHING,
         knows="everything but the future", searched="nothing", swept=False,
     ),
     Controller(
-        "ppo", "PPO", ("#E69F00", "D"), with_policy, told=everything,
+        "ppo", "PPO", ("#E69F00", "D"), with_policy, told=("parameters", *LIMITS),
         knows="dead zone", drawn=True,
         searched="388 weights on the paper's plant: 5 M samples a policy; settings by 79 "
         "trials: 121 M samples, 30 min",
-        networks=partial(policies, "ppo-[0-9]*.npz"),
+        networks=partial(trained, PolicyNetwork, "ppo-[0-9]*.npz"),
     ),
     Controller(
-        "ppo-hard", "PPO (hard)", ("#8F6200", "D"), with_policy, told=everything,
+        "ppo-hard", "PPO (hard)", ("#8F6200", "D"), with_policy, told=("parameters", *LIMITS),
         knows="nothing",
         searched="12,608 weights on plants that vary: 4 M samples a policy; settings by 43 "
         "trials: 36 M samples, 12 min",
-        networks=partial(policies, "ppo-hard-*.npz"),
+        networks=partial(trained, PolicyNetwork, "ppo-hard-*.npz"),
     ),
     Controller(
         "nn-smith", "neural Smith", ("#0072B2", "^"),
-        NeuralSmithPredictor, told=data_sheet, knows=_DATA_SHEET,
-        searched=f"{_LAW}; one step test", networks=law, drawn=True,
+        NeuralSmithPredictor, told=DATA_SHEET, knows=_DATA_SHEET,
+        searched=f"{_LAW}; one step test", networks=_NETWORK, drawn=True,
     ),
     Controller(
         "nn-self-tuning", "neural self-tuning", ("#00664B", "v"),
-        NeuralSelfTuningController, told=data_sheet,
+        NeuralSelfTuningController, told=DATA_SHEET,
         knows=f"{_DATA_SHEET}; delay range",
-        searched=f"{_LAW}; 31 settings by hand; one step test", networks=law,
+        searched=f"{_LAW}; 31 settings by hand; one step test", networks=_NETWORK,
     ),
 )  # fmt: skip
 ROSTER = {each.name: each for each in _CONTROLLERS}
