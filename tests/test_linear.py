@@ -78,11 +78,10 @@ def test_plant_without_a_new_steady_state_is_refused():
 def test_bad_plant_file_is_named(tmp_path):
     path = tmp_path / "plant.json"
     for text, complaint in {
-        None: "plant.json cannot be read: No such file",
+        None: "plant.json must be a JSON file of arguments.*No such file",
         "{": "plant.json must be a JSON file",
         "[1, 2]": "plant.json must be a JSON file of arguments",
         '{"delay": -1}': "delay must be",
-        "[" * 100_000: "plant.json must be a JSON file",
     }.items():
         if text is not None:
             path.write_text(text)

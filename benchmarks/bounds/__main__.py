@@ -65,18 +65,14 @@ def work(options: Options) -> str:
         for name, case in cases.items()
     }
     print(", ".join(filter(None, ["Mean |e| in °C", options.plant.name])) + ":")
-    _show("", ["no control", *HEADINGS.values(), *["MPC"] * bool(options.mpc)])
-    found: dict[str, list[str]] = {}
+    found = {"": ["no control", *HEADINGS.values(), *["MPC"] * bool(options.mpc)]}
     try:
         found.update(options.fan_out.stream(tasks, "bounds"))
     finally:
-        for name in [each for each in tasks if each in found]:
-            _show(name, found[name])
+        for name in [each for each in ("", *tasks) if each in found]:
+            cells = "".join(f"{cell:>26}" for cell in found[name])
+            print(f"{name:20}{cells}".rstrip(), flush=True)
     return "\n" + textwrap.fill(NOTE, shutil.get_terminal_size((150, 24)).columns)
-
-
-def _show(name: str, cells: list[str]) -> None:
-    print((f"{name:20}" + "".join(f"{cell:>26}" for cell in cells)).rstrip(), flush=True)
 
 
 def row(case: Scenario, samples: int, drawn: Mapping[str, Any], mpc: int | None) -> list[str]:

@@ -1,10 +1,9 @@
 """Compute the least possible mean error of any case of the environment, and scores from it.
 
-README.md says for which controllers each kind holds. The mean error is that of the rewards, of
-|e(k)| over k = 1 to N. A bound is the mean over the episodes that the environment draws; for
-each, it is the optimum of `linear_program.py`, given what `unknown.py` leaves unknown. A
-controller at k may know the transmitter's readings up to k, and perhaps any set points, plant
-numbers and loads up to k, but not the true output, `info["output"]`. It may undo the dead zone.
+README.md says what each kind holds for. The mean error is that of the rewards, of |e(k)| over
+k = 1 to N. A controller at k may know the transmitter's readings up to k, and perhaps any set
+points, plant numbers and loads up to k, but not the true output, `info["output"]`. It may undo
+the dead zone.
 """
 
 from __future__ import annotations
@@ -46,8 +45,7 @@ CACHE = ROOT / "results" / "bounds"
 class LeastPossible(Estimate):
     """The least possible mean |e| of a case, degC, with a 95 % interval over drawn episodes.
 
-    `value`, `low`, `high` and `runs` are those of `Estimate`; the ends equal `value` where
-    nothing is drawn.
+    The ends of the interval equal `value` where nothing is drawn.
     """
 
     kind: str
@@ -59,10 +57,10 @@ class LeastPossible(Estimate):
     "causal" only their mean is a bound."""
 
     def score(self, errors: ArrayLike) -> Array:
-        """Return scores: 0 for the mean error without control, 1 for `value`.
+        """Return scores of mean errors, degC: 0 without control, 1 for `value`.
 
-        `errors` are mean |e| of runs, degC, of any shape; a single run may exceed 1 by chance.
-        A ValueError is raised if nothing is better than no control.
+        A single run may exceed 1 by chance. A ValueError is raised if nothing is better than no
+        control.
         """
         idle = self.idle.value
         if idle - self.value <= 1e-9 * max(idle, 1.0):
@@ -87,25 +85,19 @@ def least_possible(
     samples
         N, length of an episode.
     kind
-        One of `KINDS`. None chooses as reports and `mptc_gym.evaluate` do: "causal" for random
-        set points; otherwise "reference", or "preview" if a set point changes before the plant
-        has settled, or if both are the same.
+        One of `KINDS`: "causal" is for random set points alone, "reference" for those that the
+        plant settles at before they change; a ValueError is raised otherwise. None chooses as
+        reports and `mptc_gym.evaluate` do: "causal" for random set points; otherwise
+        "reference", or "preview" if there is none or if both are the same.
     episodes
         Number of episodes, if anything is drawn.
     seed
         Episode i is the one that the environment draws with seed `seed + i`. The defaults are
         the episodes of `mptc_gym.evaluate`.
     folder
-        Folder in which the result is kept, under a name made from the arguments and the code.
-        None: it is computed anew.
+        Folder in which the result is kept; None: it is computed anew.
     **arguments
         Arguments of the environment.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range; if the kind is "causal" and set points are not random;
-        or if it is "reference" and a set point changes before the plant has settled.
     """
     parameters = Parameters(**arguments)
     for name, count in (("samples", samples), ("episodes", episodes)):

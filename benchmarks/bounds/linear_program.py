@@ -59,8 +59,6 @@ class Plan:
 
     error: Array
     """The lower bound of E|e(k)|, degC."""
-    output: Array
-    """The mean of y(k), degC."""
     flow: Array
     """The mean of u_a(k), t/h."""
     cost: float
@@ -137,9 +135,8 @@ def plan(
         flow[start:-1] = _solve(*own, targets, unknowns, np.roots(model.parameters.b))
     # The last flow affects no output; if it does not move, it costs nothing either.
     flow[-1] = flow[-2] if samples > 1 else 0.0
-    output = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
-    error = unknown.mean_error(setpoint - output)
-    return Plan(error, output, flow, float(error[1:].sum() + price @ flow))
+    error = unknown.mean_error(setpoint - scipy.sparse.linalg.spsolve_triangular(A, B @ flow))
+    return Plan(error, flow, float(error[1:].sum() + price @ flow))
 
 
 def _unknowns(count: int, cost: Any, low: Any, high: Any) -> Array:

@@ -107,14 +107,11 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     The time constant and the delay follow from the times at which the response reaches 28.3 %
     and 63.2 % of its final value: T = 1.5 (t_63 - t_28), and the delay is t_63 - T (C. L.
     Smith, "Digital Computer Process Control", 1972). As if read off a chart, the gain has four
-    digits, the time constant three, and the delay is a whole number of samples.
+    digits, the time constant three, and the delay is a whole number of samples, with the one
+    that any input takes to show. A ValueError is raised if the plant reaches no new steady
+    state, or if its gain is 0.
 
-    A range is replaced by its middle, and a drifting plant is tested at k = 0. The flow moves
-    outside the dead zone, and noise and load disturbances average out. A ValueError is raised
-    if the plant reaches no new steady state, or if its gain is 0.
-
-    These are arguments of `PIController.simc` and `SmithPredictor`: degC per t/h, and s. The
-    delay includes the one sample that any input takes to show.
+    These are arguments of `PIController.simc` and `SmithPredictor`: degC per t/h, and s.
     """
     plant, interval = nominal(parameters), parameters.sampling_interval
     slowest = float(np.abs(np.roots([1.0, *-plant.alpha])).max(initial=0.0))
@@ -136,8 +133,7 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     )
     time_constant = 1.5 * (late - early)
     # In samples, u(k) shows at y(k + 1) at the earliest.
-    still = round(sum(parameters.range_of("delay")) / 2)
-    delay = max(1, round(still + late - time_constant + 1.0))
+    delay = max(1, round(round(plant.numbers.delay) + late - time_constant + 1.0))
     return {
         "gain": float(f"{plant.gain:.4g}"),
         "time_constant": float(f"{time_constant * interval:.3g}"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import gymnasium
@@ -37,10 +37,7 @@ class Agent(Protocol):
 
 
 class IdleValve:
-    """No control: leave the valve at 0 t/h.
-
-    The actuator's limits are in t/h, the same for all runs or of shape (runs,).
-    """
+    """No control: leave the valve at 0 t/h, with limits for all runs or of shape (runs,)."""
 
     def __init__(self, u_min: Any = -10.0, u_max: Any = 10.0) -> None:
         self.action = np.reshape(action_from_command(0.0, u_min, u_max), (-1, 1))
@@ -112,7 +109,6 @@ def rollout(
     has the noise and the set point of seed `seed + i`. `before` is called with k before
     the controller acts at sample k, to observe or to damage it.
     """
-    signals = np.empty((len(fields(Trajectory)), samples, plants.num_envs))
     seeds = [*range(seed, seed + plants.num_envs)]
     agent.reset()
     clock = itertools.count()
@@ -122,20 +118,21 @@ def rollout(
             before(next(clock))
         return agent.act(observations)
 
-    for k, (at, after, _) in enumerate(run_batch(plants, act, samples, seeds)):
+    signals = []
+    for at, after, _ in run_batch(plants, act, samples, seeds):
         # A step reports the command and the applied flow of the sample that it starts at.
-        signals[:, k] = (
-            at["setpoint"], at["output"], after["command"], after["applied"], at["noise"],
-            after["error"], after["setpoint"],
-        )  # fmt: skip
-    return Trajectory(*signals)
+        here = at["setpoint"], at["output"], after["command"], after["applied"], at["noise"]
+        signals.append(np.array([*here, after["error"], after["setpoint"]]))
+    return Trajectory(*np.stack(signals, axis=1))
 
 
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     """Compute the measures of each run by their names in CSV files, each of shape (runs,).
 
     - `mae`: mean of |e(k)| over k = 1 to N, the errors in the rewards;
-    - `mae_start`, `mae_changes`, `mae_steady`: what it is the sum of; see `_parts`;
+    - `mae_start`, `mae_changes`, `mae_steady`: what it is the sum of: the samples before
+      `START`, the `CHANGE` samples from a later change of the set point on, with what reaches
+      beyond `START` of an earlier one, and the rest;
     - `ise`: integral of e^2 over the same samples;
     - `itae`: integral of t |e|, with t counted from the latest set-point change;
     - `total_variation`: valve travel, the total variation of the applied flow, from rest at 0;
@@ -150,19 +147,24 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     The last two are NaN if the actuator's numbers are drawn from ranges.
     """
     interval = parameters.sampling_interval / 60.0  # min
-    command = trajectory.command
+    command, error = trajectory.command, np.abs(trajectory.next_error)
     inside = saturated = np.full(command.shape, np.nan)
     if not {"dead_zone", "u_min", "u_max"} & set(parameters.ranges):
         zone, u_min, u_max = parameters.dead_zone, parameters.u_min, parameters.u_max
         inside = np.abs(command) < least_effective(zone, u_min, u_max)  # as the plant judges it
         saturated = (command <= u_min) | (command >= u_max)
+    k = np.arange(1, len(error) + 1)[:, np.newaxis]
+    changed = np.diff(trajectory.next_setpoint, axis=0, prepend=trajectory.setpoint[:1]) != 0.0
+    latest = np.maximum.accumulate(np.where(changed, k, -CHANGE), axis=0)
+    start, moved = k < START, k < latest + CHANGE
+    parts = {"start": start, "changes": ~start & moved, "steady": ~start & ~moved}
     pairs = zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
     itae, overshoot, settling = np.array([_measure_steps(*each) for each in pairs]).T
     moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
     return {
         "mae": mean_error(trajectory),
-        **_parts(trajectory),
-        "ise": interval * np.square(trajectory.next_error).sum(axis=0),
+        **{f"mae_{name}": (error * part).mean(axis=0) for name, part in parts.items()},
+        "ise": interval * np.square(error).sum(axis=0),
         "itae": interval**2 * itae,
         "total_variation": np.abs(moves).sum(axis=0),
         "overshoot": 100.0 * overshoot,
@@ -170,21 +172,6 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
         "dead_zone_share": 100.0 * inside.mean(axis=0),
         "saturation_share": 100.0 * saturated.mean(axis=0),
     }
-
-
-def _parts(trajectory: Trajectory) -> dict[str, Array]:
-    """Return what the parts of each run contribute to its mean error, degC.
-
-    They are the samples before `START`, the `CHANGE` samples from a later change of the set
-    point on, with what reaches beyond `START` of an earlier one, and the rest.
-    """
-    error, setpoint = np.abs(trajectory.next_error), trajectory.next_setpoint
-    k = np.arange(1, len(error) + 1)[:, np.newaxis]
-    changed = np.diff(setpoint, axis=0, prepend=trajectory.setpoint[:1]) != 0.0
-    latest = np.maximum.accumulate(np.where(changed, k, -CHANGE), axis=0)
-    start, moved = k < START, k < latest + CHANGE
-    parts = {"start": start, "changes": ~start & moved, "steady": ~start & ~moved}
-    return {f"mae_{name}": (error * part).mean(axis=0) for name, part in parts.items()}
 
 
 def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +18,7 @@ from benchmarks.lib.command import Parameter, Repeated, blame, options
 from benchmarks.lib.storage import UsageError
 from benchmarks.loop.linear import nominal
 from mptc_gym import PRESETS, Parameters
-from mptc_gym.parameters import PLANT_NUMBERS, slowest_pole
+from mptc_gym.parameters import slowest_pole
 
 Arguments = dict[str, Any]  # of the environment
 
@@ -120,10 +121,9 @@ class PlantOptions:
             name, equals, value = text.partition("=")
             if not (name and equals):
                 raise UsageError(f"--set must be ARGUMENT=VALUE, got {text!r}")
-            try:
+            arguments[name] = value  # a bare word, such as random
+            with suppress(ValueError):
                 arguments[name] = json.loads(value)
-            except (ValueError, RecursionError):
-                arguments[name] = value  # a bare word, such as random
         given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
         try:
             a = Parameters.of_environment(arguments).a
@@ -140,10 +140,8 @@ class PlantOptions:
 def _read(path: Path) -> dict[str, Any]:
     """Return the arguments in a JSON file such as `plant.json`."""
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")).items())
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    except (AttributeError, ValueError, RecursionError) as error:  # not JSON, or no object
+        return dict(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, TypeError, ValueError) as error:  # not there, no object, or not JSON
         raise ValueError(
             f'{path} must be a JSON file of arguments, such as {{"delay": 20}}: {error}'
         ) from error
@@ -168,21 +166,16 @@ def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
     """
     from scipy.stats.qmc import LatinHypercube  # here: slow to import
 
-    generator = np.random.default_rng(seed)
-    drawn = LatinHypercube(len(SPANS) + 2, rng=generator).random(count)
-    drifting = ("gain_factor", "time_constant_factor")
-    ends = np.array([*SPANS.values(), *(SPANS[name] for name in drifting)])
-    rows = ends[:, 0] + drawn * (ends[:, 1] - ends[:, 0])
-    plants = []
-    for i, row in enumerate(rows.round(4).tolist()):
+    drifts = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_drift"}
+    low, high = np.array([*SPANS.values(), *(SPANS[name] for name in drifts)]).T
+    drawn = LatinHypercube(len(low), rng=np.random.default_rng(seed)).random(count)
+    plants: list[Arguments] = []
+    for row in (low + drawn * (high - low)).round(4).tolist():
         plant = dict(zip(SPANS, row, strict=False)) | {"delay": round(row[0])}
-        if i >= count // 2:
-            gain, time_constant = row[len(SPANS) :]
-            plant |= {
-                "gain_drift": gain / plant["gain_factor"],
-                "time_constant_drift": time_constant / plant["time_constant_factor"],
-                "drift_samples": samples,
-            }
+        if len(plants) >= count // 2:
+            ends = zip(drifts.items(), row[len(SPANS) :], strict=True)
+            plant |= {drift: end / plant[factor] for (factor, drift), end in ends}
+            plant["drift_samples"] = samples
         plants.append(plant)
     return plants
 
@@ -204,7 +197,7 @@ def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
 
 def _scales(plant: Parameters) -> list[float]:
     """Return a plant's delay, dead zone, variance of the reach, and factors, as in `SPANS`."""
-    middle = {name: sum(plant.range_of(name)) / 2.0 for name in PLANT_NUMBERS}
-    reach = float(nominal(plant).gain) * (middle["u_max"] - middle["u_min"]) / 2.0
-    middle["noise_variance"] = reach**2
+    model = nominal(plant)
+    reach = float(model.gain) * (model.numbers.u_max - model.numbers.u_min) / 2.0
+    middle = {**vars(model.numbers), "noise_variance": reach**2}
     return [middle[name] for name in SPANS]
