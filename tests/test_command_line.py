@@ -66,6 +66,8 @@ REFUSED = {
         (["--set", "render_mode=human"], "--set: render_mode is not an argument of the plant"),
         (["--agent", "PI=agents:PIController"], "'PI' is taken"),
         (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
+        (["--out", ""], '--out: unable to convert "" into'),
+        (["--out", "/proc/here"], "cannot be written to: "),
     ],
     "datasets": [(["middlepoint/paper/ppo-v0"], 'Choose from: "middle')],
     "identify": [
@@ -79,6 +81,7 @@ REFUSED = {
     "sweep": [
         (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),
         (["--plants", "10"], "--plants and --design-seed are for --design random"),
+        (["--out", __file__], "cannot be written to: it is no folder"),
     ],
     "train": [([], "NETWORK is missing: one of nn-smith, ppo, ppo-hard")],
     "watch": [
@@ -247,14 +250,3 @@ class TestEnds:
         assert done.returncode == 1
         assert "the output is cut off: No space left on device" in done.stderr
         assert "Traceback" not in done.stderr
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the words are Linux's")
-@pytest.mark.parametrize("name", ["compare", "sweep"])
-def test_a_folder_that_cannot_be_written_to(name, refused):
-    for out, complaint in {
-        "": '--out: unable to convert "" into',
-        __file__: "cannot be written to: it is no folder",
-        "/proc/here": "cannot be written to: No such file",
-    }.items():
-        assert complaint in refused(main_of(name), ["--out", out])

@@ -59,17 +59,6 @@ def test_flows_by_hand(arguments, wrapper, moves, flows):
     assert [info["applied"] for info in infos] == pytest.approx(flows, abs=5e-5)
 
 
-def test_a_reset_of_some_leaves_the_flows_of_the_others():
-    envs = make_many(max_move=0.5)
-    envs.reset(seed=0)
-    moves = np.full((2, 1), 0.4, np.float32)
-    before, _ = (envs.step(moves)[4]["command"] for _ in range(2))
-    envs.reset(options={"reset_mask": np.array([True, False])})
-    first, second = envs.step(moves)[4]["command"]
-    assert first < 1.5 * before[0]  # another plant, with other limits
-    assert second == pytest.approx(3.0 * before[1], rel=1e-4)
-
-
 def test_drawn_numbers_are_those_of_the_episode():
     env = make(RANGES, max_move=2.0, compensate_dead_zone=True)
     drawn = set()

@@ -4,10 +4,10 @@ A page says where its numbers come from by a comment above a table, a list or a 
 
     <!-- numbers: report.md -->
 
-names files in `benchmarks/published`, or none, and why. A column of a table must be one column
-of one table of these files, row by row: the rows are found by their labels. The rows of a table
-without such labels follow the sections of the file. A number of a text must stand in a row that
-the text names, if it names one. A page may have fewer digits than the file, or millions (M).
+names files in `benchmarks/published`, or none, and why. A number of a table must stand in a row
+of these files with the same label; the rows of a table without such labels follow the sections
+of the file. A number of a text must stand in a row that the text names, if it names one. A page
+may have fewer digits than the file, or millions (M).
 """
 
 import csv
@@ -99,43 +99,22 @@ def same(number, unit, known):
     return any(f"{float(known) * scale + e:.{digits}f}" == number for e in (1e-9, -1e-9))
 
 
-def explained(column, part, found):
-    """Return whether one column of one table has all numbers of {label: (number, unit)}."""
-    for table in found:
-        if not set(column) <= set(table):
-            continue
-        for key in {key for label in column for key in table[label]}:
-            cells = [read(table[label].get(key, ""))[part] for label in column]
-            for place in range(min(map(len, cells))):
-                known = [cell[place][0] for cell in cells]
-                if all(map(same, *zip(*column.values(), strict=True), known)):
-                    return True
-    return False
-
-
 def faults_of(block, files):
-    """Return what on a page its files do not say."""
+    """Return the numbers on a page that its files do not have."""
     found = [table for file in files for table in tables(file)]
     if not block.startswith("|"):
         return faults_of_text(block, found)
-    faults, columns = [], defaultdict(dict)
     rows = rows_of(block.splitlines())
-    sections = (PUBLISHED / files[0]).read_text("utf-8").split("\n## ")[1:]
-    if not all(any(plain(label) in table for table in found) for label, *_ in rows):
-        if len(rows) != len(sections):
-            return [f"rows that the files do not have: {[label for label, *_ in rows]}"]
-        for (_, *cells), section in zip(rows, sections, strict=True):
-            faults += unknown(" | ".join(cells), section)
-        return faults
-    for label, *cells in rows:
-        for j, cell in enumerate(cells):
-            for part, numbers in enumerate(read(cell)):
-                for place, number in enumerate(numbers):
-                    columns[j, part, place][plain(label)] = number
+    known = [
+        " ; ".join(text for table in found for text in table.get(plain(label), {}).values())
+        for label, *_ in rows
+    ]
+    if not all(known):
+        known = (PUBLISHED / files[0]).read_text("utf-8").split("\n## ")[1:]
     return [
-        f"column {j + 1}: {column}"
-        for (j, part, _), column in columns.items()
-        if not explained(column, part, found)
+        number
+        for (_, *cells), there in zip(rows, known, strict=True)
+        for number in unknown(" | ".join(cells), there)
     ]
 
 

@@ -18,7 +18,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
-    VecEnvWrapper,
     VecNormalize,
 )
 from stable_baselines3.common.vec_env import VecFrameStack as Stack
@@ -211,15 +210,6 @@ def telling(tell):
     return odd(step=lambda env, action: (*(found := env.step(action))[:4], tell(found[4])))
 
 
-class Times(VecEnvWrapper):
-    def reset(self):
-        return 0.1 * self.venv.reset()
-
-    def step_wait(self):
-        observations, *others = self.venv.step_wait()
-        return 0.1 * observations, *others
-
-
 class NoResetInfos(DummyVecEnv):
     """A vector environment of somebody's, from before `reset_infos`."""
 
@@ -336,7 +326,6 @@ RIGHT = {
     "SubprocVecEnv": lambda _: memory(processes()),
     "plants in groups": lambda _: memory(make_vec_env(NOISY, N, group=N, **SHORT)),
     "VecEnv without reset_infos": lambda _: memory(NoResetInfos([made] * N)),
-    "VecEnvWrapper of one's own": lambda _: memory(Times(dummy()), scaled),
     "plants that differ in rewards": lambda _: memory(
         DummyVecEnv([made, partial(made, reward="absolute")])),
     "VecNormalize": lambda _: with_statistics(VecNormalize(dummy())),

@@ -251,16 +251,12 @@ class TestExport:
 
 
 @pytest.mark.parametrize("name", ppo.RECIPES)
-def test_the_budget_of_the_search_is_that_of_its_log(name):
+def test_those_of_the_project_are_of_the_recipes_and_the_search_is_that_of_its_log(name):
     log = pd.read_csv(ROOT / "benchmarks/published/ppo_trials.csv")
     trials = log[log.policy == name]
     samples, minutes = trials.samples.sum() / 1e6, trials.cpu_seconds.sum() / 60
     said = f"{len(trials)} trials: {samples:.0f} M samples, {minutes:.0f} min"
     assert ROSTER[name].searched.endswith(said)
-
-
-@pytest.mark.parametrize("name", ppo.RECIPES)
-def test_those_of_the_project_are_of_the_recipes(name):
     recipe = ppo.RECIPES[name]
     asked = json.loads(json.dumps(asdict(recipe)))
     members = ROSTER[name].members()
