@@ -19,13 +19,11 @@ from benchmarks.controllers.roster import ROSTER, Controller, label
 from benchmarks.lib.command import Folder, Parameter, Runs, Seed, blame, command, options
 from benchmarks.lib.storage import Kept, UsageError, origin, out_folder, write_csv, write_json
 from benchmarks.loop.rollout import Trajectory, held, measure
-from benchmarks.loop.scenarios import SPANS, PlantOptions, around, random_design
+from benchmarks.loop.scenarios import SPANS, Arguments, PlantOptions, around, random_design
 from mptc_gym import Parameters
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Arguments = dict[str, Any]  # of the environment
 
 SAMPLES = 1200  # of a run
 SETPOINT: Arguments = {"setpoint": "square", "setpoint_period": 600}
@@ -40,10 +38,9 @@ COLUMNS = {  # of the overview: headings and formats
 }
 TEXT = (
     "Multiple: mean error / least possible error, the median and 90th percentile over the "
-    "plants (the median run of each). Travel: of the valve in a run, the median. "
-    "Oscillates: on steady stretches the standard deviation of the error is "
-    f"{OSCILLATES:g} °C larger than without control. This, and no better than no control, are "
-    "shares of the runs."
+    "plants (the median run of each). Travel: of the valve in a run, the median. Oscillates: "
+    f"on steady stretches the standard deviation of the error is {OSCILLATES:g} °C larger "
+    "than without control. This, and no better than no control, are shares of the runs."
 )
 PICTURE = "Error on each plant, as a multiple of the least possible"
 GROUPS = {  # of the plants of a random design, a row each
@@ -217,8 +214,8 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) 
     draw(runs, out / "map.png", nominal)
     ends = runs[[name for name in SPANS if name in runs]].agg(["min", "max"])
     spans = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, (low, high) in ends.items())
-    overview = summarise(runs).rename(columns={"agent": "controller"})
-    overview["controller"] = overview["controller"].map(label)
+    overview = summarise(runs)
+    overview.insert(0, "controller", overview.pop("agent").map(label))
     for name, (heading, form) in COLUMNS.items():
         overview[heading] = overview.pop(name).map(form.format)
     text = [f"The plants have: {spans}.", TEXT]
@@ -257,15 +254,14 @@ def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
     from benchmarks.lib.report import MULTIPLE, draw_legend, panels, scale_by_excess
 
     centre = [sum(nominal.range_of(name)) / 2.0 for name in ("delay", "gain_factor")]
-    scale, names = LogNorm(0.01, 3.0), list(runs["agent"].unique())
+    look: Any = {"marker": "s", "cmap": "cividis_r", "norm": LogNorm(0.01, 3.0)}
+    names = list(runs["agent"].unique())
     with panels(path, [*map(label, names)], 2.3, 3, PICTURE) as (figure, axes):
         for panel, name in zip(axes, names, strict=True):
             plants = runs[runs["agent"] == name].groupby("plant")
             delay, gain = plants["delay"].first(), plants["gain_factor"].first()
             excess = plants["ratio"].median().sub(1.0).clip(lower=0.01)
-            image = panel.scatter(
-                delay, gain, 20, excess, marker="s", cmap="cividis_r", norm=scale
-            )
+            image = panel.scatter(delay, gain, 20, excess, **look)
             often = plants["oscillates"].mean() >= 0.5
             panel.plot(delay[often], gain[often], "wo", ms=3.5, mec="k", label="oscillates")
             often = plants["useless"].mean() >= 0.5
@@ -274,8 +270,8 @@ def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
         for panel in axes[-3:]:
             panel.set_xlabel("delay (samples)")
         figure.supylabel("gain factor", fontsize="medium")
-        place: Any = {"location": "bottom", "aspect": 60, "extend": "both"}
-        bar = figure.colorbar(image, ax=axes, label=MULTIPLE, **place)
+        below: Any = {"location": "bottom", "aspect": 60, "extend": "both"}
+        bar = figure.colorbar(image, ax=axes, label=MULTIPLE, **below)
         scale_by_excess(bar.ax, "x", 0.013, 3.0 / 1.3)
         handles, texts = panel.get_legend_handles_labels()
         draw_legend(figure, dict(zip(texts, handles, strict=True)))

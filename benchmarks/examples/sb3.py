@@ -53,7 +53,7 @@ def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
 def changes(window: Tensor, single: int) -> Tensor:
     """Return the differences between means over stretches of a window, newest first.
 
-    The first stretches have a single sample; those that follow have 2, 4, 8 and so on.
+    The first have a `single` sample; those that follow have 2, 4, 8 and so on.
     """
     lengths = [1] * single
     while left := window.shape[1] - sum(lengths):

@@ -44,11 +44,7 @@ class Draw:
         return self.uniform(low, high) * (self.uniform(0.0, 1.0) < share)
 
     def plants(self) -> Numbers:
-        """Draw the numbers of the plants for `MiddlePointTorchEnv`, and `small`.
-
-        `small` is a factor of set point, dead zone, noise and load: the same problem within a
-        fraction of the plant's authority.
-        """
+        """Draw the plants' numbers; `small` scales set point, dead zone, noise and load."""
         one = torch.ones(self._n)
         gain, constant = (
             torch.exp(self.uniform(math.log(low), math.log(high)))
@@ -154,10 +150,7 @@ class _TorchLaw(Law):
 
 
 class Loops:
-    """A batch of plants controlled by the network, starting from rest.
-
-    The law and the nominal models are those of `NeuralSmithPredictor`.
-    """
+    """Plants from rest under the network, the law and models of `NeuralSmithPredictor`."""
 
     def __init__(
         self, plants: MiddlePointTorchEnv, numbers: Numbers, models: Numbers, seed: int
@@ -193,9 +186,9 @@ class Loops:
         self._observations, _ = plants.reset(seed=seed, options={"signals": signals})
 
     def run(self, net: Network, samples: int) -> tuple[Tensor, Tensor]:
-        """Continue; return e(k + 1) as multiples of the authority, u_a(k) of half the range.
+        """Return e(k + 1) of the authority and u_a(k) of half the range, (samples, n).
 
-        Both have the shape (samples, n). Gradients do not reach back beyond this call.
+        It goes on from the last call, behind which gradients do not reach.
         """
         self._plants.detach()
         for owner in (self, self._law):

@@ -1,7 +1,6 @@
 """Train the network of `nn-smith` by the gradient through plants of all kinds.
 
-The network controls a batch of simulated plants, each with a nominal model of it.
-The error of the whole run is differentiated with respect to the weights, back through plant,
+The error of a whole run is differentiated with respect to the weights, back through plant,
 actuator and law. The literature calls this differentiable predictive control (J. Drgona et al.,
 "Differentiable predictive control: deep learning alternative to explicit model predictive
 control for unknown nonlinear systems", Journal of Process Control 116, 2022, 80-92).
@@ -25,6 +24,7 @@ from benchmarks.train.loops import Draw, Loops, environment
 
 VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED = 64, 600, 3_000_000
 # Kinds of validation plants, with the ranges drawn from: low, high, and the power of `small`.
+# They do not occur in training, and their models are exact.
 KINDS: dict[str, dict[str, tuple[float, float, int]]] = {
     "calm": {},
     "noise": {"noise_variance": (0.1, 1.0, 2)},
@@ -112,10 +112,7 @@ def loss_of(errors: Tensor, applied: Tensor, small: Tensor, training: Training) 
 
 
 def validate(net: Net, training: Training) -> dict[str, float]:
-    """Return the geometric mean of |e|, of the authority, for each kind of plants and for all.
-
-    These plants do not occur in training. Their nominal models are exact.
-    """
+    """Return the geometric mean of |e|, of the authority, for each of `KINDS` and for all."""
     n, samples = VALIDATION_PLANTS, VALIDATION_SAMPLES
     plants, found = environment(n, samples), {}
     for i, (kind, drawn) in enumerate(KINDS.items()):
