@@ -116,13 +116,13 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             infos, nobody = self._restart(ended, {}), [self._flags(~ended) for _ in range(2)]
             return self._shown.present(), self._zeros + 0, *nobody, infos
         self._clock += 1
-        observations, rewards, terminations, truncations, infos = self._advance(a)
-        if self._clock >= self._first_end:
-            observations, rewards, truncations = self._end(observations, rewards, infos)
-        return observations, rewards, terminations, truncations, infos
+        returned = self._advance(a)
+        return returned if self._clock < self._first_end else self._end(*returned)
 
-    def _end(self, observations: Array, rewards: Array, infos: Infos) -> tuple[Array, ...]:
-        """Handle the end of episodes, also in the infos; return what else it changes."""
+    def _end(
+        self, observations: Array, rewards: Array, nobody: Array, _: Array, infos: Infos
+    ) -> tuple[Array, Array, Array, Array, Infos]:
+        """Handle the end of episodes in what a step returns."""
         ended = self._clock - self._starts >= self._limit
         flags = self._flags(ended)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
@@ -131,14 +131,14 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             infos |= {"final_info": final, "final_obs": self._final(ended, observations)}
             infos |= {"_final_info": flags, "_final_obs": flags}
             self._restart(ended, infos)
-            return self._shown.present(), rewards, self._flags(ended)
+            return self._shown.present(), rewards, nobody, self._flags(ended), infos
         if self._ended is not None:  # at the previous step
             rewards = self._where(self._flags(self._ended), 0, rewards)
             self._restart(self._ended, infos)
             observations = self._shown.present()
             ended = self._clock - self._starts >= self._limit
         self._ended = ended if ended.any() else None
-        return observations, rewards, self._flags(ended)
+        return observations, rewards, nobody, self._flags(ended), infos
 
     def _restart(self, mask: Mask, infos: Infos) -> Infos:
         """Begin an episode of some plants, and return the infos with theirs at k = 0."""

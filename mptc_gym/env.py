@@ -227,8 +227,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         self._ranges = Ranges(parameters)
         self._signals = Signals.of(parameters)
         self._has_more_info = parameters.is_disturbed or parameters.drifts
-        self._streams: Streams | None = None
-        self._root: np.random.Generator | None = None  # source of the streams
+        self._streams: list[Streams] = []  # of the one plant, from the first reset on
+        self._root: np.random.Generator | None = None  # their source
         # y_d, n, w and the measurement noise of the samples ahead, the next one last.
         self._ahead: list[tuple[float, ...]] = []
 
@@ -249,13 +249,13 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             Not used.
         """
         super().reset(seed=seed)
-        if self._streams is None or self._root is not self.np_random:
+        if self._root is not self.np_random:
             self._root = self.np_random
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
-            self._streams = Streams.of_seed(seeds.entropy, seeds.spawn_key)
+            self._streams = [Streams.of_seed(seeds.entropy, seeds.spawn_key)]
         parameters = self.parameters
-        drawn = self._ranges.draw([self._streams])
-        setpoint = self._signals.reset(ONE, [self._streams], drawn).item()
+        drawn = self._ranges.draw(self._streams)
+        setpoint = self._signals.reset(ONE, self._streams, drawn).item()
         numbers = plant_numbers(drawn, 0)
         self._plant = Plant(parameters, numbers)
 
@@ -298,7 +298,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             if not math.isfinite(a):
                 one_action(a)  # which refuses it
         if not self._ahead:
-            if self._streams is None:
+            if not self._streams:
                 raise ResetNeeded("call reset before step")
             self._ahead = self._signals.ahead()[::-1]
         setpoint, noise, load, transmitter_noise = self._ahead.pop()

@@ -57,24 +57,16 @@ class PlantNumbers(Generic[Value]):
     measurement_noise_variance: Value = _arg(
         0.0, checks.not_negative, "degC^2", "variance of the transmitter's white noise"
     )
-    disturbance_amplitude: Value = _arg(
-        0.0, checks.not_negative, "degC", "largest level of the load disturbance's steps"
-    )
+    disturbance_amplitude: Value = _arg(0.0, checks.not_negative, "degC", "largest load level")
     disturbance_interval: Value = _arg(
-        150.0, checks.at_least_1, "samples", "mean interval of these steps; below 10 it is 10"
+        150.0, checks.at_least_1, "samples", "mean interval of its steps; below 10 it is 10"
     )
     disturbance_walk_variance: Value = _arg(
         0.0, checks.not_negative, "degC^2", "variance that the load's walk gains a sample"
     )
-    gain_factor: Value = _arg(
-        1.0, checks.positive, "1", "steady-state gain, as a multiple of that of `a` and `b`"
-    )
-    time_constant_factor: Value = _arg(
-        1.0, checks.positive, "1", "dominant time constant, as a multiple of that of `a`"
-    )
-    gain_drift: Value = _arg(
-        1.0, checks.positive, "1", "factor by which the gain changes in `drift_samples`"
-    )
+    gain_factor: Value = _arg(1.0, checks.positive, "1", "multiple of the steady-state gain")
+    time_constant_factor: Value = _arg(1.0, checks.positive, "1", "that of the time constant")
+    gain_drift: Value = _arg(1.0, checks.positive, "1", "factor of the gain in `drift_samples`")
     time_constant_drift: Value = _arg(1.0, checks.positive, "1", "that of the time constant")
 
     def chosen(self, names: Sequence[str]) -> dict[str, Value]:
@@ -116,12 +108,8 @@ class Parameters(PlantNumbers[Number]):
     c: Sequence[float] = _arg(
         (1.0, -0.35740, -0.03392), checks.polynomial, "1", "C in (28), from z^0; begins with 1"
     )
-    drift_samples: int = _arg(
-        1200, checks.duration, "samples", "how long gain and time constant drift"
-    )
-    sampling_interval: float = _arg(  # Section 5
-        8.0, checks.positive, "s", "scale of the time axis, without effect on the dynamics"
-    )
+    drift_samples: int = _arg(1200, checks.duration, "samples", "duration of the drifts")
+    sampling_interval: float = _arg(8.0, checks.positive, "s", "scale of the time axis only")
     # The paper plots the set point without stating it.
     setpoint: str | float | Sequence[float] = _arg(
         "square",
@@ -141,22 +129,16 @@ class Parameters(PlantNumbers[Number]):
     )
     # The observation. By default it is the six inputs of the paper's network: y_d(k), y_d(k-1),
     # y_d(k-2), e(k), e(k-1), e(k-2).
-    setpoint_window: int = _arg(
-        3, checks.samples, "samples", "how many of the latest set points the observation holds"
-    )
+    setpoint_window: int = _arg(3, checks.samples, "samples", "latest set points observed")
     error_window: int = _arg(3, checks.samples, "samples", "the same of errors")
     output_window: int = _arg(0, checks.samples, "samples", "the same of measured outputs")
     action_window: int = _arg(0, checks.samples, "samples", "the same of past actions")
-    temperature_span: float = _arg(
-        50.0, checks.positive, "degC", "the transmitter's readings saturate at + and - this"
-    )
+    temperature_span: float = _arg(50.0, checks.positive, "degC", "readings saturate at +-this")
     reward: str = _arg("quadratic", checks.reward, "", '"quadratic" or "absolute"')
     error_scale: float = _arg(
         5.0, checks.positive, "degC", 'error that costs 1/2 ("quadratic") or 1 ("absolute")'
     )
-    move_weight: float = _arg(
-        0.0, checks.not_negative, "1", "cost of a change of the normalised action by 1"
-    )
+    move_weight: float = _arg(0.0, checks.not_negative, "1", "cost of moving the action by 1")
 
     def __post_init__(self) -> None:
         for name, argument in ARGUMENTS.items():

@@ -216,8 +216,7 @@ class PlantBatch:
             outputs[which] = 0.0
         for name, values in numbers.chosen(self._drawn).items():
             getattr(self._numbers, name)[which] = values
-        if {"dead_zone", "u_min", "u_max"}.intersection(self._drawn):
-            self._update_actuator()
+        self._update_actuator()
         if self._own_delays:
             first = self._longest - numbers.delay.astype(np.intp)
             rows = np.arange(len(self._taken))[:, np.newaxis] + first
@@ -284,11 +283,9 @@ class PlantBatch:
 
     def _update_actuator(self) -> None:
         """Update what the scaling of commands and (29) take from the plant numbers."""
-        dead_zone, u_min, u_max = (
-            getattr(self._numbers, name) for name in ("dead_zone", "u_min", "u_max")
-        )
-        half_range, edge = (u_max - u_min) / 2.0, least_effective(dead_zone, u_min, u_max)
-        numbers = map(np.array, (0.0, 1.0, half_range, u_min, edge))
+        u_min, u_max = self._numbers.u_min, self._numbers.u_max
+        edge = least_effective(self._numbers.dead_zone, u_min, u_max)
+        numbers = map(np.array, (0.0, 1.0, (u_max - u_min) / 2.0, u_min, edge))
         limits = (np.full(self._num_envs, limit) for limit in (u_min, u_max))
         self._actuator = *numbers, *limits
 

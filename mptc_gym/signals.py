@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, Parameters, PlantNumbe
 
 Values = NDArray[np.float64]  # one per plant; of plant numbers, () where all share one value
 Indices = NDArray[np.intp]  # of some plants, sorted
+AllStreams = Mapping[int, "Streams"] | Sequence["Streams"]  # those of each plant
 
 DRAWS = 32  # of plant numbers per episode: enough for all, and for future ones
 BLOCK = 600  # samples of a signal generated together
@@ -120,9 +121,7 @@ class Ranges:
 
 def plant_numbers(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
     """Return the numbers of plant i of many."""
-    own = {
-        name: (each[i] if each.ndim else each).item() for name, each in vars(numbers).items()
-    }
+    own = {name: a[i].item() if a.ndim else a.item() for name, a in vars(numbers).items()}
     return PlantNumbers(**own)
 
 
@@ -140,20 +139,18 @@ class Noise:
         # C times the standard deviation of xi: [lag, plant, 0].
         self._colour = np.zeros((len(c), num_envs, 1))
         self._past = np.zeros((num_envs, len(c) - 1))
-        self._generators: dict[int, np.random.Generator] = {}
         # One row per sample, so that what all plants need at once is contiguous.
         self._block = np.zeros((block, num_envs))
         self._row = 0  # the next row
 
-    def reset(
-        self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
-    ) -> None:
-        """Begin an episode of some plants, with the streams of each."""
+    def reset(self, which: Indices, streams: AllStreams, numbers: PlantNumbers[Values]) -> None:
+        """Begin an episode of some plants."""
         deviations = np.sqrt(getattr(numbers, f"{self._name}_variance"))
         self._colour[:, which] = deviations[..., np.newaxis] * self._c
         self._past[which] = 0.0
-        for i, own in zip(which.tolist(), streams, strict=True):
-            self._generators[i] = getattr(own, self._name).next_episode()
+        self._streams = streams
+        for i in which.tolist():
+            getattr(streams[i], self._name).next_episode()
         if len(which) == len(self._past):
             self._row = len(self._block)
         else:
@@ -183,7 +180,7 @@ class Noise:
             draws = np.empty((len(plants), order + samples))
             draws[:, :order] = self._past[plants]
             for i, row in zip(plants.tolist(), draws[:, order:], strict=True):
-                self._generators[i].standard_normal(out=row)
+                getattr(self._streams[i], self._name).generator.standard_normal(out=row)
             self._past[plants] = draws[:, samples:]
             # If there are no gaps, a slice is much faster.
             gaps = plants[-1] - plants[0] >= len(plants)
@@ -214,13 +211,13 @@ class Levels:
             self.values = [kind] if isinstance(kind, float) else list(kind)
             self.lengths = [1] * (len(self.values) - 1) + [FOREVER]
 
-    def next(self, place: int, generator: np.random.Generator | None) -> tuple[float, int]:
+    def next(self, place: int, stream: EpisodeStream) -> tuple[float, int]:
         """Return the level at a place, or draw one, degC; and for how many samples it holds."""
-        if generator is None:
+        if not self.random:
             place %= len(self.values)
             return self.values[place], self.lengths[place]
-        level = generator.uniform(-self.amplitude, self.amplitude)
-        return level, int(generator.integers(self.shortest, self.longest, endpoint=True))
+        level = stream.generator.uniform(-self.amplitude, self.amplitude)
+        return level, int(stream.generator.integers(self.shortest, self.longest, endpoint=True))
 
 
 class _Held(ABC):
@@ -259,14 +256,14 @@ class SetPoint(_Held):
         self._levels = Levels(parameters)
         self._values = np.array(self._levels.values)
         self._lengths = np.array(self._levels.lengths)
-        self._generators: dict[int, np.random.Generator] = {}
         self._places = np.zeros(num_envs, np.intp)  # of the next level
 
-    def reset(self, which: Indices, streams: Sequence[Streams]) -> Values:
-        """Begin an episode of some plants, with the streams of each; return y_d(0)."""
+    def reset(self, which: Indices, streams: AllStreams) -> Values:
+        """Begin an episode of some plants, and return y_d(0)."""
+        self._streams = streams
         if self._levels.random:
-            for i, own in zip(which.tolist(), streams, strict=True):
-                self._generators[i] = own.setpoint.next_episode()
+            for i in which.tolist():
+                streams[i].setpoint.next_episode()
         self._places[which] = 0
         self._changes[which] = self._next_change = self._clock
         self._catch_up()
@@ -279,7 +276,7 @@ class SetPoint(_Held):
         end = self._next_change - self._clock - 1  # of the level, counted from the next sample
         while end < BLOCK:
             values += [level] * (end - len(values))
-            level, length = self._levels.next(place, self._generators.get(0))
+            level, length = self._levels.next(place, self._streams[0].setpoint)
             place, end = place + 1, end + length
         self._now[0], self._places[0] = level, place
         self._clock += BLOCK
@@ -290,7 +287,7 @@ class SetPoint(_Held):
         which = np.flatnonzero(due)
         if self._levels.random:
             for i in which.tolist():
-                self._now[i], length = self._levels.next(0, self._generators[i])
+                self._now[i], length = self._levels.next(0, self._streams[i].setpoint)
                 self._changes[i] += length
         else:
             places = self._places[which]
@@ -310,7 +307,6 @@ class Disturbance(_Held):
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs)
-        self._generators: dict[int, np.random.Generator] = {}
         # Amplitude, probability of a jump, and half width of the walk's steps.
         self._shapes = np.zeros((num_envs, 3))
         self._last = np.zeros((num_envs, 2))
@@ -319,12 +315,9 @@ class Disturbance(_Held):
         self._ends = np.arange(1, num_envs + 1) * LEVELS_AT_A_TIME
         self._places = self._ends.copy()  # of the next level, in the flattened levels
 
-    def reset(
-        self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
-    ) -> None:
-        """Begin an episode of some plants, with the streams of each."""
-        for i, own in zip(which.tolist(), streams, strict=True):
-            self._generators[i] = own.plant.generator
+    def reset(self, which: Indices, streams: AllStreams, numbers: PlantNumbers[Values]) -> None:
+        """Begin an episode of some plants, whose numbers have been drawn before."""
+        self._streams = streams
         shape = self._shapes[which].T
         shape[0] = numbers.disturbance_amplitude
         shape[1] = LOAD_INTERVAL / numbers.disturbance_interval
@@ -357,7 +350,7 @@ class Disturbance(_Held):
             plants = which[start : start + PLANTS_AT_A_TIME]
             draws = np.empty((len(plants), LEVELS_AT_A_TIME, 3))
             for i, row in zip(plants.tolist(), draws, strict=True):
-                self._generators[i].random(out=row)
+                self._streams[i].plant.generator.random(out=row)
             self._levels[plants] = self._sum(plants, draws)
         self._places[which] = self._ends[which] - LEVELS_AT_A_TIME
 
@@ -396,7 +389,7 @@ class Signals(NamedTuple):
         )
 
     def reset(
-        self, which: Indices, streams: Sequence[Streams], numbers: PlantNumbers[Values]
+        self, which: Indices, streams: AllStreams, numbers: PlantNumbers[Values]
     ) -> Values:
         """Begin an episode of some plants, and return y_d(0); the other signals start at 0."""
         for signal in (self.noise, self.disturbance, self.measurement_noise):

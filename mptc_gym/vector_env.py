@@ -196,10 +196,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
         which, parameters = np.flatnonzero(mask), self.parameters
-        streams = [self._streams[i] for i in which.tolist()]
-        numbers = self._ranges.draw(streams)
+        numbers = self._ranges.draw([self._streams[i] for i in which.tolist()])
         self._plants.reset(which, numbers)
-        setpoint = self._signals.reset(which, streams, numbers)
+        setpoint = self._signals.reset(which, self._streams, numbers)
         rest_action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         self._actions[which] = rest_action
         self._shown.reset(which, setpoint, rest_action)
@@ -283,7 +282,7 @@ class _Window:
             self._row[STEPS_PER_SHIFT:] = self._row[:-STEPS_PER_SHIFT]
             self._place = STEPS_PER_SHIFT
         self._place -= 1
-        window = self._view()
+        window = self._row[self._place : self._place + self._elements].reshape(self._shape)
         for i, newest in self._newest:
             window[newest] = samples[i] if i < 3 else samples[i].clip(-1.0, 1.0)
         return window.copy()
