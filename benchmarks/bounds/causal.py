@@ -3,7 +3,7 @@
 With `setpoint="random"` the set point has a law: levels are independent and uniform in
 [-A, A], and each is held for a number of samples that is uniform from S to L. A controller
 without preview learns of a change when it happens. So u_a(j) depends only on the set points up
-to j, and for every pi(j) with conditional mean zero, E[pi(j) | set points up to j] = 0,
+to j, and for every pi(j) with E[pi(j) | set points up to j] = 0,
 
     E[sum_j pi(j) u_a(j)] = 0.
 
@@ -11,15 +11,14 @@ Hence the mean error of such a controller is the mean of the sum of |e(k)| and p
 which is at least the mean, over the set points, of its minimum over all flows, even those that
 know the future (D. B. Brown, J. E. Smith and P. Sun, "Information relaxations and duality in
 stochastic dynamic programs", Operations Research 58, 2010, 785-801). Every pi gives a bound; a
-good pi takes away what the linear program would gain from knowing the future. Here it is
+poor one makes it loose, never wrong. Here it is
 
     pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
 
-G[k, j] is the effect of u_a(j) on y(k), and g(k) a guess of the slope of E|e(k)|. After a
-change it is the sign of the change, until the output can have followed; later in a hold it is a
-number between -1 and 1, odd in the level, that weighs staying against moving ahead to where the
-next level is expected. The guess is chosen so that its conditional means have a closed form.
-A poor guess makes the bound loose, never wrong.
+G[k, j] is the effect of u_a(j) on y(k), and g(k) a guess of the slope of E|e(k)|, whose
+conditional means have a closed form. After a change it is the sign of the change, until the
+output can have followed; later in a hold it is a number between -1 and 1, odd in the level,
+that weighs staying against moving ahead to where the next level is expected.
 """
 
 from __future__ import annotations

@@ -60,11 +60,12 @@ def work(options: Options) -> str:
     scenarios = [there[name] for name in known("--scenarios", names, there)]
     if not scenarios:
         raise UsageError("--scenarios: none to run")
-    place = "results/compare-presets" if options.presets else "results/compare"
-    whole = Options(presets=options.presets, controllers=ControllerOptions(fan_out=fan_out))
-    if options != whole:
-        place = "results/compare-other"
-    folder, made = out_folder(options.out or Path(place)), origin()
+    place = "compare-presets" if options.presets else "compare"
+    if options != Options(
+        presets=options.presets, controllers=ControllerOptions(fan_out=fan_out)
+    ):
+        place = "compare-other"
+    folder, made = out_folder(options.out or Path("results", place)), origin()
     runs = options.runs
     bounds = {f"bounds of {each.name}": partial(scale_of, each, runs) for each in scenarios}
     cells = {
@@ -72,16 +73,11 @@ def work(options: Options) -> str:
         for (name, controller), each in itertools.product(controllers.items(), scenarios)
     }
     tasks: dict[str, Any] = {**bounds, **cells}
-
-    def length(name: str) -> tuple[bool, bool, int]:
-        case = tasks[name].args[0]
-        return name in bounds, bool(case.parameters.ranges), case.samples
-
+    # Short tasks last, so that no core waits long at the end.
+    longest_first = sorted(tasks, key=lambda name: -tasks[name].args[0].samples)
     found: dict[str, Any] = {}
     try:
-        # Short tasks last, so that no core waits long at the end.
-        longest_first = {name: tasks[name] for name in sorted(tasks, key=length, reverse=True)}
-        found.update(fan_out.stream(longest_first, "compare"))
+        found.update(fan_out.stream({name: tasks[name] for name in longest_first}, "compare"))
     finally:
         if missing := len(tasks) - len(found):
             made["missing"] = f"{missing} of {len(tasks)} tasks are missing"

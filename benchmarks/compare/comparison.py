@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from benchmarks.controllers.roster import ROSTER, Controller, label
 from benchmarks.lib.report import Section, write_report
@@ -21,7 +20,6 @@ from benchmarks.loop.rollout import CHANGE, START, Trajectory, is_random, measur
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES, SEED
 
-Array = NDArray[np.float64]
 BOOTSTRAP = 0  # seed of the bootstraps
 SCORE = "Mean over the cases, 95 % interval; travel of the valve in the median run."
 BOUND = (
@@ -329,10 +327,9 @@ def difference_table(estimates: pd.DataFrame) -> pd.DataFrame:
 
 
 def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
-    table = rows.assign(cell=cells).pivot_table(
-        index="agent", columns="scenario", values="cell", aggfunc="first", sort=False
-    )
-    table = table.loc[[*agents]].fillna("").rename(index=label)
+    """Return a table of cells, a row for each of the agents and a column for each case."""
+    table = rows.assign(cell=cells).pivot(index="agent", columns="scenario", values="cell")
+    table = table.loc[[*agents], rows["scenario"].unique()].fillna("").rename(index=label)
     return table.rename_axis(index="controller", columns=None).reset_index()
 
 
