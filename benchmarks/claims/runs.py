@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from math import inf, isfinite
 from typing import Any
 
 import numpy as np
@@ -51,11 +51,7 @@ class Batch:
         )
 
     def run(
-        self,
-        agent: Agent,
-        samples: int,
-        before: Callable[[int], object] | None = None,
-        **arguments: Any,
+        self, agent: Agent, samples: int, before: Any = None, **arguments: Any
     ) -> Trajectory:
         """Run a controller on plants with these arguments; for `before` see `rollout`."""
         plants = make_plants(self.runs, samples, **arguments)
@@ -72,12 +68,7 @@ class Batch:
 
 
 def judge(
-    quantity: str,
-    found: Estimate | ArrayLike,
-    unit: str = "",
-    *,
-    at_least: float = -math.inf,
-    at_most: float = math.inf,
+    quantity: str, found: Any, unit: str = "", *, at_least: float = -inf, at_most: float = inf
 ) -> Finding:
     """Judge a number: an estimate, the median of one value per run, or an exact value.
 
@@ -85,11 +76,10 @@ def judge(
     bound, and not shown if no part of the interval does.
     """
     if not isinstance(found, Estimate):
-        values = np.asarray(found, dtype=np.float64)
-        one = float(values.flat[0])
-        found = quantile(values, 0.5) if values.ndim else Estimate(one, one, one, 1)
+        one = float(np.ravel(found)[0])
+        found = quantile(found, 0.5) if np.ndim(found) else Estimate(one, one, one, 1)
     bounds = {"at least": at_least, "at most": at_most}
-    asked = [f"{name} {bound:g}" for name, bound in bounds.items() if math.isfinite(bound)]
+    asked = [f"{name} {bound:g}" for name, bound in bounds.items() if isfinite(bound)]
     shown = "undecided" if asked else ""
     if asked and at_least <= found.low and found.high <= at_most:
         shown = "yes"
@@ -101,7 +91,7 @@ def judge(
 
 def judge_share(quantity: str, found: NDArray[np.bool_], *, often: bool = False) -> Finding:
     """Judge the share of runs in which `found` is true; `often` requires `OFTEN`."""
-    at_least = 100 * OFTEN if often else -math.inf
+    at_least = 100 * OFTEN if often else -inf
     return judge(quantity, share(found).scaled(100), "% of runs", at_least=at_least)
 
 

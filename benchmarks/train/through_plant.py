@@ -71,10 +71,10 @@ class Net(nn.Module):
         super().__init__()
 
         def layers(hidden: int, outputs: int) -> nn.Sequential:
+            first, second = nn.Linear(INPUTS, hidden), nn.Linear(hidden, hidden)
             return nn.Sequential(
-                nn.Linear(INPUTS, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(),
-                nn.Linear(hidden, outputs),
-            )  # fmt: skip
+                first, nn.SiLU(), second, nn.SiLU(), nn.Linear(hidden, outputs)
+            )
 
         self.choosing = layers(training.choosing, OUTPUTS)
         self.adding = layers(training.adding, 1)
@@ -91,15 +91,14 @@ class Net(nn.Module):
 
     def export(self, **provenance: Any) -> LawNetwork:
         """Return the networks in NumPy."""
-        parts = [
-            [
-                (layer.weight.detach().numpy(), layer.bias.detach().numpy())
-                for layer in part
-                if isinstance(layer, nn.Linear)
+
+        def arrays(part: Any) -> Any:
+            layers = part[::2]  # without the activations
+            return [
+                (each.weight.detach().numpy(), each.bias.detach().numpy()) for each in layers
             ]
-            for part in (self.choosing, self.adding)
-        ]
-        return LawNetwork(parts[0], parts[1], provenance)
+
+        return LawNetwork(arrays(self.choosing), arrays(self.adding), provenance)
 
 
 def loss_of(errors: Tensor, applied: Tensor, small: Tensor, training: Training) -> Tensor:
