@@ -162,7 +162,7 @@ def scale_of(case: Arguments, runs: int) -> dict[str, Any]:
 
     found = {**run_agent(ROSTER["nothing"], case, case, runs), "limit": math.nan}
     with suppress(ValueError):
-        least = least_possible(samples=SAMPLES, kind="reference", folder=None, **case)
+        least = least_possible(samples=SAMPLES, kind="reference", **case)
         found["limit"] = least.value
     return found
 

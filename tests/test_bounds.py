@@ -9,14 +9,12 @@ import pytest
 from scipy import linalg, optimize, signal
 
 from benchmarks.bounds import __main__ as command
-from benchmarks.bounds import least
 from benchmarks.bounds.__main__ import main
 from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.least import least_possible
 from benchmarks.bounds.linear_program import equations, plan, reference, response
 from benchmarks.bounds.unknown import noise_variance, unknown
 from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.lib import storage
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS
@@ -136,7 +134,7 @@ class TestProgramme:
             "time_constant_drift": 1.5, "drift_samples": 300, "time_constant_factor": 0.8,
         }  # fmt: skip
         case = {"setpoint": setpoint.tolist(), **arguments}
-        least = least_possible(samples=300, kind="preview", folder=None, **case)
+        least = least_possible(samples=300, kind="preview", **case)
         best = best_plan([*setpoint, 6.0], **arguments)
         assert best.flow.min() == pytest.approx(-12.0)
         actions = iter(action_from_command(best.flow, -12.0, 6.0))
@@ -232,7 +230,7 @@ class TestCausal:
     def test_no_controller_beats_it_and_it_is_tighter_than_that_with_preview(self):
         arguments = {"setpoint": "random", "dead_zone": 0.0}
         kinds = {
-            kind: least_possible(samples=400, kind=kind, episodes=4, folder=None, **arguments)
+            kind: least_possible(samples=400, kind=kind, episodes=4, **arguments)
             for kind in ("preview", "causal")
         }
         found = errors(MPC, 4, 400, **arguments)
@@ -243,24 +241,13 @@ class TestCausal:
 
 class TestLeastPossible:
     def test_score(self):
-        least = least_possible(samples=600, folder=None, setpoint=5.0)
+        least = least_possible(samples=600, setpoint=5.0)
         idle = least.idle.value
         scores = least.score([idle, least.value, (idle + least.value) / 2])
         assert scores == pytest.approx([0.0, 1.0, 0.5])
-        hopeless = least_possible(samples=10, folder=None, setpoint=5.0)
+        hopeless = least_possible(samples=10, setpoint=5.0)
         with pytest.raises(ValueError, match="nothing to gain"):
             hopeless.score(1.0)
-
-    def test_it_is_kept_by_all_that_shapes_it(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(storage, "commit", lambda: 40 * "a")  # a clean checkout
-        ask = {"samples": 60, "kind": "preview", "folder": tmp_path, "setpoint": 5.0}
-        first = least_possible(**ask)
-        with monkeypatch.context() as patch:
-            patch.setattr(least, "_least", None)  # nothing is computed now
-            assert least_possible(**ask) == first
-        for other in ({"samples": 61}, {"delay": 3}, {"kind": "reference"}, {"seed": 1}):
-            least_possible(**{**ask, **other})
-        assert len(list(tmp_path.rglob("*.pkl"))) == 5
 
     def test_bad_arguments(self):
         for message, arguments in {
@@ -272,14 +259,14 @@ class TestLeastPossible:
             "must be held until": {"kind": "reference", "setpoint_period": 100},
         }.items():
             with pytest.raises(ValueError, match=message):
-                least_possible(folder=None, **{"samples": 600, **arguments})
+                least_possible(**{"samples": 600, **arguments})
 
 
 class TestPredictiveController:
     @pytest.mark.parametrize("plant", [{}, {"gain_factor": 1.3, "time_constant_factor": 0.8}])
     def test_it_reaches_the_limit_without_noise(self, plant):
         case = {"samples": 600, "setpoint": 5.0, **plant}
-        limit = least_possible(kind="reference", folder=None, **case).value
+        limit = least_possible(kind="reference", **case).value
         (found,) = mean_error(run_mpc(1, **case))
         assert limit * (1 - 1e-4) <= found <= 1.02 * limit
 

@@ -110,9 +110,7 @@ class TestBounds:
         drawn = bool(plant.ranges) or plant.setpoint == "random"
         assert len(set(kept.tolist())) == (120 if drawn else 1)
         i = 118 if drawn else 0
-        least = least_possible(
-            samples=1200, episodes=1, seed=SEED + i, folder=None, **CASES[name]
-        )
+        least = least_possible(samples=1200, episodes=1, seed=SEED + i, **CASES[name])
         assert kept[i] == pytest.approx(least.value, abs=2e-6)
 
     def test_they_say_how_they_were_made(self):

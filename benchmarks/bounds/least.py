@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
-from functools import partial
-from pathlib import Path
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.linear_program import TAIL, plan, reference
 from benchmarks.bounds.unknown import unknown
 from benchmarks.lib.statistics import Estimate, student
-from benchmarks.lib.storage import ROOT, Kept
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import (
     IdleValve,
@@ -38,7 +36,6 @@ from mptc_gym.signals import plant_numbers
 Array = NDArray[np.float64]
 
 KINDS = "preview", "causal", "reference"
-CACHE = ROOT / "results" / "bounds"
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,6 @@ def least_possible(
     kind: str | None = None,
     episodes: int = EPISODES,
     seed: int = SEED,
-    folder: Path | None = CACHE,
     **arguments: Any,
 ) -> LeastPossible:
     """Return the least possible mean |e(k)| over k = 1 to `samples`.
@@ -94,8 +90,6 @@ def least_possible(
     seed
         Episode i is the one that the environment draws with seed `seed + i`. The defaults are
         the episodes of `mptc_gym.evaluate`.
-    folder
-        Folder in which the result is kept; None: it is computed anew.
     **arguments
         Arguments of the environment.
     """
@@ -104,16 +98,7 @@ def least_possible(
         if not isinstance(count, int) or count < 1:
             raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
 
-    def of(kind: str) -> LeastPossible:
-        task = partial(_least_possible, parameters, samples, kind, episodes, seed)
-        if folder is None:
-            return task()
-        found: LeastPossible | None = Kept(folder).load(task)
-        if found is None:
-            found = task()
-            Kept(folder).save(task, found)
-        return found
-
+    of = partial(_least_possible, parameters, samples, episodes, seed)
     drawn = parameters.setpoint == "random"
     kinds = KINDS if drawn else ("preview", "reference")
     if kind in kinds or (drawn and kind is None):
@@ -129,8 +114,9 @@ def least_possible(
     return preview
 
 
+@cache  # as a report asks for several kinds of a case
 def _least_possible(
-    parameters: Parameters, samples: int, kind: str, episodes: int, seed: int
+    parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
 ) -> LeastPossible:
     # The episodes that the environment draws, with the valve left alone.
     runs = episodes if is_random(parameters) else 1

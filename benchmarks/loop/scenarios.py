@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from benchmarks.lib.command import Parameter, Repeated, blame, options
+from benchmarks.lib.command import Parameter, Repeated, options
 from benchmarks.lib.storage import UsageError
 from benchmarks.loop.linear import nominal
 from mptc_gym import PRESETS, Parameters
@@ -115,8 +115,11 @@ class PlantOptions:
         """Return those that differ from the defaults; `UsageError` if one is invalid."""
         arguments: dict[str, Any] = dict(PRESETS[self.preset]) if self.preset else {}
         if self.plant:
-            with blame("--plant"):
-                arguments |= _read(self.plant)
+            try:
+                arguments |= dict(**json.loads(self.plant.read_text(encoding="utf-8")))
+            except (OSError, TypeError, ValueError) as error:  # not there, no object, no JSON
+                like = 'a JSON file of arguments, such as {"delay": 20}'
+                raise UsageError(f"--plant: {self.plant} must be {like}: {error}") from error
         for text in self.set:
             name, equals, value = text.partition("=")
             if not (name and equals):
@@ -135,16 +138,6 @@ class PlantOptions:
         except (TypeError, ValueError) as error:  # the first: of an unknown argument
             raise UsageError(f"{', '.join(given)}: {error}") from error
         return arguments
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """Return the arguments in a JSON file such as `plant.json`."""
-    try:
-        return dict(**json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, TypeError, ValueError) as error:  # not there, no object, or not JSON
-        raise ValueError(
-            f'{path} must be a JSON file of arguments, such as {{"delay": 20}}: {error}'
-        ) from error
 
 
 # Ranges of the plants drawn for sweeps and for training. With a gain factor below 0.74, 5 degC
