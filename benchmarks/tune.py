@@ -22,7 +22,7 @@ from benchmarks.lib.command import (
     progress_bar,
 )
 from benchmarks.lib.storage import Kept, origin, out_folder, write_csv
-from benchmarks.loop.rollout import mean_error, settled, split
+from benchmarks.loop.rollout import mean_error, settled
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -136,8 +136,7 @@ def score(name: str, runs: int, first_run: int, gains: Mapping[Any, float]) -> d
     medians = {}
     for i, (case, (samples, first, arguments)) in enumerate(CASES.items()):
         trajectory = controller.run(arguments, samples, runs, first_run + i * 100_000)
-        _, counted = split(trajectory, first)
-        medians[case] = float(np.median(mean_error(counted)))
+        medians[case] = float(np.median(mean_error(trajectory[first:])))
         if case == "constant":
             failed = 1.0 - float(settled(trajectory).mean())
     objective = float(np.mean(list(medians.values()))) + PENALTY * failed

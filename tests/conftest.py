@@ -104,10 +104,9 @@ def trajectory(
     applied: ArrayLike | None = None,
 ) -> Trajectory:
     """Return one run, of columns, as if each step led to its own sample."""
-    still = np.zeros(len(setpoint))
-    command = still if command is None else command
-    columns = setpoint, output, command, command if applied is None else applied, still
-    columns = (*columns, np.subtract(setpoint, output), setpoint)
+    command = np.zeros(len(setpoint)) if command is None else command
+    applied = command if applied is None else applied
+    columns = setpoint, output, command, applied, np.subtract(setpoint, output), setpoint
     return Trajectory(*(np.array(column, dtype=float)[:, np.newaxis] for column in columns))
 
 

@@ -17,7 +17,7 @@ from agents import PIController
 from agents.pi import SEARCHED_GAINS
 from benchmarks.claims.runs import OFTEN, Array, Batch, Finding, judge, judge_share, judge_time
 from benchmarks.loop import linear
-from benchmarks.loop.rollout import mean_error, settled, split
+from benchmarks.loop.rollout import mean_error, settled
 from benchmarks.loop.scenarios import SETPOINTS as CASES
 from mptc_gym import PRESETS, Parameters
 
@@ -304,7 +304,7 @@ def reliability(batch: Batch) -> Findings:
                     networks.weights = weights
 
             runs = batch.run(networks, 2 * LEARNING, damage, **CONSTANT)
-            before, after = split(runs, LEARNING)
+            before, after = runs[:LEARNING], runs[LEARNING:]
             error[nodes] = mean_error(after)
             case = f"{nodes} nodes, one stuck at {stuck_at}, {GAINS[slower]}"
             if stuck_at == 0:

@@ -62,12 +62,14 @@ class Trajectory:
     """u(k), t/h."""
     applied: Array
     """u_a(k), t/h."""
-    noise: Array
-    """n(k), degC."""
     next_error: Array
     """e(k + 1), degC, which the reward of sample k is for. Mean errors are over k = 1 to N."""
     next_setpoint: Array
     """y_d(k + 1), degC."""
+
+    def __getitem__(self, samples: slice) -> Trajectory:
+        """Return the signals of some samples."""
+        return Trajectory(*(signal[samples] for signal in vars(self).values()))
 
 
 def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vector.VectorEnv:
@@ -121,7 +123,7 @@ def rollout(
     signals = []
     for at, after, _ in run_batch(plants, act, samples, seeds):
         # A step reports the command and the applied flow of the sample that it starts at.
-        here = at["setpoint"], at["output"], after["command"], after["applied"], at["noise"]
+        here = at["setpoint"], at["output"], after["command"], after["applied"]
         signals.append(np.array([*here, after["error"], after["setpoint"]]))
     return Trajectory(*np.stack(signals, axis=1))
 
@@ -185,8 +187,7 @@ def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]
         if change == 0.0:  # a run that begins at set point 0
             continue
         overshoot = max(overshoot, float(np.max(-error / change)))
-        outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(change))
-        last = outside[-1] if len(outside) else -1
+        last = max(np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(change)), default=-1)
         settling = max(settling, math.inf if last == stop - start - 1 else float(last + 1))
     return itae, overshoot, settling
 
@@ -207,9 +208,3 @@ def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
     setpoint, output = trajectory.setpoint[-LAST:], trajectory.output[-LAST:]
     within = np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint)
     return np.asarray(within.all(axis=0))
-
-
-def split(trajectory: Trajectory, sample: int) -> tuple[Trajectory, Trajectory]:
-    """Return the trajectory before a sample, and the rest from that sample on."""
-    arrays = vars(trajectory).values()
-    return Trajectory(*(a[:sample] for a in arrays)), Trajectory(*(a[sample:] for a in arrays))
