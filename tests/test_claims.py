@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.claims import claims
-from benchmarks.claims.__main__ import main, sections, table
+from benchmarks.claims.__main__ import main
 from benchmarks.claims.claims import CLAIMS, Claim, converged_at, examined
-from benchmarks.claims.runs import Batch, judge, verdict
+from benchmarks.claims.runs import Batch, judge, sections, table, verdict
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.rollout import settled
 from tests.conftest import ROOT, trajectory
@@ -49,8 +49,8 @@ class TestVerdicts:
             good.append(judge("a number", Estimate(value, low, high, 1000)))
         good.append(judge("another", 0.5, "t/h"))
         good.append(judge("the last", 0.5, at_most=0.4))
-        numbers = table({"good": good, "none": []})
-        overview, of_good, of_none = sections(numbers)
+        numbers = table(CLAIMS, {"good": good, "none": []})
+        overview, of_good, of_none = sections(CLAIMS, numbers)
         assert overview.table.to_numpy().tolist() == [
             ["It is good", "holds in part"], ["It cannot be", "cannot be tested from the text"],
         ]  # fmt: skip

@@ -1,22 +1,29 @@
-"""Run batches of the NN and the PI controller, and judge the numbers found by them."""
+"""Run batches of the NN and the PI controller, and judge and report what is found."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf, isfinite, isinf
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from agents import DirectNNController, PIController
+from benchmarks.lib.report import Section
 from benchmarks.lib.statistics import Estimate, quantile, share
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 
 Array = NDArray[np.floating]
 Finding = dict[str, Any]  # a row of the table of numbers
 
+NOTE = (
+    "Every number rests on independent draws of initial weights and noise. What a claim asks "
+    "of a number counts as shown if the whole 95 % interval keeps it. A claim holds if all "
+    "that it asks is shown, and in part if some is."
+)
 OFTEN = 0.9  # "works", "converges": in at least this share of the draws
 
 
@@ -109,3 +116,45 @@ def verdict(findings: Iterable[Finding]) -> str:
     if all(shown):
         return "holds"
     return "holds in part" if any(shown) else "does not hold"
+
+
+def table(claims: Mapping[str, Any], found: Mapping[str, Sequence[Finding]]) -> pd.DataFrame:
+    """Return one row for each finding about a claim, and one for a claim without findings."""
+    rows = []
+    for name, findings in found.items():
+        claim, judged = claims[name], verdict(findings)
+        about = {"claim": name, "section": claim.section, "statement": claim.statement}
+        rows += [{**about, "verdict": judged, **each} for each in findings or [{"runs": None}]]
+    # Nullable integers, as a claim without findings has no runs.
+    return pd.DataFrame(rows).astype({"runs": "Int64"})
+
+
+def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
+    """Return the sections of the report: the verdicts, then the numbers of each claim."""
+    verdicts = numbers.drop_duplicates("claim")[["statement", "verdict"]]
+    found = [Section("", [NOTE], verdicts.rename(columns={"statement": "claim"}))]
+    for name, rows in numbers.groupby("claim", sort=False):
+        claim, measured = claims[str(name)], rows.dropna(subset="runs")
+        title = f"{claim.statement}: {rows['verdict'].iloc[0]}"
+        shown = _formatted(measured) if len(measured) else None
+        found.append(Section(title, [f"{claim.section}. {claim.method}"], shown))
+    return found
+
+
+def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
+    value, low, high = (rows[name].map(_three_digits) for name in ("value", "low", "high"))
+    columns = {
+        "measured": rows["quantity"] + rows["unit"].map(lambda unit: unit and f" ({unit})"),
+        "value": value,
+        "95 % interval": (low + " to " + high).where(rows["runs"] != 1, "exact"),
+        "asked": rows["criterion"],
+        "shown": rows["shown"].replace("no", "**no**"),
+    }
+    return pd.DataFrame(columns)
+
+
+def _three_digits(value: float) -> str:
+    if isinf(value):
+        return "never" if value > 0 else "?"
+    digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 3
+    return f"{value:,.{digits}f}"
