@@ -67,8 +67,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         # Each plant's k is the clock minus its start.
         self._clock = 0
         self._starts = np.zeros(num_envs, np.int64)
-        self._first_end = 0
-        self._was_reset = False
+        self._first_end = 0  # until the first reset
         self._ended: Mask | None = None  # plants still to be reset, if any
 
     def reset(
@@ -90,10 +89,9 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         if options is not None and not isinstance(options, Mapping):
             reject("options", options, "a dict or None")
         mask = self._checked_mask(options or {})
-        if not self._was_reset and not mask.all():
+        if not self._first_end and not mask.all():
             raise ResetNeeded("reset all environments before some of them")
         self._prepare(mask, seed, options or {})
-        self._was_reset = True
         infos = self._restart(mask, {})
         return self._shown.present(), infos
 
@@ -105,7 +103,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         Actions of another shape or not finite are a ValueError; nothing is then changed. Plants
         never reset or, with autoreset disabled, ended plants raise a `ResetNeeded`.
         """
-        if not self._was_reset:
+        if not self._first_end:
             raise ResetNeeded("call reset before step")
         ended = self._ended
         if ended is not None and self.autoreset_mode is AutoresetMode.DISABLED:

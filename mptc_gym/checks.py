@@ -166,11 +166,10 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     return _number_that(lambda value: True, allowed)(name, value)
 
 
-def or_range(check: Check, name: str, value: Any) -> Number:
+def or_range(check: Callable[[str, Any], float], name: str, value: Any) -> Number:
     """Return what `check` takes, or a range [low, high] of it."""
     if not isinstance(value, list | tuple):
-        single: float = check(name, value)
-        return single
+        return check(name, value)
     ends = [check(name, each) for each in value]
     if len(ends) != 2 or ends[0] > ends[1]:
         reject(name, value, "one number, or a range [low, high] with low <= high")

@@ -160,19 +160,12 @@ def frame(record: Record) -> NDArray[np.uint8]:
 def show(record: Record, fps: float) -> None:
     """Show a picture in the window, opened if necessary, at most `fps` times a second."""
     pygame.display.init()
-    screen = pygame.display.get_surface()
-    if screen is None or screen.get_size() != SIZE:
-        screen = pygame.display.set_mode(SIZE)
-        pygame.display.set_caption("MiddlePoint-v0")
+    screen = pygame.display.get_surface() or pygame.display.set_mode(SIZE)
+    pygame.display.set_caption("MiddlePoint-v0")
     screen.blit(draw(record), (0, 0))
     pygame.event.pump()
     clock.tick(fps)
     pygame.display.flip()
-
-
-def close() -> None:
-    """Close the window."""
-    pygame.display.quit()
 
 
 def ticks(low: float, high: float) -> list[float]:
@@ -184,6 +177,4 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def _short(value: float) -> str:
-    if not abs(value) < 1e5:
-        return f"{value:.3g}"
-    return f"{round(value, 2) + 0.0:.2f}"  # never -0.00
+    return f"{round(value, 2) + 0.0:.2f}" if abs(value) < 1e5 else f"{value:.3g}"  # never -0.00

@@ -364,9 +364,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     def close(self) -> None:
         """Close the window, if there is one."""
         if self.render_mode == "human" and self._record is not None:
-            from mptc_gym import drawing
+            import pygame
 
-            drawing.close()
+            pygame.display.quit()
         self._record = None
 
     def _add_more_info(self, info: dict[str, float], load: float) -> None:

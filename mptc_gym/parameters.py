@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, Final, Generic, NamedTuple, TypeVar
@@ -17,6 +17,7 @@ from mptc_gym import checks
 from mptc_gym.checks import Number, reject
 
 Value = TypeVar("Value")  # of a plant number: float, an array for many plants, or `Number`
+_LOAD: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 
 
 class Argument(NamedTuple):
@@ -26,11 +27,6 @@ class Argument(NamedTuple):
     check: checks.Check  # returns a valid value in plain Python types, or raises a ValueError
     unit: str
     meaning: str
-
-    @property
-    def is_integer(self) -> bool:
-        """Whether an integer is drawn from a range, both ends included."""
-        return isinstance(self.default, int)
 
 
 def _arg(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
@@ -69,7 +65,7 @@ class PlantNumbers(Generic[Value]):
     gain_drift: Value = _arg(1.0, checks.positive, "1", "factor of the gain in `drift_samples`")
     time_constant_drift: Value = _arg(1.0, checks.positive, "1", "that of the time constant")
 
-    def chosen(self, names: Sequence[str]) -> dict[str, Value]:
+    def chosen(self, names: Iterable[str]) -> dict[str, Value]:
         """Return some of the numbers by name."""
         return {name: getattr(self, name) for name in names}
 
@@ -90,11 +86,7 @@ class Parameters(PlantNumbers[Number]):
 
     <arguments>
 
-    Raises
-    ------
-    ValueError
-        If an argument is out of range; the message names the argument, the value and what is
-        allowed.
+    The ValueError for an argument out of range names it, its value and what is allowed.
     """
 
     # The plant, (28): A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k). With an unstable A, y
@@ -150,11 +142,8 @@ class Parameters(PlantNumbers[Number]):
         if self.changes_time_constant:
             self._check_time_constant()
         if self.is_disturbed and not abs(slowest_pole(self.a)) < 1.0:
-            reject(
-                "disturbance_amplitude, disturbance_walk_variance",
-                (self.disturbance_amplitude, self.disturbance_walk_variance),
-                "0 for this a, which is not stable and has no steady state",
-            )
+            allowed = "0 for this a, which is not stable and has no steady state"
+            reject(", ".join(_LOAD), tuple(self.chosen(_LOAD).values()), allowed)
         if not any(self.windows):
             names = "setpoint_window, error_window, output_window, action_window"
             reject(names, self.windows, "such that the observation has at least one element")
@@ -204,14 +193,15 @@ class Parameters(PlantNumbers[Number]):
         return value if isinstance(value, tuple) else (value, value)
 
     @property
-    def ranges(self) -> tuple[str, ...]:
-        """Names of the plant numbers that are drawn at each reset."""
-        return tuple(name for name in PLANT_NUMBERS if isinstance(getattr(self, name), tuple))
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest value of the plant numbers that are drawn at each reset."""
+        numbers = self.chosen(PLANT_NUMBERS)
+        return {name: value for name, value in numbers.items() if isinstance(value, tuple)}
 
     @property
     def is_disturbed(self) -> bool:
         """Whether there is a load disturbance."""
-        return self._can_differ(0.0, "disturbance_amplitude", "disturbance_walk_variance")
+        return self._can_differ(0.0, *_LOAD)
 
     def _can_differ(self, value: float, *names: str) -> bool:
         return any(self.range_of(name) != (value, value) for name in names)

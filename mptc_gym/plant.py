@@ -7,6 +7,7 @@ There are two implementations, side by side: `Plant` in plain floats, fastest fo
 from __future__ import annotations
 
 from collections import deque
+from itertools import pairwise
 from operator import mul
 from typing import Any, Final
 
@@ -90,10 +91,7 @@ class Dynamics:
         alpha: list[Any] = list(self._alpha)
         if self._quotient is not None:
             pole = 1.0 - self._rate / time_constant
-            alpha = [
-                pole * before - here
-                for before, here in zip(self._quotient, self._quotient[1:], strict=False)
-            ]
+            alpha = [pole * before - here for before, here in pairwise(self._quotient)]
         return alpha, gain / time_constant, self._sum / time_constant
 
 

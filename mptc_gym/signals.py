@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, Parameters, PlantNumbers
+from mptc_gym.parameters import PLANT_NUMBERS, Parameters, PlantNumbers
 
 Values = NDArray[np.float64]  # one per plant; of plant numbers, () where all share one value
 Indices = NDArray[np.intp]  # of some plants, sorted
-AllStreams = Mapping[int, "Streams"] | Sequence["Streams"]  # those of each plant
+Sources = Mapping[int, "Streams"] | Sequence["Streams"]  # those of each plant
 
 DRAWS = 32  # of plant numbers per episode: enough for all, and for future ones
 BLOCK = 600  # samples of a signal generated together
@@ -86,15 +86,14 @@ class Ranges:
     """Draw arguments that are ranges, uniformly; a delay is an integer, both ends included.
 
     Every plant number has its own draw, whether it is a range or not, so that one more range
-    does not change the others' draws. `names` are the arguments that are ranges. `given` are
-    all plant numbers, with the lower end of a range, as arrays of shape ().
+    does not change the others' draws. `names` are the arguments that are ranges, with their
+    ends. `given` are all plant numbers, with the lower end of a range, in arrays of shape ().
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self.names = parameters.ranges
         # The disturbance's draws follow those of the plant numbers.
         self._draws = bool(self.names) or parameters.is_disturbed
-        self._ranges = {name: parameters.range_of(name) for name in self.names}
         self.given: PlantNumbers[Values] = PlantNumbers(
             **{name: np.array(parameters.range_of(name)[0]) for name in PLANT_NUMBERS}
         )
@@ -110,12 +109,10 @@ class Ranges:
         for own, row in zip(streams, draws, strict=True):
             own.plant.next_episode().random(out=row)
         drawn = {}
-        for name, (low, high) in self._ranges.items():
-            share = draws[:, PLANT_NUMBERS[name]]
-            if ARGUMENTS[name].is_integer:
-                drawn[name] = low + np.floor(share * (high + 1 - low)).astype(int)
-            else:
-                drawn[name] = low + share * (high - low)
+        for name, (low, high) in self.names.items():
+            whole = isinstance(low, int)
+            above = draws[:, PLANT_NUMBERS[name]] * (high + whole - low)
+            drawn[name] = low + (np.floor(above).astype(int) if whole else above)
         return replace(self.given, **drawn)
 
 
@@ -143,7 +140,7 @@ class Noise:
         self._block = np.zeros((block, num_envs))
         self._row = 0  # the next row
 
-    def reset(self, which: Indices, streams: AllStreams, numbers: PlantNumbers[Values]) -> None:
+    def reset(self, which: Indices, streams: Sources, numbers: PlantNumbers[Values]) -> None:
         """Begin an episode of some plants."""
         deviations = np.sqrt(getattr(numbers, f"{self._name}_variance"))
         self._colour[:, which] = deviations[..., np.newaxis] * self._c
@@ -258,7 +255,7 @@ class SetPoint(_Held):
         self._lengths = np.array(self._levels.lengths)
         self._places = np.zeros(num_envs, np.intp)  # of the next level
 
-    def reset(self, which: Indices, streams: AllStreams) -> Values:
+    def reset(self, which: Indices, streams: Sources) -> Values:
         """Begin an episode of some plants, and return y_d(0)."""
         self._streams = streams
         if self._levels.random:
@@ -315,7 +312,7 @@ class Disturbance(_Held):
         self._ends = np.arange(1, num_envs + 1) * LEVELS_AT_A_TIME
         self._places = self._ends.copy()  # of the next level, in the flattened levels
 
-    def reset(self, which: Indices, streams: AllStreams, numbers: PlantNumbers[Values]) -> None:
+    def reset(self, which: Indices, streams: Sources, numbers: PlantNumbers[Values]) -> None:
         """Begin an episode of some plants, whose numbers have been drawn before."""
         self._streams = streams
         shape = self._shapes[which].T
@@ -379,8 +376,7 @@ class Signals(NamedTuple):
     @classmethod
     def of(cls, parameters: Parameters, num_envs: int = 1, block: int = BLOCK) -> Signals:
         """Make the signals of an environment, with `block` samples of noise at a time."""
-        colour_of = colours(parameters).items()
-        noises = {name: Noise(name, c, num_envs, block) for name, c in colour_of}
+        noises = {n: Noise(n, c, num_envs, block) for n, c in colours(parameters).items()}
         return cls(
             SetPoint(parameters, num_envs),
             noises.get("noise"),
@@ -388,9 +384,7 @@ class Signals(NamedTuple):
             noises.get("measurement_noise"),
         )
 
-    def reset(
-        self, which: Indices, streams: AllStreams, numbers: PlantNumbers[Values]
-    ) -> Values:
+    def reset(self, which: Indices, streams: Sources, numbers: PlantNumbers[Values]) -> Values:
         """Begin an episode of some plants, and return y_d(0); the other signals start at 0."""
         for signal in (self.noise, self.disturbance, self.measurement_noise):
             if signal is not None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mptc_gym.checks import reject
-from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS, Parameters
+from mptc_gym.parameters import PLANT_NUMBERS, Parameters
 from mptc_gym.plant import DRIFT_INTERVAL
 from mptc_gym.signals import LOAD_INTERVAL, Levels, colours
 
@@ -52,7 +52,7 @@ class Episodes:
         self.zeros, self.generator = zeros, torch.Generator(zeros.device)
         self.generator.seed()  # of the system's own, until `reset` is given one
         self.clock = self.unused = 0
-        self._ranges = {name: parameters.range_of(name) for name in parameters.ranges}
+        self._ranges = parameters.ranges
         # If one limit is drawn, both are tensors: PyTorch clamps either between two numbers or
         # between two tensors.
         limits = {"u_min", "u_max"}
@@ -77,7 +77,7 @@ class Episodes:
         """
         first = {}
         for name, (low, high) in self._ranges.items():
-            whole = ARGUMENTS[name].is_integer
+            whole = isinstance(low, int)
             values = given[name].reset(mask) if name in given else self.draw(low, high, whole)
             self.numbers[name] = select(mask, values, self.zeros + self.numbers[name])
             first[name] = values.to(torch.int64) if whole else values
@@ -351,9 +351,9 @@ def read_signals(
         if not values.isfinite().all():
             raise ValueError(f"{path} must be finite")
         if name in ranges:
-            ends = parameters.range_of(name)
+            ends = ranges[name]
             low, high = values.new_tensor(ends)
-            whole = not ARGUMENTS[name].is_integer or bool((values == values.round()).all())
+            whole = isinstance(ends[0], float) or bool((values == values.round()).all())
             if not (whole and bool(((low <= values) & (values <= high)).all())):
                 reject(path, got, f"within its range, {list(ends)}")
             values = values[:, None]

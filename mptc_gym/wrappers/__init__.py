@@ -97,9 +97,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, and set the wanted flow to 0."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._numbers |= {name: info[name] for name in NUMBERS if name in info}
-        self._actuator = Actuator(self._numbers, *self._increments)
-        self._flow = 0.0
+        numbers = self._numbers | {name: info[name] for name in NUMBERS if name in info}
+        self._actuator, self._flow = Actuator(numbers, *self._increments), 0.0
         return observation, info
 
     def action(self, action: Any) -> NDArray[np.float32]:
