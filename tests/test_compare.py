@@ -304,7 +304,8 @@ class TestCompare:
     @pytest.mark.usefixtures("undrawn")
     def test_where_limits_are_drawn_shares_are_not_measured(self, monkeypatch, tmp_path):
         monkeypatch.chdir(tmp_path)
-        assert main(["--preset", "hard", "--agents", "pi", "--runs", "2", "--jobs", "1"]) == 0
+        given = "--set u_max=[8,12] --scenarios constant --agents pi --runs 2 --jobs 1"
+        assert main(given.split()) == 0
         (folder,) = (tmp_path / "results").iterdir()  # of its own, as it is a part
         assert folder.name == "compare-other"
         assert pd.read_csv(folder / "runs.csv")["saturation_share"].isna().all()

@@ -243,7 +243,7 @@ class Waiting(TorchDispatchMode):
 @pytest.mark.parametrize("differentiable", [False, True])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_step_never_waits_for_the_device(mode, differentiable):
-    shell = {"max_episode_steps": 30, "autoreset_mode": mode, "differentiable": differentiable}
+    shell = {"max_episode_steps": 12, "autoreset_mode": mode, "differentiable": differentiable}
     most = {**PRESETS["hard"], "action_window": 5, "move_weight": 0.1, "u_max": [9.0, 10.0]}
     for plant in (most, {}):
         env = make(3, **shell, **plant)
@@ -252,7 +252,7 @@ def test_a_step_never_waits_for_the_device(mode, differentiable):
         env.step(torch.zeros(3, 1, dtype=torch.float64))
         env.reset(options={"reset_mask": torch.tensor([True, False, False])})
         with Waiting():
-            for _ in range(65):
+            for _ in range(27):
                 env.step(torch.zeros(3, 1, dtype=torch.float64))
 
 

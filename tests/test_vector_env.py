@@ -77,7 +77,7 @@ def test_it_equals_one_environment_after_the_other(
             native = many.IncrementalAction(made()[1] if of_sync else native, **moves[0])
             assert native.action_space == sync.action_space
         assert_equal(native.reset(seed=seed), sync.reset(seed=seed))
-        compare(native, sync, steps=50, rng=rng, partial_resets=partial_resets)
+        compare(native, sync, steps=40, rng=rng, partial_resets=partial_resets)
         assert_equal(native.reset(), sync.reset())
         compare(native, sync, steps=10, rng=rng, partial_resets=partial_resets)
 
@@ -105,11 +105,10 @@ def used(made):
     return made(), tracemalloc.get_traced_memory()[0], tracemalloc.stop()
 
 
-@pytest.mark.parametrize("limit", [10**6, None])
-def test_a_plant_costs_a_few_kib_and_nothing_grows_in_the_long_run(limit):
+def test_a_plant_costs_a_few_kib_and_nothing_grows_in_the_long_run():
     def made(plants):
-        own = {"max_episode_steps": limit, "autoreset_mode": "SameStep", "action_window": 20}
-        envs = MiddlePointVectorEnv(plants, **own, **NOISY)
+        own = {"max_episode_steps": 10**6, "action_window": 20, **NOISY}
+        envs = MiddlePointVectorEnv(plants, **own)
         envs.reset(seed=0)
         envs.step(np.zeros((plants, 1)))
         return envs
