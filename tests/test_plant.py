@@ -43,26 +43,6 @@ def test_dynamics_equal_a_transfer_function_with_noise(a, b, c, delay, rng):
     assert np.ptp(by_noise) > 1.0
 
 
-SIZES = [(0, 0), (5 - 1e-12, 0), (5, 5), (7.5, 7.5), (10, 10), (10.001, 10), (1e300, 10)]
-
-
-@pytest.mark.parametrize(
-    ("command", "arguments", "expected"),
-    [
-        *((sign * size, {}, sign * passed) for size, passed in SIZES for sign in (-1.0, 1.0)),
-        (0.1, {"dead_zone": 0.0}, 0.1),
-        (6.9, {"dead_zone": 7.0}, 0.0),
-        (-12.0, {"u_min": -4.0}, -4.0),  # saturation comes after the dead zone
-        (4.0, {"u_min": -4.0}, 0.0),
-        (3.0, {"u_min": 6.0, "u_max": 8.0, "dead_zone": 2.0}, 6.0),
-    ],
-)
-def test_actuator_whose_edge_passes(command, arguments, expected):
-    limits = (arguments.get("u_min", -10.0), arguments.get("u_max", 10.0))
-    found = step(action_from_command(command, *limits), **arguments)[1]
-    assert found == pytest.approx(expected, abs=1e-12)
-
-
 def exact(command, u_min, u_max, dead_zone):
     return action_from_command(command, u_min, u_max)
 
@@ -92,7 +72,9 @@ def test_a_command_on_the_edge_of_the_dead_zone_passes_as_an_action(
         assert action.dtype == (np.float64 if scaled is exact else np.float32)
         plant = Plant(mptc_gym.Parameters(), numbers)
         arrived, passed, _ = plant.step(action.item(), 0.0, 0.0)
-        assert passed == np.clip(arrived, u_min, u_max)  # and not 0
+        assert passed == np.clip(arrived, u_min, u_max)  # and not 0: saturation comes after
+        within = plant.step(action_from_command(0.999 * command, u_min, u_max), 0.0, 0.0)
+        assert within[1] == 0.0
         # Rounding to float32 makes 1.2e-7 of the range, at the most.
         assert arrived == pytest.approx(command, abs=1.3e-7 * (reach + abs(u_min) + edge))
 
