@@ -16,7 +16,6 @@ Copy this one file; `benchmarks/train/ppo.py` is built on it. It works for these
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -145,9 +144,7 @@ def main() -> None:
     options = parser.parse_args()
 
     torch.set_num_threads(1)  # the networks are too small for more
-    began = time.process_time()
     model = make_model(options.seed).learn(options.steps, Exploration(-1.2, -4.0))
-    print(f"seed {options.seed}, {time.process_time() - began:.0f} s")
     save(model, options.out / f"ppo-{options.seed}.zip")
     for env in ("MiddlePoint-v0", "MiddlePointNoisy-v0"):
         print(evaluate(model, spec_of(model, env)))

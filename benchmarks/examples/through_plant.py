@@ -47,9 +47,8 @@ def run(network: nn.Module, plants: MiddlePointTorchEnv, samples: int, seed: int
 def main(steps: int = 100, plants: int = 64, samples: int = 300) -> Evaluation:
     """Train a policy, and evaluate it on the square wave."""
     torch.manual_seed(0)
-    network = nn.Sequential(
-        nn.Linear(48, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 1)
-    )
+    layers = nn.Linear(48, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 1)
+    network = nn.Sequential(*layers)
     batch = MiddlePointTorchEnv(plants, differentiable=True, **WINDOWS, **SETPOINTS)
     optimiser = torch.optim.Adam(network.parameters())
     for step in range(steps):

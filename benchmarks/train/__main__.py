@@ -28,8 +28,8 @@ class Options:
     network: Annotated[str, Parameter(choices=NETWORKS)] = field(kw_only=False)
     """What to train."""
     networks: Count | None = None
-    """Number of networks to train, each from its own seed (default: 1 for nn-smith, where
-    validation chooses the best of several; 5 for PPO, which are all compared)."""
+    """Networks to train, each from its own seed (default: 1 for nn-smith, where validation
+    chooses the best; 5 for PPO, which are all compared)."""
     steps: Count | None = None
     """Optimiser steps or, for PPO, samples of experience (default: as published)."""
     out: Folder = Path("results/networks")

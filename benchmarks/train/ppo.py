@@ -1,9 +1,8 @@
 """Train PPO of Stable-Baselines3 on many plants at once, and export its policy to NumPy.
 
-`RECIPES` holds the settings of `ppo`, for the paper's plant, and of `ppo-hard`, for plants that
-vary. What makes them work stands in `benchmarks/examples/sb3.py`, from which they take it:
-groups of plants that meet the same, changes in place of levels, policies without biases, and
-exploration that falls. Here are plants of several kinds, longer memories and the validation.
+`RECIPES` are those of `ppo`, for the paper's plant, and of `ppo-hard`, for plants that vary.
+What makes them work stands in `benchmarks/examples/sb3.py`, from which they take it. Here are
+plants of several kinds, longer memories and the validation.
 """
 
 from __future__ import annotations
