@@ -211,7 +211,8 @@ def compared(tmp_path):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Leave out the pictures, which take most of the time."""
-    monkeypatch.setattr(plots, "draw", lambda *_: None)
+    for name in ("plot_scores", "plot_travel", "plot_responses"):
+        monkeypatch.setattr(plots, name, lambda *_: None)
 
 
 def assert_golden(found, name):

@@ -102,14 +102,12 @@ def plan(
     within the limits: a linear program, as each bound of E|m - n| is a maximum of lines.
 
     The bound is loose where the required flow lies within the dead zone, or alternates between
-    the two sides of a limit: the mean of 0 and 5 t/h is 2.5 t/h, and the mean of what the noise
-    requires may lie within limits that single demands exceed.
+    the two sides of a limit: the mean of 0 and 5 t/h is 2.5 t/h.
 
     The model covers at least the samples of `setpoint`, y_d(k) in degC. The plant starts from
     rest with the flows of the `past`, shape (start,). A `penalty` is in degC for each t/h of
     u_a(k), shape (samples,). A `quiet` plan is, of equally good ones, the one that comes to the
-    set point with the least travel. A RuntimeError is raised if all attempts fail or take too
-    long.
+    set point with the least travel. A RuntimeError is raised if no attempt solves it in time.
     """
     samples, start = len(setpoint), np.size(past)
     price = np.broadcast_to(np.asarray(penalty, float), samples)

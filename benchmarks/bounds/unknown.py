@@ -1,8 +1,8 @@
 """Bound the mean error from below by what no command can counteract in time.
 
-A flow applied at j affects y(j + d + 1) at the earliest. So the flows that shape y(k) are
-chosen at k - d - 1 or before, and cannot counteract what happens after that: d + 1 samples of
-the noise xi, of the load's walk and of its jumps. With n(k) the sum of their effects on y(k),
+A flow applied at j affects y(j + d + 1) at the earliest, and is chosen without what happens
+later. So no flow counteracts d + 1 samples of the noise xi, of the load's walk and of its
+jumps. With n(k) the sum of their effects on y(k),
 
     e(k) = m(k) - n(k),    m(k): the error expected from what is known at k - d - 1.
 
@@ -18,8 +18,7 @@ Three steps lead to it; each can only lower the result.
 2. Each distribution is replaced by equally probable atoms, the means of its slices. A convex
    function has a smaller mean over these atoms (Jensen within each slice).
 3. m may depend on the pattern of the jumps. With the tangent of slope s to E|m - n| in each
-   pattern, a_pattern + s m, the mean over the patterns is at least
-   sum p_pattern a_pattern + s E[m].
+   pattern, a_pattern + s m, the mean over them is at least sum p_pattern a_pattern + s E[m].
 
 The bound is loose where the load jumps: by about 1 % on the preset "disturbed".
 """
@@ -73,12 +72,10 @@ def unknown(model: LinearModel) -> Unknown:
 def noise_variance(model: LinearModel) -> Array:
     """Return the variance of the noise in y(k) that is unknown at k - d - 1, degC^2, for all k.
 
-    With a noisy transmitter it is that of the best prediction. Early in an episode, less noise
-    has accumulated.
+    With a noisy transmitter it is that of the best prediction.
     """
-    samples = len(model.load)
-    R = model.numbers.noise_variance
-    V = model.numbers.measurement_noise_variance
+    samples, numbers = len(model.load), model.numbers
+    R, V = numbers.noise_variance, numbers.measurement_noise_variance
     if R == 0.0:
         return np.zeros(samples)
     Phi, enters = model.state_space()

@@ -209,12 +209,18 @@ def write(
     estimates = estimate(runs, scales)
     scores = ranked(estimates)
     write_numbers(folder / "estimates.csv", estimates.drop(columns="scores"))
+    errors = runs.groupby(["scenario", "agent"])["mae"].mean()
     drawn = [name for name, each in controllers.items() if each.drawn]
-    shown = [(scale.scenario, responses[name]) for name, scale in scales.items()]
     from benchmarks.compare import plots  # here: processes that run cases do without
 
     try:
-        plots.draw(folder, runs, shown, drawn, estimates, scores)
+        plots.plot_scores(scores, estimates, folder / "scores.png")
+        plots.plot_travel(runs, estimates, [*scores], folder / "travel.png")
+        for name, scale in scales.items():
+            rows = responses[name]
+            few = rows[rows["agent"].isin(drawn)]
+            rows, path = rows if few.empty else few, folder / f"{name}.png"
+            plots.plot_responses(rows, errors[name], scale.scenario, path)
     finally:  # with the pictures that there are
         sections = report(runs, estimates, scores, scales, cases, controllers)
         write_report(folder, "Comparison of controllers", sections, "compare", made, printed=2)

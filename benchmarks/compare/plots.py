@@ -28,27 +28,6 @@ FARTHEST = 1.5  # distance of a score from 1 at which the axis ends
 HELD = 15  # minutes that are shown of a held set point without load
 
 
-def draw(
-    folder: Path,
-    runs: pd.DataFrame,
-    responses: Sequence[tuple[Scenario, pd.DataFrame]],
-    few: Sequence[str],
-    estimates: pd.DataFrame,
-    scores: Mapping[str, Estimate],
-) -> None:
-    """Draw all pictures: of scores, of errors and travel, and of responses in each case.
-
-    These are of a few agents, or of all where none of them has finished.
-    """
-    errors = runs.groupby(["scenario", "agent"])["mae"].mean()
-    plot_scores(scores, estimates, folder / "scores.png")
-    plot_travel(runs, estimates, [*scores], folder / "travel.png")
-    for case, rows in responses:
-        shown = rows[rows["agent"].isin(few)]
-        shown = rows if shown.empty else shown
-        plot_responses(shown, errors[case.name], case, folder / f"{case.name}.png")
-
-
 def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: Path) -> None:
     """Draw the score of every controller, sorted, and small marks for its cases."""
     style = looks([*scores])

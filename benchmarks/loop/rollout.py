@@ -94,8 +94,8 @@ def is_random(parameters: Parameters) -> bool:
     """Return whether anything is drawn for an episode, even if only its noise."""
     noises = "noise_variance", "measurement_noise_variance"
     noisy = any(parameters.range_of(name)[1] > 0.0 for name in noises)
-    drawn = bool(parameters.ranges) or parameters.setpoint == "random"
-    return drawn or noisy or parameters.is_disturbed
+    drawn = noisy or parameters.is_disturbed or parameters.setpoint == "random"
+    return drawn or bool(parameters.ranges)
 
 
 def rollout(

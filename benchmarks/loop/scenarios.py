@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,16 +25,12 @@ Arguments = dict[str, Any]  # of the environment
 
 @dataclass(frozen=True)
 class Scenario:
-    """A case: a plant, a set point and the length of a run."""
+    """A case: the length of a run, and arguments of the environment beyond the defaults."""
 
     name: str
-    """Name in options and file names."""
     title: str
-    """Title in headings."""
     samples: int
-    """Length of a run, samples."""
-    arguments: dict[str, Any] = field(default_factory=dict)
-    """Arguments of the environment that differ from the defaults."""
+    arguments: dict[str, Any]
 
     @property
     def parameters(self) -> Parameters:
