@@ -24,16 +24,10 @@ Place = tuple[int, int, int, int]  # pixels from the left edge, from the top, wi
 
 SIZE = 960, 540
 # The lines have the colours of Okabe and Ito, safe for colour-blind readers.
-TEMPERATURE: Colour = (0, 114, 178)
-SETPOINT: Colour = (213, 94, 0)
-APPLIED: Colour = (0, 158, 115)
-COMMAND: Colour = (40, 40, 40)
-DEAD_ZONE: Colour = (222, 222, 222)
-IN_TRANSIT: Colour = (205, 229, 246)
-LIMIT: Colour = (130, 130, 130)
-_GRID: Colour = (236, 237, 240)
-_INK: Colour = (60, 64, 70)
-_PAPER: Colour = (255, 255, 255)
+TEMPERATURE, SETPOINT = (0, 114, 178), (213, 94, 0)
+APPLIED, COMMAND = (0, 158, 115), (40, 40, 40)
+DEAD_ZONE, IN_TRANSIT = (222, 222, 222), (205, 229, 246)
+LIMIT, _GRID, _INK, _PAPER = (130, 130, 130), (236, 237, 240), (60, 64, 70), (255, 255, 255)
 TEMPERATURES, FLOWS = (72, 44, 864, 214), (72, 324, 864, 182)  # places of the panels
 clock = pygame.time.Clock()  # limits the frame rate
 

@@ -23,6 +23,7 @@ from mptc_gym.signals import ONE, Ranges, Signals, Streams, plant_numbers
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys, see `reset`
 _FLOAT32 = np.dtype(np.float32)  # faster to pass than the type
+_METADATA = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
 
 NO_MODE = (
     "render does nothing without a render mode: give one to gymnasium.make, as in "
@@ -203,10 +204,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     * v0: first version.
     """  # noqa: E501 (the tables)
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (as in Env)
-        "render_modes": ["human", "rgb_array"],
-        "render_fps": 30,
-    }
+    metadata: dict[str, Any] = _METADATA
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         self.parameters = parameters = Parameters.of_environment(arguments)
@@ -216,11 +214,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = observation_space(parameters)
         # Used by step, in two tuples: unpacking one is faster than reading as many attributes.
-        self._reward_terms = (
-            parameters.error_scale,
-            parameters.reward == "quadratic",
-            parameters.move_weight,
-        )
+        quadratic = parameters.reward == "quadratic"
+        self._reward_terms = parameters.error_scale, quadratic, parameters.move_weight
         # Where errors, outputs and actions begin in the observation, and where it ends.
         heads = np.cumsum(parameters.windows).tolist()
         self._layout = parameters.temperature_span, *heads

@@ -7,7 +7,7 @@ There are two implementations, side by side: `Plant` in plain floats, fastest fo
 from __future__ import annotations
 
 from collections import deque
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from operator import mul
 from typing import Any, Final
 
@@ -64,10 +64,8 @@ class Dynamics:
         if parameters.changes_time_constant:
             pole = slowest_pole(parameters.a).real  # as Parameters has checked
             self._rate = 1.0 - pole
-            quotient = [1.0]  # Q, by Horner's scheme
-            for coefficient in parameters.a[1:-1]:
-                quotient.append(coefficient + pole * quotient[-1])
-            self._quotient = (*quotient, 0.0)
+            terms = accumulate(parameters.a[:-1], lambda before, here: here + pole * before)
+            self._quotient = (*terms, 0.0)  # Q, by Horner's scheme
 
     def share(self, age: Any) -> Any:
         """Return the completed share of the drifts at k = `age`, from 0 to 1."""

@@ -315,12 +315,11 @@ class Disturbance(_Held):
     def reset(self, which: Indices, streams: Sources, numbers: PlantNumbers[Values]) -> None:
         """Begin an episode of some plants, whose numbers have been drawn before."""
         self._streams = streams
-        shape = self._shapes[which].T
-        shape[0] = numbers.disturbance_amplitude
-        shape[1] = LOAD_INTERVAL / numbers.disturbance_interval
+        probability = LOAD_INTERVAL / numbers.disturbance_interval
         # Uniform within +-h, a step of the walk has the variance h^2 / 3.
-        shape[2] = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
-        self._shapes[which] = shape.T
+        width = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
+        shapes = np.broadcast_arrays(numbers.disturbance_amplitude, probability, width)
+        self._shapes[which] = np.stack(shapes, axis=-1)
         self._last[which] = self._now[which] = 0.0
         self._places[which] = self._ends[which]
         self._changes[which] = self._clock + LOAD_INTERVAL

@@ -72,10 +72,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     while `MiddlePointEnv` continues without a warning.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (as in VectorEnv)
-        **MiddlePointEnv.metadata,
-        "render_modes": ["rgb_array"],
-    }
+    metadata: dict[str, Any] = MiddlePointEnv.metadata | {"render_modes": ["rgb_array"]}
     _where = staticmethod(np.where)
 
     def __init__(
@@ -108,12 +105,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._everyone, self._nobody = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
         span = parameters.temperature_span
         self._span = np.full(num_envs, -span), np.full(num_envs, span), span * span
-        self._reward_terms = (
-            np.array(parameters.error_scale),
-            np.array(-0.5),
-            parameters.reward == "quadratic",
-            parameters.move_weight,
-        )
+        quadratic, scale = parameters.reward == "quadratic", np.array(parameters.error_scale)
+        self._reward_terms = scale, np.array(-0.5), quadratic, parameters.move_weight
 
     __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
 
