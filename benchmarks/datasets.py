@@ -30,6 +30,7 @@ IDS = {
     for plant in ("paper", "disturbed", "fouling")
     for behaviour in BEHAVIOURS
 }
+COLUMNS = "controller", "seed", "observations", "actions", "rewards"  # of an episode
 VARIABLE, HOME = "MINARI_DATASETS_PATH", "~/.minari/datasets"
 DESCRIPTION = """\
 Middle-point temperature of a once-through boiler, preset {plant!r}, random set points, under
@@ -73,49 +74,38 @@ def arguments_of(plant: str) -> dict[str, Any]:
 def record(plant: str, behaviour: str, episodes: int = EPISODES) -> list[dict[str, Any]]:
     """Log a plant of `IDS` under the controllers of one of `BEHAVIOURS`, which take turns.
 
-    Episode i is a dict of its `controller` and its `seed`, which is `SEED + i`, and of arrays:
-    `observations`, shape (SAMPLES + 1, size); `actions`, shape (SAMPLES, 1), within [-1, 1];
-    and `rewards`, -|e(k+1)| in degC, shape (SAMPLES,).
+    Episode i is a dict of `COLUMNS`: its controller, its seed, which is `SEED + i`, and arrays
+    of observations, actions within [-1, 1], and rewards, -|e(k+1)| in degC.
     """
     from benchmarks.controllers.roster import ROSTER
+    from benchmarks.loop.rollout import make_plants
 
     arguments, names = arguments_of(plant), BEHAVIOURS[behaviour][:episodes]
     logged: list[dict[str, Any]] = [{}] * episodes
     for turn, name in enumerate(names):
         seeds = list(range(SEED + turn, SEED + episodes, len(names)))
-        (factory,) = ROSTER[name].members()
-        columns = _log(factory.in_service(arguments, len(seeds), SEED), arguments, seeds)
+        controller: Any = ROSTER[name].in_service(arguments, len(seeds), SEED)
+        controller.reset()
+        plants: Any = make_plants(len(seeds), SAMPLES, **arguments)
+        seen, _ = plants.reset(seed=seeds)
+        observations, actions, errors = [seen], [], []
+        for _ in range(SAMPLES):
+            # Beyond +-1 the actuator saturates: clipping does not change what the plant does.
+            actions.append(np.clip(controller.act(seen), -1.0, 1.0).astype(np.float32))
+            seen, _, _, _, info = plants.step(actions[-1])
+            observations.append(seen)
+            errors.append(info["error"])
+        rewards: Any = -np.abs(errors)
+        arrays = (np.stack(each, axis=1) for each in (observations, actions, rewards))
         logged[turn :: len(names)] = [
-            {"controller": name, "seed": seed, **{key: columns[key][i] for key in columns}}
-            for i, seed in enumerate(seeds)
+            dict(zip(COLUMNS, (name, *columns), strict=True))
+            for columns in zip(seeds, *arrays, strict=True)
         ]
     return logged
 
 
-def _log(controller: Any, arguments: dict[str, Any], seeds: list[int]) -> dict[str, Any]:
-    """Return observations, actions and rewards of a batch of episodes."""
-    plants: Any = gymnasium.make_vec(
-        "MiddlePoint-v0", len(seeds), max_episode_steps=SAMPLES, **arguments
-    )
-    seen, _ = plants.reset(seed=seeds)
-    observations, actions, errors = [seen], [], []
-    controller.reset()
-    for _ in range(SAMPLES):
-        # Beyond +-1 the actuator saturates, so clipping does not change what the plant does.
-        actions.append(np.clip(controller.act(seen), -1.0, 1.0).astype(np.float32))
-        seen, _, _, _, info = plants.step(actions[-1])
-        observations.append(seen)
-        errors.append(info["error"])
-    logged: dict[str, Any] = {"observations": observations, "actions": actions}
-    logged["rewards"] = -np.abs(errors)
-    return {name: np.stack(rows, axis=1) for name, rows in logged.items()}
-
-
 def write(root: Path, name: str, episodes: int) -> str:
-    """Write a complete data set or none, replacing one of the same name.
-
-    The name is its id, `namespace/name-v0`. Return its mean errors, as text.
-    """
+    """Write a complete data set or none, replacing that of this id; return its mean errors."""
     place, logged = root / name, record(*IDS[name], episodes)
     try:
         # Minari does not list the contents of hidden folders.
@@ -146,12 +136,11 @@ def _create(name: str, episodes: list[dict[str, Any]]) -> str:
     idle = evaluate(lambda seen: np.zeros((len(seen), 1)), episodes=EVALUATIONS, **arguments)
     least = float(np.asarray(idle.least).mean())
     error = float(-np.mean([each["rewards"] for each in episodes]))
-    logged = "seed", "observations", "actions", "rewards"
     ends = {"terminations": [False] * SAMPLES, "truncations": [*[False] * (SAMPLES - 1), True]}
     env = gymnasium.make("MiddlePoint-v0", max_episode_steps=SAMPLES, **arguments)
     dataset = minari.create_dataset_from_buffers(
         name,
-        [EpisodeBuffer(**{key: each[key] for key in logged}, **ends) for each in episodes],
+        [EpisodeBuffer(**{key: each[key] for key in COLUMNS[1:]}, **ends) for each in episodes],
         env=env,
         eval_env=env,
         algorithm_name=controllers,
@@ -164,7 +153,6 @@ def _create(name: str, episodes: list[dict[str, Any]]) -> str:
         num_episodes_average_score=EVALUATIONS,
         data_format="hdf5",
     )
-    env.close()
     about = {
         "behaviour_error": error,
         "least_possible_error": least,
@@ -173,12 +161,10 @@ def _create(name: str, episodes: list[dict[str, Any]]) -> str:
         "mptc_gym_version": __version__,
     }
     dataset.storage.update_metadata(about)
-    dataset.storage.update_episode_metadata(
-        [{"controller": each["controller"]} for each in episodes]
-    )
-    return (
-        f"mean |e| {error:.3f} °C, least possible {least:.3f}, no control {idle.mean_error:.3f}"
-    )
+    controllers_of = [{"controller": each["controller"]} for each in episodes]
+    dataset.storage.update_episode_metadata(controllers_of)
+    of_plant = f"least possible {least:.3f}, no control {idle.mean_error:.3f}"
+    return f"mean |e| {error:.3f} °C, {of_plant}"
 
 
 main = command("datasets", Options, work)

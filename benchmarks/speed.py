@@ -47,16 +47,13 @@ def work(options: Options) -> str:
     """Measure, print the tables and return the closing line."""
     from benchmarks.lib.report import on_screen
 
-    sizes = ON_DEVICE if options.device else BATCHES
-    tables: dict[str, Callable[[], Cases]] = {}
-    if options.device is None:
-        tables["One environment, from gymnasium.make"] = one_by_one
-    tables |= {
-        f"Vector environments, n = {n:,}": partial(in_batch, n, options.device) for n in sizes
-    }
     with blame("--device"):
-        for title, cases in tables.items():
-            print(f"\n{title}\n{on_screen(compare(cases(), options.rounds))}", flush=True)
+        for n in ON_DEVICE if options.device else (1, *BATCHES):
+            title = "One environment, from gymnasium.make"
+            if n > 1:
+                title = f"Vector environments, n = {n:,}"
+            cases = one_by_one() if n == 1 else in_batch(n, options.device)
+            print(f"\n{title}\n{on_screen(compare(cases, options.rounds))}", flush=True)
     return f"Medians of {options.rounds} rounds; in parentheses, 10th to 90th percentile."
 
 
@@ -81,39 +78,33 @@ def one_by_one() -> Cases:
 
 def in_batch(n: int, device: str | None) -> Cases:
     """Return the cases of `n` environments; those of a device are PyTorch's alone."""
-    cases: Cases = {}
+    made: dict[str, Any] = {}
     if device is None:
-        make = partial(gymnasium.make_vec, vectorization_mode="vector_entry_point")
-        cases = {REFERENCE: stepping(make(REFERENCE, n))}
-        cases |= {
-            PLANT + name: stepping(make(PLANT, n, **each)) for name, each in PLANTS.items()
-        }
-        if importlib.util.find_spec("torch") is None:
-            return cases
-    import torch
+        make = partial(gymnasium.make_vec, num_envs=n, vectorization_mode="vector_entry_point")
+        made = {REFERENCE: make(REFERENCE)}
+        made |= {PLANT + name: make(PLANT, **each) for name, each in PLANTS.items()}
+    if device or importlib.util.find_spec("torch"):
+        import torch
 
-    from mptc_gym.torch_env import MiddlePointTorchEnv
+        from mptc_gym.torch_env import MiddlePointTorchEnv
 
-    torch.set_num_threads(1)  # one core, as for the others
-    for name, each in PLANTS.items():
-        envs = MiddlePointTorchEnv(n, device=device or "cpu", **each)
-        cases[f"in PyTorch{name}"] = stepping(
-            envs,
-            partial(torch.as_tensor, device=device),
-            torch.accelerator.synchronize if device not in (None, "cpu") else lambda: None,
-        )
-    return cases
+        torch.set_num_threads(1)  # one core, as for the others
+        on_device = partial(MiddlePointTorchEnv, n, device=device or "cpu")
+        made |= {f"in PyTorch{name}": on_device(**each) for name, each in PLANTS.items()}
+    return {name: stepping(envs) for name, envs in made.items()}
 
 
-def stepping(
-    envs: Any,
-    convert: Callable[[Any], Any] = np.asarray,
-    wait: Callable[[], object] = lambda: None,
-) -> Case:
-    """Return the case of a vector environment: an episode and its reset, `wait` at the end."""
+def stepping(envs: Any) -> Case:
+    """Return the case of a vector environment: an episode and its reset, all awaited."""
     envs.reset(seed=0)
     envs.action_space.seed(0)
-    actions = [convert(envs.action_space.sample()) for _ in range(20)]
+    actions = [envs.action_space.sample() for _ in range(20)]
+    wait: Callable[[], object] = list
+    if hasattr(envs, "device"):
+        import torch
+
+        actions = [torch.as_tensor(each, device=envs.device) for each in actions]
+        wait = torch.accelerator.synchronize if envs.device.type != "cpu" else list
 
     def run() -> None:
         for k in range(EPISODE + 1):

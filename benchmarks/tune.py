@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -23,9 +23,6 @@ from benchmarks.lib.command import (
 )
 from benchmarks.lib.storage import Kept, origin, out_folder, write_csv
 from benchmarks.loop.rollout import mean_error, settled
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 SEED = 1_000_000  # of the search
 STARTUP = 200  # trials at random before the sampler learns
@@ -81,7 +78,7 @@ def work(options: Options) -> str:
 
     name, made = options.controller, origin()
     out = out_folder(options.out / name)
-    trials = search(name, options.trials, options.runs, out)
+    trials = pd.DataFrame(search(name, options.trials, options.runs, out))
     # The best gains of a search owe some of their result to luck; new runs show how much.
     best = trials.nsmallest(FINALISTS, "objective")
     gains = best[[*TUNED[name]]].map(lambda gain: float(f"{gain:.3g}")).to_dict("records")
@@ -94,7 +91,7 @@ def work(options: Options) -> str:
     return f"All trials are in {out}/trials.csv, the best in {out}/report.md"
 
 
-def search(name: str, count: int, runs: int, out: Path) -> pd.DataFrame:
+def search(name: str, count: int, runs: int, out: Path) -> list[dict[str, float]]:
     """Try gains of a controller, and return and write one row for each trial.
 
     What a trial tries follows from those before it. So an interrupted search takes the same
@@ -105,6 +102,8 @@ def search(name: str, count: int, runs: int, out: Path) -> pd.DataFrame:
 
     optuna.logging.set_verbosity(optuna.logging.CRITICAL)
     study, kept = optuna.create_study(), Kept(out / "tasks")
+    scale = partial(optuna.distributions.FloatDistribution, log=True)
+    spans: Any = {each: scale(*span) for each, span in TUNED[name].items()}
     rows: list[dict[str, float]] = []
     try:
         with progress_bar("trials", count) as advance:
@@ -112,25 +111,20 @@ def search(name: str, count: int, runs: int, out: Path) -> pd.DataFrame:
                 study.sampler = optuna.samplers.TPESampler(
                     seed=SEED + i, n_startup_trials=STARTUP, multivariate=True
                 )
-                trial, spans = study.ask(), TUNED[name].items()
-                gains = {
-                    each: trial.suggest_float(each, *span, log=True) for each, span in spans
-                }
-                task = {f"trial {i}": partial(score, name, runs, FIRST_RUN, gains)}
+                trial = study.ask(spans)
+                task = {f"trial {i}": partial(score, name, runs, FIRST_RUN, trial.params)}
                 rows += dict(FanOut(jobs=1).stream(task, kept=kept)).values()
                 study.tell(trial, rows[-1]["objective"])
                 advance()
     finally:
         write_csv(out / "trials.csv", pd.DataFrame(rows))
-    return pd.DataFrame(rows)
+    return rows
 
 
 def score(name: str, runs: int, first_run: int, gains: Mapping[Any, float]) -> dict[str, float]:
-    """Judge a controller with these gains on the cases of the search.
+    """Return the gains, what `NOTE` says of a controller with them, and who does not settle.
 
-    Each case has seeds of its own, beginning with `first_run`. Returned are the gains; for
-    each case the median over runs of the mean |e|, degC; `not converged`, the share of runs
-    at the constant set point that fail to settle; and `objective`, as `NOTE` says.
+    Each case has seeds of its own, beginning with `first_run`.
     """
     controller = replace(ROSTER[name], make=partial(ROSTER[name].make, **gains))
     medians = {}
