@@ -135,13 +135,11 @@ class TestZips:
         assert actions[0] == actions[1] == actions[2]
         loaded.learn(64)
 
-    def test_long_names_and_steps_in_a_name(self, tmp_path):
-        model, names = model_of(make_vec_env()), {"m" * 250 + ".zip", "model.step8"}
-        for name in names:
-            save(model, tmp_path / name)
-        assert {each.name for each in tmp_path.iterdir()} == names
+    def test_a_name_stays_as_it_is_and_one_that_is_too_long_is_refused(self, tmp_path):
+        save(model := model_of(make_vec_env()), tmp_path / "model.step8")
         (tmp_path / "other").touch()
-        assert len({each.stat().st_mode for each in tmp_path.iterdir()}) == 1
+        modes = {each.name: each.stat().st_mode for each in tmp_path.iterdir()}
+        assert modes["model.step8"] == modes["other"]
         with pytest.raises(ValueError, match="cannot be written: File name too long"):
             save(model, tmp_path / ("m" * 300))
 
@@ -175,7 +173,6 @@ class TestZips:
         with zipfile.ZipFile(file) as archive:
             record = archive.read(ours.MEMBER).decode()
         for edited, message in (
-            ("[" * 100_000, "RecursionError"),
             ("{}", "KeyError"),
             (record.replace("PPO", "PPOO"), "AttributeError"),
             (None, "must be a zip of mptc_gym.sb3.save; others are loaded by"),
