@@ -251,7 +251,7 @@ def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
     """Draw each controller's errors over delay and gain, the median of each plant."""
     from matplotlib.colors import LogNorm
 
-    from benchmarks.lib.report import MULTIPLE, draw_legend, panels, scale_by_excess
+    from benchmarks.lib.report import MULTIPLE, panels, scale_by_excess
 
     centre = [sum(nominal.range_of(name)) / 2.0 for name in ("delay", "gain_factor")]
     look: Any = {"marker": "s", "cmap": "cividis_r", "norm": LogNorm(0.01, 3.0)}
@@ -273,8 +273,8 @@ def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
         below: Any = {"location": "bottom", "aspect": 60, "extend": "both"}
         bar = figure.colorbar(image, ax=axes, label=MULTIPLE, **below)
         scale_by_excess(bar.ax, "x", 0.013, 3.0 / 1.3)
-        handles, texts = panel.get_legend_handles_labels()
-        draw_legend(figure, dict(zip(texts, handles, strict=True)))
+        named = panel.get_legend_handles_labels()
+        figure.legend(*named, loc="outside lower center", ncols=4)
 
 
 main = command("sweep", Options, work)

@@ -16,7 +16,6 @@ from benchmarks.lib.report import (
     MULTIPLE,
     NEAREST,
     draw_actuator,
-    draw_legend,
     drawn,
     panels,
     scale_by_excess,
@@ -92,7 +91,7 @@ def plot_travel(
             label(agent): Line2D([], [], color=colour, marker=marker, linestyle="")
             for agent, (colour, marker) in style.items()
         }
-        draw_legend(figure, entries)
+        figure.legend(entries.values(), entries, loc="outside lower center", ncols=4)
 
 
 def plot_responses(

@@ -188,11 +188,6 @@ def panels(
         yield figure, axes[: len(names)]
 
 
-def draw_legend(figure: Figure, entries: dict[str, Any]) -> None:
-    """Put a legend of handles by label below the panels."""
-    figure.legend(entries.values(), entries, loc="outside lower center", ncols=4)
-
-
 def scale_by_excess(axes: Axes, name: str, low: float, high: float) -> None:
     """Make the axis "x" or "y" of `multiple - 1` logarithmic, with multiples as its ticks."""
     from matplotlib import ticker
