@@ -72,8 +72,7 @@ def _table(path: Path) -> pd.DataFrame:
     """Return a file's table of texts."""
     try:
         text = path.read_text(encoding="utf-8-sig", errors="replace")
-        heading = text.partition("\n")[0]
-        separator = next((mark for mark in ";\t" if mark in heading), ",")
+        separator = next((mark for mark in ";\t" if mark in text.partition("\n")[0]), ",")
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)  # of too many cells
             table = pd.read_csv(

@@ -12,7 +12,7 @@ from benchmarks.identify.model import Model
 from benchmarks.lib.report import COLOURS, Section, drawn
 from benchmarks.lib.statistics import ENDS
 
-SHOWN = 4_000  # rows that are drawn, the last ones of a log: more would blur
+SHOWN = slice(-4_000, None)  # rows that are drawn: more would blur
 HOW = (
     "u is Kp times the sum of r - y and its integral over time divided by Ti, where u is "
     "the flow, r the set point and y the temperature, all from the operating point. Reverse "
@@ -29,8 +29,8 @@ HOW = (
 
 def report(model: Model, advised: dict[str, Any]) -> list[Section]:
     """Return the sections of the report; `advised` is the content of `controllers.json`."""
-    flow, degree = model.log.given.flow_unit, model.log.given.temperature_unit
-    rest = model.operating_flow
+    given, rest = model.log.given, model.operating_flow
+    flow, degree = given.flow_unit, given.temperature_unit
     units = {"delay": "samples", "dead_zone": flow, "gain": f"{degree} per {flow}"}
     rows = [
         (name.replace("_", " "), f"{at:.4g}", f"[{low:.4g}, {high:.4g}]", units.get(name, "s"))
@@ -45,11 +45,10 @@ def report(model: Model, advised: dict[str, Any]) -> list[Section]:
     ]
     refused = [f"**Nothing is recommended.** {' '.join(advised['warnings'])}"]
     text = [
-        *([] if advice else refused),
+        *(advice or refused),
         "Fitted to the first two thirds of the log, the model explains "
         f"{100 * max(model.explained[0], 0.0):.1f} % of the temperature's variance in the "
         "last, by simulation from the flow, but for a straight line.",
-        *advice,
         *model.notes,
         f"All numbers are deviations from the operating point: a flow of {rest:g} {flow}, at "
         f"which the temperature is {model.operating_temperature:.4g} {degree}. The flow can be "
@@ -57,10 +56,10 @@ def report(model: Model, advised: dict[str, Any]) -> list[Section]:
         "intervals.",
     ]
     table = pd.DataFrame(rows, columns=["", "value", "95 %", "unit"])
-    shown = {"identify.png": "The log, the model and the response to a step"}
+    picture = {"identify.png": "The log, the model and the response to a step"}
     sections = [
         Section("What the log shows", text, table),
-        Section("The log and the model", pictures=shown),
+        Section("The log and the model", pictures=picture),
         Section("How to type the controller", HOW),
     ]
     return sections if advice else sections[:2]
@@ -68,26 +67,26 @@ def report(model: Model, advised: dict[str, Any]) -> list[Section]:
 
 def draw(model: Model, path: Path) -> None:
     """Draw the log with the model's simulation of it, and the step response with its band."""
-    log, shown, h = model.log, slice(-SHOWN, None), model.log.sampling_interval
+    log, h, plant = model.log, model.log.sampling_interval, model.plant
     flow, degree = log.given.flow_unit, log.given.temperature_unit
-    minutes = (np.arange(len(log.flow)) * h / 60.0)[shown]
+    minutes = (np.arange(len(log.flow)) * h / 60.0)[SHOWN]
     title = "The log as recorded and as the model simulates it, and its response to a step"
     with drawn(path, 5, title) as figure:
         places = figure.subplot_mosaic([["y", "y"], ["u", "step"]], height_ratios=[3, 2])
         above, below, step = (places[name] for name in ("y", "u", "step"))
-        above.plot(minutes, log.temperature[shown], color="0.5", lw=1, label="recorded")
-        above.plot(minutes, model.simulated[shown], color=COLOURS[1], label="model")
+        above.plot(minutes, log.temperature[SHOWN], color="0.5", lw=1, label="recorded")
+        above.plot(minutes, model.simulated[SHOWN], color=COLOURS[1], label="model")
         above.set(xlabel="time (min)", ylabel=f"temperature ({degree})")
         above.legend(loc="upper left", ncols=2)
         above.margins(y=0.2)  # room for the legend
-        below.step(minutes, log.flow[shown], where="post", color=COLOURS[0], lw=1)
+        below.step(minutes, log.flow[SHOWN], where="post", color=COLOURS[0], lw=1)
         zone = model.estimates["dead_zone"].value * np.array([-1.0, 1.0])
         below.axhspan(*(model.operating_flow + zone), color="0.9", label="dead zone")
         below.legend(loc="upper left")
         below.set(xlabel="time (min)", ylabel=f"flow ({flow})")
-        ones = np.ones(int((model.plant.delay + 5.0 * model.plant.slowest) / h) + 2)
+        ones = np.ones(int((plant.delay + 5.0 * plant.slowest) / h) + 2)
         after = np.arange(len(ones)) * h / 60.0
         band = np.quantile([each.simulated(ones, h) for each in model.possible], ENDS, axis=0)
         step.fill_between(after, *band, color=COLOURS[0], alpha=0.25, lw=0)
-        step.plot(after, model.plant.simulated(ones, h), color=COLOURS[0])
+        step.plot(after, plant.simulated(ones, h), color=COLOURS[0])
         step.set(xlabel="time after the step (min)", ylabel=f"{degree} per {flow}")
