@@ -45,15 +45,12 @@ class Draw:
 
     def plants(self) -> Numbers:
         """Draw the plants' numbers; `small` scales set point, dead zone, noise and load."""
-        one = torch.ones(self._n)
-        gain, constant = (
-            torch.exp(self.uniform(math.log(low), math.log(high)))
-            for low, high in ((0.7, 1.7), (0.45, 2.2))
-        )
+        gain = torch.exp(self.uniform(math.log(0.7), math.log(1.7)))
+        constant = torch.exp(self.uniform(math.log(0.45), math.log(2.2)))
         skewed = self.uniform(0.0, 1.0) < 0.25
-        u_min = torch.where(skewed, -self.uniform(8.5, 13.0), -10.0 * one)
-        u_max = torch.where(skewed, self.uniform(8.5, 13.0), 10.0 * one)
-        small = torch.where(self.uniform(0.0, 1.0) < 0.25, self.uniform(0.1, 0.6), one)
+        u_min = torch.where(skewed, -self.uniform(8.5, 13.0), -10.0)
+        u_max = torch.where(skewed, self.uniform(8.5, 13.0), 10.0)
+        small = torch.where(self.uniform(0.0, 1.0) < 0.25, self.uniform(0.1, 0.6), 1.0)
         kind = self.uniform(0.0, 1.0)  # calm, load alone, or everything
         loaded, noisy = small * (kind > 0.15), small**2 * (kind > 0.35)
         drifts = self.uniform(0.0, 1.0) < 0.2
@@ -70,8 +67,8 @@ class Draw:
             "disturbance_interval": self.uniform(100.0, 300.0),
             "disturbance_walk_variance": self.some(0.4, 0.0, 0.001) * noisy,
             "small": small,
-            "gain_drift": torch.where(drifts, self.uniform(0.75, 1.33), one),
-            "time_constant_drift": torch.where(drifts, self.uniform(0.75, 1.33), one),
+            "gain_drift": torch.where(drifts, self.uniform(0.75, 1.33), 1.0),
+            "time_constant_drift": torch.where(drifts, self.uniform(0.75, 1.33), 1.0),
         }
         return {**numbers, "setpoint": self.levels(numbers)}
 
@@ -83,9 +80,8 @@ class Draw:
         size = (0.3 + 0.65 * self.uniform(0.0, 1.0, self._samples // 60 + 2, n)) * most
         sign = torch.sign(self.uniform(-1.0, 1.0, *size.shape))
         begun, length = self.uniform(0.0, 150.0).floor(), self.uniform(60.0, 300.0).floor()
-        held = (size * sign).gather(
-            0, ((age + begun) // length).long().clamp(max=len(size) - 1)
-        )
+        number = ((age + begun) // length).long().clamp(max=len(size) - 1)
+        held = (size * sign).gather(0, number)
         phase = self.uniform(0.0, 600.0).floor()
         square = torch.where((age + phase) // 300 % 2 == 0, size[0], -size[0])
         return torch.where(self.uniform(0.0, 1.0) < 0.5, square, held)
@@ -167,17 +163,16 @@ class Loops:
         newer, older = (unit * (b / sum(NOMINAL.b)) for b in NOMINAL.b)
         self._beta = torch.where(first, unit, newer), torch.where(first, zero, older)
         self._delay = models["delay"].long()
-        self._law = _TorchLaw(
-            Prior(
-                unit=unit,
-                fading=pole ** (models["delay"] + 1.0 + 0.5 * first),
-                time_constant=constant,
-                delay=models["delay"],
-                dead_zone=models["dead_zone"] / self._half,
-                centre=-(high + low) / (high - low),
-                uncertainty=models["uncertainty"],
-            ),
+        prior = Prior(
+            unit=unit,
+            fading=pole ** (models["delay"] + 1.0 + 0.5 * first),
+            time_constant=constant,
+            delay=models["delay"],
+            dead_zone=models["dead_zone"] / self._half,
+            centre=-(high + low) / (high - low),
+            uncertainty=models["uncertainty"],
         )
+        self._law = _TorchLaw(prior)
         self._before = torch.zeros(LONGEST + BLOCK, len(gain))  # the model's outputs
         self._new: list[Tensor] = []
         self._model = self._last_model = self._flow = self._last_flow = zero
