@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.bounds.causal import SetPointLaw
-from benchmarks.bounds.linear_program import TAIL, plan, reference
+from benchmarks.bounds.linear_program import SMOOTH, TAIL, plan, reference
 from benchmarks.bounds.unknown import unknown
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.loop.linear import LinearModel
@@ -143,7 +143,12 @@ def _least(
     model = LinearModel(parameters, numbers, np.arange(len(setpoint) + ahead))
     unforeseen = unknown(model)
     if kind == "reference":
-        return reference(model, unforeseen, setpoint).cost
-    penalised = kind == "causal" and parameters.setpoint_amplitude > 0.0
-    penalty = SetPointLaw(model, unforeseen).penalty(setpoint) if penalised else 0.0
-    return plan(model, unforeseen, setpoint, penalty=penalty).cost
+        error, flow = reference(model, unforeseen, setpoint)
+        price = SMOOTH * np.abs(np.diff(flow, prepend=0.0))
+    else:
+        penalty = np.zeros(len(setpoint))
+        if kind == "causal" and parameters.setpoint_amplitude > 0.0:
+            penalty = SetPointLaw(model, unforeseen).penalty(setpoint)
+        error, flow = plan(model, unforeseen, setpoint, penalty=penalty)
+        price = penalty * flow
+    return float(error[1:].sum() + price.sum())  # no flow changes e(0)

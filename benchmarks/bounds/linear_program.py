@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -53,18 +53,6 @@ class Unknown:
         return np.diff(ends, axis=1, prepend=0.0)
 
 
-@dataclass(frozen=True)
-class Plan:
-    """A solution of the linear program. All arrays have the shape (samples,)."""
-
-    error: Array
-    """The lower bound of E|e(k)|, degC."""
-    flow: Array
-    """The mean of u_a(k), t/h."""
-    cost: float
-    """The minimum of the objective over k = 1 to N, as no flow changes e(0); degC."""
-
-
 def equations(model: LinearModel, samples: int) -> tuple[Any, Any]:
     """Return A and B of (28) without noise, A y = B u, for an episode from rest."""
     lags = 1, int(model.numbers.delay) + 1
@@ -91,8 +79,8 @@ def plan(
     past: ArrayLike = (),
     quiet: bool = False,
     penalty: ArrayLike = 0.0,
-) -> Plan:
-    """Minimise the sum of the bounds of E|e(k)| over the mean flow.
+) -> tuple[Array, Array]:
+    """Minimise the sum of the bounds of E|e(k)| over the mean flow; return bounds and flow.
 
     Take any controller, causal or not, and let y and u_a stand for their means over all noise,
     load and randomness of the controller. As (28) is linear, the means obey it without noise;
@@ -133,8 +121,8 @@ def plan(
         flow[start:-1] = _solve(*own, targets, unknowns, np.roots(model.parameters.b))
     # The last flow affects no output; if it does not move, it costs nothing either.
     flow[-1] = flow[-2] if samples > 1 else 0.0
-    error = unknown.mean_error(setpoint - scipy.sparse.linalg.spsolve_triangular(A, B @ flow))
-    return Plan(error, flow, float(error[1:].sum() + price @ flow))
+    output = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
+    return unknown.mean_error(setpoint - output), flow
 
 
 def _unknowns(count: int, cost: Any, low: Any, high: Any) -> Array:
@@ -190,8 +178,8 @@ def _solve(
     )
 
 
-def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> Plan:
-    """Return the best mean flow of a controller that never expects another change.
+def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> tuple[Array, Array]:
+    """Return what `plan` does, for a controller that never expects another change.
 
     Where set points have no law (a square wave, a list), the only bound is that with preview:
     for one given sequence any controller may have the times of its changes built in. The
@@ -208,13 +196,12 @@ def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> Plan:
         last = stop == len(setpoint)
         beyond = np.full(0 if last else model.lag + TAIL, setpoint[start])
         ahead = np.concatenate([setpoint[:stop], beyond])
-        found = plan(model, unknown, ahead, past=flow[:start], quiet=True)
-        flow, error[start:stop] = found.flow, found.error[start:stop]
+        of_hold, flow = plan(model, unknown, ahead, past=flow[:start], quiet=True)
+        error[start:stop] = of_hold[start:stop]
         moving = np.ptp(flow[max(stop - model.lag - 1, start - 1, 0) : stop])
         if not last and (stop - start < model.lag or moving > SETTLED * (high - low)):
             raise ValueError(
                 "setpoint must be held until the plant has settled, or there is no reference; "
                 f"got a hold of {stop - start} samples"
             )
-    travel = np.abs(np.diff(flow, prepend=0.0)).sum()
-    return replace(found, error=error, cost=float(error[1:].sum() + SMOOTH * travel))
+    return error, flow

@@ -87,10 +87,7 @@ def work(options: Options) -> str:
                 **made,
                 "options": {**asdict(options), "agents": [*controllers]},
                 "seeds": [*range(SEED, SEED + options.runs)],
-                "scenarios": {
-                    each.name: {"samples": each.samples, "arguments": each.arguments}
-                    for each in scenarios
-                },
+                "scenarios": {each.name: vars(each) for each in scenarios},
                 "policies": {each.agent: each.policies for each in finished if each.policies},
             }
             write_json(folder / "provenance.json", about)
