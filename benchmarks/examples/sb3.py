@@ -40,6 +40,15 @@ SETTINGS: dict[str, Any] = {
     "gae_lambda": 1.0,  # below 1, the value function also stands in for effects in transit
 }
 WINDOWS = {"setpoint_window": 3, "error_window": 1, "output_window": 64, "action_window": 64}
+PLANTS: dict[str, Any] = {
+    "wrapper": {"max_move": 2.0, "compensate_dead_zone": True},
+    "noise_variance": [0.0, 0.5],
+    "setpoint": "random",
+    "setpoint_amplitude": 6.0,
+    "reward": "absolute",
+    "error_scale": 50.0,  # for returns of order 1, which are learnt quickly
+    **WINDOWS,
+}
 
 
 def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
@@ -117,24 +126,6 @@ def make_ppo(plants: VecEnv, seed: int, **policy: Any) -> PPO:
     return model
 
 
-def make_model(seed: int) -> PPO:
-    """Return an untrained model of the plants."""
-    plants = make_vec_env(
-        "MiddlePoint-v0",
-        512,
-        group=GROUP,
-        wrapper={"max_move": 2.0, "compensate_dead_zone": True},
-        noise_variance=[0.0, 0.5],
-        setpoint="random",
-        setpoint_amplitude=6.0,
-        reward="absolute",
-        error_scale=50.0,  # for returns of order 1, which are learnt quickly
-        **WINDOWS,
-    )
-    linear = {"pi": [], "vf": [64, 64]}  # the policy; the value function has two layers
-    return make_ppo(plants, seed, features_extractor_class=Changes, net_arch=linear)
-
-
 def main() -> None:
     """Train a policy, save it and print its scores."""
     parser = argparse.ArgumentParser(description="PPO of Stable-Baselines3 on 512 plants.")
@@ -144,7 +135,10 @@ def main() -> None:
     options = parser.parse_args()
 
     torch.set_num_threads(1)  # the networks are too small for more
-    model = make_model(options.seed).learn(options.steps, Exploration(-1.2, -4.0))
+    plants = make_vec_env("MiddlePoint-v0", 512, group=GROUP, **PLANTS)
+    linear = {"pi": [], "vf": [64, 64]}  # the policy; the value function has two layers
+    model = make_ppo(plants, options.seed, features_extractor_class=Changes, net_arch=linear)
+    model.learn(options.steps, Exploration(-1.2, -4.0))
     save(model, options.out / f"ppo-{options.seed}.zip")
     for env in ("MiddlePoint-v0", "MiddlePointNoisy-v0"):
         print(evaluate(model, spec_of(model, env)))
