@@ -99,21 +99,16 @@ def is_count(value: Any, minimum: int = 0) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= minimum
 
 
-def _number_that(holds: Callable[[float], bool], allowed: str) -> Callable[[str, Any], float]:
-    """Return a check that takes a number if a condition holds, and never returns -0."""
-
-    def checked(name: str, value: Any) -> float:
-        if not is_number(value) or not holds(value):
-            reject(name, value, allowed)
-        return float(value) + 0.0
-
-    return checked
+def number(name: str, value: Any, low: float = -LARGEST, allowed: str | None = None) -> float:
+    """Return a number of at least `low`, never -0."""
+    if not is_number(value) or value < low:
+        reject(name, value, allowed or f"a number from {low:g} to {LARGEST:g}")
+    return float(value) + 0.0
 
 
-number = _number_that(lambda value: True, "a number within +-1e9")
-not_negative = _number_that(lambda value: value >= 0, "a number from 0 to 1e9")
-positive = _number_that(lambda value: value >= 1e-9, "a number from 1e-9 to 1e9")
-at_least_1 = _number_that(lambda value: value >= 1, "a number from 1 to 1e9")
+not_negative = partial(number, low=0.0)
+positive = partial(number, low=1e-9)
+at_least_1 = partial(number, low=1.0)
 
 
 def count(name: str, value: Any, minimum: int, maximum: int) -> int:
@@ -163,7 +158,7 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
         return numbers(name, value, allowed, math.inf)
     if isinstance(value, str) and value in SETPOINTS:
         return value
-    return _number_that(lambda value: True, allowed)(name, value)
+    return number(name, value, allowed=allowed)
 
 
 def or_range(check: Callable[[str, Any], float], name: str, value: Any) -> Number:

@@ -217,10 +217,9 @@ class PlantBatch:
             first = self._longest - numbers.delay.astype(np.intp)
             rows = np.arange(len(self._taken))[:, np.newaxis] + first
             self._taken[:, which] = rows * self._num_envs + which
-        if self._changes_dynamics:
-            if self._drifts:
-                self._starts[which] = self._clock
-            self._update_dynamics()
+        if self._drifts:
+            self._starts[which] = self._clock
+        self._update_dynamics()
 
     def step(
         self, action: Values, noise: Values, load: Values | None = None
