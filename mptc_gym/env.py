@@ -221,7 +221,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         self._layout = parameters.temperature_span, *heads
         self._ranges = Ranges(parameters)
         self._signals = Signals.of(parameters)
-        self._has_more_info = parameters.is_disturbed or parameters.drifts
+        self._is_disturbed, self._drifts = parameters.is_disturbed, parameters.drifts
+        self._has_more_info = self._is_disturbed or self._drifts
         self._streams: list[Streams] = []  # of the one plant, from the first reset on
         self._root: np.random.Generator | None = None  # their source
         # y_d, n, w and the measurement noise of the samples ahead, the next one last.
@@ -366,9 +367,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
 
     def _add_more_info(self, info: dict[str, float], load: float) -> None:
         """Add the info that belongs to arguments that are off by default."""
-        if self.parameters.is_disturbed:
+        if self._is_disturbed:
             info["disturbance"] = load
-        if self.parameters.drifts:
+        if self._drifts:
             info["gain_factor"], info["time_constant_factor"] = self._plant.factors
 
 
