@@ -179,35 +179,31 @@ def _interval(value: float, values: list[float]) -> Interval:
 
 
 def _check(log: Log) -> None:
-    """Raise a ValueError if no plant can be seen in a log."""
+    """Raise a ValueError if no plant can be seen in a log.
+
+    That is so if the flow's moves are a linear controller's, but for few: the least absolute
+    errors of a regression on the last temperatures leave the others as outliers.
+    """
     for name, values in (("flow", log.flow), ("temperature", log.temperature)):
         if not np.nanmax(values) - np.nanmin(values) > 1e-9 * np.nanmax(np.abs(values)):
             raise ValueError(f"the {name} is constant: the log does not show a response")
-    if follows(log.flow, log.temperature):
+    u, y, span = log.flow, log.temperature, float(np.ptp(log.flow))
+    table = np.column_stack([y[2:], y[1:-1], y[:-2], u[1:-1], np.ones(len(u) - 2)])
+    there = np.isfinite(table).all(axis=1)
+    table, moves = table[there], np.diff(u)[1:][there]
+    weight = np.ones(len(table))
+    for _ in range(20):
+        law = np.linalg.lstsq(table * weight[:, np.newaxis], moves * weight, rcond=None)[0]
+        left = np.abs(moves - table @ law)
+        weight = 1.0 / np.sqrt(left + 1e-4 * span)
+    typical = float(np.median(left))
+    own = left > max(8.0 * typical, 0.02 * span)
+    if typical < 0.5 * np.median(np.abs(moves)) and own.sum() < 4:
         raise ValueError(
             "the flow follows the temperature, and nothing else moves it: in a closed loop "
             "with a constant set point, the log shows the controller. Move the set point, or "
             "the flow by hand"
         )
-
-
-def follows(flow: Array, temperature: Array) -> bool:
-    """Return whether the flow's moves are a linear controller's, but for few.
-
-    The least absolute errors of a regression on the last temperatures leave the moves that do
-    not follow from these as outliers.
-    """
-    lagged = temperature[2:], temperature[1:-1], temperature[:-2], flow[1:-1]
-    table = np.column_stack([*lagged, np.ones(len(flow) - 2), np.diff(flow)[1:]])
-    table = table[np.isfinite(table).all(axis=1)]
-    weight = np.ones((len(table), 1))
-    for _ in range(20):
-        x, moves = (table * weight)[:, :-1], (table * weight)[:, -1]
-        left = np.abs(table[:, -1] - table[:, :-1] @ np.linalg.lstsq(x, moves, rcond=None)[0])
-        weight = 1.0 / np.sqrt(left + 1e-4 * np.ptp(flow))[:, np.newaxis]
-    typical, moved = float(np.median(left)), float(np.median(np.abs(table[:, -1])))
-    own = left > max(8.0 * typical, 0.02 * float(np.ptp(flow)))
-    return typical < 0.5 * moved and int(own.sum()) < 4
 
 
 def held_out(fit: Fit) -> tuple[float, float]:
