@@ -45,8 +45,9 @@ class PredictiveController:
         # stays the same.
         self._stays = 1.0 - np.minimum(LOAD_INTERVAL / numbers.disturbance_interval, 1.0)
         uniform = np.square(numbers.disturbance_amplitude) / 3.0
-        self._step_variance = uniform * (1.0 - np.square(self._stays))
-        self._walk_variance = LOAD_INTERVAL * numbers.disturbance_walk_variance
+        steps = uniform * (1.0 - np.square(self._stays))
+        walk = LOAD_INTERVAL * numbers.disturbance_walk_variance
+        self._variances = np.stack([numbers.noise_variance + TINY, steps, walk], axis=1)
         self._drifts = parameters.drifts
         # The state: y(k), y(k-1), ...; xi(k), xi(k-1), ...; the steps of the load and its walk.
         self._n_y = max(len(parameters.a) - 1, 1)
@@ -123,17 +124,14 @@ class PredictiveController:
         """Return the state transition from k - 1 to k, and the process noise's covariance."""
         changes = k % LOAD_INTERVAL == 0
         F = np.zeros((self._num_envs, self._size, self._size))
-        xi, steps, walk = np.zeros((3, self._num_envs, self._size))
-        F[:, :-2, :-2], xi[:, :-2] = model.state_space()
-        F[:, -2, -2] = self._stays if changes else 1.0
-        F[:, -1, -1] = 1.0
+        sources = np.zeros((self._num_envs, self._size, 3))  # xi, the steps and the walk
+        F[:, :-2, :-2], sources[:, :-2, 0] = model.state_space()
+        F[:, -2, -2], F[:, -1, -1] = self._stays if changes else 1.0, 1.0
         F[:, 0, -2:] = model.load[:, np.newaxis] * F[:, [-2, -1], [-2, -1]]
-        steps[:, 0], steps[:, -2] = model.load, 1.0
-        walk[:, 0], walk[:, -1] = model.load, 1.0
-        Q = _outer(xi, self._numbers.noise_variance + TINY)
-        if changes:
-            Q = Q + _outer(steps, self._step_variance) + _outer(walk, self._walk_variance)
-        return F, Q
+        sources[:, 0, 1:] = model.load[:, np.newaxis]
+        sources[:, -2, 1] = sources[:, -1, 2] = 1.0
+        variances = self._variances * [1, changes, changes]
+        return F, np.einsum("nk,nik,njk->nij", variances, sources, sources)
 
     def _predict(self) -> Array:
         """Return the outputs expected from k + 1 on without further commands."""
@@ -195,8 +193,3 @@ class PredictiveController:
             if np.abs(plan - before).max() < TOLERANCE:
                 break
         return plan
-
-
-def _outer(vectors: Array, variances: Array) -> Array:
-    outer: Array = np.einsum("n,ni,nj->nij", variances, vectors, vectors)
-    return outer

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -127,13 +126,10 @@ class Controller:
     ) -> Trajectory:
         """Run the given controller, by default a new one for this plant; see `rollout`."""
         agent, arguments = controller or self(plant, runs, seed), {**plant, **self.observation}
-        opened: Any = getattr(agent, "opened", None)  # of a user's, that acts in its own
-        with (
-            opened(samples, **arguments)
-            if opened
-            else closing(make_plants(runs, samples, **arguments))
-        ) as plants:
-            return rollout(plants, agent, samples, seed)
+        if hasattr(agent, "opened"):  # a user's, that acts in its own
+            with agent.opened(samples, **arguments) as plants:
+                return rollout(plants, agent, samples, seed)
+        return rollout(make_plants(runs, samples, **arguments), agent, samples, seed)
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
         """Return a controller that is ready for plants it was not made for.
@@ -180,7 +176,7 @@ _LAW = (
 _RULE = "nothing: one step test, a rule"
 _NETWORK = partial(trained, LawNetwork, "nn-smith.npz")
 
-_CONTROLLERS = (
+ROSTER = {each.name: each for each in (
     Controller(
         "nothing", "no control", ("#8C8C8C", "x"), IdleValve,
         knows="nothing", searched="nothing", observation={}, compared=False, swept=False,
@@ -255,8 +251,7 @@ _CONTROLLERS = (
         knows=f"{_DATA_SHEET}; delay range",
         searched=f"{_LAW}; 31 settings by hand; one step test", networks=_NETWORK,
     ),
-)  # fmt: skip
-ROSTER = {each.name: each for each in _CONTROLLERS}
+)}  # fmt: skip
 
 
 def label(agent: str) -> str:

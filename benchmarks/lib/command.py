@@ -1,14 +1,12 @@
 """Declare and run the commands `python -m benchmarks.NAME`, and their tasks in parallel.
 
-A command is one file, `benchmarks/NAME.py`, or a folder with a `__main__.py`, in which stand
+A command is a file, `benchmarks/NAME.py`, or a folder with a `__main__.py`. In it stand
 
 - a dataclass of options, decorated by `options`: its docstring is the head of the help, and the
-  string under a field is the help of that option. A field of another such dataclass, such as
-  `FanOut`, adds the options of that one;
+  string under a field the help of that option. A field of another such dataclass adds its own;
 - a function `work` of these options, which prints what it finds and returns the closing line.
   What is slow to import, it imports itself, so that the help takes no time;
-- `main = command("NAME", Options, work)`, and at the end
-  `if __name__ == "__main__": raise SystemExit(main())`.
+- `main = command("NAME", Options, work)`, which the last line calls.
 """
 
 from __future__ import annotations

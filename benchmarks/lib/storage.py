@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import pickle
 import platform
 import subprocess
 import tempfile
@@ -108,19 +109,16 @@ class Kept:
 
     def load(self, task: Callable[[], Any]) -> Any:
         """Return the result of a task; None if it is missing or damaged."""
-        import joblib
-
+        path = self.path(task)
         with suppress(Exception):  # whatever a damaged file raises
-            return joblib.load(self.path(task))
+            return pickle.loads(path.read_bytes()) if path else None
         return None
 
     def save(self, task: Callable[[], Any], result: Any) -> None:
         """Write the result of a task, completely or not at all."""
-        import joblib
-
         if path := self.path(task):
             with replacing(path) as partial:
-                joblib.dump(result, partial)
+                partial.write_bytes(pickle.dumps(result))
 
 
 @cache
