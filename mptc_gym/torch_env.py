@@ -33,7 +33,6 @@ from mptc_gym.torch_signals import (
     as_tensor,
     make_signals,
     read_signals,
-    select,
 )
 
 _IN_CACHE = 1 << 17  # numbers processed at once
@@ -240,15 +239,18 @@ class MiddlePointTorchEnv(BatchEnv):
         return error.abs().mul_(-1.0 / scale)
 
     def _begin(self, mask: Mask) -> dict[str, Tensor]:
-        which = None if mask.all() else self._flags(mask)
+        which = self._flags(mask)
         self._episodes.clock, self._episodes.unused = self._clock, len(self._ahead)
         self._ahead = []
+        if mask.all():  # signals may be others than before
+            self._episodes.unused = 0
+            self.detach()
         first = self._episodes.reset(which, self._starts, self._given)
         self._plants.reset(which)
         at_rest = {name: each.reset(which) for name, each in self._signals.items()}
         numbers, setpoint = self._episodes.numbers, at_rest["setpoint"]
         rest_action = self._zeros + action_from_command(0.0, numbers["u_min"], numbers["u_max"])
-        self._action = select(which, rest_action, self._action)
+        self._action = torch.where(which, rest_action, self._action)
         self._shown.reset(which, setpoint, rest_action)
         first |= {"setpoint": setpoint, "error": setpoint}
         return first | {name: self._zeros + numbers[name] for name in self._factor_names}
@@ -311,28 +313,26 @@ class _Window:
         *self._windows, self._past_actions = windows
         self._episodes, self._differentiable = episodes, differentiable
         self._zeros = zeros = episodes.zeros
-        self._actions: list[Tensor] = []  # those shown, newest first
+        self._actions = [zeros[None]] * self._past_actions  # those shown, newest first
         # Set points, errors and outputs, oldest first: those of one observation, then those of
         # the latest block.
-        self._rows: list[list[Tensor]] = [[] for _ in self._windows]
+        self._rows = [[zeros] * w for w in self._windows]
         self._ahead: Iterator[Tensor] = iter(())  # observations of the block, without actions
         # Observations are stacked while they fit in the cache.
         numbers = max(1, sum(self._windows) * len(zeros))
         self._at_once = max(1, _IN_CACHE // numbers) if zeros.is_cpu else LONGEST
 
-    def reset(self, which: Tensor | None, setpoint: Tensor, rest_action: Tensor) -> None:
+    def reset(self, which: Tensor, setpoint: Tensor, rest_action: Tensor) -> None:
         """Begin an episode of some plants at rest."""
         for rows, w, newest in zip(
             self._rows, self._windows, (setpoint, setpoint, self._zeros), strict=True
         ):
             at_rest = [*[self._zeros] * (w - 1), newest.clone()][:w]
             end = len(rows) - self._episodes.unused
-            past = rows[end - w : end] or at_rest
-            rows[:] = [select(which, *each) for each in zip(at_rest, past, strict=True)]
+            past = rows[end - w : end]
+            rows[:] = [torch.where(which, *each) for each in zip(at_rest, past, strict=True)]
         if self._past_actions:
-            shown = rest_action.clamp(-1.0, 1.0).expand(self._past_actions, -1)
-            if which is not None:
-                shown = torch.where(which, shown, torch.cat(self._actions))
+            shown = torch.where(which, rest_action.clamp(-1.0, 1.0), torch.cat(self._actions))
             self._actions = [shown] if self._differentiable else [*shown.split(1)]
 
     def add(self, *blocks: Tensor) -> None:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
 from itertools import islice, pairwise
 from typing import Any
 
@@ -56,9 +55,14 @@ class TorchPlants:
         shortest, self._longest = map(int, parameters.range_of("delay"))
         self.most_samples = shortest + 1
         self._order = len(parameters.a) - 1  # of A
+        # Flows that have yet to take effect, for all terms of B; and outputs, those of the
+        # latest block and those that A needs from before it. Both have the oldest first.
+        flows = self._longest + len(self._beta)
+        self._flows = deque([self._zeros] * flows, flows)
+        self._outputs = [self._zeros] * self._order
 
-    def reset(self, mask: Tensor | None) -> None:
-        """Bring some plants, or all, to rest, with the numbers of the current episodes."""
+    def reset(self, mask: Tensor) -> None:
+        """Bring some plants to rest, with the numbers of the current episodes."""
         numbers, zeros = self._episodes.numbers, self._zeros
         self._now: tuple[Any, Any] | None = None  # factors and coefficients of (28)
         plants = PlantNumbers(**numbers)
@@ -70,16 +74,9 @@ class TorchPlants:
                 (zeros + begin, zeros + (end - begin))
                 for begin, end in zip(self._factors, last, strict=True)
             ]
-        # Flows that have yet to take effect, for all terms of B; and outputs, those of the
-        # latest block and those that A needs from before it. Both have the oldest first.
-        if mask is None:
-            flows = self._longest + len(self._beta)
-            self._flows = deque([zeros] * flows, flows)
-            self._outputs = [zeros] * self._order
-        else:
-            used = self._outputs[: len(self._outputs) - self._episodes.unused]
-            self._outputs = [each.masked_fill(mask, 0.0) for each in used]
-            self._flows.extend(torch.stack([*self._flows]).masked_fill_(mask, 0.0).unbind())
+        used = self._outputs[: len(self._outputs) - self._episodes.unused]
+        self._outputs = [each.masked_fill(mask, 0.0) for each in used]
+        self._flows.extend(torch.stack([*self._flows]).masked_fill_(mask, 0.0).unbind())
         self._limits = u_min, u_max = numbers["u_min"], numbers["u_max"]
         self._middle = zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
@@ -126,7 +123,10 @@ class TorchPlants:
             if load is not None:
                 forced = _plus(forced, load_gain, load[first:last])
             all_factors += [factors] * (last - first)
-            rows = _follow(rows, forced.unbind(), alpha)
+            for output in forced.unbind():
+                for lag, coefficient in enumerate(alpha, start=1):
+                    output = _plus(output, coefficient, rows[-lag])
+                rows.append(output)
         self._outputs = rows
         return torch.stack(rows[self._order :]), all_factors
 
@@ -166,18 +166,6 @@ class TorchPlants:
                 factors = tuple(_plus(first, share, more) for first, more in self._drift)
             self._now = factors, self._dynamics.coefficients(*factors)
         return self._now
-
-
-def _follow(
-    past: Sequence[Tensor], forced: Iterable[Tensor], alpha: Sequence[Number]
-) -> list[Tensor]:
-    """Return past outputs and those that follow by A of (28), oldest first."""
-    outputs = list(past)
-    for output in forced:
-        for lag, coefficient in enumerate(alpha, start=1):
-            output = _plus(output, coefficient, outputs[-lag])
-        outputs.append(output)
-    return outputs
 
 
 def _plus(first: Tensor, factor: Number, second: Tensor) -> Tensor:

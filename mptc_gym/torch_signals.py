@@ -1,9 +1,9 @@
 """Generate external signals in PyTorch, drawn from one generator, or pass on given ones.
 
 The signals have two methods, for many plants and a block of samples at a time, without a loop
-over plants. `reset(mask)` begins an episode of some plants, or of all if `mask` is None, and
-returns the signal at k = 0, shape (n,). `next(samples)` returns a block of the samples that
-follow, degC, shape (samples, n). All share the clock of `Episodes`.
+over plants. `reset(mask)` begins an episode of some plants and returns the signal at k = 0,
+shape (n,). `next(samples)` returns a block of the samples that follow, degC, shape
+(samples, n). All share the clock of `Episodes`.
 """
 
 from __future__ import annotations
@@ -24,11 +24,6 @@ from mptc_gym.signals import LOAD_INTERVAL, Levels, colours
 LONGEST = 64  # most samples in a block
 SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
 Number = float | Tensor  # one for all plants, or one per plant, shape (n,)
-
-
-def select(mask: Tensor | None, new: Tensor, old: Tensor) -> Tensor:
-    """Return new values for some plants, old ones for the others; None selects all plants."""
-    return new if mask is None else torch.where(mask, new, old)
 
 
 def as_tensor(values: Any, like: Tensor) -> Tensor | None:
@@ -69,7 +64,7 @@ class Episodes:
         self._rows = torch.arange(LONGEST, device=zeros.device)[:, None]
 
     def reset(
-        self, mask: Tensor | None, starts: NDArray[np.int64], given: Mapping[str, Given]
+        self, mask: Tensor, starts: NDArray[np.int64], given: Mapping[str, Given]
     ) -> dict[str, Tensor]:
         """Begin an episode of some plants, and return the numbers that are drawn or given.
 
@@ -79,13 +74,13 @@ class Episodes:
         for name, (low, high) in self._ranges.items():
             whole = isinstance(low, int)
             values = given[name].reset(mask) if name in given else self.draw(low, high, whole)
-            self.numbers[name] = select(mask, values, self.zeros + self.numbers[name])
+            self.numbers[name] = torch.where(mask, values, self.numbers[name])
             first[name] = values.to(torch.int64) if whole else values
         if (starts == self.clock).all():
             self._starts = self.clock
         else:
-            before = torch.zeros_like(self.zeros, dtype=torch.int64) + self._starts
-            self._starts = select(mask, torch.full_like(before, self.clock), before)
+            before = torch.zeros_like(mask, dtype=torch.int64) + self._starts
+            self._starts = before.masked_fill(mask, self.clock)
         if self._changes:
             self._due = {*np.unique(starts % DRIFT_INTERVAL).tolist()}
         return first
@@ -120,17 +115,14 @@ class Noise:
     def __init__(self, name: str, c: Sequence[float], episodes: Episodes) -> None:
         self._variance, self._c, self._order = f"{name}_variance", c, len(c) - 1
         self._episodes = episodes
+        self._xi = episodes.zeros.expand(self._order, -1)  # those of the latest block last
 
-    def reset(self, mask: Tensor | None) -> Tensor:
+    def reset(self, mask: Tensor) -> Tensor:
         """Begin an episode of some plants."""
-        zeros = self._episodes.zeros
         self._deviation = self._episodes.numbers[self._variance] ** 0.5
-        if mask is None:
-            self._xi = zeros.expand(self._order, -1)  # those of the latest block last
-        else:
-            used = len(self._xi) - self._episodes.unused
-            self._xi = self._xi[:used].masked_fill(mask, 0.0)
-        return zeros
+        used = len(self._xi) - self._episodes.unused
+        self._xi = self._xi[:used].masked_fill(mask, 0.0)
+        return self._episodes.zeros
 
     def next(self, samples: int) -> Tensor:
         """Draw the next samples."""
@@ -138,11 +130,11 @@ class Noise:
         past = self._xi[len(self._xi) - order :]
         self._xi = past.new_empty(order + samples, past.shape[1])
         self._xi[:order] = past
-        drawn = self._xi[order:]
-        if isinstance(self._deviation, float):
-            noise = drawn.normal_(0.0, self._deviation, generator=generator)
+        noise, deviation = self._xi[order:], self._deviation
+        if isinstance(deviation, float):
+            noise.normal_(0.0, deviation, generator=generator)
         else:
-            noise = drawn.normal_(generator=generator).mul_(self._deviation)
+            noise.normal_(generator=generator).mul_(deviation)
         for lag, coefficient in enumerate(self._c[1:], start=1):
             noise = noise.add(self._xi[order - lag : order - lag + samples], alpha=coefficient)
         return noise
@@ -164,12 +156,12 @@ class RandomSetPoint:
         # The level of then and where it ends, and the same of the level that follows.
         self._level = self._end = self._next_level = self._next_end = zeros
 
-    def reset(self, mask: Tensor | None) -> Tensor:
+    def reset(self, mask: Tensor) -> Tensor:
         """Begin an episode of some plants."""
         self._count_from(self._episodes.clock)
         level, hold = self._draw()
-        self._level = select(mask, level, self._level)
-        self._end = select(mask, hold, self._end)
+        self._level = torch.where(mask, level, self._level)
+        self._end = torch.where(mask, hold, self._end)
         self._known_until = self._drawn_at
         return self._level
 
@@ -208,18 +200,15 @@ class RepeatedSetPoint:
         self._ends = torch.tensor(levels.lengths, device=self._values.device).cumsum(0)
         self._period = sum(levels.lengths)
 
-    def reset(self, mask: Tensor | None) -> Tensor:
+    def reset(self, mask: Tensor) -> Tensor:
         """Begin an episode of some plants."""
         return self._values[0].expand(len(self._episodes.zeros))
 
     def next(self, samples: int) -> Tensor:
         """Return the next samples."""
-        n = len(self._episodes.zeros)
-        if len(self._values) == 1:
-            return self._values.expand(samples, n)
         ages = self._episodes.ages(samples)
         places = torch.bucketize(ages % self._period, self._ends, right=True)
-        return self._values[places].expand(samples, n)
+        return self._values[places].expand(samples, len(self._episodes.zeros))
 
 
 class Disturbance:
@@ -227,17 +216,14 @@ class Disturbance:
 
     def __init__(self, episodes: Episodes) -> None:
         self._episodes = episodes
-
-    def reset(self, mask: Tensor | None) -> Tensor:
-        """Begin an episode of some plants."""
-        zeros = self._episodes.zeros
         # Steps and walk at the sample before the latest block, and at those of the block.
-        if mask is None:
-            self._parts = [(zeros, zeros)]
-        else:
-            step, walk = self._parts[-1 - self._episodes.unused]
-            self._parts = [(step.masked_fill(mask, 0.0), walk.masked_fill(mask, 0.0))]
-        return zeros
+        self._parts = [(episodes.zeros, episodes.zeros)]
+
+    def reset(self, mask: Tensor) -> Tensor:
+        """Begin an episode of some plants."""
+        step, walk = self._parts[-1 - self._episodes.unused]
+        self._parts = [(step.masked_fill(mask, 0.0), walk.masked_fill(mask, 0.0))]
+        return self._episodes.zeros
 
     def next(self, samples: int) -> Tensor:
         """Draw the next samples."""
@@ -290,9 +276,9 @@ class Given:
         self._values, self._episodes = values, episodes
         self._episode = torch.full_like(episodes.zeros, -1, dtype=torch.int64)  # of each plant
 
-    def reset(self, mask: Tensor | None) -> Tensor:
+    def reset(self, mask: Tensor) -> Tensor:
         """Begin the next episode of some plants."""
-        self._episode = self._episode + (1 if mask is None else mask)
+        self._episode = self._episode + mask
         return self._at(torch.zeros_like(self._episode)[None])[0]
 
     def next(self, samples: int) -> Tensor:
