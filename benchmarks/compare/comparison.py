@@ -45,14 +45,10 @@ class Case:
 
     scenario: str
     agent: str
-    runs: pd.DataFrame
-    """Measures, one row for each run of each member."""
-    responses: pd.DataFrame
-    """Percentiles over the runs, one row for each sample."""
-    policies: Sequence[Mapping[str, Any]]
-    """Origin of each member, if it was trained."""
-    seconds: float
-    """Processor time of the runs, s."""
+    runs: pd.DataFrame  # measures, a row for each run of each member
+    responses: pd.DataFrame  # percentiles over the runs, a row for each sample
+    policies: Sequence[Mapping[str, Any]]  # origins of the members that were trained
+    seconds: float  # processor time of the runs
 
 
 def run_case(scenario: Scenario, controller: Controller, runs: int) -> Case:
@@ -103,10 +99,8 @@ class Scale:
     """The bounds that the errors of a case are measured against."""
 
     scenario: Scenario
-    least: Any
-    """`LeastPossible`, of the kind "causal", "reference" or "preview" that applies."""
-    preview: float
-    """The least possible error of any controller, even with foresight, degC."""
+    least: Any  # `LeastPossible` of the kind that applies
+    preview: float  # the least possible error of any controller, even with foresight, degC
 
 
 def scale_of(scenario: Scenario, runs: int) -> Scale:
@@ -346,12 +340,8 @@ def costs_table(cases: Sequence[Case], controllers: Mapping[str, Controller]) ->
         own = [case for case in cases if case.agent == name]
         # The roster says it in a record, a user's own controller itself.
         said = next((dict(policy) for case in own for policy in case.policies), {})
-        rows.append(
-            {
-                "controller": label(name),
-                "prior knowledge": controller.knows or said.get("knows", ""),
-                "searched or trained": controller.searched or said.get("searched", ""),
-                "runs (s)": f"{sum(case.seconds for case in own):.1f}",
-            }
-        )
-    return pd.DataFrame(rows)
+        knows = controller.knows or said.get("knows", "")
+        searched = controller.searched or said.get("searched", "")
+        rows.append([label(name), knows, searched, f"{sum(case.seconds for case in own):.1f}"])
+    columns = ["controller", "prior knowledge", "searched or trained", "runs (s)"]
+    return pd.DataFrame(rows, columns=columns)
