@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from agents.actuator import applied_flow
 from agents.controller import NotNegative, Positive
 from agents.neural_law import NOMINAL, Law, LawNetwork, Prior
-from agents.self_tuning import SelfTuningController
+from agents.self_tuning import SelfTuningController, dot
 
 Array = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ class NeuralSelfTuningController(SelfTuningController):
         load = residual - (1.0 - rule.prior.unit) * before
         self._residual = residual
         now, last = (
-            np.einsum("ij,ij->i", self._sums, self._units[:, self._now - ago]) / self._authority
+            dot(self._sums, self._units[:, self._now - ago]) / self._authority
             for ago in range(2)
         )
         flow = self._flows[:, self._now - 1]

@@ -221,7 +221,7 @@ class SelfTuningController(ModelBasedController):
 
         np.clip(gains, *sorted(self.gain * multiple for multiple in GAINS), out=gains)
         weighted = weights * gains
-        squares = _dot(weighted, gains) + _dot(weights, self._variance / information)
+        squares = dot(weighted, gains) + dot(weights, self._variance / information)
         # Variance over all gains, as a share of the square of their mean.
         self._gain_variance = share * squares / np.square(weighted.sum(1)) - 1.0
         for adopted, design in ((self._weights, weights), (self._gains, weighted)):
@@ -270,8 +270,8 @@ class SelfTuningController(ModelBasedController):
         fading = self._trust * (output - self._bias) - models @ self._fading
         self._disturbance += (1.0 - DISTURBANCE_POLE) * (fading - self._disturbance)
         response = self._units[:, self._now]
-        foreseen = _dot(self._sums, response) + self._bias + self._disturbance
-        command: Array = _dot(self._shares, response)
+        foreseen = dot(self._sums, response) + self._bias + self._disturbance
+        command: Array = dot(self._shares, response)
         command += self._feedback * (setpoint - foreseen)
         return command
 
@@ -304,7 +304,7 @@ class SelfTuningController(ModelBasedController):
         return values.reshape(self._loops, len(self._delays), -1)
 
 
-def _dot(first: Array, second: Array) -> Array:
+def dot(first: Array, second: Array) -> Array:
     """Return the dot products of corresponding rows."""
     products: Array = np.einsum("ij,ij->i", first, second)
     return products

@@ -38,19 +38,6 @@ from mptc_gym.torch_signals import (
 _IN_CACHE = 1 << 17  # numbers processed at once
 
 
-def _check_device(device: str | torch.device) -> torch.device:
-    """Return a device that supports tensors and a generator; ValueError otherwise."""
-    try:
-        checked = torch.device(device)
-        torch.zeros(1, device=checked)
-        torch.Generator(checked)
-    except (AssertionError, RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"device must be one that PyTorch can use here, got {device!r}: {error}"
-        ) from error
-    return checked
-
-
 class MiddlePointTorchEnv(BatchEnv):
     """n plants that advance together, with observations, actions and rewards in tensors.
 
@@ -81,8 +68,7 @@ class MiddlePointTorchEnv(BatchEnv):
     autoreset_mode : AutoresetMode
         The mode.
     checks_actions : bool
-        Whether actions that are not finite are refused, which requires waiting for the device;
-        see Waiting.
+        Whether actions that are not finite are refused; see Waiting.
 
     Raises
     ------
@@ -95,10 +81,9 @@ class MiddlePointTorchEnv(BatchEnv):
     -----
     **Random numbers.** All come from one `torch.Generator` on the device, which `reset(seed=)`
     restarts: the same seed, arguments and resets give the same numbers on the same device, with
-    the same versions of this package and of PyTorch. They differ from the numbers in NumPy,
-    which stay the same from version to version; the distributions are equal. In NumPy, the j-th
-    episode of a plant depends neither on the length of earlier episodes nor on the other
-    plants; here it does. So compare controllers in NumPy, or on external signals.
+    the same versions of this package and of PyTorch. Their distributions are those of NumPy,
+    but the numbers differ, and the j-th episode of a plant depends on the length of earlier
+    episodes and on the other plants. So compare controllers in NumPy, or on external signals.
 
     **External signals.** `reset(options={"signals": signals})` takes a dict of tensors: "noise"
     (n), "setpoint" (y_d), "disturbance" (w) and "measurement_noise", degC, each of shape
@@ -107,16 +92,14 @@ class MiddlePointTorchEnv(BatchEnv):
     the j-th element, and after the last the first again. What is not in the dict is drawn. A
     step beyond the last sample raises a ValueError.
 
-    **Gradients.** The actuator is not smooth. The gradient goes straight through the dead zone,
-    as if there were none, and is 0 beyond the limits, where nothing changes; readings beyond
-    the transmitter's span have no gradient, either. So a policy also learns from commands
-    without effect, whose true gradient is 0. `detach` cuts the graph for truncated
+    **Gradients.** The gradient goes straight through the dead zone, as if there were none, so a
+    policy also learns from commands without effect, whose true gradient is 0. It is 0 beyond
+    the actuator's limits and the transmitter's span. `detach` cuts the graph for truncated
     backpropagation. An action shows after `delay` + 1 samples: shorter segments have no
     gradient. Without `differentiable` no graph is kept.
 
-    **Waiting.** `step` never waits for the device: the host knows when episodes end. To avoid
-    waiting, actions that are not finite are refused on the CPU only; elsewhere, where
-    `checks_actions` is False, the plants that got them show NaN until they are reset. `reset`
+    **Waiting.** `step` never waits for the device. So actions that are not finite are refused
+    on the CPU only; elsewhere, the plants that got them show NaN until they are reset. `reset`
     may wait.
 
     **Memory.** The caller may keep or overwrite what a step returns, except that, in the infos,
@@ -145,10 +128,14 @@ class MiddlePointTorchEnv(BatchEnv):
             reject("dtype", dtype, "torch.float32 or torch.float64")
         if not isinstance(differentiable, bool):
             reject("differentiable", differentiable, "True or False")
-        self.device, self.dtype = _check_device(device), dtype
+        try:
+            self.device, self.dtype = torch.device(device), dtype
+            self._zeros = torch.zeros(num_envs, dtype=dtype, device=self.device)
+            torch.Generator(self.device)
+        except (AssertionError, RuntimeError, TypeError, ValueError) as error:
+            reject("device", device, f"one that PyTorch can use here ({error})")
         self.differentiable = differentiable
         self.checks_actions = self.device.type == "cpu"
-        self._zeros = torch.zeros(num_envs, dtype=dtype, device=self.device)
         self._action = self._zeros  # of the last step
         self._move_weight = self.parameters.move_weight
 
