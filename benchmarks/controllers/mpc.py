@@ -52,10 +52,10 @@ class PredictiveController:
         # The state: y(k), y(k-1), ...; xi(k), xi(k-1), ...; the steps of the load and its walk.
         self._n_y = max(len(parameters.a) - 1, 1)
         self._size = self._n_y + len(parameters.c) - 1 + 2
-        # For each sample ahead and each b, the index of the input that shows; below 1, none.
-        ahead = np.arange(1, int(self._delay.max()) + HORIZON + 1)
-        lag = np.arange(len(parameters.b))
-        self._shows = self._delay[:, np.newaxis, np.newaxis] + lag - ahead[:, np.newaxis] + 1
+        # For each sample from k on and each b, the index of the input that shows; 0 for none.
+        ahead = np.arange(int(self._delay.max()) + HORIZON + 1)[:, np.newaxis]
+        lag = np.arange(len(parameters.b)) + 1
+        self._shows = (self._delay[:, np.newaxis, np.newaxis] + lag - ahead).clip(0)
         self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON)
         self._models: dict[int, tuple[LinearModel, Array, Array]] = {}  # by age, samples
         self.reset()
@@ -85,16 +85,11 @@ class PredictiveController:
         inside = np.abs(command) < self._dead_zone
         if inside.any():
             edge = np.copysign(self._dead_zone, command)
-            firsts = [
-                applied_flow(first, self._dead_zone, self._u_min, self._u_max)
-                for first in (np.zeros_like(edge), edge)
-            ]
-            plans = [self._optimise(Q, target, plan, first) for first in firsts]
-            costs = [
-                np.einsum("ni,nij,nj->n", u, Q, u) / 2 - (target * u).sum(axis=1)
-                for u in (np.ascontiguousarray(each.T) for each in plans)
-            ]
-            rests = costs[0] <= costs[1]
+            flow = applied_flow(edge, self._dead_zone, self._u_min, self._u_max)
+            plans = [self._optimise(Q, target, plan, first) for first in (0.0, flow)]
+            rests = np.less_equal(
+                *(np.einsum("in,nij,jn->n", u, Q, u) / 2 - (target.T * u).sum(0) for u in plans)
+            )
             plan = np.where(inside, np.where(rests, *plans), plan)
             command = np.where(inside, np.where(rests, 0.0, edge), command)
         self._plan = plan
@@ -106,13 +101,10 @@ class PredictiveController:
 
     def _filter(self, output: Array) -> None:
         """Advance the state from k - 1 to k, and correct it with the reading y(k)."""
-        k, b = self._k, len(self._p.b)
-        model, *_ = self._model(k)
-        F, Q = self._transition(k, model)
+        model, *_ = self._model(self._k)
+        F, Q = self._transition(self._k, model)
         x = np.einsum("nij,nj->ni", F, self._state)
-        past = np.take_along_axis(
-            self._inputs[:, 1:], self._delay[:, np.newaxis] + np.arange(b), axis=1
-        )
+        past = np.take_along_axis(self._inputs, self._shows[:, 0], axis=1)
         x[:, 0] += (past * model.beta).sum(axis=1)
         P = F @ self._covariance @ F.transpose(0, 2, 1) + Q
         variance = P[:, 0, 0] + self._numbers.measurement_noise_variance
@@ -136,8 +128,8 @@ class PredictiveController:
     def _predict(self) -> Array:
         """Return the outputs expected from k + 1 on without further commands."""
         c, n_y = self._p.c, self._n_y
-        past = self._shows.clip(0)
-        moved = self._inputs[np.arange(self._num_envs)[:, np.newaxis, np.newaxis], past]
+        every = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
+        moved = self._inputs[every, self._shows[:, 1:]]
         ahead = range(self._k + 1, self._k + 1 + moved.shape[1])
         models = [self._model(k)[0] for k in ahead]
         moved *= np.stack([model.beta for model in models], axis=1)
@@ -173,7 +165,7 @@ class PredictiveController:
         return self._models[age]
 
     def _optimise(
-        self, Q: Array, target: Array, start: Array, first: Array | None = None
+        self, Q: Array, target: Array, start: Array, first: Array | float | None = None
     ) -> Array:
         """Minimise u Q u / 2 - target u within the limits by coordinate descent.
 

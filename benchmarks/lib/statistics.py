@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 CONFIDENCE = 0.95
 ENDS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)  # quantiles at the ends of an interval
 RESAMPLES = 2000  # bootstrap resamples
-PERCENTILES = {"median": 50, "p10": 10, "p90": 90}
 
 
 @dataclass(frozen=True)
@@ -120,6 +119,6 @@ def percentiles(
     """
     method = method if np.isfinite(values).all() else "higher"
     return {
-        name: np.percentile(values, percentile, axis=-1, method=method)
-        for name, percentile in PERCENTILES.items()
+        name: np.percentile(values, at, axis=-1, method=method)
+        for name, at in (("median", 50), ("p10", 10), ("p90", 90))
     }
