@@ -93,8 +93,7 @@ def row(case: Scenario, samples: int, drawn: Mapping[str, Any], mpc: int | None)
         with suppress(ValueError):
             cells[-1] = f"{least(kind=kind):.4f}"
     if mpc:
-        (predictive,) = ROSTER["mpc"].members()
-        runs = predictive.run(case.arguments, samples, mpc, drawn["seed"])
+        runs = ROSTER["mpc"].run(case.arguments, samples, mpc, drawn["seed"])
         cells.append(f"{bootstrap(mean_error(runs), seed=0):.4f}")
     return cells
 
