@@ -47,7 +47,7 @@ def compare(native, sync, *, steps, rng, partial_resets):
         ended = ours[3] & ~mask & (mode is AutoresetMode.NEXT_STEP)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     arguments=valid_arguments,
     num_envs=st.integers(1, 6),
