@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from numbers import Integral, Real
 from typing import Annotated, Any, Final, get_type_hints
 
@@ -51,11 +51,7 @@ def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
     raise ValueError(f"{name} must be numbers, got {value!r}")
 
 
-@cache
-def _checked_fields(controller: type[Controller]) -> dict[str, Any]:
-    """Return the types of a controller's arguments that say what is allowed, by argument."""
-    hints = get_type_hints(controller, include_extras=True).items()
-    return {name: hint for name, hint in hints if hasattr(hint, "__metadata__")}
+_types_of = cache(partial(get_type_hints, include_extras=True))  # which is slow
 
 
 @dataclass(eq=False, kw_only=True)
@@ -94,8 +90,9 @@ class Controller(ABC):
     _edge = 0.0  # of the dead zone, t/h; a command on it keeps its effect as an action
 
     def __post_init__(self) -> None:
-        for name, of in _checked_fields(type(self)).items():
-            setattr(self, name, check(name, getattr(self, name), of))
+        for name, of in _types_of(type(self)).items():
+            if hasattr(of, "__metadata__"):
+                setattr(self, name, check(name, getattr(self, name), of))
         if self.u_min >= self.u_max:
             raise ValueError(f"u_min must be below u_max = {self.u_max!r}, got {self.u_min!r}")
         self.reset()

@@ -81,8 +81,7 @@ class Prior:
     centre: Any
     """Centre of the limits: flows within 1 of it pass."""
     uncertainty: Any
-    """Standard deviation of the natural logarithm of the gain; it stands for the uncertainty
-    of the other numbers, too."""
+    """Standard deviation of the gain's logarithm; it stands for all other numbers, too."""
 
 
 class Law:
@@ -106,8 +105,7 @@ class Law:
         return value
 
     def __init__(self, prior: Prior, aggressiveness: float = 0.0) -> None:
-        self.prior, zero = prior, prior.unit * 0.0
-        self._zero = zero
+        self.prior, self._zero = prior, prior.unit * 0.0
         of_load = np.arange(_MEANS) < _LOADS
         self._of_load = self._array(of_load)
         self._alike = self._array(np.equal.outer(of_load, of_load))  # means of one kind
@@ -116,10 +114,10 @@ class Law:
         self._load_preference = self._array(LOAD_PREFERENCE)
         self._residual_preference = self._array(RESIDUAL_PREFERENCE)
         self._tilt, self._aggressiveness = self._array(TILT), aggressiveness
-        self._means = zero[:, None] * self._rates
-        self._innovations = zero[:, None] + self._array([0.0] * INNOVATIONS)
+        self._means = self._zero[:, None] * self._rates
+        self._innovations = self._zero[:, None] + self._array([0.0] * INNOVATIONS)
         self._misses = [self._means[:, :_LOADS] + LEAST_NOISE] * len(MISS_RATES)
-        self.adopt(prior, zero + 1.0, zero)
+        self.adopt(prior, self._zero + 1.0, self._zero)
 
     def adopt(self, prior: Prior, ratio: Any, residual: Any) -> None:
         """Adopt new numbers of the plants, and convert the memory to them.
@@ -287,10 +285,8 @@ class NeuralSmithPredictor(ModelBasedController):
         Standard deviation of the gain, as a share of it; 0 where the numbers are exact. It also
         stands for the time constant, which may be wrong by half as much again, and for the
         delay: 0.1 means two samples.
-    setpoint_index
-        Index of y_d(k), degC, in the observation.
-    error_index
-        Index of e(k), degC, in the observation.
+    setpoint_index, error_index
+        Indices of y_d(k) and e(k), degC, in the observation.
     network
         The weights; by default those that come with the project.
     """

@@ -34,10 +34,9 @@ class NeuralSelfTuningController(SelfTuningController):
     network
         The weights; by default those that come with the project.
     aggressiveness
-        How much quicker the law is than the network asks for, see `agents.neural_law.Law`. The
-        network was trained with fixed models; the residual of a changing model is sooner out of
-        date. It fades where the plant is calm, as it would only move the valve there. 0 halves
-        the valve travel in noise.
+        How much quicker the law is than the network asks for, which was trained with fixed
+        models: the residual of a changing one is sooner out of date. It fades where the plant
+        is calm, as it would only move the valve there. 0 halves the valve travel in noise.
     """
 
     forgetting: Positive = 0.999

@@ -68,11 +68,9 @@ class SelfTuningController(ModelBasedController):
     dead_zone
         Best guess of the half width of the actuator's dead zone, t/h. The bank holds this one
         and up to seven around it; for the default of 0, three above it.
-    shortest_delay_samples
-        Shortest delay that the plant may have, in samples; like `delay`, it includes the one
-        sample that any input takes to show.
-    longest_delay_samples
-        Longest delay that the plant may have, in samples; at most 10,000.
+    shortest_delay_samples, longest_delay_samples
+        Delays that the plant may have, in samples, at most 10,000; like `delay`, they include
+        the one sample that any input takes to show.
     closed_loop_time_constant
         Time constant of the closed loop, as a share of the identified one of the plant.
     forgetting

@@ -21,9 +21,8 @@ from mptc_gym.torch_signals import Episodes, Number
 def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:
     """Return the flow u_a that the actuator applies, (29), t/h.
 
-    Its gradient with respect to the command is 1 within the limits, straight through the dead
-    zone as if there were none, and 0 beyond them. Commands of a magnitude above `edge` have an
-    effect. The limits are both floats, or both of shape (n,).
+    Its gradient is 1 within the limits, also in the dead zone, and 0 beyond. Commands of a
+    magnitude above `edge` have an effect. The limits are both floats, or both of shape (n,).
     """
     alike = isinstance(edge, float) and isinstance(u_min, float) and isinstance(u_max, float)
     if alike and not command.requires_grad and u_min <= 0.0 <= u_max:
@@ -41,9 +40,8 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
 class TorchPlants:
     """Many plants side by side, with gradients where the actions have them.
 
-    Because of the delay, the outputs of the d + 1 samples after an action follow from the
-    actions so far, where d is the shortest delay that can be drawn. So they are computed in a
-    block, of at most `most_samples`.
+    With d the shortest delay that can be drawn, the outputs of the d + 1 samples after an
+    action follow from the actions so far, and are computed in a block of `most_samples`.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:

@@ -37,10 +37,9 @@ def as_tensor(values: Any, like: Tensor) -> Tensor | None:
 class Episodes:
     """The current episodes: clock, starts and plant numbers, shared by signals and plants.
 
-    `zeros`, shape (n,), have the device and type to use, and `generator` is the one source of
-    all draws. Before each block of samples, `clock` is set to the time of the first of them,
-    and before a reset to the time at which episodes begin. `unused` samples of the latest block
-    then lie ahead of it, and are dropped.
+    `zeros`, shape (n,), have the device and type to use; `generator` makes all draws. Before
+    a block of samples, `clock` is set to the time of the first, and before a reset to the time
+    at which episodes begin; `unused` samples of the latest block, ahead of it, are dropped.
     """
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
@@ -143,8 +142,7 @@ class Noise:
 class RandomSetPoint:
     """A set point of random levels, each held for a random number of samples.
 
-    In `shortest` samples, a plant changes its level at most once, so one further level is drawn
-    for them. Blocks are no longer than that.
+    One further level is drawn at a time: blocks are no longer than the shortest level.
     """
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
