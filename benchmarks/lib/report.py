@@ -129,7 +129,6 @@ NEAREST = 1e-3  # excess over the least possible error at which a logarithmic ax
 EXCESSES = (0.001, 0.01, 0.1, 0.5, 1.0, 4.0, 9.0, 29.0)
 STYLE: Any = {
     "axes.grid": True,
-    "axes.labelsize": "medium",
     "axes.spines.right": False,
     "axes.spines.top": False,
     "axes.titlelocation": "left",
