@@ -85,7 +85,7 @@ REFUSED = {
     ],
     "train": [([], "NETWORK is missing: one of nn-smith, ppo, ppo-hard")],
     "watch": [
-        (["--agent", "pi=none"], "--agent must be .*, and .pi. is taken"),
+        (["--agent", "pi=none"], "--agent: .pi=none. must be .*; .pi. is taken"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
         (["--scenario", "triangle"], "--scenario.*constant-noise"),
         (["--preset", "paper", "--scenario", "load"], "no 'load'; there are square, constant"),

@@ -124,7 +124,7 @@ class TestOwnControllers:
 
     @pytest.mark.parametrize("location", ["agents", "agents:No", "nowhere:x", ".:y", "..a:y"])
     def test_bad_locations(self, location):
-        with pytest.raises(UsageError, match=re.escape(f"--agent: {location!r} ")):
+        with pytest.raises(UsageError, match=f"--agent: .*{re.escape(location)}' "):
             members_of(location)
 
     @pytest.mark.parametrize(
@@ -234,8 +234,8 @@ class TestSavedPolicies:
             ("No:{}/bare.zip", "must begin with an algorithm"),
             ("SAC:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("PPO:{}/nan.zip", "Expected parameter loc"),
-            ("{}/velocity.zip", "must be such as PPO:model.zip"),
-            ("PPO:{}/none.zip", "must be such as PPO:model.zip"),
+            ("{}/velocity.zip", "must be NEW_NAME=.* that is there"),
+            ("PPO:{}/none.zip", "must be NEW_NAME=.* that is there"),
         ],
     )
     def test_what_is_refused(self, location, complaint, zips):

@@ -48,19 +48,14 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
     locations: dict[str, tuple[str, ...]] = {}
     for text in own:
         name, equals, location = text.partition("=")
-        taken = f", and {name!r} is taken" if name.lower() in ROSTER else ""
-        if taken or not (name and equals):
-            raise UsageError(
-                "--agent must be NEW_NAME=MODULE:FACTORY or NEW_NAME=PPO:FILE.zip"
-                f"{taken}, got {text!r}"
-            )
+        taken = f"; {name!r} is taken" if name.lower() in ROSTER else ""
         module, _, file = location.partition(":")
-        is_zip = location.endswith(".zip")
-        package = module.partition(".")[0] or "-"
-        if not (Path(file).is_file() if is_zip else importlib.util.find_spec(package)):
+        is_zip, package = location.endswith(".zip"), module.partition(".")[0] or "-"
+        there = Path(file).is_file() if is_zip else importlib.util.find_spec(package)
+        if taken or not (name and equals and there):
             raise UsageError(
-                f"--agent: {location!r} must be such as PPO:model.zip, a file that is there, "
-                "or MODULE:FACTORY, of a module that is there"
+                f"--agent: {text!r} must be NEW_NAME=MODULE:FACTORY or NEW_NAME=PPO:FILE.zip, "
+                f"of a module or a file that is there{taken}"
             )
         locations[name] = *locations.get(name, ()), location
     if not (names or own):
