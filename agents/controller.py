@@ -63,18 +63,15 @@ class Controller(ABC):
 
     Parameters
     ----------
-    u_min
-        Lower limit of the actuator, t/h.
-    u_max
-        Upper limit of the actuator, t/h. Limits scale the action; they do not clip commands.
+    u_min, u_max
+        Limits of the actuator, t/h. They scale the action, and do not clip commands.
 
     Attributes
     ----------
     n_obs : int
         The minimum number of elements in an observation.
     command : float64 or ndarray of float64
-        The last command u, before the actuator, t/h: a scalar after `act` on one observation,
-        an array of shape (batch,) after `act` on a batch.
+        The last command u, before the actuator, t/h; after `act` on a batch, shape (batch,).
 
     Raises
     ------

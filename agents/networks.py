@@ -136,9 +136,8 @@ class PolicyNetwork(Controller):
     layers
         Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
     observation
-        The windows of the observation that the network expects, by the names of the
-        environment's arguments: `setpoint_window`, `error_window`, `output_window`,
-        `action_window`. A window that is not named is 0.
+        The windows that the network expects, by the environment's arguments `setpoint_window`,
+        `error_window`, `output_window` and `action_window`; 0 where not named.
     input_scale
         Factor for each element of the observation; shape (n_obs,).
     activation

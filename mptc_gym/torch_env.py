@@ -102,10 +102,9 @@ class MiddlePointTorchEnv(BatchEnv):
     on the CPU only; elsewhere, the plants that got them show NaN until they are reset. `reset`
     may wait.
 
-    **Memory.** The caller may keep or overwrite what a step returns, except that, in the infos,
-    masks and drift factors may be one tensor for several steps. Tensors of several steps may
-    share a block of memory, which is freed when none of them is left. Observations are
-    transposed views: each column is contiguous in memory.
+    **Memory.** The caller may keep or overwrite what a step returns, but in the infos masks and
+    drift factors may be one tensor for several steps. Tensors of several steps may share a
+    block of memory, freed with the last of them. Columns of observations are contiguous.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as in VectorEnv)
@@ -137,7 +136,6 @@ class MiddlePointTorchEnv(BatchEnv):
         self.differentiable = differentiable
         self.checks_actions = self.device.type == "cpu"
         self._action = self._zeros  # of the last step
-        self._move_weight = self.parameters.move_weight
 
         self._episodes = Episodes(self.parameters, self._zeros)
         self._plants = TorchPlants(self.parameters, self._episodes)
@@ -175,8 +173,8 @@ class MiddlePointTorchEnv(BatchEnv):
             self._compute_block()
         rewards, terminations, truncations, infos = self._ahead.pop()
         observations = self._shown.next(a)
-        if self._move_weight:
-            rewards = rewards - self._move_weight * (a - self._action).abs()
+        if self.parameters.move_weight:
+            rewards = rewards - self.parameters.move_weight * (a - self._action).abs()
             self._action = a.clone()  # the caller may overwrite it
         infos["command"], infos["applied"] = command, applied
         return observations, rewards, terminations, truncations, infos

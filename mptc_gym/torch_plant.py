@@ -110,9 +110,12 @@ class TorchPlants:
         """
         rows, all_factors = self._outputs[len(self._outputs) - self._order :], []
         response = self._response(samples)
-        begins = [k for k in range(samples) if k == 0 or self._changes_at(k)]
+        due = self._episodes.any_due if self._drifts else (lambda row: False)
+        begins = [k for k in range(samples) if k == 0 or due(k)]
         for first, last in pairwise([*begins, samples]):
-            factors, (alpha, scale, load_gain) = self._dynamics_at(first)
+            if self._now is None or due(first):
+                self._now = self._dynamics_at(first)
+            factors, (alpha, scale, load_gain) = self._now
             forced = response[first:last]
             if noise is not None:
                 forced = _plus(noise[first:last], scale, forced)
@@ -148,22 +151,16 @@ class TorchPlants:
             response = response.add_(earlier, alpha=coefficient)
         return response
 
-    def _changes_at(self, row: int) -> bool:
-        """Whether the drifting dynamics of any plant change at a row of the block."""
-        return self._drifts and self._episodes.any_due(row)
-
     def _dynamics_at(self, row: int) -> tuple[Any, Any]:
         """Return gain and time constant at a row, and the coefficients of (28) for them."""
-        if self._now is None or self._changes_at(row):
-            factors: tuple[Any, ...] = self._factors
-            if self._drifts:
-                age = self._episodes.age(row)
-                if isinstance(age, Tensor):
-                    age = age.to(self._zeros.dtype)
-                share = self._dynamics.share(age - age % DRIFT_INTERVAL)
-                factors = tuple(_plus(first, share, more) for first, more in self._drift)
-            self._now = factors, self._dynamics.coefficients(*factors)
-        return self._now
+        factors: tuple[Any, ...] = self._factors
+        if self._drifts:
+            age = self._episodes.age(row)
+            if isinstance(age, Tensor):
+                age = age.to(self._zeros.dtype)
+            share = self._dynamics.share(age - age % DRIFT_INTERVAL)
+            factors = tuple(_plus(first, share, more) for first, more in self._drift)
+        return factors, self._dynamics.coefficients(*factors)
 
 
 def _plus(first: Tensor, factor: Number, second: Tensor) -> Tensor:
