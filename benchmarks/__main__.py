@@ -1,7 +1,5 @@
 """List the questions and the command that answers each: `python -m benchmarks`."""
 
-from __future__ import annotations
-
 import difflib
 import importlib
 import re

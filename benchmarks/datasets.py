@@ -1,7 +1,5 @@
 """Write offline data sets of plants under controllers: `python -m benchmarks.datasets`."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

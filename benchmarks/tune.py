@@ -1,7 +1,5 @@
 """Search for a controller's gains with Optuna: `python -m benchmarks.tune --help`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Make a film of a controller at work: `python -m benchmarks.watch --help`."""
 
-from __future__ import annotations
-
 import textwrap
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Check single values: each function returns a plain Python value, or raises a ValueError."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial

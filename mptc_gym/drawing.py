@@ -1,7 +1,5 @@
 """Draw a record of the loop with pygame: temperatures above, flows below, and its window."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import chain, pairwise

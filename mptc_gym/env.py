@@ -1,7 +1,5 @@
 """Simulate one plant, its set point and its transmitter: the environment `MiddlePoint-v0`."""
 
-from __future__ import annotations
-
 import inspect
 import math
 from copy import copy

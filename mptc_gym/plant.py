@@ -4,8 +4,6 @@ There are two implementations, side by side: `Plant` in plain floats, fastest fo
 `PlantBatch` in arrays. Both do the same operations in the same order and agree bit for bit.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from itertools import accumulate, pairwise
 from operator import mul

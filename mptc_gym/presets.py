@@ -1,7 +1,5 @@
 """Define presets of the environment, from the paper's cases to a hard one."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 _BOILER: Final[dict[str, Any]] = {

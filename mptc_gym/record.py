@@ -3,8 +3,6 @@
 A record holds only numbers, so that it can be copied with its environment.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 from mptc_gym.parameters import PlantNumbers

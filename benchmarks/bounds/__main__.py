@@ -1,7 +1,5 @@
 """Print the least possible mean error: `python -m benchmarks.bounds --help`."""
 
-from __future__ import annotations
-
 import shutil
 import textwrap
 from collections.abc import Mapping

@@ -21,8 +21,6 @@ output can have followed; later in a hold it is a number between -1 and 1, odd i
 that weighs staying against moving ahead to where the next level is expected.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy  # loads its modules on first use
 from numpy.typing import NDArray

@@ -6,8 +6,6 @@ points, plant numbers and loads up to k, but not the true output, `info["output"
 the dead zone.
 """
 
-from __future__ import annotations
-
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import cache, partial

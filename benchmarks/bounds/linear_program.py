@@ -1,7 +1,5 @@
 """Solve the linear program behind every bound, and plan the flow of a reference."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -23,8 +23,6 @@ Three steps lead to it; each can only lower the result.
 The bound is loose where the load jumps: by about 1 % on the preset "disturbed".
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy  # loads its modules on first use
 from numpy.typing import NDArray

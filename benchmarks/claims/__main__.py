@@ -1,7 +1,5 @@
 """Test the paper's claims: `python -m benchmarks.claims --help`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Examine the paper's claims: the runs for each, and the criteria that it must meet."""
 # ruff: noqa: B023, D103 (closures are called at once; what each function does stands above it)
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping

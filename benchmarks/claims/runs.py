@@ -1,7 +1,5 @@
 """Run batches of the NN and the PI controller, and judge and report what is found."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, isinf

@@ -1,7 +1,5 @@
 """Compare controllers in the same noise: `python -m benchmarks.compare --help`."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import asdict, dataclass, field
 from functools import partial

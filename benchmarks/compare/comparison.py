@@ -1,7 +1,5 @@
 """Run controllers on cases, estimate how far they are from the least possible error, report."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 It shows how close a controller can come to the bounds of `benchmarks.bounds`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -3,8 +3,6 @@
 The code of a user's own runs in the tasks that need it: what is wrong with it costs no other.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import pkgutil

@@ -13,8 +13,6 @@ Copy this one file; `benchmarks/train/ppo.py` is built on it. It works for these
 - The action changes the flow (`IncrementalAction`), which also compensates the dead zone.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping
 from pathlib import Path

@@ -5,8 +5,6 @@ respect to the policy's weights: no value function, no exploration. Training tak
 on one core. The policy is then tested on the paper's square wave, which it was not trained on.
 """
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Identify a plant from a log and tune a PI for it: `python -m benchmarks.identify --help`."""
 
-from __future__ import annotations
-
 import os
 import time
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Turn an identified plant into a PI controller, and into the environment's arguments."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Identify a plant from a log, and doubt what was found."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Report on an identified plant, its controller and the log."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

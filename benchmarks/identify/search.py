@@ -1,7 +1,5 @@
 """Search for the plant, valve and loads of a log, and draw what it leaves possible."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import accumulate

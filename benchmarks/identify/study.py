@@ -3,8 +3,6 @@
 About half of the logs are of plants with a fault. Recommended loops are tried on true plants.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from contextlib import suppress

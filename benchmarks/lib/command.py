@@ -9,8 +9,6 @@ A command is a file, `benchmarks/NAME.py`, or a folder with a `__main__.py`. In 
 - `main = command("NAME", Options, work)`, which the last line calls.
 """
 
-from __future__ import annotations
-
 import errno
 import importlib
 import inspect

@@ -7,8 +7,6 @@ Between the limits of the actuator (29) the plant is
 where w is the load. Gain and time-constant factors and their drifts are part of alpha and beta.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

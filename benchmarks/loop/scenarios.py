@@ -3,8 +3,6 @@
 A design is a set of plants around the paper's: a grid over delay and gain, or drawn at random.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

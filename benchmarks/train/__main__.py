@@ -1,7 +1,5 @@
 """Train the neural controllers: `python -m benchmarks.train --help`."""
 
-from __future__ import annotations
-
 import importlib
 from dataclasses import dataclass, field, replace
 from functools import partial

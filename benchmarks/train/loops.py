@@ -1,7 +1,5 @@
 """Simulate batches of drawn plants under the network, to train and to validate it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

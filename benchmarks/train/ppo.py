@@ -5,8 +5,6 @@ What makes them work stands in `benchmarks/examples/sb3.py`, from which they tak
 plants of several kinds, longer memories and the validation.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

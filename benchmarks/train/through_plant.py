@@ -6,8 +6,6 @@ actuator and law. The literature calls this differentiable predictive control (J
 control for unknown nonlinear systems", Journal of Process Control 116, 2022, 80-92).
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import statistics
