@@ -1,7 +1,5 @@
 """Model the actuator (29), and choose commands that it passes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

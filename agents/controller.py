@@ -1,7 +1,5 @@
 """Define the base classes of all controllers, and check their arguments."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 `PlantBatch` in `mptc_gym.plant` does so in NumPy, a sample at a time.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from itertools import islice, pairwise
 from typing import Any
