@@ -143,7 +143,7 @@ def compare(cases: Cases, rounds: int) -> pd.DataFrame:
     )
 
 
-main = command("speed", Options, work, interrupted="nothing is kept.")
+main = command("speed", Options, work)
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

@@ -120,7 +120,7 @@ def write_film(path: Path, case: Scenario, controller: Controller, seed: int) ->
     return title
 
 
-main = command("watch", Options, work, interrupted="nothing is kept.")
+main = command("watch", Options, work)
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from benchmarks.lib.command import Finite, Folder, Repeated, command, options
+from benchmarks.lib.command import Finite, Folder, command, options
 from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
 
 # NumPy reads it when it is imported. Threads for small matrices only wait for each other.
@@ -31,7 +31,7 @@ class Options:
     """Column of the flow."""
     temperature: str = "temperature"
     """Column of the temperature."""
-    disturbance: Repeated = ()
+    disturbance: tuple[str, ...] = ()
     """Column of a measured disturbance (repeatable)."""
     time_unit: Literal["ms", "s", "min", "h", "D"] = "s"
     """Unit of the times, unless these are dates; D are days."""
@@ -71,7 +71,7 @@ def work(options: Options) -> str:
     return f"{seconds:.1f} s of processor time. The plant and the report are in {out}/"
 
 
-main = command("identify", Options, work, interrupted="nothing is written.")
+main = command("identify", Options, work)
 
 if __name__ == "__main__":
     raise SystemExit(main(None))

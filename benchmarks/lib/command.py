@@ -12,7 +12,6 @@ A command is a file, `benchmarks/NAME.py`, or a folder with a `__main__.py`. In 
 import errno
 import importlib
 import inspect
-import logging
 import math
 import os
 import signal
@@ -46,10 +45,8 @@ def stop(error: BaseException, program: str = "python -m benchmarks") -> NoRetur
     If a package is missing, the sentence names the extra that installs it. An import that fails
     for another reason is a bug, and is raised.
     """
-    said, cause = str(error), error
-    while cause.__cause__ is not None:
-        cause = cause.__cause__
-    name = (cause.name or "").partition(".")[0] if isinstance(cause, ImportError) else ""
+    said, cause = str(error), error.__cause__ or error
+    name = str(getattr(cause, "name", "")).partition(".")[0]
     extras = [extra for extra, packages in EXTRAS.items() if name in packages.split()]
     if extras:
         said = f'{name} is not installed: pip install -e ".[{extras[0]}]" ({cause})'
@@ -60,7 +57,7 @@ def stop(error: BaseException, program: str = "python -m benchmarks") -> NoRetur
 
 
 try:
-    from cyclopts import App, CycloptsError, MissingArgumentError
+    from cyclopts import App, CycloptsError
     from cyclopts import Parameter as Parameter  # for the commands, whose first import this is
     from cyclopts.validators import Number
 except ImportError as _missing:
@@ -90,7 +87,6 @@ Runs = Annotated[int, _integers(1, 100_000)]
 Seed = Annotated[int, _integers(0, 2**63)]
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
-Repeated = tuple[str, ...]
 Folder = Annotated[
     Path, Parameter(help="Folder to write to.", converter=partial(_strictly, Path), n_tokens=1)
 ]
@@ -137,20 +133,12 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
     try:
         found = app(list(given), exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        text = " ".join(str(error).split())
-        if isinstance(error, MissingArgumentError) and error.argument:
-            choices = ", ".join(error.argument.get_choices() or ())
-            text = f"{error.argument.names[0].lstrip('-').upper()} is missing"
-            text += f": one of {choices}" if choices else "; --help says what it is"
-        raise UsageError(text) from error
+        raise UsageError(" ".join(str(error).split())) from error
     return found if isinstance(found, declared) else None
 
 
 def command(
-    name: str,
-    declared: type[Group],
-    work: Callable[[Group], str],
-    interrupted: str = "what has finished is written.",
+    name: str, declared: type[Group], work: Callable[[Group], str]
 ) -> Callable[..., int]:
     """Return the `main` of the command `python -m benchmarks.NAME`.
 
@@ -179,23 +167,23 @@ def command(
                 _ignore_signals()
             return said
 
-        return finish(whole, program, interrupted)
+        return finish(whole, program)
 
     return main
 
 
-def finish(work: Callable[[], str], program: str, interrupted: str = "") -> int:
+def finish(work: Callable[[], str], program: str) -> int:
     """Do work, print the line that it returns, and return the exit status.
 
     This is 0 for success; 1 if tasks failed, a file could not be written or memory ran out; 130
-    after Ctrl-C and 143 after SIGTERM, with the message `interrupted`. An invalid option or a
-    missing package ends the program with 2.
+    after Ctrl-C and 143 after SIGTERM. An invalid option or a missing package ends the program
+    with 2.
     """
     try:
         if said := work():
             print(said, flush=True)
     except KeyboardInterrupt as stopped:
-        print(f"\nInterrupted: {interrupted}", flush=True)
+        print("\nInterrupted: what has finished is written.", flush=True)
         return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
     except (UnfinishedError, MemoryError) as error:
         print(str(error) or "There is not enough memory for so many runs or samples.")
@@ -295,10 +283,7 @@ class FanOut:
                 before = signal.signal(signal.SIGINT, signal.SIG_IGN)
                 answers: Iterator[Answer] = parallel(calls)
                 signal.signal(signal.SIGINT, before)
-            with warnings.catch_warnings():
-                # Of tasks that nobody waits for any more, as an error ends the command.
-                warnings.filterwarnings("ignore", module="joblib")
-                yield from answers
+            yield from answers
         except TerminatedWorkerError as error:
             raise UnfinishedError(
                 "a process was killed, perhaps for lack of memory: try fewer --jobs"
@@ -311,9 +296,7 @@ def _attempt(name: str, task: Task) -> Answer:
         return name, task(), ""
     except UsageError as error:  # a sentence, of a user's own controller
         return name, None, str(error)
-    except SystemExit as left:
-        return name, None, f"A controller called sys.exit({left.code!r})"
-    except Exception:
+    except (Exception, SystemExit):
         return name, None, traceback.format_exc().strip()
 
 
@@ -321,11 +304,10 @@ def _attempt(name: str, task: Task) -> Answer:
 def progress_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
     """Show a progress bar on a terminal, and yield what moves it on by one task."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+    from rich.progress import Progress
 
-    columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     console, hidden = Console(stderr=True), not (title and sys.stderr.isatty())
-    with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
+    with Progress(console=console, transient=True, disable=hidden) as progress:
         bar = progress.add_task(title, total=total)
         yield lambda: progress.advance(bar)
 
@@ -349,7 +331,6 @@ def _connect() -> None:
             runtime_env={"working_dir": str(ROOT), "excludes": [*stays]},
             ignore_reinit_error=True,
             log_to_driver=False,
-            logging_level=logging.ERROR,
         )
     except (OSError, RuntimeError, ValueError) as error:
         raise UsageError(

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import scipy  # loads its modules on first use
 from numpy.typing import ArrayLike, NDArray
 
-CONFIDENCE = 0.95
-ENDS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)  # quantiles at the ends of an interval
+ENDS = 0.025, 0.975  # quantiles at the ends of an interval; 95 % is SciPy's default, too
 RESAMPLES = 2000  # bootstrap resamples
 
 
@@ -66,20 +65,17 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
     there are too few runs.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
-    # Infinite values cannot be interpolated; the next higher value is used instead.
-    finite = bool(np.isfinite(ordered).all())
-    method: Literal["linear", "higher"] = "linear" if finite else "higher"
-    interval = scipy.stats.quantile_test(ordered, p=probability).confidence_interval(CONFIDENCE)
+    interval = scipy.stats.quantile_test(ordered, p=probability).confidence_interval()
     low = -np.inf if np.isnan(interval.low) else interval.low
     high = np.inf if np.isnan(interval.high) else interval.high
-    value = np.quantile(ordered, probability, method=method)
+    value = percentile(ordered, 100.0 * probability)
     return Estimate(float(value), float(low), float(high), len(ordered))
 
 
 def share(happened: NDArray[np.bool_]) -> Estimate:
     """Estimate the share of runs in which something happens, with Wilson's interval."""
     count, runs = int(happened.sum()), len(happened)
-    interval = scipy.stats.binomtest(count, runs).proportion_ci(CONFIDENCE, method="wilson")
+    interval = scipy.stats.binomtest(count, runs).proportion_ci(method="wilson")
     return Estimate(count / runs, float(interval.low), float(interval.high), runs)
 
 
@@ -109,16 +105,16 @@ def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
     return Estimate(value, float(low), float(high), together.size)
 
 
-def percentiles(
-    values: NDArray[np.float64], method: Literal["linear", "nearest", "higher"] = "linear"
-) -> dict[str, Any]:
-    """Return the median, 10th and 90th percentiles along the last axis.
+def percentile(values: NDArray[np.float64], at: float, method: Any = "linear") -> Any:
+    """Return a percentile along the last axis.
 
-    Infinite values ("not settled") cannot be interpolated. If there are any, the next higher
-    value is used.
+    Infinite values ("not settled") cannot be interpolated: the next higher value is used.
     """
     method = method if np.isfinite(values).all() else "higher"
-    return {
-        name: np.percentile(values, at, axis=-1, method=method)
-        for name, at in (("median", 50), ("p10", 10), ("p90", 90))
-    }
+    return np.percentile(values, at, axis=-1, method=method)
+
+
+def percentiles(values: NDArray[np.float64], method: str = "linear") -> dict[str, Any]:
+    """Return the median, 10th and 90th percentiles along the last axis."""
+    named = {"median": 50, "p10": 10, "p90": 90}
+    return {name: percentile(values, at, method) for name, at in named.items()}

@@ -3,9 +3,6 @@
 Also the two errors by which a command ends with a sentence: `UsageError` and `UnfinishedError`.
 """
 
-from __future__ import annotations
-
-import errno
 import json
 import os
 import pickle
@@ -19,10 +16,7 @@ from datetime import datetime, timezone
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:  # pandas is slow to import
-    import pandas as pd
+from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent.parent  # the checkout
 
@@ -68,8 +62,8 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, default=str) + "\n")
 
 
-def write_csv(path: Path, table: pd.DataFrame) -> None:
-    """Write a table without its index, completely or not at all, the same on every system."""
+def write_csv(path: Path, table: Any) -> None:
+    """Write a table of pandas without its index, completely or not at all."""
     with replacing(path) as partial:
         table.to_csv(partial, index=False, lineterminator="\n")
 
@@ -78,10 +72,9 @@ def out_folder(folder: Path, option: str = "--out") -> Path:
     """Create and return the folder of an option; `UsageError` if it is not writable."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as probe:
-            probe.write(b"x")
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        why = "it is no folder" if error.errno == errno.EEXIST else error.strerror
+        why = error.strerror
         raise UsageError(f"{option}: {folder} cannot be written to: {why}") from error
     return folder
 
@@ -96,16 +89,13 @@ class Kept:
     folder: Path
 
     def path(self, task: Callable[[], Any]) -> Path | None:
-        """Return the file of a task, named after its function and arguments.
-
-        There is none without a commit, at one that is dirty, and of what cannot be pickled.
-        """
+        """Return the file of a task, named after its function and arguments, if it has one."""
         import joblib  # here: slow to import
 
-        with suppress(Exception):
-            if (name := commit()).isalnum():
-                return self.folder / name[:12] / f"{joblib.hash(task)}.pkl"
-        return None
+        name = commit()
+        if not name.isalnum():  # there is none, or it is dirty
+            return None
+        return self.folder / name[:12] / f"{joblib.hash(task)}.pkl"
 
     def load(self, task: Callable[[], Any]) -> Any:
         """Return the result of a task; None if it is missing or damaged."""
@@ -121,7 +111,6 @@ class Kept:
                 partial.write_bytes(pickle.dumps(result))
 
 
-@cache
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that affect a result."""
     import mptc_gym  # here: Gymnasium and NumPy are slow to import
@@ -142,12 +131,11 @@ def origin() -> dict[str, Any]:
 @cache
 def commit() -> str:
     """Return the checkout's commit, with "-dirty" if files differ; "" without git."""
-    hashed, differing = ["git", "rev-parse", "HEAD"], ["git", "status", "--porcelain"]
+    status = ["git", "status", "--porcelain=v2", "--branch"]
     try:
-        name, changes = (
-            subprocess.run(each, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-            for each in (hashed, differing)
-        )
+        run = subprocess.run(status, cwd=ROOT, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return ""
-    return name.strip() + "-dirty" * bool(changes)
+    first, *others = run.stdout.splitlines()  # "# branch.oid NAME", more of it, and files
+    changed = any(not line.startswith("#") for line in others)
+    return first.split()[-1] + "-dirty" * changed

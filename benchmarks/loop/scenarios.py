@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from benchmarks.lib.command import Parameter, Repeated, options
+from benchmarks.lib.command import Parameter, options
 from benchmarks.lib.storage import UsageError
 from benchmarks.loop.linear import nominal
 from mptc_gym import PRESETS, Parameters
@@ -79,7 +79,7 @@ class PlantOptions:
     benchmarks.identify writes."""
     preset: Annotated[str | None, Parameter(choices=PRESETS)] = None
     """A plant that comes with the environment."""
-    set: Repeated = ()
+    set: tuple[str, ...] = ()
     """An argument of the environment, such as delay=30 or delay=[12,24] (repeatable;
     overrides --plant, which overrides --preset)."""
 
