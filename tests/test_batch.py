@@ -10,6 +10,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
+from scipy.signal import lfilter
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters
 from mptc_gym.batch import FACTORS, INFO
@@ -247,45 +248,62 @@ class TestDraws:
             assert_mean(normal**power, moment)
         assert_mean(np.abs(normal) < 0.6745, 0.5)  # the quartiles of a normal distribution
 
-    @pytest.mark.parametrize("period", [240, 7, 1])
-    def test_set_points_have_their_levels_and_lengths(self, library, period):
-        n, steps, size = 300, 40 * max(period // 6, 3), 4.0
-        arguments = {"setpoint_period": period, "setpoint_amplitude": size, "delay": 25}
-        env = library.make(n, setpoint="random", **arguments)
-        _, infos = env.reset(seed=1)
-        levels = np.vstack([plain(infos["setpoint"]), collected(env, steps, "setpoint")])
-        assert np.abs(levels).max() <= size
+    @pytest.mark.parametrize(
+        ("period", "interval", "walk", "resets"),
+        [
+            (240, 50.0, 0.0, 0.0),
+            (60, 1e9, 0.01, 0.02),
+            (7, 2.0, 0.0, 0.02),
+            (1, 50.0, 0.01, 0),
+        ],
+    )
+    def test_signals_are_distributed_by_the_age_of_the_episode(
+        self, library, period, interval, walk, resets
+    ):
+        n, variance, size, jump = 600, 2.0, 4.0, 2.0
+        env = library.make(
+            n, noise_variance=variance, c=[1.0, 3.0], setpoint="random", setpoint_period=period,
+            setpoint_amplitude=size, disturbance_amplitude=jump, disturbance_interval=interval,
+            disturbance_walk_variance=walk, delay=25, max_episode_steps=130,
+        )  # fmt: skip
+        names = "setpoint", "noise", "disturbance"
+        infos = plain(env.reset(seed=6)[1])
+        rng, age, ended = np.random.default_rng(0), np.zeros(n, int), np.zeros(n, bool)
+        rows = [(age, *(infos[name] for name in names))]
+        for _ in range(250):
+            _, _, _, truncated, infos = plain(env.step(np.zeros((n, 1))))
+            mask = rng.random(n) < resets
+            first = plain(env.reset(options={"reset_mask": mask})[1]) if resets else infos
+            age = np.where(ended | mask, 0, age + 1)
+            ended = truncated & ~mask
+            rows.append((age, *(np.where(mask, first[name], infos[name]) for name in names)))
+        ages, setpoint, noise, load = np.swapaxes(rows, 0, 1)
+        assert_mean(noise[ages == 1] ** 2, variance)
+        assert_mean(noise[ages == 2] ** 2, variance * (1 + 3**2))
+        assert_mean((noise[1:] * noise[:-1])[ages[1:] == 2], variance * 3)
+        # Every ten samples a load takes a step of its walk, and may jump to another level.
+        moves, due = np.diff(load, axis=0), (ages[1:] % 10 == 0) & (ages[1:] > 0)
+        assert not load[ages < 10].any()
+        assert not moves[(ages[1:] > 0) & ~due].any()
+        jumps = min(10 / interval, 1)
+        jumped = 1 - (1 - jumps) ** (ages[1:][due] / 10 - 1)
+        assert_mean(moves[due] != 0.0, 1.0 if walk else jumps)
+        assert_mean(moves[due], 0.0)
+        squares = 10 * walk + jumps * (1 + jumped) * jump**2 / 3
+        assert_mean(moves[due] ** 2, squares.mean())
+        assert walk or np.abs(load).max() <= jump
+        # Set points change at the renewals of what they are held for, uniform within two ends.
         shortest, longest = max(1, -(-period // 6)), max(1, -(-period // 6), period // 2)
-        first, starts = [], []
-        for column in levels.T:
-            changes = np.flatnonzero(np.diff(column)) + 1
-            lengths = np.diff(changes, prepend=0)
-            assert set(lengths) <= set(range(shortest, longest + 1))
-            first.append(lengths[:5])  # as many of each plant, so that none is preferred
-            starts.append(column[np.append(0, changes[:5])])
-        assert_mean(np.transpose(first), (shortest + longest) / 2)
-        if longest < 100:
-            assert (np.min(first), np.max(first)) == (shortest, longest)
-        assert_mean(np.ravel(starts), 0.0)
-        assert_mean(np.ravel(starts) ** 2, size**2 / 3)
-        ends = np.min(starts), np.max(starts)
-        assert ends == pytest.approx((-size, size), abs=0.03 * size)
-
-    @pytest.mark.parametrize("interval", [50.0, 2.0])
-    def test_loads_step_at_their_times(self, library, interval):
-        n, steps, size = 300, 1000, 2.0
-        env = library.make(n, disturbance_amplitude=size, disturbance_interval=interval)
-        env.reset(seed=2)
-        load = np.vstack([np.zeros(n), collected(env, steps, "disturbance")])
-        moves = np.diff(load, axis=0)  # from k to k + 1
-        assert not moves[np.arange(1, steps + 1) % 10 != 0].any()
-        moves = moves[9::10]
-        # Below ten samples, every change is a step.
-        assert_mean(moves != 0.0, min(10 / interval, 1.0))
-        levels = load[10::10][moves != 0.0] / size
-        assert np.abs(levels).max() <= 1.0
-        assert_mean(levels, 0.0)
-        assert_mean(levels**2, 1 / 3)
+        held = np.zeros(longest + 1)
+        held[shortest:] = 1 / (longest + 1 - shortest)
+        renewals = lfilter([1.0], [1.0, *-held[1:]], np.eye(1, 131)[0]).round(9)
+        changes = np.diff(setpoint, axis=0, prepend=0.0) != 0.0
+        for decade in range(13):
+            at = ages // 10 == decade
+            assert_mean(changes[at], renewals[ages[at].astype(int)].mean())
+        for power, moment in ((1, 0.0), (2, size**2 / 3), (4, size**4 / 5)):
+            assert_mean(setpoint[changes] ** power, moment)
+        assert np.abs(setpoint).max() <= size
 
     def test_ranges_have_both_ends(self, library):
         n = 4_000
@@ -302,39 +320,6 @@ class TestDraws:
             assert 1.5 - 0.75 * 20 / n < gains.max() <= 1.5
             assert_mean(gains, 1.125)
             assert_mean((delays - 18) * (gains - 1.125), 0.0)
-
-    def test_resets_leave_the_distributions_as_they_are(self, library):
-        n, variance, walk, jump = 800, 2.0, 0.01, 0.3
-        env = library.make(
-            n, noise_variance=variance, c=[1.0, 3.0], disturbance_walk_variance=walk,
-            disturbance_amplitude=jump, disturbance_interval=10, setpoint="random",
-            setpoint_period=60, max_episode_steps=100,
-        )  # fmt: skip
-        names = "setpoint", "noise", "disturbance"
-        _, infos = env.reset(seed=6)
-        rng, age, ended = np.random.default_rng(0), np.zeros(n, int), np.zeros(n, bool)
-        rows = [(age.copy(), *(plain(infos[name]) for name in names))]
-        for _ in range(250):
-            _, _, _, truncated, infos = plain(env.step(np.zeros((n, 1))))
-            age = np.where(ended, 0, age + 1)
-            mask = rng.random(n) < 0.02
-            _, first = plain(env.reset(options={"reset_mask": mask}))
-            age[mask] = 0
-            ended = truncated & ~mask
-            found = (np.where(mask, first[name], infos[name]) for name in names)
-            rows.append((age.copy(), *found))
-        ages, setpoint, noise, load = np.swapaxes(rows, 0, 1)
-        assert_mean(noise[ages == 1] ** 2, variance)
-        assert_mean(noise[ages == 2] ** 2, variance * (1 + 3**2))
-        assert_mean((noise[1:] * noise[:-1])[ages[1:] == 2], variance * 3)
-        assert not load[ages < 10].any()
-        assert_mean(load[ages == 10] ** 2, 10 * walk + jump**2 / 3)
-        assert_mean(load[ages == 45] ** 2, 40 * walk + jump**2 / 3)
-        lengths = set()
-        for level, age in zip(setpoint.T, ages.T, strict=True):
-            begun = np.flatnonzero((np.diff(level, prepend=0) != 0) | (age == 0))
-            lengths |= {*np.diff(age[begun])[age[begun[1:]] > 0]}
-        assert (min(lengths), max(lengths)) == (10, 30)
 
     def test_the_seed_is_all_that_differs(self, library):
         def trajectory(seed):
