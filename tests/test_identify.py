@@ -131,7 +131,7 @@ class TestFit:
         assert "does not test the valve" in warning
         applied = Options(TCLAB, applied=True)  # a heater has no valve
         assert identify(replace(thin, given=applied)).warnings == []
-        assert any("heater2 is a known disturbance" in note for note in model.notes)
+        assert any("cannot hold heater2" in note for note in model.notes)
 
 
 def behind(log, rule):
@@ -145,7 +145,7 @@ class TestValves:
         log = recorded(700)
         slow = behind(log, lambda p, u: p + min(max(u - p, -0.3), 0.3))
         model = identify(replace(log, temperature=slow))
-        assert any("a second at most" in note for note in model.notes)
+        assert any("rate limit" in note for note in model.notes)
         assert model.plant.gain == pytest.approx(-0.6825, rel=0.05)
 
     @pytest.mark.parametrize(

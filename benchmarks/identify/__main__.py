@@ -1,7 +1,6 @@
 """Identify a plant from a log and tune a PI for it: `python -m benchmarks.identify --help`."""
 
 import os
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -55,7 +54,7 @@ def work(options: Options) -> str:
     from benchmarks.identify import advice, log, model, report  # slow to import
     from benchmarks.lib.report import write_report
 
-    made, began, out = origin(), time.process_time(), out_folder(options.out)
+    made, out = origin(), out_folder(options.out)
     try:
         found = model.identify(log.read_log(options))
         plant, ranges = advice.plants(found)
@@ -67,8 +66,7 @@ def work(options: Options) -> str:
         write_json(out / f"{name}.json", content)
     title = f"The plant of {options.log.name}"
     write_report(out, title, report.report(found, advised), "identify", made)
-    seconds = time.process_time() - began
-    return f"{seconds:.1f} s of processor time. The plant and the report are in {out}/"
+    return f"The plant and the report are in {out}/"
 
 
 main = command("identify", Options, work)

@@ -16,7 +16,6 @@ from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
 
 MOST_SENSITIVE = 1.8  # largest Ms of a recommended loop
-SHARE = 0.95  # of the possible plants that must stay within it
 DELAYS = (1.0, 0.8, 0.9, 1.1, 1.2)  # of each of them, as multiples of its own
 SLOWER = 1.15 ** np.arange(30)  # closed loops that are tried, as multiples of the rule's
 
@@ -33,11 +32,10 @@ def responses(plants: list[Plant], h: float) -> tuple[Complex, Complex]:
 
 
 def sensitivities(controller: PIController, back: Complex, answers: Complex) -> Array:
-    """Return Ms with each plant, of `responses`.
+    """Return Ms with each plant of `responses`, the largest over its delays.
 
-    Ms is the largest over the delays, and infinite if a loop is unstable. 1 + L begins at -90
-    degrees, because of the integrator, and ends real: by Nyquist's criterion the loop is stable
-    if it does not encircle 0.
+    1 + L begins at -90 degrees, because of the integrator, and ends real: by Nyquist's
+    criterion the loop is stable if it does not encircle 0.
     """
     up, down = controller.transfer()
     near = 1.0 + answers * (np.polyval(up[::-1], back) / np.polyval(down[::-1], back))
@@ -63,7 +61,7 @@ def tuned(model: Model) -> tuple[PIController, list[float], float] | None:
             u_min=model.u_min, u_max=model.u_max,
         )  # fmt: skip
         own, *others = sensitivities(pi, *loops)
-        worst = np.quantile(others, SHARE, method="higher")
+        worst = np.quantile(others, 0.95, method="higher")
         if max(own, worst) <= MOST_SENSITIVE:
             return pi, [float(own), float(worst)], slower
     return None
@@ -72,16 +70,14 @@ def tuned(model: Model) -> tuple[PIController, list[float], float] | None:
 def controllers(model: Model) -> dict[str, Any]:
     """Return the content of `controllers.json`: a PI, or why there is none.
 
-    `kp` is that of u = kp (e + integral of e / ti), positive where the flow rises when the
-    temperature is below its set point. `model` has the sample in its delay that any flow takes
-    to show. `arguments` are those of `agents.PIController`.
+    `kp` is that of u = kp (e + integral of e / ti). `arguments` are those of
+    `agents.PIController`, where the sign of `kp` is the other one.
     """
     found = None if model.warnings else tuned(model)
     if found is None:
         none = (
-            f"However slow a controller is made, Ms is above {MOST_SENSITIVE} with one in "
-            "twenty of the plants that the log leaves possible. Record a longer log, with "
-            "larger steps."
+            "However slow a controller is, Ms is too large with one in twenty of the plants "
+            "that the log leaves possible. Record a longer log, with larger steps."
         )
         return {"recommended": [], "warnings": model.warnings or [none]}
     (pi, sensitivity, slower), (lag, delay) = found, model.plant.first_order()
@@ -93,6 +89,7 @@ def controllers(model: Model) -> dict[str, Any]:
         "ti": pi.kp / pi.ki * h,
         "action": "reverse" if pi.kp < 0.0 else "direct",
         "sampling_interval": h,
+        # A flow takes a sample to show.
         "model": {"gain": model.plant.gain, "time_constant": lag, "delay": delay + h},
         "arguments": {each.name: getattr(pi, each.name) for each in fields(pi) if each.init},
         "sensitivity": sensitivity,
@@ -116,8 +113,8 @@ def plants(model: Model) -> tuple[dict[str, Any], dict[str, Any]]:
             Parameters(**each)
     except ValueError as error:
         raise ValueError(
-            f"the environment does not have such plants: {error}. See whether the units are "
-            "right (--flow-unit, --temperature-unit, --time-unit), or scale the columns"
+            f"the environment does not have such plants: {error}. Scale the columns of the "
+            "log, and name their units with --flow-unit and --temperature-unit"
         ) from error
     return arguments, ranges
 

@@ -50,8 +50,7 @@ class Plant:
     def sampled(self, h: float) -> tuple[int, Complex, Complex]:
         """Return whole samples of delay, and B and A of the lags for flows held for h, exactly.
 
-        There is a row for each lag. B begins with z^-1, as in (28), and has two coefficients,
-        as the delay is continuous.
+        There is a row for each lag. B begins with z^-1, as in (28), and has two coefficients.
         """
         whole = int(self.delay / h)
         poles = np.exp(-h / self.lags)
@@ -148,8 +147,7 @@ class Fit:
     def columns(self) -> tuple[Array, int]:
         """What temperatures are a weighted sum of, and how many of these are inputs.
 
-        The plants come first, then extra inputs, the measured disturbances, what is left of
-        the time before the log, the loads and the base line.
+        After these come what is left of the time before the log, the loads and the base line.
         """
         times, units = np.arange(len(self.flow)) * self.h, self.units
         lag = units[0].slowest

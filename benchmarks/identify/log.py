@@ -15,8 +15,6 @@ from benchmarks.identify.__main__ import Options
 from benchmarks.identify.fit import Array
 
 FEWEST, MOST = 100, 20_000  # rows; of a longer log, the last ones are used
-LONGEST_GAP = 20  # rows
-SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}
 
 
 @dataclass(frozen=True)
@@ -27,20 +25,14 @@ class Log:
     temperature: Array  # at the time of its row; NaN where it is unknown
     sampling_interval: float  # s
     disturbances: dict[str, Array] = field(default_factory=dict)  # by column
-    notes: tuple[str, ...] = ()  # what was read, and what was done where numbers are missing
-    # Columns, units and prior knowledge.
-    given: Options = field(default_factory=lambda: Options(Path()))
+    notes: tuple[str, ...] = ()  # what was read, and what was missing
+    given: Options = field(default_factory=lambda: Options(Path()))  # columns and units
 
 
 def read_log(given: Options) -> Log:
-    """Read a table with a heading.
+    """Read a table with a heading; a ValueError names the column and the line of what is bad.
 
     The separator may be a comma, a semicolon or a tab, the decimal mark a point or a comma.
-
-    Raises
-    ------
-    ValueError
-        If the table cannot be read; the message names the column, and the line if there is one.
     """
     table, temperature = _table(given.log), given.temperature
     names = [given.time, given.flow, temperature, *given.disturbance]
@@ -52,13 +44,12 @@ def read_log(given: Options) -> Log:
                 f"the log has no column {name!r}; it has {', '.join(map(repr, table))}. Name "
                 "the right ones with --time, --flow, --temperature and --disturbance"
             )
-    interval, places = _sampled(_times(table[given.time], SECONDS[given.time_unit]))
+    interval, places = _sampled(_times(table[given.time], given.time_unit))
     numbers = table[names[1:]].apply(_numbers)
     kept = numbers.set_index(places).reindex(np.arange(places[-1] + 1.0))[-MOST:]
     notes = [f"Read {len(table):,} rows, one every {interval:g} s; {len(kept):,} are used."]
     for column, count in kept.isna().sum().items():
-        done = "are left out of the fit" if column == temperature else "are the values before"
-        notes += [f"{count} values of {column!r} are missing, and {done}."] * bool(count)
+        notes += [f"{count} values of {column!r} are missing."] * bool(count)
         if len(kept) - count < max(FEWEST, len(kept) / 2):
             raise ValueError(
                 f"{count} of {len(kept)} values of {column!r} are missing: too many"
@@ -98,18 +89,19 @@ def _numbers(column: pd.Series[str]) -> pd.Series[float]:
     return values
 
 
-def _times(column: pd.Series[str], unit: float) -> Array:
+def _times(column: pd.Series[str], unit: Any) -> Array:
     """Return times in seconds, of numbers or dates."""
     numbers = pd.to_numeric(column.str.replace(",", "."), errors="coerce")
     if numbers.count() > len(column) / 2:
         _check(column, numbers.isna(), "a number or a date")
-        return unit * numbers.to_numpy(np.float64)
+        return pd.Timedelta(1, unit).total_seconds() * numbers.to_numpy(np.float64)
     # In the one form of dates the year comes first, in the other the day.
-    first = str(column.iloc[0])[:4].isdigit()
-    form: dict[str, Any] = {"format": "ISO8601"} if first else {"dayfirst": True}
+    form: Any = "ISO8601" if str(column.iloc[0])[:4].isdigit() else None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of a form that is not known
-        dates = pd.to_datetime(column, errors="coerce", utc=True, **form)
+        dates = pd.to_datetime(
+            column, errors="coerce", utc=True, format=form, dayfirst=not form
+        )
     _check(column, dates.isna(), "a date")
     return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), np.float64)
 
@@ -134,7 +126,7 @@ def _sampled(times: Array) -> tuple[float, Array]:
     late -= late.rolling(25, center=True, min_periods=1).median()
     for bad, what in (
         (steps <= 0.0, "times must increase. Sort the rows, and leave out what is there twice"),
-        (whole > LONGEST_GAP, "rows are missing before it. Divide the log there"),
+        (whole > 20, "rows are missing before it. Divide the log there"),
         (late.abs() > 0.35, f"most steps are {interval:g} s. Resample the log to equal ones"),
         (steps < 1e-4, "if the times are days, say --time-unit D"),
     ):

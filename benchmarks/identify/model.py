@@ -10,13 +10,11 @@ from benchmarks.identify.fit import Array, Fit, Plant
 from benchmarks.identify.log import Log
 from benchmarks.identify.search import FAULT, HYSTERESES, VALVES, Found, draws, search
 
-LAGS = 30  # of the autocorrelation of the errors, blocks
-COMMANDS = 5  # distinct ones, at least, that test a valve
 FAVOUR = 6.0  # deviance by which valves may differ that explain a log alike
 RIVAL = 1.3  # largest ratio of the gains behind valves that explain a log alike
 TEST = (
-    "The test that tells: move the flow up and down in small steps, twice in each direction, "
-    "and then from one end to the other."
+    "The test that tells: move the flow by small steps, twice up and twice down, and then from "
+    "one end to the other."
 )
 
 
@@ -55,26 +53,18 @@ class Model:
     def notes(self) -> list[str]:
         """What a user should know of the log and the fit."""
         best, valve, log = self.found.best, self.found.valve, self.log
-        size, unit, degree = valve.size, log.given.flow_unit, log.given.temperature_unit
+        size, unit = f"{valve.size:.3g}", log.given.flow_unit
+        if valve.name == "rate limit":
+            size, unit = f"{valve.size / best.h:.3g}", f"{unit} a second"
         times = ", ".join(f"{at / 60.0:.0f}" for at in sorted(best.loads))
         remarks = {
-            f"The valve seems to move by {size / best.h:.3g} {unit} a second at most, which "
-            "plant.json cannot hold.": valve.name == "rate limit",
-            f"The valve seems to end at ±{size:.3g} {unit} from the operating point.":
-            valve.name == "saturation",
-            "Beyond the dead zone the flow seems to rise from 0, which plant.json cannot hold.":
-            valve.name == "subtractive dead zone",
-            f"The log is sampled {best.rows} times as often as the plant needs: means of "
-            f"{best.rows} rows are fitted.": best.rows > 1,
+            f"The valve seems to have a {valve.name} of {size} {unit}; plant.json can hold "
+            "limits and a plain dead zone alone.": valve.name not in ("none", "dead zone"),
+            f"The log is sampled {best.rows} times as often as the plant needs.": best.rows > 1,
             f"Loads seem to have moved the temperature at {times} min.": bool(best.loads),
-        }  # fmt: skip
-        gains = best.solution.c[len(best.units) :][: 3 * len(best.known)].reshape(-1, 3)
-        known = [
-            f"{name} is a known disturbance with a gain of {gain:.4g} {degree} a unit, "
-            "which plant.json cannot hold."
-            for name, gain in zip(log.disturbances, gains.sum(axis=1), strict=True)
-        ]
-        return [*log.notes, *(each for each, holds in remarks.items() if holds), *known]
+            f"plant.json cannot hold {', '.join(log.disturbances)}.": bool(log.disturbances),
+        }
+        return [*log.notes, *(each for each, holds in remarks.items() if holds)]
 
     @cached_property
     def warnings(self) -> list[str]:
@@ -82,45 +72,36 @@ class Model:
         found, gain = self.found, self.estimates["gain"]
         errors, fault = found.best.solution.errors, found.faults[0]
         evident = fault.drop > FAULT
-        alike = np.correlate(errors, errors, "full")[len(errors) :][:LAGS] / (errors @ errors)
-        large = float(np.mean(np.abs(alike) > max(0.1, 2.5 / np.sqrt(len(errors)))))
+        alike = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
+        large = np.abs(alike) > max(0.1, 2.5 / np.sqrt(len(errors)))
         bar = max(found.valve.drop - FAVOUR, FAULT)
         rivals = [abs(each.fit.plant.gain) for each in found.rivals if each.drop > bar]
         doubts = {
-            "The log does not test the valve, as the flow had so few values, and nothing is "
-            "known of its dead zone. Record a log with a dozen flows, or the flow behind the "
-            "valve (--applied).": not self.tested,
+            "The log does not test the valve, as the flow had so few values. Record a dozen "
+            "flows, or the flow behind the valve (--applied).": not self.tested,
             f"The valve does not seem to pass what it is told: {fault.name} of "
-            f"{fault.size:.2g} {self.log.given.flow_unit}, or another fault of the valve. "
-            f"{TEST} If the temperature follows alike, the plant is not of the model's form.":
+            f"{fault.size:.2g} {self.log.given.flow_unit}, or another fault. {TEST} If the "
+            "temperature follows alike, the plant is not of the model's form.":
             evident and fault.name in HYSTERESES,
             f"The plant seems to change: {fault.name}. Identify each level, time or direction "
             "from a log of its own.": evident and fault.name not in HYSTERESES,
             "Valves of two kinds explain the log alike, and the plants behind them differ. "
             + TEST: max(rivals, default=1.0) > RIVAL * min(rivals, default=1.0),
-            "Not even the direction is known in which the temperature answers the flow. Move "
-            "the flow to and fro a dozen times, further than here, and hold it until the "
-            "temperature has settled.": gain.low * gain.high <= 0.0,
+            "Not even the direction is known in which the temperature answers. Move the flow "
+            "further, a dozen times, and let it settle each time.": gain.low * gain.high <= 0.0,
             "The delay may be longer than a sixth of the log, which is not looked for: record "
             "a longer one.": self.estimates["delay"].high >= len(self.log.flow) / 6.0,
             "The model leaves more than half open: the noise hides the response, or it "
             "changes. Move the flow further, and look for other inputs (--disturbance).":
             max(self.explained) < 0.5,
-            f"The prediction errors are far from white ({100 * large:.0f} % of their "
-            "autocorrelations are large): the plant or its disturbances are not of the "
-            "model's form.": large > 0.25,
+            "The prediction errors are far from white: the plant or its disturbances are not "
+            "of the model's form.": bool(large.mean() > 0.25),
         }  # fmt: skip
         return [sentence for sentence, holds in doubts.items() if holds]
 
 
 def identify(log: Log) -> Model:
-    """Return the plant of a log, with warnings of what speaks against it.
-
-    Raises
-    ------
-    ValueError
-        If the log does not show a plant at all; the message says why.
-    """
+    """Return the plant of a log; a ValueError says why it does not show one at all."""
     _check(log)
     h, given, level = log.sampling_interval, log.given, float(np.nanmean(log.temperature))
     rest = resting_flow(log.flow, given.operating_flow)
@@ -135,7 +116,7 @@ def identify(log: Log) -> Model:
         )
     # Of flows that differ by noise alone, one counts.
     flows = np.unique(np.round(log.flow / (0.02 * np.ptp(log.flow))))
-    tested = given.applied or len(flows) >= COMMANDS
+    tested = given.applied or len(flows) >= 5
     possible, ends = draws(found, command)
     zone = _interval(valve.size if valve.name.endswith("dead zone") else 0.0, ends)
     delay = _interval(plant.delay / h, [each.delay / h for each in possible])

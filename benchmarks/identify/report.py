@@ -10,18 +10,16 @@ from benchmarks.identify.model import Model
 from benchmarks.lib.report import COLOURS, Section, drawn
 from benchmarks.lib.statistics import ENDS
 
-SHOWN = slice(-4_000, None)  # rows that are drawn: more would blur
+TITLE = "The log as recorded and as the model simulates it, and its response to a step"
 HOW = (
     "u is Kp times the sum of r - y and its integral over time divided by Ti, where u is "
     "the flow, r the set point and y the temperature, all from the operating point. Reverse "
     "acting: the flow falls when the temperature rises; direct acting: it rises. Where the "
     "action is a setting of its own, type Kp without its sign. `agents.PIController` has "
     "the opposite sign: its arguments are in controllers.json.",
-    "Ms is the most that the loop amplifies a disturbance while no limit and no dead zone "
-    "is met: with the model, and with 95 % of the plants that the log leaves possible, "
-    "their delay a fifth longer and shorter among them. Around set points that need a flow "
-    "within a dead zone the loop cycles. More controllers: `python -m benchmarks.compare "
-    "--plant plant.json`.",
+    "Ms is the most that the loop amplifies a disturbance: with the model, and with 95 % of "
+    "the plants that the log leaves possible, their delays a fifth longer and shorter. Around "
+    "set points that need a flow within a dead zone the loop cycles.",
 )
 
 
@@ -54,30 +52,24 @@ def report(model: Model, advised: dict[str, Any]) -> list[Section]:
         "intervals.",
     ]
     table = pd.DataFrame(rows, columns=["", "value", "95 %", "unit"])
-    picture = {"identify.png": "The log, the model and the response to a step"}
-    sections = [
-        Section("What the log shows", text, table),
-        Section("The log and the model", pictures=picture),
-        Section("How to type the controller", HOW),
-    ]
-    return sections if advice else sections[:2]
+    shown = Section("What the log shows", text, table, {"identify.png": TITLE})
+    return [shown, *[Section("How to type the controller", HOW)] * bool(advice)]
 
 
 def draw(model: Model, path: Path) -> None:
     """Draw the log with the model's simulation of it, and the step response with its band."""
     log, h, plant = model.log, model.log.sampling_interval, model.plant
     flow, degree = log.given.flow_unit, log.given.temperature_unit
-    minutes = (np.arange(len(log.flow)) * h / 60.0)[SHOWN]
-    title = "The log as recorded and as the model simulates it, and its response to a step"
-    with drawn(path, 5, title) as figure:
+    minutes = np.arange(len(log.flow)) * h / 60.0
+    with drawn(path, 5, TITLE) as figure:
         places = figure.subplot_mosaic([["y", "y"], ["u", "step"]], height_ratios=[3, 2])
         above, below, step = (places[name] for name in ("y", "u", "step"))
-        above.plot(minutes, log.temperature[SHOWN], color="0.5", lw=1, label="recorded")
-        above.plot(minutes, model.simulated[SHOWN], color=COLOURS[1], label="model")
+        above.plot(minutes, log.temperature, color="0.5", lw=1, label="recorded")
+        above.plot(minutes, model.simulated, color=COLOURS[1], label="model")
         above.set(xlabel="time (min)", ylabel=f"temperature ({degree})")
         above.legend(loc="upper left", ncols=2)
         above.margins(y=0.2)  # room for the legend
-        below.step(minutes, log.flow[SHOWN], where="post", color=COLOURS[0], lw=1)
+        below.step(minutes, log.flow, where="post", color=COLOURS[0], lw=1)
         zone = model.estimates["dead_zone"].value * np.array([-1.0, 1.0])
         below.axhspan(*(model.operating_flow + zone), color="0.9", label="dead zone")
         below.legend(loc="upper left")

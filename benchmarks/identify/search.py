@@ -58,7 +58,6 @@ HYSTERESES = {
         (0.1, 0.2, 0.3, 0.4, 0.6), (1.0, 0.7),
     ),
 }  # fmt: skip
-FINER = (0.75, 0.87, 1.0, 1.15, 1.33), (0.93, 1.0, 1.07), ()  # sizes around the best one
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ def with_valves(
         sizes = [unit * share for share in kind.sizes]
         # A size at a place, and the place at that size, in turns. The plant that was found
         # without hysteresis is too slow for one: there each size has its own place.
-        for finer in FINER:
+        for finer in ((0.75, 0.87, 1.0, 1.15, 1.33), (0.93, 1.0, 1.07), ()):
             tried = []
             for size in sizes:
                 passed = kind.passed(command, size)
@@ -123,17 +122,13 @@ def with_changes(fit: Fit) -> list[Hypothesis]:
 class Found:
     """The most likely plant of a log, and its rivals."""
 
+    best: Fit
     fits: list[Fit]  # the best one of each shape
     valve: Hypothesis  # a sound one, a dead zone or a limit, which the fits take into account
     rivals: list[Hypothesis]  # all such valves that were tried
     # What no controller should be tuned for, the likeliest first, and what each explains beyond
     # the valve that was found.
     faults: list[Hypothesis]
-
-    @property
-    def best(self) -> Fit:
-        """The best fit."""
-        return min(self.fits, key=by_price)
 
 
 def search(fit: Fit, command: Array, *, applied: bool) -> Found:
@@ -162,7 +157,7 @@ def search(fit: Fit, command: Array, *, applied: bool) -> Found:
     faults = with_changes(best)
     if not applied:
         faults += with_valves(best, command, HYSTERESES, best.reweighted().refined(12))
-    return Found(fits, valve, rivals, sorted(faults, key=lambda each: -each.drop))
+    return Found(best, fits, valve, rivals, sorted(faults, key=lambda each: -each.drop))
 
 
 def _coarse(fit: Fit, command: Array, zones: tuple[float, ...]) -> Fit:
@@ -190,13 +185,12 @@ def _refined(near: Fit, starts: list[Fit]) -> list[Fit]:
 
     Its own shape starts from its own place, and the others from theirs.
     """
-    white, found = near.reweighted(), dict[str, Fit]()
+    white, found = near.reweighted(), dict[str, list[Fit]]()
     for each in starts:
         p = near.p if each.shape == near.shape else each.p
         fit = replace(white, shape=each.shape, p=p).refined()
-        if each.shape not in found or fit.deviance < found[each.shape].deviance:
-            found[each.shape] = fit
-    return list(found.values())
+        found.setdefault(each.shape, []).append(fit)
+    return [min(alike, key=by_deviance) for alike in found.values()]
 
 
 def _with_loads(fit: Fit) -> Fit:
@@ -205,7 +199,7 @@ def _with_loads(fit: Fit) -> Fit:
     spacing = max(fit.scale / 4.0, end / 300.0)
     for _ in range(MOST_LOADS - len(fit.loads)):
         times = np.arange(spacing, end, spacing).tolist()
-        more = [replace(fit, loads=(*fit.loads, at)) for at in times]
+        more = (replace(fit, loads=(*fit.loads, at)) for at in times)
         likeliest = min(more, key=by_deviance)
         if likeliest.deviance > fit.deviance - LOAD:
             break

@@ -101,11 +101,9 @@ def tried(seed: int, fault: str) -> dict[str, Any]:
     late = delay + h / 2 + half + sum(lags[2:]) - plant.lead
     simc = (lag + half) / gain / 2 / late, min(lag + half, 8 * late)
     if fault.startswith("two levels"):
-        flow, temperature = simulate(plant, np.sign(held), noise)
-    elif kind == 2:
-        flow, temperature = simulate(plant, 0.7 * gain * held, noise, 0.6 * simc[0], simc[1])
-    else:
-        flow, temperature = simulate(plant, held, noise)
+        held, kind = np.sign(held), 0
+    scale, kp = (0.7 * gain, 0.6 * simc[0]) if kind == 2 else (1.0, 0.0)
+    flow, temperature = simulate(plant, scale * held, noise, kp, simc[1])
     found: dict[str, Any] = {"fault": fault, "logs": 1, "recommended": 0, "unsafe": 0}
     with suppress(ValueError):  # refused
         model = identify(Log(flow, temperature, h, given=Options(Path(), operating_flow=0.0)))
