@@ -3,7 +3,6 @@
 import os
 import shutil
 import tempfile
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +12,7 @@ import numpy as np
 
 from benchmarks.lib.command import Count, Names, Parameter, command, options
 from benchmarks.lib.storage import UnfinishedError, out_folder
-from mptc_gym import PRESETS, __version__, evaluate
+from mptc_gym import PRESETS, evaluate
 
 SAMPLES, EPISODES = 1200, 100  # per episode, and per data set
 SEED = 9_000_000  # of the first episode; no comparison and no bound uses these seeds
@@ -30,11 +29,6 @@ IDS = {
 }
 COLUMNS = "controller", "seed", "observations", "actions", "rewards"  # of an episode
 VARIABLE, HOME = "MINARI_DATASETS_PATH", "~/.minari/datasets"
-DESCRIPTION = """\
-Middle-point temperature of a once-through boiler, preset {plant!r}, random set points, under
-{controllers}. The reward of a step is -|error| in degC. `mptc_gym.evaluate(policy,
-dataset.env_spec, episodes=50)` scores a policy on the episodes of `evaluation_seeds`, where
-`least_possible_error` is the least possible mean |error|, `idle_error` that without control."""
 
 
 @options
@@ -54,9 +48,6 @@ class Options:
 def work(options: Options) -> str:
     """Write data sets."""
     root = out_folder(Path(os.environ.get(VARIABLE) or HOME).expanduser().absolute(), VARIABLE)
-    for left in root.glob(".partial-*"):  # by killed runs
-        if time.time() - left.stat().st_mtime > 600:  # s; no data set takes as long to write
-            shutil.rmtree(left, ignore_errors=True)
     for name in dict.fromkeys(options.ids or IDS):
         print(f"{name}: {write(root, name, options.episodes)}", flush=True)
     return f"The data sets are in {root}"
@@ -95,10 +86,8 @@ def record(plant: str, behaviour: str, episodes: int = EPISODES) -> list[dict[st
             errors.append(info["error"])
         rewards: Any = -np.abs(errors)
         arrays = (np.stack(each, axis=1) for each in (observations, actions, rewards))
-        logged[turn :: len(names)] = [
-            dict(zip(COLUMNS, (name, *columns), strict=True))
-            for columns in zip(seeds, *arrays, strict=True)
-        ]
+        rows = zip([name] * len(seeds), seeds, *arrays, strict=True)
+        logged[turn :: len(names)] = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
     return logged
 
 
@@ -129,8 +118,8 @@ def _create(name: str, episodes: list[dict[str, Any]]) -> str:
     import minari
     from minari.data_collector import EpisodeBuffer
 
-    plant, controllers = IDS[name][0], ", ".join(BEHAVIOURS[IDS[name][1]])
-    arguments = arguments_of(plant)
+    plant, behaviour = IDS[name]
+    arguments, controllers = arguments_of(plant), ", ".join(BEHAVIOURS[behaviour])
     idle = evaluate(lambda seen: np.zeros((len(seen), 1)), episodes=EVALUATIONS, **arguments)
     least = float(np.asarray(idle.least).mean())
     error = float(-np.mean([each["rewards"] for each in episodes]))
@@ -145,7 +134,7 @@ def _create(name: str, episodes: list[dict[str, Any]]) -> str:
         author="The mptc_gym developers",
         author_email="",  # None would be a warning, here and below
         code_permalink="",
-        description=DESCRIPTION.format(plant=plant, controllers=controllers),
+        description=f"Preset {plant} with random set points. The reward is -|error| in degC.",
         ref_min_score=-idle.mean_error * SAMPLES,
         ref_max_score=-least * SAMPLES,
         num_episodes_average_score=EVALUATIONS,
@@ -156,13 +145,12 @@ def _create(name: str, episodes: list[dict[str, Any]]) -> str:
         "least_possible_error": least,
         "idle_error": idle.mean_error,
         "evaluation_seeds": list(idle.seeds),
-        "mptc_gym_version": __version__,
     }
     dataset.storage.update_metadata(about)
     controllers_of = [{"controller": each["controller"]} for each in episodes]
     dataset.storage.update_episode_metadata(controllers_of)
-    of_plant = f"least possible {least:.3f}, no control {idle.mean_error:.3f}"
-    return f"mean |e| {error:.3f} °C, {of_plant}"
+    bounds = f"least possible {least:.3f}, no control {idle.mean_error:.3f}"
+    return f"mean |e| {error:.3f} °C, {bounds}"
 
 
 main = command("datasets", Options, work)

@@ -9,16 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import (
-    Count,
-    FanOut,
-    Folder,
-    Parameter,
-    Runs,
-    command,
-    options,
-    progress_bar,
-)
+from benchmarks.lib.command import Folder, Parameter, Runs, command, options, progress_bar
 from benchmarks.lib.storage import Kept, origin, out_folder, write_csv
 from benchmarks.loop.rollout import mean_error, settled
 
@@ -61,7 +52,7 @@ class Options:
 
     controller: Annotated[str, Parameter(choices=TUNED)] = field(kw_only=False)
     """Whose gains to search."""
-    trials: Count = 800
+    trials: Runs = 800
     """How many sets of gains to try."""
     runs: Runs = 100
     """Runs of each case in a trial."""
@@ -110,8 +101,9 @@ def search(name: str, count: int, runs: int, out: Path) -> list[dict[str, float]
                     seed=SEED + i, n_startup_trials=STARTUP, multivariate=True
                 )
                 trial = study.ask(spans)
-                task = {f"trial {i}": partial(score, name, runs, FIRST_RUN, trial.params)}
-                rows += dict(FanOut(jobs=1).stream(task, kept=kept)).values()
+                task = partial(score, name, runs, FIRST_RUN, trial.params)
+                rows.append(kept.load(task) or task())
+                kept.save(task, rows[-1])
                 study.tell(trial, rows[-1]["objective"])
                 advance()
     finally:

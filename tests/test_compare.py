@@ -277,7 +277,7 @@ class TestCompare:
         said = capsys.readouterr().out
         assert "2 of 4 tasks failed; the others are done" in said
         assert "bad, constant: " in said
-        assert "--agent: 'my_controllers:Mine' cannot be imported: AttributeError" in said
+        assert "--agent: 'my_controllers:Mine' cannot be loaded: AttributeError" in said
         assert "**Unfinished: 2 of 4 tasks are missing.**" in (out / "report.md").read_text()
         assert json.loads((out / "provenance.json").read_text())["complete"] is False
 

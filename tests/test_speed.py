@@ -18,7 +18,7 @@ def test_ratios_compare_rounds_with_each_other(monkeypatch):
 def test_it_runs_with_and_without_pytorch(torch, monkeypatch, capsys):
     if torch:
         pytest.importorskip("torch")
-    small = {"EPISODE": 3, "BATCHES": (2,), "ON_DEVICE": (3,)}
+    small = {"EPISODE": 3, "BATCHES": (1, 2), "ON_DEVICE": (3,)}
     for name, value in small.items():
         monkeypatch.setattr(speed, name, value)
     monkeypatch.setattr(speed.importlib.util, "find_spec", lambda _: torch or None)

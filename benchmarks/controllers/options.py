@@ -7,7 +7,7 @@ import importlib.util
 import inspect
 import pkgutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -40,17 +40,16 @@ class ControllerOptions:
 def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controller]:
     """Return controllers of the roster by name, then a user's own, as given to `--agent`.
 
-    These have a member for each location. Their `members` raises a `UsageError` that says what
-    is wrong with one.
+    These have a member for each location. `members` raises a `UsageError` if one is faulty.
     """
     locations: dict[str, tuple[str, ...]] = {}
     for text in own:
-        name, equals, location = text.partition("=")
+        name, _, location = text.partition("=")
         taken = f"; {name!r} is taken" if name.lower() in ROSTER else ""
-        module, _, file = location.partition(":")
+        module, colon, file = location.partition(":")
         is_zip, package = location.endswith(".zip"), module.partition(".")[0] or "-"
         there = Path(file).is_file() if is_zip else importlib.util.find_spec(package)
-        if taken or not (name and equals and there):
+        if taken or not (name and colon and there):
             raise UsageError(
                 f"--agent: {text!r} must be NEW_NAME=MODULE:FACTORY or NEW_NAME=PPO:FILE.zip, "
                 f"of a module or a file that is there{taken}"
@@ -76,57 +75,44 @@ class Own:
 
 
 def _found(locations: Sequence[str]) -> dict[str, Own]:
-    with blame("--agent"):
-        return {
-            each: _saved(*each.split(":", 1)) if each.endswith(".zip") else _imported(each)
-            for each in locations
-        }
+    return {each: _loaded(each) for each in locations}
+
+
+def _loaded(location: str) -> Own:
+    try:
+        return _saved(location) if location.endswith(".zip") else _imported(location)
+    except (Exception, SystemExit) as error:  # whatever a user's code or file raises
+        text = f"{location!r} cannot be loaded: {type(error).__name__}: {error}"
+        raise UsageError(f"--agent: {text}") from error
 
 
 def _imported(location: str) -> Own:
     """Import a user's factory; the README of `benchmarks.compare` says what it may have."""
-    try:
-        factory: Any = pkgutil.resolve_name(location)
-    except (Exception, SystemExit) as error:  # whatever the code of a user raises
-        text = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{location!r} cannot be imported: {text}") from error
-    if not callable(factory):
-        raise ValueError(f"{location!r} must be MODULE:FACTORY, got {factory!r}")
-    observation = getattr(factory, "observation", PAPER_WINDOWS)
-    if not (isinstance(observation, Mapping) and set(observation) <= set(WINDOWS)):
+    factory: Any = pkgutil.resolve_name(location)
+    observation = dict(getattr(factory, "observation", PAPER_WINDOWS))
+    if not set(observation) <= set(WINDOWS):
         allowed = ", ".join(WINDOWS)
-        raise ValueError(
-            f"observation of {factory!r} must be a dict with names out of {allowed}, "
-            f"got {observation!r}"
-        )
+        raise ValueError(f"observation must have names out of {allowed}, got {observation}")
     about = {name: str(getattr(factory, name, "")) for name in ("knows", "searched")}
-    return Own(factory, dict(observation), about)
+    return Own(factory, observation, about)
 
 
-def _saved(algorithm: str, file: str) -> Own:
+def _saved(location: str) -> Own:
     """Load a model, which acts as its file says, or else in the plain environment."""
-    from mptc_gym.sb3 import load  # here: PyTorch takes seconds to load
+    import stable_baselines3  # here: PyTorch takes seconds to load
 
-    kind: Any = None
-    for package in ("stable_baselines3", "sb3_contrib"):
-        with suppress(ImportError):
-            kind = kind or getattr(importlib.import_module(package), algorithm, None)
-    if kind is None:
-        raise ValueError(f"{algorithm}:{file} must begin with an algorithm, such as PPO:{file}")
-    about = {}
+    from mptc_gym.sb3 import load
+
+    algorithm, _, file = location.partition(":")
     try:
-        model = load(file, device="cpu")
+        model: Any = load(file, device="cpu")
     except ValueError:  # not of `mptc_gym.sb3.save`
-        try:
-            model = kind.load(file, device="cpu")
-        except Exception as error:  # whatever a file of another algorithm raises
-            text = f"{type(error).__name__}: {error}"
-            raise ValueError(f"'{algorithm}:{file}' cannot be loaded: {text}") from error
-        about["note"] = f"{file} names no environment: run in the plain one, without wrappers"
+        kind: Any = getattr(stable_baselines3, algorithm, None)
+        kind = kind or pkgutil.resolve_name(f"sb3_contrib:{algorithm}")
+        model = kind.load(file, device="cpu")
     weights = sum(weight.numel() for weight in model.policy.parameters())
     samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
-    about["searched"] = f"{weights:,} weights: {samples}"
-    return Own(lambda: model, provenance=about)
+    return Own(lambda: model, provenance={"searched": f"{weights:,} weights: {samples}"})
 
 
 def _make(*, network: Own, **told: Any) -> Any:
@@ -161,14 +147,13 @@ class Policy:
         """Yield the plants that it acts in, with these arguments or refused."""
         env: Any = self.env
         if env is None:
-            made_by: Any = IDS["paper"]
             more = {**arguments, "max_episode_steps": samples}
+            make = partial(make_one, IDS["paper"], more)
             if getattr(self.policy, "get_env", lambda: None)() is not None:
                 from mptc_gym.sb3 import spec_of
 
                 plant = {each: more[each] for each in more if each not in WINDOWS}
-                made_by, more = spec_of(self.policy, **plant), {}
-            make = partial(make_one, made_by, more)
+                make = partial(make_one, spec_of(self.policy, **plant), {})
             env = native_batch(make(), self.runs) or make
         with opened(env, self.runs) as given:
             with blame("--agent"):

@@ -32,7 +32,7 @@ from mptc_gym import Parameters
 
 LEARNING = 1200  # samples of the square wave on which a network is commissioned
 COMMISSIONING_SEED = 3_000_000  # of plants and noise during commissioning
-OWN = (("#5B3FA6", "P"), ("#A08CDB", "X"), ("#B22222", "P"), ("#F08080", "X"))
+OWN = ("#5B3FA6", "P"), ("#B22222", "X")
 
 # What a controller may be told, by the arguments of its `make`.
 LIMITS = "u_min", "u_max"
