@@ -2,50 +2,48 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
 from functools import partial
 from typing import Any, Final, cast
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
 from mptc_gym.checks import reject, shorten
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.plant import action_from_command
+from mptc_gym.presets import IDS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
-_NATIVE: Final = MiddlePointEnv, MiddlePointVectorEnv
 _SB3: Final = "stable_baselines3.common"
 _TOLERANCE: Final = 1e-6  # of infos, degC or t/h, and relative to them
+Env = gymnasium.Env[Any, Any]
 Act = Callable[[Any], Any]  # observations, one row a plant, to actions
 Infos = Mapping[str, Any]  # arrays, one element per plant
-Steps = Iterator[tuple[Infos, Infos, NDArray[np.bool_]]]
+Steps = Iterator[tuple[Infos, NDArray[np.bool_]]]
 
 
 def rollout(plants: Any, act: Act, samples: int, seeds: list[int]) -> Steps:
-    """Reset a batch of plants, and step it through samples k = 0, 1, ...
-
-    Yield the infos at sample k, those at k + 1, and whether the episodes have ended.
-
-    This is the one loop, for scores, benchmarks and tests. `plants` are a vector environment of
-    Gymnasium or a `FromVecEnv`.
-    """
+    """Reset and step plants; yield infos at samples k = 0, 1, ..., and which episodes end."""
     try:
         observations, infos = plants.reset(seed=seeds)
     except RuntimeError as error:  # of a Monitor, in the middle of an episode
         raise ValueError(f"env must allow another episode: {error}") from error
+    yield infos, np.zeros(plants.num_envs, np.bool_)
     shape = plants.num_envs, *plants.single_action_space.shape
     for _ in range(samples):
         actions = _checked(act(observations), shape)
-        before = infos
         observations, _, terminated, truncated, infos = plants.step(actions)
         # Where the same step resets a plant, the last sample's infos are apart.
-        yield before, infos.get("final_info", infos), terminated | truncated
+        yield infos.get("final_info", infos), terminated | truncated
 
 
 def _checked(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
@@ -82,8 +80,7 @@ def start(policy: Any, n: int) -> Act:
     act: Any = getattr(policy, forms[0]) if forms else policy
     if isinstance(policy, type) or not callable(act):
         reject("policy", policy, "a function, or an object with predict or act, not a class")
-    function, owner = behind(act)
-    owner = policy if forms else owner
+    (function, _), (_, owner) = behind(act), behind(policy)
     if callable(getattr(owner, "reset", None)):
         owner.reset()
     is_module = isinstance(owner, loaded("torch.nn.Module"))
@@ -99,7 +96,7 @@ def start(policy: Any, n: int) -> Act:
         act = _predicting(act, named, n)
     elif "deterministic" in {*named} - {*getattr(act, "keywords", ())}:
         act = partial(act, deterministic=True)
-    return cast("Act", _evaluating(owner, act, forward) if is_module else act)
+    return cast("Act", _in_torch(owner, act, forward) if is_module else act)
 
 
 def _predicting(predict: Any, named: Mapping[str, inspect.Parameter], n: int) -> Act:
@@ -118,8 +115,8 @@ def _predicting(predict: Any, named: Mapping[str, inspect.Parameter], n: int) ->
     return act
 
 
-def _evaluating(module: Any, act: Act, tensors: bool) -> Act:
-    """Return the function of a `torch.nn.Module`, in evaluation mode and without gradients."""
+def _in_torch(module: Any, act: Act, tensors: bool) -> Act:
+    """Return the function of a `torch.nn.Module`, without gradients."""
     torch: Any = sys.modules["torch"]
     like = next(module.parameters(), torch.empty(0))
 
@@ -128,23 +125,17 @@ def _evaluating(module: Any, act: Act, tensors: bool) -> Act:
             return {name: tensor(each) for name, each in seen.items()}
         return torch.tensor(seen).to(like)
 
-    def evaluating(observations: Any) -> Any:
-        in_training = [part for part in module.modules() if part.training]
-        module.eval()
-        try:
-            with torch.no_grad():
-                actions = act(tensor(observations) if tensors else observations)
-        finally:
-            for part in in_training:
-                part.training = True
+    def acting(observations: Any) -> Any:
+        with torch.no_grad():
+            actions = act(tensor(observations) if tensors else observations)
         return np.array(actions.tolist()) if isinstance(actions, torch.Tensor) else actions
 
-    return evaluating
+    return acting
 
 
-def is_vec_env(env: Any) -> bool:
-    """Whether environments are a `VecEnv` of Stable-Baselines3."""
-    return isinstance(env, loaded(f"{_SB3}.vec_env.VecEnv"))
+def is_environment(env: Any) -> bool:
+    """Whether this is an environment or many, of Gymnasium or of Stable-Baselines3."""
+    return isinstance(env, (gymnasium.Env, VectorEnv, loaded(f"{_SB3}.vec_env.VecEnv")))
 
 
 def layers(env: Any) -> Iterator[Any]:
@@ -156,25 +147,24 @@ def layers(env: Any) -> Iterator[Any]:
     for name in ("venv", "env", "envs", "batches"):
         inside = vars(env).get(name, ())
         for each in inside if isinstance(inside, list | tuple) else (inside,):
-            if isinstance(each, gymnasium.Env | VectorEnv) or is_vec_env(each):
+            if is_environment(each):
                 yield from layers(each)
     yield from _asked(env, "unwrapped")
 
 
 def _asked(env: Any, name: str) -> list[Any]:
     """Return an attribute of a layer, or of environments in its processes, if they run."""
-    if name in vars(env):
-        return [vars(env)[name]]
     with suppress(Exception):  # whatever closed ones raise
         if "processes" in vars(env):
             ask = getattr(env, "env_method", None) or env.call
             return [*env.get_attr(name)] if any(ask("has_wrapper_attr", name)) else []
-    return []
+    return [vars(env)[name]] if name in vars(env) else []
 
 
 def natives(env: Any) -> list[MiddlePointEnv | MiddlePointVectorEnv]:
     """Return the plants in environments."""
-    return [each for each in layers(env) if isinstance(each, _NATIVE)]
+    kinds = MiddlePointEnv, MiddlePointVectorEnv
+    return [each for each in layers(env) if isinstance(each, kinds)]
 
 
 def overlap(env: Any, other: Any) -> bool:
@@ -231,32 +221,62 @@ def _normalisers(env: Any) -> Iterator[tuple[Any, str]]:
 
 
 @contextmanager
-def opened(env: Any, n: int, policy: Any = None) -> Iterator[Any]:
-    """Yield given environments, or n that a function makes, frozen and ready for episodes.
+def opened(env: Any, n: int, policy: Any = None, /, **arguments: Any) -> Iterator[Any]:
+    """Yield environments, n where they are to be made, frozen and ready for episodes.
 
-    Those of a function are closed afterwards. Others are as before, but for a new episode.
+    Those that exist are as before afterwards, but for a new episode. Others are closed.
     """
-    given = isinstance(env, gymnasium.Env | VectorEnv) or is_vec_env(env)
-    if not (given or callable(env)):
-        allowed = "an id, an EnvSpec, environments, or a function that makes one"
-        reject("env", env, f"{allowed} (a model that was loaded has no environments)")
+    given = is_environment(env)
     with ExitStack() as stack:
-        plants = FromVecEnv(env) if is_vec_env(env) else env
-        if not given or isinstance(env, gymnasium.Env):
-            plants = SyncVectorEnv([lambda: env] if given else [partial(_one, env)] * n)
+        plants = _batch(env, n, arguments)
+        if not given:
             stack.callback(plants.close)
-            plants.closed = given  # then it is not ours to close
         if not natives(plants):
             reject("env", env, "an open environment of MiddlePointEnv in NumPy, wrapped or not")
-        for layer, flag in _normalisers(plants):
-            stack.callback(setattr, layer, flag, getattr(layer, flag))
-            setattr(layer, flag, False)
+        _, owner = behind(policy)
+        parts = owner.modules() if isinstance(owner, loaded("torch.nn.Module")) else ()
+        for each, flag in [*_normalisers(plants), *((part, "training") for part in parts)]:
+            stack.callback(setattr, each, flag, getattr(each, flag))
+            setattr(each, flag, False)
         if given:
-            stack.callback(_restart, plants, policy, _fresh(plants))
+            last: list[Any] = [each.np_random_seed for each in natives(plants)]
+            stack.callback(_restart, plants, policy, np.hstack(last).tolist())
         yield plants
 
 
-def _one(make: Callable[[], Any]) -> gymnasium.Env[Any, Any]:
+def _batch(env: Any, n: int, arguments: Mapping[str, Any]) -> Any:
+    """Return environments of any kind in the form of a vector environment."""
+    if isinstance(env, str | EnvSpec):
+        make = partial(make_one, env, arguments)
+        single = make()
+        plants = native_batch(single, n) or SyncVectorEnv([make] * n)
+        plants.unwrapped.spec = single.spec
+        return plants
+    if arguments:
+        raise ValueError(f"{', '.join(arguments)} must be given where env is made")
+    if isinstance(env, gymnasium.Env):
+        plants = SyncVectorEnv([lambda: env])
+        plants.closed = True  # as it is not ours to close
+        return plants
+    if is_environment(env):
+        return env if isinstance(env, VectorEnv) else FromVecEnv(env)
+    if not callable(env):
+        allowed = "an id, an EnvSpec, environments, or a function that makes one"
+        reject("env", env, f"{allowed} (a model that was loaded has no environments)")
+    return SyncVectorEnv([partial(_one, env)] * n)
+
+
+def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
+    """Make an environment from an id or a spec; ValueError if it cannot be found."""
+    try:
+        return gymnasium.make(env, disable_env_checker=True, **arguments)
+    except (gymnasium.error.Error, ImportError):
+        close = difflib.get_close_matches(str(env), IDS.values(), n=1)
+        hint = f"did you mean {close[0]}?" if close else f"such as {IDS['paper']}"
+        reject("env", env, f"the id of an environment ({hint})")
+
+
+def _one(make: Callable[[], Any]) -> Env:
     """Return the environment that a function makes."""
     made = make()
     if not isinstance(made, gymnasium.Env):
@@ -265,36 +285,49 @@ def _one(make: Callable[[], Any]) -> gymnasium.Env[Any, Any]:
     return made
 
 
-def _fresh(plants: Any) -> list[int]:
-    """Return new seeds that follow from the last ones, so that a training can be repeated."""
-    each_last: list[Any] = [each.np_random_seed for each in natives(plants)]
-    last = np.hstack(each_last).tolist()
-    entropy = None if None in last else [abs(seed) for seed in last]
-    return [*map(int, np.random.SeedSequence(entropy).generate_state(plants.num_envs))]
+def native_batch(single: Env, n: int, **modes: Any) -> Any:
+    """Return n of an environment in one batch, in an `autoreset_mode` and so on.
+
+    There is none, but None, for another class or wrappers other than `IncrementalAction`.
+    """
+    from mptc_gym.wrappers.vector import IncrementalAction  # here: it imports this module
+
+    spec, plant = single.spec, single.unwrapped
+    wrappers = spec.additional_wrappers if spec else ()
+    names = [each.entry_point for each in wrappers]
+    known = names in ([], ["mptc_gym.wrappers:IncrementalAction"])
+    if spec is None or type(plant) is not MiddlePointEnv or not known:
+        return None
+    modes["max_episode_steps"] = spec.max_episode_steps
+    plants: Any = MiddlePointVectorEnv(n, **modes, **asdict(plant.parameters))
+    plants.spec = spec
+    for each in wrappers:
+        plants = IncrementalAction(plants, **(each.kwargs or {}))
+    return plants
 
 
-def _restart(plants: Any, policy: Any, seeds: list[int]) -> None:
-    """Reset plants with other seeds, so that training never meets the episodes of a score."""
+def _restart(plants: Any, policy: Any, last: list[int]) -> None:
+    """Reset plants, so that training never meets the episodes of a score."""
+    # Seeds that follow from the last ones: the training can be repeated.
+    entropy = None if None in last else [*map(abs, last)]
+    seeds = np.random.SeedSequence(entropy).generate_state(plants.num_envs).tolist()
     observations = None
     with suppress(Exception):  # a Monitor may not allow it; what is broken raised its own
         observations, _ = plants.reset(seed=seeds)
     algorithm = loaded(f"{_SB3}.base_class.BaseAlgorithm")
-    if not (isinstance(policy, algorithm) and policy.env and overlap(policy.env, plants)):
-        return
-    policy._last_obs = None  # its training begins anew
-    if isinstance(plants, FromVecEnv) and plants.env is policy.env:
-        # In a callback it goes on with these, and would store the None.
-        policy._last_obs = observations
-        policy._last_episode_starts = np.ones(plants.num_envs, np.bool_)
-        if (normalised := policy.get_vec_normalize_env()) is not None:
+    if isinstance(policy, algorithm) and policy.env and overlap(policy.env, plants):
+        # In a callback, training goes on with these; otherwise None makes it begin anew.
+        whole = isinstance(plants, FromVecEnv) and plants.env is policy.env
+        policy._last_obs = observations if whole else None
+        policy._last_episode_starts = np.ones(policy.n_envs, np.bool_)
+        if whole and (normalised := policy.get_vec_normalize_env()) is not None:
             policy._last_original_obs = normalised.get_original_obs()
 
 
 def check_fit(policy: Any, plants: Any) -> None:
     """Refuse environments that a policy was not made for, if it is one that can tell."""
-    _, owner = behind(policy)
+    here, (_, owner) = _traits(plants), behind(policy)
     if hasattr(owner, "check_environment"):
-        here = _traits(plants)
         wrapped = ", ".join(here["wrappers"] | here["action wrappers"])
         owner.check_environment(natives(plants)[0].parameters, wrapped, plants.num_envs)
     models = loaded(f"{_SB3}.base_class.BaseAlgorithm"), loaded(f"{_SB3}.policies.BaseModel")
@@ -306,7 +339,6 @@ def check_fit(policy: Any, plants: Any) -> None:
     }
     own = getattr(policy, "env", None)
     if own and not isinstance(plants, FromVecEnv):
-        here = _traits(plants)
         pairs |= {name: (its, here[name]) for name, its in _traits(own).items()}
     for name, (its, found) in pairs.items():
         if its != found:
@@ -319,15 +351,13 @@ def check_fit(policy: Any, plants: Any) -> None:
 
 def _traits(env: Any) -> dict[str, set[Any]]:
     """Return what changes observations and actions, as far as it can be known, by kind."""
-    kinds = {
-        kind.__name__
-        for each in layers(env)
-        if vars(each).get("norm_obs", True)  # a VecNormalize may be of rewards alone
-        for kind in type(each).mro()
-    }
+    every = [*layers(env)]
+    # A VecNormalize may be of rewards alone.
+    shown = [each for each in every if vars(each).get("norm_obs", True)]
+    kinds = {kind.__name__ for each in shown for kind in type(each).mro()}
     found: dict[str, set[Any]] = {"wrappers": kinds & {"VecNormalize", "VecFrameStack"}}
     if plants := natives(env):  # unlike closed processes, which cannot be asked
-        moves = [each for layer in layers(env) for each in _asked(layer, "_increments")]
+        moves = [each for layer in every for each in _asked(layer, "_increments")]
         found["action wrappers"] = {f"IncrementalAction{each}" for each in moves}
         found["windows"] = {plant.parameters.windows for plant in plants}
     return found
@@ -337,24 +367,19 @@ def replayed(steps: Steps, plants: Any, seeds: list[int]) -> Steps:
     """Yield steps, as long as `plants`, given the same seeds and commands, show the same."""
     _, shown = plants.reset(seed=seeds)
     limits = [shown.get(name, getattr(plants.parameters, name)) for name in ("u_min", "u_max")]
-    for k, (before, after, ended) in enumerate(steps):
-        if k == 0:
-            before = before or shown  # where it does not keep the infos of a reset
-            _check_infos(before, shown, k)
-        flows = np.asarray(after.get("command", np.zeros(plants.num_envs)))
-        *_, shown = plants.step(action_from_command(flows, *limits)[:, np.newaxis])
-        _check_infos(after, shown, k + 1)
-        yield before, after, ended
-
-
-def _check_infos(infos: Infos, shown: Infos, k: int) -> None:
-    """Refuse infos at sample k that are not those shown by the native plants."""
-    # The last names first: what is drawn tells more than what follows from it.
-    for name in reversed([name for name in shown if not name.startswith("_")]):
-        found, right = infos.get(name, np.nan), shown[name]
-        if not (np.abs(found - right) <= _TOLERANCE * (1.0 + np.abs(right))).all():
-            raise ValueError(
-                f"env must run the episodes of its seeds, whose {name} by sample {k} is "
-                f"{shorten(right)}, got {shorten(infos.get(name))}: it must not reset with "
-                "another seed, skip or repeat samples, or change the plant or info"
-            )
+    for k, (infos, ended) in enumerate(steps):
+        if k > 0:
+            flows = np.asarray(infos.get("command", np.zeros(plants.num_envs)))
+            *_, shown = plants.step(action_from_command(flows, *limits)[:, np.newaxis])
+        elif not infos:  # where it does not keep those of a reset
+            infos = shown
+        # The last names first: what is drawn tells more than what follows from it.
+        for name in reversed([name for name in shown if not name.startswith("_")]):
+            found, right = infos.get(name, np.nan), shown[name]
+            if not (np.abs(found - right) <= _TOLERANCE * (1.0 + np.abs(right))).all():
+                raise ValueError(
+                    f"env must run the episodes of its seeds, whose {name} by sample {k} is "
+                    f"{shorten(right)}, got {shorten(infos.get(name))}: it must not reset with "
+                    "another seed, skip or repeat samples, or change the plant or info"
+                )
+        yield infos, ended

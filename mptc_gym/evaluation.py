@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import difflib
+import itertools
 import json
-from collections.abc import Mapping
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from functools import cache
 from importlib import resources
-from typing import Any, Final, cast
+from typing import Any, Final
 
-import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from mptc_gym import acting
-from mptc_gym.checks import MOST_PLANTS, count, reject
-from mptc_gym.env import MiddlePointEnv
+from mptc_gym.checks import MOST_PLANTS, count
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.presets import IDS
 from mptc_gym.vector_env import MiddlePointVectorEnv
-from mptc_gym.wrappers.vector import IncrementalAction as VectorIncrementalAction
 
-Env = gymnasium.Env[Any, Any]
 Values = NDArray[np.float64]  # one per episode, shape (episodes,)
 
 SEED: Final = 7_000_000  # of the first fixed episode, as the next one has the next seed
@@ -156,24 +150,16 @@ valve travel 0 t/h; 100 episodes, all alike
     """
     episodes = count("episodes", episodes, 2, MOST_PLANTS)
     first = count("seed", seed, 0, 2**63)
-    seeds, most, native = range(first, first + episodes), SAMPLES, None
-    if isinstance(env, str | EnvSpec):
-        single = make_one(env, arguments)
-        most = cast("EnvSpec", single.spec).max_episode_steps or SAMPLES
-        native = native_batch(single, episodes)
-        if not isinstance(single.unwrapped, MiddlePointEnv):
-            reject("env", env, "the id of an environment of this package")
-        env = partial(make_one, env, arguments)
-    elif arguments:
-        raise ValueError(f"{', '.join(arguments)} must be given where env is made")
-    given = nullcontext(native) if native else acting.opened(env, episodes, policy)
-    with given as plants:
-        one, *others = [native.unwrapped] if native else acting.natives(plants)
+    seeds, by_id = range(first, first + episodes), isinstance(env, str | EnvSpec)
+    with acting.opened(env, episodes, policy, **arguments) as plants:
+        one, *others = acting.natives(plants)
         case = case_of(one.parameters)
         if any(case_of(each.parameters) != case for each in others):
             raise ValueError("env must have the same plants, but for windows and rewards")
         acting.check_fit(policy, plants)
-        expected = None if native else one.parameters
+        most = (by_id and plants.spec.max_episode_steps) or SAMPLES
+        # What the package itself makes runs the episodes of its seeds.
+        expected = None if by_id and plants.unwrapped is one else one.parameters
         errors, travels, samples = _run(policy, plants, seeds, most, expected)
     return Evaluation(
         env=one.spec.id if one.spec else type(one).__name__,
@@ -186,41 +172,12 @@ valve travel 0 t/h; 100 episodes, all alike
     )
 
 
-def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
-    """Make an environment from an id or a spec; ValueError if it cannot be found."""
-    try:
-        return gymnasium.make(env, disable_env_checker=True, **arguments)
-    except (gymnasium.error.Error, ImportError):
-        close = difflib.get_close_matches(str(env), IDS.values(), n=1)
-        hint = f"did you mean {close[0]}?" if close else f"such as {IDS['paper']}"
-        reject("env", env, f"the id of an environment ({hint})")
-
-
-def native_batch(single: Env, n: int, **modes: Any) -> Any:
-    """Return n of an environment in one batch, in an `autoreset_mode` and so on.
-
-    There is none, but None, for another class or wrappers other than `IncrementalAction`.
-    """
-    spec, plant = single.spec, single.unwrapped
-    if spec is None or type(plant) is not MiddlePointEnv:
-        return None
-    wrappers = [each.entry_point for each in spec.additional_wrappers]
-    if wrappers not in ([], ["mptc_gym.wrappers:IncrementalAction"]):
-        return None
-    modes["max_episode_steps"] = spec.max_episode_steps
-    plants = MiddlePointVectorEnv(n, **modes, **asdict(plant.parameters))
-    plants.spec = spec
-    moves: Any = [each.kwargs for each in spec.additional_wrappers]
-    return VectorIncrementalAction(plants, **moves[0]) if moves else plants
-
-
 def _run(
     policy: Any, plants: Any, seeds: range, most: int, expected: Parameters | None = None
 ) -> tuple[Values, Values, int]:
-    """Run one episode per seed, in rounds of as many as there are plants.
+    """Return the mean |e(k)|, degC, and valve travel, t/h, of an episode per seed; and N.
 
-    Episodes are refused unless they are those of plants with the arguments `expected`, if any.
-    Return the mean |e(k)| over k = 1 to N, degC, and the valve travel, t/h, of each; and N.
+    Others than those of plants with the arguments `expected`, if any, are refused.
     """
     rounds, lengths, n = [], set(), plants.num_envs
     for first in seeds[::n]:
@@ -229,7 +186,8 @@ def _run(
         if expected:
             steps = acting.replayed(steps, MiddlePointVectorEnv(n, **asdict(expected)), own)
         totals = np.zeros((2, n))
-        for k, (before, after, ended) in enumerate(steps, 1):  # noqa: B007 (used below)
+        pairs = itertools.pairwise(steps)
+        for k, ((before, _), (after, ended)) in enumerate(pairs, 1):  # noqa: B007 (used below)
             totals += np.abs((after["error"], after["applied"] - before["applied"]))
             if ended.any():
                 break

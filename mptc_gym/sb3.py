@@ -10,6 +10,7 @@ Requires `pip install "mptc_gym[sb3]"`.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import pkgutil
 import tempfile
@@ -30,17 +31,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env import sync_envs_normalization as synchronise
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from mptc_gym.acting import check_fit, natives, opened, overlap
+from mptc_gym.acting import check_fit, make_one, native_batch, natives, opened, overlap
 from mptc_gym.checks import MOST_PLANTS, count, reject
-from mptc_gym.evaluation import (
-    EPISODES,
-    SEED,
-    WINDOWS,
-    Evaluation,
-    evaluate,
-    make_one,
-    native_batch,
-)
+from mptc_gym.evaluation import EPISODES, SEED, WINDOWS, Evaluation, evaluate
 from mptc_gym.wrappers import IncrementalAction
 
 __all__ = ["GymnasiumVecEnv", "ScoreCallback", "load", "make_vec_env", "save", "spec_of"]
@@ -76,11 +69,11 @@ class GymnasiumVecEnv(VecEnv):
         self.infos: dict[str, Any] = {}
         # Of each environment, the number of its batch and its own number there.
         self._places = [(i, j) for i, each in enumerate(batches) for j in range(each.num_envs)]
-        self._edges = np.cumsum([batch.num_envs for batch in batches])[:-1]
+        edges = [0, *itertools.accumulate(batch.num_envs for batch in batches)]
+        self._parts = [(batches[i], slice(*edges[i : i + 2])) for i in range(len(batches))]
         spaces = batches[0].single_observation_space, batches[0].single_action_space
         super().__init__(len(self._places), *spaces)
-        self._returns = np.zeros(self.num_envs)
-        self._lengths = np.zeros(self.num_envs, np.int64)
+        self._totals = np.zeros((2, self.num_envs))  # return and length of each episode
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seeds of the next reset: environment i has `seed + i // group`."""
@@ -90,26 +83,24 @@ class GymnasiumVecEnv(VecEnv):
 
     def reset(self) -> NDArray[Any]:
         """Reset all environments, with the seeds set by `seed`."""
-        seeds: Any = np.split(np.array(self._seeds, object), self._edges)
-        pairs = zip(self.batches, seeds, strict=True)
-        resets = [batch.reset(seed=own.tolist()) for batch, own in pairs]
+        seeds: Any = self._seeds
+        resets = [batch.reset(seed=seeds[part]) for batch, part in self._parts]
         self._reset_seeds()
-        self._returns[:], self._lengths[:] = 0.0, 0
+        self._totals[:] = 0.0
         self.reset_infos = [_alone(resets[i][-1], j) for i, j in self._places]
         return self._joined(resets)[0]
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Store the actions, shape (num_envs, action size)."""
-        self._actions = np.split(actions, self._edges)
+        self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step with the stored actions."""
-        pairs = zip(self.batches, self._actions, strict=True)
-        steps = [batch.step(actions) for batch, actions in pairs]
+        steps = [batch.step(self._actions[part]) for batch, part in self._parts]
         observations, rewards, terminated, truncated = self._joined(steps)
         ended = terminated | truncated
-        self._returns += rewards
-        self._lengths += 1
+        self._totals[0] += rewards
+        self._totals[1] += 1.0
         infos: list[dict[str, Any]] = [{} for _ in ended]
         for place in np.flatnonzero(ended).tolist():
             i, j = self._places[place]
@@ -119,9 +110,12 @@ class GymnasiumVecEnv(VecEnv):
                 **_alone(found["final_info"], j),
                 "terminal_observation": found["final_obs"][j],
                 "TimeLimit.truncated": bool(truncated[place] and not terminated[place]),
-                "episode": {"r": float(self._returns[place]), "l": int(self._lengths[place])},
+                "episode": {
+                    "r": float(self._totals[0, place]),
+                    "l": int(self._totals[1, place]),
+                },
             }
-        self._returns[ended], self._lengths[ended] = 0.0, 0
+        self._totals[:, ended] = 0.0
         return observations, rewards.astype(np.float32), ended, infos
 
     def _joined(self, returned: list[tuple[Any, ...]]) -> list[NDArray[Any]]:
@@ -229,21 +223,20 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
 
 
 def _spec(model: Any) -> EnvSpec:
-    """Return the spec of one of a model's environments, if that makes one."""
-    plants = model.get_env() if isinstance(model, BaseAlgorithm) else None
-    if plants is None:
-        raise ValueError("policy must be a model with its environments: see mptc_gym.sb3.load")
-    spec, *_ = plants.get_attr("spec")
+    """Return the spec of the first of a model's environments, if that makes one."""
+    spec: Any = None
     try:
+        spec, *_ = model.get_env().get_attr("spec")
         # Gymnasium cannot make the Monitor that each model adds, and it changes nothing.
         kept = tuple(each for each in spec.additional_wrappers if each.name != "Monitor")
         spec = dataclasses.replace(spec, additional_wrappers=kept)
         gymnasium.make(EnvSpec.from_json(spec.to_json()))
     except Exception as error:  # from wrappers of anybody
         raise ValueError(
-            "policy's environments must come from gymnasium.make or make_vec_env, in wrappers "
-            "that can be imported and record their arguments, as gymnasium.utils."
-            f"RecordConstructorArgs does, got {spec}: {error}"
+            "policy must be a model with its environments (see mptc_gym.sb3.load), which must "
+            "come from gymnasium.make or make_vec_env, in wrappers that can be imported and "
+            "record their arguments, as gymnasium.utils.RecordConstructorArgs does, got "
+            f"{spec}: {error}"
         ) from error
     return cast("EnvSpec", spec)
 
@@ -256,17 +249,12 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     saved as Stable-Baselines3 does. ValueError if the environments differ or cannot be made
     from their spec, or the file cannot be written.
     """
-    path, spec = _zip_path(path), _spec(model)
-    if isinstance(outermost := model.get_env(), VecEnvWrapper):
+    path, spec, plants = _zip_path(path), _spec(model), cast("VecEnv", model.get_env())
+    if isinstance(plants, VecEnvWrapper) or len({str(s) for s in plants.get_attr("spec")}) > 1:
         raise ValueError(
-            f"policy must not be in {type(outermost).__name__} to be saved here: save it by "
-            "model.save(path), and the statistics by model.get_vec_normalize_env().save(path)"
-        )
-    first, *others = cast("VecEnv", outermost).get_attr("spec")
-    if any(each is not first and each.to_json() != first.to_json() for each in others):
-        raise ValueError(
-            "policy must have environments that do not differ to be saved here, as `load` "
-            "makes all by the spec of the first: save it by model.save(path)"
+            "policy must have environments that do not differ, in no VecEnvWrapper, to be "
+            f"saved here, got {type(plants).__name__}: save it by model.save(path), and "
+            "statistics by model.get_vec_normalize_env().save(path)"
         )
     algorithm = f"{type(model).__module__}:{type(model).__name__}"
     record = json.dumps({"algorithm": algorithm, "spec": spec.to_json()})
@@ -355,8 +343,6 @@ class ScoreCallback(BaseCallback):
         self.every = count("every", every, 1, 10**12)
         self.episodes = count("episodes", episodes, 2, MOST_PLANTS)
         self.path = None if path is None else _zip_path(path)
-        if path and (Path(path).is_dir() or not Path(path).parent.is_dir()):
-            reject("path", path, "the name of a zip in a folder that exists, not a folder")
         self.scores: list[tuple[int, Evaluation]] = []
         self.best: Evaluation | None = None
         self._env, self._arguments = env, arguments
@@ -370,12 +356,12 @@ class ScoreCallback(BaseCallback):
         # Not kept in place of the id: the next model may have other windows.
         self._score_in: Any = partial(evaluate, env=env, **arguments)
         self._hand_over()
-        if self.path is not None:
-            with tempfile.TemporaryDirectory() as folder:  # what cannot be saved is said now
-                save(self.model, Path(folder, "model"))
-        make = partial(make_one, env, {}) if isinstance(env, EnvSpec) else env
-        if callable(make):
-            with opened(make, 1) as plants:
+        if self.path is not None:  # what cannot be saved, or not there, is said now
+            trial = self.path.with_name(f".{self.path.name}")
+            save(self.model, trial)
+            trial.unlink()
+        if isinstance(env, EnvSpec) or callable(env):
+            with opened(env, 1) as plants:
                 check_fit(self.model, plants)
 
     def _hand_over(self) -> None:

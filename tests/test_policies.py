@@ -404,7 +404,7 @@ REFUSED = {
         lambda: (DirectNNController(num_envs=2), NOISY), "num_envs=3"),
     "unknown id": (
         lambda: (law, "MiddlePointNosy-v0"), r"id of an env.*did you mean MiddlePointNoisy-v0"),
-    "another environment": (lambda: (law, "CartPole-v1"), "of this package, got 'CartPole-v1'"),
+    "another environment": (lambda: (law, "CartPole-v1"), "of MiddlePointEnv .* 'CartPole-v1'"),
     "module without forward": (lambda: (torch.nn.Module(), NOISY), "as agent.actor_mean"),
     "predict": (lambda: (lambda seen: (law(seen), None), NOISY), "a model, not its predict"),
     "no environment": (lambda: (law, 7), "env must be an id, an EnvSpec, environments, or a f"),

@@ -20,7 +20,7 @@ from benchmarks.lib.command import FanOut, Names, Parameter, blame, options
 from benchmarks.lib.storage import UsageError
 from mptc_gym import IDS, Parameters
 from mptc_gym.acting import check_fit, natives, opened, start
-from mptc_gym.evaluation import case_of, make_one, native_batch
+from mptc_gym.evaluation import case_of
 
 AgentNames = Annotated[Names, Parameter(help="Controllers to run.", choices=ROSTER)]
 
@@ -145,17 +145,15 @@ class Policy:
     @contextmanager
     def opened(self, samples: int, **arguments: Any) -> Iterator[Any]:
         """Yield the plants that it acts in, with these arguments or refused."""
-        env: Any = self.env
+        env, more = self.env, {}
         if env is None:
-            more = {**arguments, "max_episode_steps": samples}
-            make = partial(make_one, IDS["paper"], more)
+            env, more = IDS["paper"], {**arguments, "max_episode_steps": samples}
             if getattr(self.policy, "get_env", lambda: None)() is not None:
                 from mptc_gym.sb3 import spec_of
 
                 plant = {each: more[each] for each in more if each not in WINDOWS}
-                make = partial(make_one, spec_of(self.policy, **plant), {})
-            env = native_batch(make(), self.runs) or make
-        with opened(env, self.runs) as given:
+                env, more = spec_of(self.policy, **plant), {}
+        with opened(env, self.runs, self.policy, **more) as given:
             with blame("--agent"):
                 case = case_of(Parameters(**arguments))
                 if any(case_of(each.parameters) != case for each in natives(given)):

@@ -121,7 +121,8 @@ def rollout(
         return agent.act(observations)
 
     signals = []
-    for at, after, _ in run_batch(plants, act, samples, seeds):
+    steps = run_batch(plants, act, samples, seeds)
+    for (at, _), (after, _) in itertools.pairwise(steps):
         # A step reports the command and the applied flow of the sample that it starts at.
         here = at["setpoint"], at["output"], after["command"], after["applied"]
         signals.append(np.array([*here, after["error"], after["setpoint"]]))
