@@ -21,10 +21,9 @@ from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS
 from mptc_gym import Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.signals import Ranges
-from tests.verify_bounds import beats, controllers, errors
+from tests.verify_bounds import CONTROLLERS, beats, errors
 
 CALM = Parameters()
-MPC = controllers()["mpc"]
 
 
 def run_mpc(runs, samples, seed=0, **arguments):
@@ -233,7 +232,7 @@ class TestCausal:
             kind: least_possible(samples=400, kind=kind, episodes=4, **arguments)
             for kind in ("preview", "causal")
         }
-        found = errors(MPC, 4, 400, **arguments)
+        found = errors(CONTROLLERS["mpc"], 4, 400, **arguments)
         assert not beats(found, kinds["causal"])
         assert kinds["preview"].value < 0.5 * kinds["causal"].value
         assert found.mean() < 1.3 * kinds["causal"].value

@@ -25,107 +25,73 @@ from tests.conftest import native_and_sync
 
 SHAPE = (540, 960, 3)
 UP = np.ones(1, np.float32)
-LEFT, TOP, WIDTH, HEIGHT = drawing.FLOWS
+LEFT, TOP, WIDTH, _ = drawing.FLOWS
 
 
-def record(*samples, setpoint=0.0, sampling_interval=8.0, **numbers):
+def record(*samples, sampling_interval=8.0, **numbers):
     """Return a record of samples (y_d, y, u, u_a) of the paper's plant, or one unlike it."""
     paper = Ranges(Parameters()).given
-    made = Record(replace(paper, **numbers), sampling_interval, setpoint)
+    made = Record(replace(paper, **numbers), sampling_interval, 0.0)
     for sample in samples:
         made.add(*sample)
     return made
 
 
-def rows(picture, colour, x):
-    """Return where a colour is in a column, below the headings."""
-    found = np.flatnonzero((picture[:, round(x)] == colour).all(axis=1))
-    return found[(found > 40) & ((found < 280) | (found > 320))]
+@pytest.mark.parametrize(
+    ("delay", "dead_zone", "u_max"), [(18, 2.0, 10.0), (40, 8.0, 10.0), (0, 0.0, 5.0)]
+)
+def test_curves_and_marks_are_where_the_axes_say(delay, dead_zone, u_max):
+    early, late = (-12.0, 12.0, 4.0, 0.0), (-12.0, -12.0, 100.0, u_max)
+    made = record(*[early] * 60, *[late] * 90, delay=delay, dead_zone=dead_zone, u_max=u_max)
+    picture = drawing.frame(made)
 
+    def ends(colour, k):
+        """Return the highest and the lowest value with a colour, in the axes of its panel."""
+        (low, high), panel = made.flows, drawing.FLOWS
+        if colour in (drawing.TEMPERATURE, drawing.SETPOINT):
+            (low, high), panel = made.temperatures, drawing.TEMPERATURES
+        found = np.flatnonzero(
+            (picture[:, round(LEFT + k / 200 * WIDTH)] == colour).all(axis=1)
+        )
+        found = found[(found > panel[1]) & (found < panel[1] + panel[3])]
+        return high - (found[[0, -1]] - panel[1]) / panel[3] * (high - low)
 
-def column(k):
-    """Return where sample k lies, as long as the picture has not begun to move."""
-    return LEFT + k / 200 * WIDTH
-
-
-def test_temperatures_are_where_they_are_and_the_set_point_shows_above_them():
-    levels = (12.0,) * 60 + (0.0,) * 60 + (-12.0,) * 60
-    picture = drawing.frame(record(*[(-12.0, level, 0.0, 0.0) for level in levels]))
-    found = [rows(picture, drawing.TEMPERATURE, column(k)) for k in (30, 90, 150)]
-    setpoint = rows(picture, drawing.SETPOINT, column(30.5)).mean()
-    # From -12 - 5 % of the range to 12 + 5 %, in a panel of 214 pixels.
-    height = 12 / 26.4 * drawing.TEMPERATURES[3]
-    apart = np.diff([found[0].mean(), found[1].mean(), setpoint])
-    assert apart == pytest.approx([height] * 2, abs=1)
-    both = rows(picture, drawing.SETPOINT, column(150.5))
-    assert both.mean() == setpoint  # in front of the temperature, which is seen behind it
-    assert len(found[2]) == len(found[0]) - len(both) > 0
-
-
-def test_flows_are_where_they_are_and_a_command_beyond_the_limit_is_in_the_panel():
-    inside, beyond = (0.0, 0.0, 4.0, 0.0), (0.0, 0.0, 100.0, 10.0)
-    picture = drawing.frame(record(*[inside] * 50, *[beyond] * 100))
-    scale = HEIGHT / 24.8  # pixels per t/h: 12 % of the range above it and below
-    zero, limit = (rows(picture, drawing.APPLIED, column(k + 0.5)).mean() for k in (25, 100))
-    assert zero - limit == pytest.approx(10 * scale, abs=1)
-    command = rows(picture, drawing.COMMAND, column(25.5)).mean()
-    assert zero - command == pytest.approx(4 * scale, abs=1)
-    assert TOP < rows(picture, drawing.COMMAND, column(100.5)).mean() < limit - 5
-    # u(49) to u(50): the vertical line is at k = 50.
-    heights = [len(rows(picture, drawing.COMMAND, column(k))) for k in (49, 50, 51)]
-    assert np.greater(heights, 9).tolist() == [False, True, False]
-
-
-@pytest.mark.parametrize(("k", "delay", "dead_zone", "u_max"), [
-    (10, 18, 0.0, 10.0), (60, 18, 2.0, 10.0), (60, 40, 8.0, 10.0), (300, 0, 4.0, 5.0),
-])  # fmt: skip
-def test_dead_zone_limits_and_what_is_in_transit_are_marked(k, delay, dead_zone, u_max):
-    still = [(0.0,) * 4] * k
-    picture = drawing.frame(record(*still, delay=delay, dead_zone=dead_zone, u_max=u_max))
-    scale = HEIGHT / (1.24 * (10.0 + u_max))
-    marks = rows(picture, drawing.LIMIT, 300)
-    marks = marks[(marks > TOP) & (marks < TOP + HEIGHT)]
-    assert np.ptp(marks) == pytest.approx((10.0 + u_max) * scale, abs=1)
-    if k < 200:  # no curve is drawn at the right edge yet
-        shaded = (picture[TOP:, LEFT + WIDTH - 2] == drawing.DEAD_ZONE).all(axis=1).nonzero()[0]
-        height = pytest.approx(2 * dead_zone * scale, abs=2)
-        assert np.ptp([*shaded, *shaded + 1] or [0]) == height
+    for k, sample in ((30.5, early), (100.5, late)):
+        colours = drawing.SETPOINT, drawing.TEMPERATURE, drawing.COMMAND, drawing.APPLIED
+        for colour, value in zip(colours, sample, strict=True):
+            shown = made.flows[1] if value == 100.0 else value  # the edge of the panel
+            assert ends(colour, k) == pytest.approx(shown, abs=0.5)
+    for colour in (drawing.COMMAND, drawing.APPLIED):
+        assert np.ptp(ends(colour, 60)) > 2.0  # from u(59) to u(60), at once
+    assert ends(drawing.LIMIT, 195) == pytest.approx((u_max, -10.0), abs=0.2)
+    if dead_zone:
+        assert ends(drawing.DEAD_ZONE, 195) == pytest.approx((dead_zone, -dead_zone), abs=0.2)
     columns = np.flatnonzero((picture[TOP + 10] == drawing.IN_TRANSIT).all(axis=1))
-    assert len(columns) == pytest.approx(min(k, delay) / 200 * WIDTH, abs=3)
-    if delay:
-        assert columns[-1] == pytest.approx(column(k), abs=2)  # up to now
+    assert len(columns) == pytest.approx(delay / 200 * WIDTH, abs=3)
+    assert not delay or columns[-1] == pytest.approx(LEFT + 150 / 200 * WIDTH, abs=2)  # now
 
 
 def test_what_is_written(monkeypatch):
     texts, write = [], drawing.Panel.write
-
-    def written(made):
-        texts.clear()
-        drawing.draw(made)
-        return {text for text, _ in texts}
 
     def noted(panel, text, *colours, **place):
         texts.append((text.strip(), write(panel, text, *colours, **place)))
         return texts[-1][1]
 
     monkeypatch.setattr(drawing.Panel, "write", noted)
-    assert written(record(*[(5.0, -4.875, 4.0, 0.0)] * 32)) >= {
+    drawing.draw(record(*[(5.0, -4.875, 4.0, 0.0)] * 32))
+    assert {text for text, _ in texts} >= {
         "temperature -4.88 °C", "set point 5.00 °C", "error 9.88 °C", "time 4.27 min",
         "applied flow 0.00 t/h", "command 4.00 t/h", "dead zone", "in transit", "20", "-10",
     }  # fmt: skip
     # Ten minutes are 75 samples: under both panels, beside the 10 t/h.
     places = [place for text, place in texts if text == "10"]
     times = [place.centerx for place in places if place.left > LEFT]
-    assert times == [pytest.approx(column(75), abs=1)] * 2
-    (high,) = (place.centery for place in places if place.right < LEFT)
-    (low,) = (place.centery for text, place in texts if text == "-10")
-    assert low - high == pytest.approx(20 / 24.8 * HEIGHT, abs=1)
+    assert times == [pytest.approx(LEFT + 75 / 200 * WIDTH, abs=1)] * 2
     places = [place.inflate(8, 0) for _, place in texts]
     for i, place in enumerate(places):
         assert pygame.Rect(0, 0, *drawing.SIZE).contains(place)
         assert place.collidelist(places[:i]) == -1
-    quick = record(*[(1e9, np.nan, 0.0, 0.0)] * 31, sampling_interval=2.0)
-    assert written(quick) >= {"time 1.03 min", "set point 1e+09 °C"}
 
 
 def test_frames_stay_and_copies_in_the_middle_of_an_episode_draw_alike():

@@ -57,13 +57,9 @@ class Counting:
         return action_from_command(level / self.gain, *self.limits)
 
 
-def controllers():
-    """Return the roster's controllers by name, of trained ones the first, and `Counting`."""
-    counting = Controller("counting", "counting", ("", ""), Counting, told=EVERYTHING)
-    return {
-        **{name: entry.members()[0] for name, entry in ROSTER.items()},
-        "counting": counting,
-    }
+CONTROLLERS = {name: entry.members()[0] for name, entry in ROSTER.items()} | {
+    "counting": Controller("counting", "counting", ("", ""), Counting, told=EVERYTHING)
+}
 
 
 def errors(factory, runs, samples, **arguments):
@@ -74,8 +70,8 @@ def errors(factory, runs, samples, **arguments):
 def beats(found, least):
     """Return whether runs of the bound's episodes beat it.
 
-    They do if the interval of the difference of their mean |e|, degC, from the bound lies below
-    0. If the bound is the mean over as many episodes, each run is compared with its episode.
+    They do if the interval of the difference from it lies below 0; of its own episodes, each is
+    compared with its own bound.
     """
     paired = len(least.episodes) == len(found)
     difference = found - (np.array(least.episodes) if paired else least.value)
@@ -89,7 +85,7 @@ def main(runs=300):
         kind = "causal" if arguments.get("setpoint") == "random" else "preview"
         least = least_possible(samples=SAMPLES, kind=kind, episodes=runs, **arguments)
         rows.append({"case": name, "bound": f"{least.value:.3f}", "kind": least.kind})
-        for each, factory in controllers().items():
+        for each, factory in CONTROLLERS.items():
             found = errors(factory, runs, SAMPLES, **arguments)
             rows[-1][each] = f"{found.mean():.3f}"
             beaten += [f"{each}: {name}"] if beats(found, least) else []
