@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,61 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"  # windows that nobody sees
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
+from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 
-from agents import Controller
 from benchmarks.loop.rollout import Trajectory
-from mptc_gym import MiddlePointVectorEnv
+from mptc_gym import MiddlePointVectorEnv, checks
+from mptc_gym.evaluation import WINDOWS
+from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS
 
 ROOT = Path(__file__).parent.parent
+
+few = st.floats(-0.3, 0.3)
+tails = st.lists(few, max_size=3).map(lambda tail: [1.0, *tail])
+levels = st.floats(-100, 100)
+BY_CHECK: dict[Any, st.SearchStrategy[Any]] = {
+    checks.number: few,
+    checks.samples: st.integers(0, 30),
+    checks.duration: st.integers(1, 100),
+    checks.not_negative: st.floats(0, 4),
+    checks.at_least_1: st.floats(1, 100),
+    checks.positive: st.floats(0.5, 4),
+    checks.polynomial: tails,
+    checks.numbers: st.lists(few, min_size=1, max_size=5),
+    checks.reward: st.sampled_from(checks.REWARDS),
+    checks.setpoint: st.sampled_from(checks.SETPOINTS)
+    | levels
+    | st.lists(levels, min_size=1, max_size=5),
+}
+BY_NAME: dict[
+    str, st.SearchStrategy[Any]
+] = {  # what fits together, and readings that are not always at the end of the span
+    "dead_zone": st.floats(0, 10),
+    "u_min": st.floats(-20, -10),
+    "u_max": st.floats(0, 20),
+    "temperature_span": st.floats(0.5, 200),
+}
+
+
+STRATEGIES = {name: BY_NAME.get(name, BY_CHECK[each.check]) for name, each in ARGUMENTS.items()}
+for name in PLANT_NUMBERS:
+    STRATEGIES[name] |= st.lists(STRATEGIES[name], min_size=2, max_size=2).map(sorted)
+
+
+def _without(refused: str) -> st.SearchStrategy[dict[str, Any]]:
+    chosen = {name: each for name, each in STRATEGIES.items() if not re.match(refused, name)}
+    return st.fixed_dictionaries({}, optional=chosen)
+
+
+# Of all that is valid: another A, or other time constants of the paper's A, as not every A has
+# one to change; and an observation with at least one element.
+valid_arguments = (_without("a$") | _without("time_constant")).filter(
+    lambda arguments: any(arguments.get(name, ARGUMENTS[name].default) for name in WINDOWS)
+)
+MODES = [mode.value for mode in AutoresetMode]
+NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
 
 
 def run(
@@ -73,13 +120,6 @@ def python(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, *words]
     options = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 300.0, **options}
     return subprocess.run(command, **options)
-
-
-def run_closed(
-    env: gymnasium.Env[Any, Any], controller: Controller, samples: int, seed: int = 0
-) -> dict[str, NDArray[np.float64]]:
-    """Let a controller act for so many samples, and return what `run` does."""
-    return run(env, repeat(controller.act, samples), seed)
 
 
 def random_actions(rng: np.random.Generator, n: int) -> NDArray[np.float32]:

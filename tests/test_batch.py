@@ -14,8 +14,7 @@ from scipy.signal import lfilter
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters
 from mptc_gym.batch import FACTORS, INFO
-from tests.arguments import MODES, NOISY
-from tests.conftest import assert_the_seed_is_all_that_differs
+from tests.conftest import MODES, NOISY, assert_the_seed_is_all_that_differs
 
 
 @pytest.fixture(params=["NumPy", "PyTorch"])

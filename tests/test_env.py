@@ -14,11 +14,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from mptc_gym import PRESETS, MiddlePointEnv, Parameters, parameters
+from mptc_gym import PRESETS, MiddlePointEnv, Parameters
 from mptc_gym.evaluation import WINDOWS
 from mptc_gym.parameters import argument_table
-from tests.arguments import STRATEGIES, valid_arguments
-from tests.conftest import ROOT, run
+from tests.conftest import ROOT, run, valid_arguments
 
 INFO = {"output", "setpoint", "error", "command", "applied", "noise"}
 
@@ -255,10 +254,6 @@ def test_what_a_seed_draws_never_changes():
     for name, draw in [*zip(released, draws, strict=False)][1:]:
         low, high = EVERYTHING[name]
         assert info[name] == pytest.approx(low + (high - low) * draw, rel=1e-12), name
-
-
-def test_every_argument_is_tried_in_all_combinations():
-    assert set(STRATEGIES) == set(parameters.ARGUMENTS)
 
 
 def test_the_observation_sees_its_noise_and_nothing_else_does(rng):

@@ -14,7 +14,7 @@ from benchmarks.bounds import least_possible
 from benchmarks.bounds.__main__ import PACKAGED as CASES
 from mptc_gym import IDS, PRESETS, Evaluation, MiddlePointEnv, Parameters, evaluate
 from mptc_gym.evaluation import SEED, least_errors
-from tests.conftest import ROOT, run_closed
+from tests.conftest import ROOT, run
 
 HARD = "MiddlePointHard-v0"
 
@@ -40,7 +40,7 @@ class TestEvaluate:
         found = evaluate(PIController(), HARD, episodes=3)
         assert list(found.seeds) == [SEED, SEED + 1, SEED + 2]
         for i, seed in enumerate(found.seeds):
-            infos = run_closed(MiddlePointEnv(**PRESETS["hard"]), PIController(), 1200, seed)
+            infos = run(MiddlePointEnv(**PRESETS["hard"]), [PIController().act] * 1200, seed)
             errors, travel = np.abs(infos["error"][1:]), np.abs(np.diff(infos["applied"]))
             assert found.errors[i] == pytest.approx(errors.mean(), abs=1e-12)
             assert found.travels[i] == pytest.approx(travel.sum(), abs=1e-9)

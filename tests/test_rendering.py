@@ -20,8 +20,7 @@ from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, drawing
 from mptc_gym.parameters import Parameters
 from mptc_gym.record import Record
 from mptc_gym.signals import Ranges
-from tests.arguments import MODES, NOISY
-from tests.conftest import native_and_sync
+from tests.conftest import MODES, NOISY, native_and_sync
 
 SHAPE = (540, 960, 3)
 UP = np.ones(1, np.float32)

@@ -17,8 +17,7 @@ from mptc_gym import PRESETS, MiddlePointVectorEnv  # noqa: E402
 from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
 from mptc_gym.signals import Ranges, Signals, Streams  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv  # noqa: E402
-from tests.arguments import MODES, valid_arguments  # noqa: E402
-from tests.conftest import random_actions  # noqa: E402
+from tests.conftest import MODES, random_actions, valid_arguments  # noqa: E402
 
 
 def make(num_envs=2, **arguments):

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from mptc_gym import MiddlePointVectorEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers import vector as many
-from tests.arguments import MODES, NOISY, valid_arguments
-from tests.conftest import native_and_sync, random_actions
+from tests.conftest import MODES, NOISY, native_and_sync, random_actions, valid_arguments
 
 
 def assert_equal(ours, theirs):

@@ -10,7 +10,7 @@ from agents import PIController
 from benchmarks import watch
 from benchmarks.watch import equal_steps, main
 from mptc_gym import MiddlePointEnv
-from tests.conftest import run_closed
+from tests.conftest import run
 
 SAMPLES = 40
 
@@ -59,7 +59,7 @@ def test_a_film_shows_steps_side_by_side(given, plant, steps, written, tmp_path,
     assert min(inked[0][:, :375].sum(), inked[0][:, 375:].sum()) > 0.3 * total[0]
     # Errors are multiples of the reference's on the same step.
     samples = steps[-1][1]
-    ours = run_closed(MiddlePointEnv(**plant), PIController(), samples)["error"][1:]
+    ours = run(MiddlePointEnv(**plant), [PIController().act] * samples)["error"][1:]
     theirs = watch.REFERENCE.members()[0].run(plant, samples, 1, 0).next_error[:, 0]
     multiples = [np.abs(ours[a:b]).mean() / np.abs(theirs[a:b]).mean() for a, b in steps]
     found = " and ".join(f"{multiple:.2f}" for multiple in multiples)
