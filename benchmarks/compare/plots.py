@@ -12,14 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
 from benchmarks.controllers.roster import label, looks
-from benchmarks.lib.report import (
-    MULTIPLE,
-    NEAREST,
-    draw_actuator,
-    drawn,
-    panels,
-    scale_by_excess,
-)
+from benchmarks.lib.report import MULTIPLE, NEAREST, drawn, panels, scale_by_excess
 from benchmarks.lib.statistics import Estimate, written
 from benchmarks.loop.scenarios import Scenario
 
@@ -128,7 +121,11 @@ def plot_responses(
             left.fill_between(*band, color=colour, alpha=0.3, linewidth=0)
             left.plot(minutes, rows["output_median"], color=colour, linewidth=1.2)
             left.set_title(f"{label(agent)}: {errors[agent]:.3f} °C")
-            draw_actuator(right, plant)
+            # Where they are drawn: the least dead zone and the widest limits.
+            zone, _ = plant.range_of("dead_zone")
+            right.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0)
+            for limit in (plant.range_of("u_min")[0], plant.range_of("u_max")[1]):
+                right.axhline(limit, color="0.4", linestyle=":", linewidth=1)
             right.step(minutes, rows["applied_median"], color=colour, linewidth=1, where="post")
         left.set_xlim(0, minutes.max())
         if held and plant.is_disturbed:

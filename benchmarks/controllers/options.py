@@ -68,8 +68,7 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
 class Own:
     """What is found at a location."""
 
-    factory: Callable[..., Any]
-    """Returns a policy, or a policy and the environment that it acts in."""
+    factory: Callable[..., Any]  # returns a policy, or it and the environment that it acts in
     observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
@@ -133,9 +132,8 @@ class Policy:
     """A policy in any form that `mptc_gym.evaluate` takes, and what it acts in."""
 
     policy: Any
+    # Environment, or what makes one; None for that saved with the model, or else the plain one.
     env: Any
-    """An environment, or a function that makes one. None for that of the model, if it was saved
-    with one, or else for the plain one."""
     runs: int
 
     def reset(self) -> None:

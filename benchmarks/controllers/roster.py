@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -60,41 +60,32 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
     return {name: told[name] for name in names}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Controller:
     """A controller, or one that was trained, as all commands know it."""
 
-    name: str = field(kw_only=False)
-    """Name in options and files."""
-    label: str = field(kw_only=False)
-    """Name in tables and pictures."""
-    look: tuple[str, str] = field(kw_only=False)
-    """Colour and marker in pictures; relatives have shades of one hue and the same marker."""
-    make: Callable[..., Agent] = field(kw_only=False)
-    """Makes it from what it is told, searched gains by name, and a `network` of its own."""
-    told: Sequence[str] = LIMITS
-    """Arguments of `make`, as `knowledge` returns them."""
-    knows: str = ""
-    """Prior knowledge: what it is told about the plant."""
-    searched: str = ""
-    """What was searched or trained, and in how many trials and samples of the plant."""
+    name: str  # in options and files
+    label: str  # in tables and pictures
+    look: tuple[str, str]  # colour and marker in pictures: those of relatives are alike
+    # Makes it from what it is told, searched gains by name, and a `network` of its own.
+    make: Callable[..., Agent]
+    _: KW_ONLY
+    told: Sequence[str] = LIMITS  # arguments of `make`, as `knowledge` returns them
+    knows: str = ""  # what it is told about the plant, in words
+    searched: str = ""  # or trained, and in how many trials and samples of the plant
+    # Windows that it expects, by the environment's arguments.
     observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
-    """The observation windows that it expects, by the environment's arguments."""
+    # Reads the networks that were trained separately, by file: each makes a member.
     networks: Callable[[], Mapping[str, Any]] | None = None
-    """Reads the networks that were trained separately, by file: each makes a member."""
-    random: bool = False
-    """Whether it draws something itself, such as its first weights."""
-    learns: bool = False
-    """Whether it keeps learning from run to run."""
+    random: bool = False  # it draws something itself, such as its first weights
+    learns: bool = False  # from run to run
+    # Lowest and highest value of each of its gains in a search, by name.
     gains: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Lowest and highest value of each of its gains in a search, by name."""
-    compared: bool = True
-    swept: bool = True
-    """Whether `compare` (`compared`) and `sweep` (`swept`) run it by default."""
-    drawn: bool = False
-    """Whether its responses are drawn in a comparison."""
+    compared: bool = True  # by default, in `compare`
+    swept: bool = True  # likewise, in `sweep`
+    drawn: bool = False  # its responses are, in a comparison
+    # Origin of a trained network, JSON-serialisable; empty if nothing was trained.
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    """Origin of a trained network, JSON-serialisable; empty if nothing was trained."""
 
     def members(self) -> list[Controller]:
         """Return the controller, or one for each of the networks that it was trained to."""

@@ -151,10 +151,6 @@ def command(
         if work.__module__ == "__main__" and (spec := sys.modules["__main__"].__spec__):
             # Other processes find tasks by the name of a module to be imported.
             return int(importlib.import_module(spec.name).main())
-        os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever the shell has set
-        for stream in (sys.stdout, sys.stderr):
-            if hasattr(stream, "reconfigure"):
-                stream.reconfigure(errors="replace")  # for "°C" on an ASCII terminal
         for number in SIGNALS:
             if arguments is None and signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, _interrupt)
@@ -315,8 +311,7 @@ def progress_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
 def _connect() -> None:
     """Connect to the cluster at RAY_ADDRESS, or the one that was started on this machine.
 
-    Its nodes need Ray and the packages that a task imports. They need no checkout: Ray unpacks
-    the packages of this one, and the modules beside them, where its workers run.
+    Ray brings the checkout to its nodes, which need the packages that a task imports.
     """
     import ray  # here: an optional package that takes a second to import
     from ray.util.joblib import register_ray

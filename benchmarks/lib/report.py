@@ -44,14 +44,11 @@ img { max-width: 100%; }
 class Section:
     """A section of a report."""
 
-    title: str
-    """Heading; "" for none."""
-    text: Sequence[str] = ()
-    """Paragraphs."""
-    table: pd.DataFrame | None = None
-    """Table of text cells, in Markdown."""
+    title: str  # "" for none
+    text: Sequence[str] = ()  # paragraphs
+    table: pd.DataFrame | None = None  # of text
+    # PNG files in the report's folder, and for each what it shows, in a sentence.
     pictures: Mapping[str, str] = field(default_factory=dict)
-    """Names of PNG files in the report's folder, and for each what it shows, in a sentence."""
 
     def markdown(self, folder: Path) -> list[str]:
         """Return the paragraphs, with the pictures that are in the folder."""
@@ -131,7 +128,7 @@ STYLE: Any = {
 
 
 @contextmanager
-def drawn(path: Path, height: float, title: str = "") -> Iterator[Figure]:
+def drawn(path: Path, height: float, title: str) -> Iterator[Figure]:
     """Yield a figure of a height in inches, and save it, completely or not at all."""
     import matplotlib as mpl  # here: slow to import, and many reports have no picture
     from matplotlib.figure import Figure
@@ -139,9 +136,8 @@ def drawn(path: Path, height: float, title: str = "") -> Iterator[Figure]:
 
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.5, height))
-        if title:
-            lines = textwrap.fill(title[0].upper() + title[1:], 86)
-            figure.suptitle(lines, x=0.01, ha="left", fontsize=10, weight="bold")
+        lines = textwrap.fill(title[0].upper() + title[1:], 86)
+        figure.suptitle(lines, x=0.01, ha="left", fontsize=10, weight="bold")
         yield figure
         with replacing(path) as partial:
             figure.savefig(partial)
@@ -152,7 +148,7 @@ def drawn(path: Path, height: float, title: str = "") -> Iterator[Figure]:
 
 @contextmanager
 def panels(
-    path: Path, names: Sequence[str], height: float, columns: int, title: str = ""
+    path: Path, names: Sequence[str], height: float, columns: int, title: str
 ) -> Iterator[tuple[Figure, list[Axes]]]:
     """Yield a figure with a panel of a height in inches for each name, and save it."""
     columns = min(columns, len(names))
@@ -175,11 +171,3 @@ def scale_by_excess(axes: Axes, name: str, low: float, high: float) -> None:
     axis.set_major_locator(ticker.FixedLocator([0.001, 0.01, 0.1, 0.5, 1.0, 4.0, 9.0, 29.0]))
     axis.set_major_formatter(lambda excess, _: f"{1 + excess:g}")
     axis.set_minor_locator(ticker.NullLocator())
-
-
-def draw_actuator(axes: Axes, parameters: Any) -> None:
-    """Shade the least dead zone of a plant's `Parameters`, and mark the widest limits, t/h."""
-    zone, _ = parameters.range_of("dead_zone")
-    axes.axhspan(-zone, zone, color="0.5", alpha=0.15, linewidth=0)
-    for limit in (parameters.range_of("u_min")[0], parameters.range_of("u_max")[1]):
-        axes.axhline(limit, color="0.4", linestyle=":", linewidth=1)

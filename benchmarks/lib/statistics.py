@@ -59,10 +59,8 @@ def student(values: ArrayLike) -> Estimate:
 def quantile(values: ArrayLike, probability: float) -> Estimate:
     """Estimate a quantile over runs, shape (runs,).
 
-    The interval lies between two of the ordered values (Conover, "Practical Nonparametric
-    Statistics", 3rd edition, 1999, section 3.2; see `scipy.stats.quantile_test`). It makes no
-    assumption about the distribution, accepts infinite values ("never"), and is infinite where
-    there are too few runs.
+    The interval, that of `scipy.stats.quantile_test`, lies between two of the ordered values.
+    It assumes nothing about their distribution, and is infinite where there are too few runs.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     interval = scipy.stats.quantile_test(ordered, p=probability).confidence_interval()
@@ -83,11 +81,10 @@ def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
     """Estimate the mean over the runs of one or more tasks, by a percentile bootstrap.
 
     Tasks have the same shape: (runs,), or (members, runs) for several trained controllers in
-    the same runs. Members share the noise of a run, so they do not count as separate runs:
-    members and runs are resampled independently, and a resample takes every crossing of the two
-    (A. B. Owen, "The pigeonhole bootstrap", Annals of Applied Statistics 1, 2007, 386-411). The
-    interval also covers training variability; with only five members that differ far more than
-    runs do, its coverage is 82 %. The tasks themselves are not resampled.
+    the same runs. Members share the noise of a run, so members and runs are resampled
+    independently, and a resample takes every crossing of the two (A. B. Owen, "The pigeonhole
+    bootstrap", Annals of Applied Statistics 1, 2007, 386-411). With only five members that
+    differ far more than runs do, its coverage is 82 %.
     """
     tables = [np.atleast_2d(np.asarray(task, dtype=np.float64)) for task in tasks]
     together = np.concatenate([table.ravel() for table in tables])
