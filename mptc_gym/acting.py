@@ -1,7 +1,5 @@
 """Let any policy act in environments of any kind, both as they are given."""
 
-from __future__ import annotations
-
 import difflib
 import inspect
 import sys
@@ -139,10 +137,7 @@ def is_environment(env: Any) -> bool:
 
 
 def layers(env: Any) -> Iterator[Any]:
-    """Yield environments and all that is in them, the outermost first.
-
-    Those in other processes are not among them, but copies of their plants, while they run.
-    """
+    """Yield environments and all in them; of other processes, if they run, copied plants."""
     yield env
     for name in ("venv", "env", "envs", "batches"):
         inside = vars(env).get(name, ())
@@ -293,15 +288,14 @@ def native_batch(single: Env, n: int, **modes: Any) -> Any:
     from mptc_gym.wrappers.vector import IncrementalAction  # here: it imports this module
 
     spec, plant = single.spec, single.unwrapped
-    wrappers = spec.additional_wrappers if spec else ()
-    names = [each.entry_point for each in wrappers]
-    known = names in ([], ["mptc_gym.wrappers:IncrementalAction"])
-    if spec is None or type(plant) is not MiddlePointEnv or not known:
+    if spec is None or type(plant) is not MiddlePointEnv:
         return None
     modes["max_episode_steps"] = spec.max_episode_steps
     plants: Any = MiddlePointVectorEnv(n, **modes, **asdict(plant.parameters))
     plants.spec = spec
-    for each in wrappers:
+    for each in spec.additional_wrappers:
+        if each.entry_point != "mptc_gym.wrappers:IncrementalAction":
+            return None
         plants = IncrementalAction(plants, **(each.kwargs or {}))
     return plants
 

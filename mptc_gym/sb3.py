@@ -7,16 +7,14 @@
 Requires `pip install "mptc_gym[sb3]"`.
 """
 
-from __future__ import annotations
-
 import dataclasses
-import itertools
 import json
 import pkgutil
 import tempfile
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import accumulate, pairwise, starmap
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
@@ -62,15 +60,15 @@ class GymnasiumVecEnv(VecEnv):
     def __init__(
         self, *batches: VectorEnv, spec: EnvSpec | None = None, group: int = 1
     ) -> None:
-        for batch in batches:
-            if (mode := batch.metadata.get("autoreset_mode")) is not _SAME_STEP:
-                raise ValueError(f"batches must have autoreset_mode 'SameStep', got {mode}")
+        modes = {batch.metadata.get("autoreset_mode") for batch in batches}
+        if modes != {_SAME_STEP}:
+            raise ValueError(f"batches must have autoreset_mode 'SameStep', got {modes}")
         self.batches, self.spec, self.group = batches, spec, group
         self.infos: dict[str, Any] = {}
         # Of each environment, the number of its batch and its own number there.
         self._places = [(i, j) for i, each in enumerate(batches) for j in range(each.num_envs)]
-        edges = [0, *itertools.accumulate(batch.num_envs for batch in batches)]
-        self._parts = [(batches[i], slice(*edges[i : i + 2])) for i in range(len(batches))]
+        edges = accumulate((batch.num_envs for batch in batches), initial=0)
+        self._parts = [*zip(batches, starmap(slice, pairwise(edges)), strict=True)]
         spaces = batches[0].single_observation_space, batches[0].single_action_space
         super().__init__(len(self._places), *spaces)
         self._totals = np.zeros((2, self.num_envs))  # return and length of each episode
@@ -105,15 +103,13 @@ class GymnasiumVecEnv(VecEnv):
         for place in np.flatnonzero(ended).tolist():
             i, j = self._places[place]
             *_, found = steps[i]
+            gained, length = self._totals[:, place].tolist()
             self.reset_infos[place] = _alone(found, j)
             infos[place] = {
                 **_alone(found["final_info"], j),
                 "terminal_observation": found["final_obs"][j],
                 "TimeLimit.truncated": bool(truncated[place] and not terminated[place]),
-                "episode": {
-                    "r": float(self._totals[0, place]),
-                    "l": int(self._totals[1, place]),
-                },
+                "episode": {"r": gained, "l": int(length)},
             }
         self._totals[:, ended] = 0.0
         return observations, rewards.astype(np.float32), ended, infos
@@ -168,7 +164,7 @@ def make_vec_env(
     *,
     seed: int | None = None,
     group: int = 1,
-    wrapper: Mapping[str, Any] | Callable[..., Any] | None = None,
+    wrapper: Mapping[str, Any] | None = None,
     **arguments: Any,
 ) -> GymnasiumVecEnv:
     """Make plants that are stepped together, for the algorithms of Stable-Baselines3.
@@ -187,19 +183,17 @@ def make_vec_env(
         Number of neighbouring plants that share a seed: they draw the same noise, load and
         set points, and differ only in what a policy explores.
     wrapper
-        Adds `IncrementalAction`: its arguments, or the class itself for its defaults. Others
-        cannot take a batch: use `stable_baselines3.common.env_util.make_vec_env`.
+        Arguments of `IncrementalAction`, to add it. Other wrappers cannot take a batch: use
+        `stable_baselines3.common.env_util.make_vec_env`.
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)
     mode = arguments.pop("render_mode", None)  # of the batch alone, not of its spec
     single = make_one(env, arguments)
-    if isinstance(wrapper, Mapping):
+    if wrapper is not None:
+        if not isinstance(wrapper, Mapping):
+            reject("wrapper", wrapper, "the arguments of IncrementalAction")
         single = IncrementalAction(single, **wrapper)
-    elif callable(wrapper):
-        single = wrapper(single)
-    elif wrapper is not None:
-        reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
     batch = native_batch(single, n_envs, autoreset_mode=_SAME_STEP, render_mode=mode)
     if batch is None:
         reject("env", single, "of this package, in no wrapper other than IncrementalAction")
@@ -353,6 +347,7 @@ class ScoreCallback(BaseCallback):
             env, arguments = spec_of(self.model, env, **arguments), {}
         elif overlap(env, self.training_env):
             raise ValueError("env must not be the environments of the training: make others")
+        self._latest = self.model.num_timesteps
         # Not kept in place of the id: the next model may have other windows.
         self._score_in: Any = partial(evaluate, env=env, **arguments)
         self._hand_over()
@@ -372,9 +367,6 @@ class ScoreCallback(BaseCallback):
                 synchronise(self.training_env, self._env)
         except (AssertionError, AttributeError) as error:
             raise ValueError(f"env must be wrapped as in training: {error}") from error
-
-    def _on_training_start(self) -> None:
-        self._latest = self.num_timesteps
 
     def _on_step(self) -> bool:
         if self.num_timesteps >= self._latest + self.every:

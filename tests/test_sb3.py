@@ -50,9 +50,7 @@ class TestBatches:
             made = [partial(one, **given) for n, given in TWO for _ in range(n)]
         else:
             given = {**TRAINING, "max_episode_steps": 7}
-            batch = make_vec_env(
-                HARD, 4, wrapper=partial(IncrementalAction, **VELOCITY), **given
-            )
+            batch = make_vec_env(HARD, 4, wrapper=VELOCITY, **given)
             made = [lambda: IncrementalAction(gymnasium.make(HARD, **given), **VELOCITY)] * 4
         theirs = DummyVecEnv([lambda make=make: Monitor(make()) for make in made])
         for each in (batch, theirs):
@@ -110,7 +108,7 @@ class TestBatches:
         for message, arguments in {
             "n_envs must be an integer from 1": {"n_envs": 0},
             "group must be an integer from 1": {"group": 2},
-            "env must be of this pack": {"wrapper": partial(DelayObservation, delay=2)},
+            "env must be of this pack": {"env": DelayObservation(one(), delay=2).spec},
             "max_move must be": {"wrapper": {"max_move": 7}},
             "wrapper must be the arguments": {"wrapper": 5},
             "env must be the id of an environment": {"env": "Point-v0"},
