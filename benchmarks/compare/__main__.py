@@ -14,15 +14,10 @@ from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, SETPOINTS, Pl
 from mptc_gym.evaluation import SEED
 
 COMPARED = tuple(name for name, controller in ROSTER.items() if controller.compared)
-RUNS = 100
 _CASES = (
     f"Cases to run (default: all). Of the paper: {', '.join(SCENARIOS)}. With --presets: "
     f"{', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set: "
     f"{', '.join(name for name, *_ in SETPOINTS)}."
-)
-_OUT = (
-    "Folder to write to (default: results/compare; with --presets results/compare-presets; "
-    "where another option chooses what is run, results/compare-other)."
 )
 
 
@@ -40,9 +35,9 @@ class Options:
     plant: PlantOptions = field(default_factory=PlantOptions)
     presets: bool = False
     """Run the environment's presets instead of the paper's cases."""
-    runs: Runs = RUNS
+    runs: Runs = 100
     """Runs of each controller in each case."""
-    out: Annotated[Folder | None, Parameter(help=_OUT)] = None
+    out: Folder | None = None  # results/compare, -presets with these, -other with more options
 
 
 def work(options: Options) -> str:
@@ -70,18 +65,16 @@ def work(options: Options) -> str:
         f"{name}, {each.name}": partial(run_case, each, controller, runs)
         for (name, controller), each in itertools.product(controllers.items(), scenarios)
     }
-    tasks: dict[str, Any] = {**bounds, **cells}
     # Short tasks last, so that no core waits long at the end.
-    longest_first = sorted(tasks, key=lambda name: -tasks[name].args[0].samples)
+    tasks = dict(sorted((bounds | cells).items(), key=lambda each: -each[1].args[0].samples))
     found: dict[str, Any] = {}
     try:
-        found.update(fan_out.stream({name: tasks[name] for name in longest_first}, "compare"))
+        found.update(fan_out.stream(tasks, "compare"))
     finally:
         if missing := len(tasks) - len(found):
             made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
         if finished := [found[name] for name in cells if name in found]:
             about = {
-                "complete": not missing,
                 **made,
                 "options": {**asdict(options), "agents": [*controllers]},
                 "seeds": [*range(SEED, SEED + options.runs)],

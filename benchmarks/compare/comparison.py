@@ -22,13 +22,9 @@ BOOTSTRAP = 0  # seed of the bootstraps
 SCORE = "Mean over the cases, 95 % interval; travel of the valve in the median run."
 BOUND = (
     "Least possible without foresight; where marked *, if each change of the set point finds "
-    "the plant settled: a controller that knows the timetable can do better, but none comes "
-    "below the least with foresight."
+    "the plant settled. A controller that knows the timetable can be between the two."
 )
 PAIRED = "Below 0 a controller is better; in % the share of runs in which it is."
-COSTS = (
-    "What it is told; what was searched or trained beforehand; the processor time of its runs."
-)
 PARTS = {
     "mae_start": f"first {START} samples",
     "mae_changes": f"{CHANGE} samples after later changes",
@@ -116,13 +112,10 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
     """Return estimates with 95 % intervals, one row for each case and agent.
 
     They are the `mean` of |e|, degC; `ratio`, the mean as a multiple of `limit`, the least
-    possible error that applies; `difference`, the mean paired difference from the first agent;
-    and `improvement`, the probability of doing better than that agent, where ties count half.
-    `preview` is the least possible error of any controller. Ends are infinite if runs differ
-    but there is only one.
-
-    `scores` are those of the runs, as an array: 0 for the mean error without control, and 1 for
-    the least possible error. Their mean is the score of `mptc_gym.evaluate`.
+    possible error; `difference`, the mean paired difference from the first agent; and
+    `improvement`, the probability of doing better than that agent, where ties count half.
+    `preview` is the least possible error with foresight, `scores` those of the runs, an array.
+    Ends are infinite if runs differ but there is only one.
     """
     reference, rows = runs["agent"].iloc[0], []
     for name, scale in scales.items():
@@ -205,17 +198,14 @@ def write(
     drawn = [name for name, each in controllers.items() if each.drawn]
     from benchmarks.compare import plots  # here: processes that run cases do without
 
-    try:
-        plots.plot_scores(scores, estimates, folder / "scores.png")
-        plots.plot_travel(runs, estimates, [*scores], folder / "travel.png")
-        for name, scale in scales.items():
-            rows = responses[name]
-            few = rows[rows["agent"].isin(drawn)]
-            rows, path = rows if few.empty else few, folder / f"{name}.png"
-            plots.plot_responses(rows, errors[name], scale.scenario, path)
-    finally:  # with the pictures that there are
-        sections = report(runs, estimates, scores, scales, cases, controllers)
-        write_report(folder, "Comparison of controllers", sections, "compare", made, printed=2)
+    plots.plot_scores(scores, estimates, folder / "scores.png")
+    plots.plot_travel(runs, estimates, [*scores], folder / "travel.png")
+    for name, scale in scales.items():
+        few = responses[name][responses[name]["agent"].isin(drawn)]
+        rows, path = responses[name] if few.empty else few, folder / f"{name}.png"
+        plots.plot_responses(rows, errors[name], scale.scenario, path)
+    sections = report(runs, estimates, scores, scales, cases, controllers)
+    write_report(folder, "Comparison of controllers", sections, "compare", made, printed=2)
 
 
 def write_numbers(path: Path, table: pd.DataFrame) -> None:
@@ -254,17 +244,15 @@ def report(
             "Score: 0 without control, 1 at the least possible error",
             [SCORE],
             score_table(runs, estimates, scores),
-            {"scores.png": "The score of each controller, and a tick for each case"},
+            {
+                "scores.png": "The score of each controller, and a tick for each case",
+                "travel.png": "The mean error over valve travel: down and left is better",
+            },
         ),
         Section(
             "Mean error as a multiple of the least possible, with its 95 % interval",
             [BOUND],
             ratio_table(estimates, scales, [*scores]),
-        ),
-        Section(
-            "Error against valve travel",
-            ["Down and left is better."],
-            pictures={"travel.png": "The mean error over valve travel, a panel for each case"},
         ),
         Section(f"Difference to {label(reference)} (°C), 95 % interval", [PAIRED], paired),
         Section(
@@ -272,7 +260,7 @@ def report(
             ["Contributions to the mean error, °C: means of all runs."],
             parts.rename_axis("controller").reset_index(),
         ),
-        Section("What each controller costs", [COSTS], costs_table(cases, controllers)),
+        Section("What each controller costs", table=costs_table(cases, controllers)),
         Section(
             "Cases",
             table=pd.DataFrame(titles.items(), columns=["case", "what it is"]),
@@ -285,30 +273,25 @@ def report(
 def score_table(
     runs: pd.DataFrame, estimates: pd.DataFrame, scores: Mapping[str, Estimate]
 ) -> pd.DataFrame:
-    """Return the scores and the mean travel of the median runs, the best in bold."""
+    """Return the scores and the mean travel of the median runs, the best first."""
     cells = estimates["scores"].map(lambda each: written(each.mean(), ".2f"))
     table = _by_agent(estimates, cells, [*scores])
     travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
     of_agents = [f"{travels[agent].mean():,.0f}" for agent in scores]
     table.insert(1, "score", [f"{score:.3f}" for score in scores.values()])
     table.insert(2, "travel (t/h)", of_agents)
-    table.iloc[0] = table.iloc[0].map(lambda cell: cell and f"**{cell}**")
     return table
 
 
 def ratio_table(
     estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
 ) -> pd.DataFrame:
-    """Return the least possible and the mean errors as multiples; the least are in bold."""
+    """Return the least possible errors, and the mean errors as multiples of these."""
     bounds = pd.DataFrame({"controller": ["least possible (°C)", "with foresight (°C)"]})
     for name, scale in scales.items():
         mark = "*" * (scale.least.kind == "reference")
         bounds[name] = [f"{scale.least.value:.3f}{mark}", f"{scale.preview:.3f}"]
-    values = estimates["ratio"].map(lambda ratio: ratio.value)
-    least = values == values.groupby(estimates["scenario"]).transform("min")
-    cells = estimates["ratio"].map("{:.2f}".format)
-    cells = cells.where(~least, "**" + cells + "**")
-    table = _by_agent(estimates, cells, agents)
+    table = _by_agent(estimates, estimates["ratio"].map("{:.2f}".format), agents)
     return pd.concat([bounds, table], ignore_index=True)
 
 
@@ -339,5 +322,5 @@ def costs_table(cases: Sequence[Case], controllers: Mapping[str, Controller]) ->
         knows = controller.knows or said.get("knows", "")
         searched = controller.searched or said.get("searched", "")
         rows.append([label(name), knows, searched, f"{sum(case.seconds for case in own):.1f}"])
-    columns = ["controller", "prior knowledge", "searched or trained", "runs (s)"]
+    columns = ["controller", "prior knowledge", "searched or trained", "processor time (s)"]
     return pd.DataFrame(rows, columns=columns)

@@ -17,7 +17,6 @@ from mptc_gym.parameters import slowest_pole
 
 MOST_SENSITIVE = 1.8  # largest Ms of a recommended loop
 DELAYS = (1.0, 0.8, 0.9, 1.1, 1.2)  # of each of them, as multiples of its own
-SLOWER = 1.15 ** np.arange(30)  # closed loops that are tried, as multiples of the rule's
 
 
 def responses(plants: list[Plant], h: float) -> tuple[Complex, Complex]:
@@ -54,7 +53,7 @@ def tuned(model: Model) -> tuple[PIController, list[float], float] | None:
     h, (lag, delay) = model.log.sampling_interval, model.plant.first_order()
     late = delay + h / 2.0  # as a flow is held for a sample
     loops = responses([model.plant, *model.possible], h)
-    for slower in SLOWER.tolist():
+    for slower in (1.15 ** np.arange(30)).tolist():
         pi = PIController.simc(
             gain=model.plant.gain, time_constant=lag, delay=late,
             closed_loop_time_constant=slower * late, sampling_interval=h,

@@ -15,7 +15,6 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 BLOCKS = 30  # means of the temperature in a delay and a lag: more take time, and say no more
-ORDER = 8  # of the autoregressive model of the noise, in blocks
 
 
 @dataclass(frozen=True)
@@ -218,7 +217,7 @@ class Fit:
         """Return the fit with weights from the noise that this one leaves."""
         table, inputs = self.columns
         left = self.temperature - table[:, :inputs] @ self.solution.c[:inputs]
-        order = min(ORDER, len(left) // 15)
+        order = min(8, len(left) // 15)
         lagged = np.column_stack([left[order - i : len(left) - i] for i in range(order + 1)])
         lagged = lagged[np.isfinite(lagged).all(axis=1)]
         past = np.column_stack([lagged[:, 1:], np.ones(len(lagged))])

@@ -10,8 +10,6 @@ from benchmarks.identify.fit import Array, Fit, Plant
 from benchmarks.identify.log import Log
 from benchmarks.identify.search import FAULT, HYSTERESES, VALVES, Found, draws, search
 
-FAVOUR = 6.0  # deviance by which valves may differ that explain a log alike
-RIVAL = 1.3  # largest ratio of the gains behind valves that explain a log alike
 TEST = (
     "The test that tells: move the flow by small steps, twice up and twice down, and then from "
     "one end to the other."
@@ -74,7 +72,7 @@ class Model:
         evident = fault.drop > FAULT
         alike = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
         large = np.abs(alike) > max(0.1, 2.5 / np.sqrt(len(errors)))
-        bar = max(found.valve.drop - FAVOUR, FAULT)
+        bar = max(found.valve.drop - 6.0, FAULT)  # valves above it explain the log alike
         rivals = [abs(each.fit.plant.gain) for each in found.rivals if each.drop > bar]
         doubts = {
             "The log does not test the valve, as the flow had so few values. Record a dozen "
@@ -86,7 +84,7 @@ class Model:
             f"The plant seems to change: {fault.name}. Identify each level, time or direction "
             "from a log of its own.": evident and fault.name not in HYSTERESES,
             "Valves of two kinds explain the log alike, and the plants behind them differ. "
-            + TEST: max(rivals, default=1.0) > RIVAL * min(rivals, default=1.0),
+            + TEST: max(rivals, default=1.0) > 1.3 * min(rivals, default=1.0),
             "Not even the direction is known in which the temperature answers. Move the flow "
             "further, a dozen times, and let it settle each time.": gain.low * gain.high <= 0.0,
             "The delay may be longer than a sixth of the log, which is not looked for: record "

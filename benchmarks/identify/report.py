@@ -10,6 +10,7 @@ from benchmarks.identify.model import Model
 from benchmarks.lib.report import COLOURS, Section, drawn
 from benchmarks.lib.statistics import ENDS
 
+SHOWN = slice(-4_000, None)  # rows that are drawn: more would blur
 TITLE = "The log as recorded and as the model simulates it, and its response to a step"
 HOW = (
     "u is Kp times the sum of r - y and its integral over time divided by Ti, where u is "
@@ -60,16 +61,16 @@ def draw(model: Model, path: Path) -> None:
     """Draw the log with the model's simulation of it, and the step response with its band."""
     log, h, plant = model.log, model.log.sampling_interval, model.plant
     flow, degree = log.given.flow_unit, log.given.temperature_unit
-    minutes = np.arange(len(log.flow)) * h / 60.0
+    minutes = (np.arange(len(log.flow)) * h / 60.0)[SHOWN]
     with drawn(path, 5, TITLE) as figure:
         places = figure.subplot_mosaic([["y", "y"], ["u", "step"]], height_ratios=[3, 2])
         above, below, step = (places[name] for name in ("y", "u", "step"))
-        above.plot(minutes, log.temperature, color="0.5", lw=1, label="recorded")
-        above.plot(minutes, model.simulated, color=COLOURS[1], label="model")
+        above.plot(minutes, log.temperature[SHOWN], color="0.5", lw=1, label="recorded")
+        above.plot(minutes, model.simulated[SHOWN], color=COLOURS[1], label="model")
         above.set(xlabel="time (min)", ylabel=f"temperature ({degree})")
         above.legend(loc="upper left", ncols=2)
         above.margins(y=0.2)  # room for the legend
-        below.step(minutes, log.flow, where="post", color=COLOURS[0], lw=1)
+        below.step(minutes, log.flow[SHOWN], where="post", color=COLOURS[0], lw=1)
         zone = model.estimates["dead_zone"].value * np.array([-1.0, 1.0])
         below.axhspan(*(model.operating_flow + zone), color="0.9", label="dead zone")
         below.legend(loc="upper left")

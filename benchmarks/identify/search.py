@@ -75,8 +75,7 @@ def with_valves(
 ) -> list[Hypothesis]:
     """Return kinds of valves, each with its best size and plant, the likeliest first.
 
-    `command` is the flow commanded, from the operating point. What they explain is that beyond
-    a plain fit, by default that of the first kind.
+    What they explain is that beyond a plain fit, by default that of the first kind.
     """
     found, largest = [], float(np.abs(command).max())
     for name, kind in kinds.items():

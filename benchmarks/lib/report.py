@@ -106,9 +106,8 @@ def on_screen(table: pd.DataFrame) -> str:
     Nothing is cut: columns that find no room follow below, beside the first column again.
     """
     width = shutil.get_terminal_size((150, 24)).columns
-    cells = table.astype(str).map(lambda cell: cell.replace("**", ""))  # bold on the page
     first = table.columns[0]
-    cells = cells.set_index(first).rename_axis(index=None, columns=first)
+    cells = table.astype(str).set_index(first).rename_axis(index=None, columns=first)
     with pd.option_context("display.max_colwidth", None):
         return cells.to_string(line_width=width - 2, max_rows=None)
 
