@@ -117,6 +117,7 @@ class TestCommand:
             return run(controller, *given)
 
         monkeypatch.setattr(sweep, "run_agent", fails)
+        monkeypatch.setattr(storage, "commit", lambda: "none-dirty")  # nothing is kept
         counts = run_sweep(tmp_path, "--agents pi pi-simc", status)["agent"].value_counts()
         assert counts.sum() == rows
         assert counts["pi"] == 4
