@@ -10,20 +10,15 @@ of the file. A number of a text must stand in a row that the text names, if it n
 may have fewer digits than the file, or millions (M).
 """
 
-import csv
 import re
-from collections import defaultdict
 from functools import cache
+from pathlib import Path
 
 import pytest
 
 from mptc_gym import IDS
 from tests.conftest import ROOT
 
-UNTOLD = {
-    *("PPO", "PPO (hard)", "NN (1992)", "PI (SIMC)", "PI (1992)", "Smith", "neural Smith"),
-    *("self-tuning", "neural self-tuning"),
-}
 PUBLISHED = ROOT / "benchmarks/published"
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text("utf-8")
@@ -33,8 +28,7 @@ PAGES = {
 MARK = re.compile(r"<!-- numbers: (.*?) -->\n\n?(.*?)(?:\n\n|\Z)", re.DOTALL)
 NUMBER = re.compile(r"(?<![\w.,#])(\d[\d,]*(?:\.\d+)?)(?![\w,.]*[\w])( M\b| %| t/h)?")
 INTERVAL = re.compile(r" \([^()]* to [^()]*\)")
-# Of a screen: a number with its interval, or words with one space between them.
-CELL = re.compile(r"[\d.,]+(?: \([^()]*\))?(?= |$)|\S+(?: \S+)*")
+CELLS = {".md": r"(?<!\\)\|", ".csv": ",", ".txt": " {2,}"}  # what lies between them
 
 
 def read(text):
@@ -47,49 +41,21 @@ def plain(label):
     return re.sub(r"\[(.*?)\]\(.*?\)", r"\1", label).strip(" `*")
 
 
-def rows_of(lines):
-    """Return the cells of the rows of a Markdown table, without its head."""
-    return [re.split(r"(?<!\\)\|", line.strip().strip("|")) for line in lines[2:]]
+def rows_of(text, kind=".md"):
+    """Return the cells of each line."""
+    lines = text.strip().splitlines()
+    return [[plain(cell) for cell in re.split(CELLS[kind], line.strip("| "))] for line in lines]
 
 
 @cache
-def tables(file):
-    """Return the tables of a file, each as {label: {column: text}}."""
-    text = (PUBLISHED / file).read_text("utf-8")
-    if file.endswith(".csv"):
-        by_agent = defaultdict(dict)
-        for row in csv.DictReader(text.splitlines()):
-            of = row.pop("scenario"), row.pop("metric", "")
-            by_agent[row.pop("agent")] |= {(*of, name): value for name, value in row.items()}
-        return [dict(by_agent)]
+def rows_in(file):
+    """Return the rows of a file, and the columns of presets with their ids as labels."""
     found = []
-    for block in re.split(r"\n\s*\n", text):
-        lines = block.strip("\n").splitlines()
-        if block.lstrip().startswith("|"):
-            table = {plain(row[0]): dict(enumerate(row)) for row in rows_of(lines)}
-            found.append(by_id(lines, table))
-        else:  # columns of a screen end below one another
-            table = {}
-            for line in lines:
-                cells = {each.end(): each[0] for each in CELL.finditer(line)}
-                table[plain(next(iter(cells.values())))] = cells
-        found.append(table)
-    return found
-
-
-def by_id(lines, table):
-    """Return a table with a row for each preset, and the best that are not told the plant."""
-    turned = {}
-    for j, name in enumerate(map(plain, rows_of(["", "", lines[0]])[0])):
-        if name in IDS:
-            column = {label: row[j] for label, row in table.items()}
-            for who in ("", "PPO"):
-                untold = [column[each] for each in UNTOLD if each in column and who in each]
-                column["best", who] = min(
-                    untold, key=lambda text: float(read(text)[0][0][0]), default=""
-                )
-            turned[IDS[name]] = column
-    return turned
+    for block in re.split(r"\n\s*\n", (PUBLISHED / file).read_text("utf-8")):
+        rows, heads = rows_of(block, Path(file).suffix), 2 if file.endswith(".md") else 0
+        columns = zip(*rows, strict=False)
+        found += rows[heads:] + [[IDS[head], *cells] for head, *cells in columns if head in IDS]
+    return [row for row in found if len(row) > 1]
 
 
 def same(number, unit, known):
@@ -100,44 +66,39 @@ def same(number, unit, known):
 
 
 def faults_of(block, files):
-    """Return the numbers on a page that its files do not have."""
-    found = [table for file in files for table in tables(file)]
+    """Return the numbers on a page that its files do not have where it says."""
+    rows = [row for file in files for row in rows_in(file)]
     if not block.startswith("|"):
-        return faults_of_text(block, found)
-    rows = rows_of(block.splitlines())
-    known = [
-        " ; ".join(text for table in found for text in table.get(plain(label), {}).values())
-        for label, *_ in rows
-    ]
+        named = [
+            row
+            for row in rows
+            if row[0] and re.search(rf"(?<!\w){re.escape(row[0])}(?!\w)", block)
+        ]
+        return unknown(block, named or rows)
+    table = rows_of(block)[2:]
+    known = [[row for row in rows if label in row[:2]] for label, *_ in table]
     if not all(known):
-        known = (PUBLISHED / files[0]).read_text("utf-8").split("\n## ")[1:]
+        known = [
+            [[each]] for each in (PUBLISHED / files[0]).read_text("utf-8").split("\n## ")[1:]
+        ]
+    pairs = zip(table, known, strict=True)
     return [
-        number
-        for (_, *cells), there in zip(rows, known, strict=True)
-        for number in unknown(" | ".join(cells), there)
+        number for (_, *cells), there in pairs for number in unknown(" | ".join(cells), there)
     ]
 
 
-def unknown(text, known):
-    """Return the numbers of a text, but for its integers without a unit, that are not known.
+def unknown(text, rows):
+    """Return the numbers of a text, but for its integers without a unit, that no row has.
 
     Means must be means, and ends of intervals such ends.
     """
+    known = " ; ".join(cell for row in rows for cell in row).replace("*", "")
     return [
         number
-        for here, there in zip(read(text), read(known.replace("*", "")), strict=True)
+        for here, there in zip(read(text), read(known), strict=True)
         for number, unit in here
         if ("." in number or unit) and not any(same(number, unit, each) for each, _ in there)
     ]
-
-
-def faults_of_text(text, found):
-    named = [
-        cells for table in found for label, cells in table.items()
-        if re.search(rf"(?<!\w){re.escape(label)}(?!\w)", text) and len(cells) > 1
-    ]  # fmt: skip
-    rows = named or [cells for table in found for cells in table.values()]
-    return unknown(text, " ; ".join(cell for row in rows for cell in row.values()))
 
 
 SOURCED = [
