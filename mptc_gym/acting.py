@@ -217,10 +217,7 @@ def _normalisers(env: Any) -> Iterator[tuple[Any, str]]:
 
 @contextmanager
 def opened(env: Any, n: int, policy: Any = None, /, **arguments: Any) -> Iterator[Any]:
-    """Yield environments, n where they are to be made, frozen and ready for episodes.
-
-    Those that exist are as before afterwards, but for a new episode. Others are closed.
-    """
+    """Yield plants, frozen. Given ones are reset afterwards, and n that it makes are closed."""
     given = is_environment(env)
     with ExitStack() as stack:
         plants = _batch(env, n, arguments)
@@ -281,10 +278,7 @@ def _one(make: Callable[[], Any]) -> Env:
 
 
 def native_batch(single: Env, n: int, **modes: Any) -> Any:
-    """Return n of an environment in one batch, in an `autoreset_mode` and so on.
-
-    There is none, but None, for another class or wrappers other than `IncrementalAction`.
-    """
+    """Return n of an environment in one batch, or None for a foreign one or its wrappers."""
     from mptc_gym.wrappers.vector import IncrementalAction  # here: it imports this module
 
     spec, plant = single.spec, single.unwrapped

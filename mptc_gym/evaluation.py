@@ -72,17 +72,15 @@ class Evaluation:
     scores: Values | None = None
 
     def __repr__(self) -> str:
-        parts = [f"{self.env}: mean error {self.mean_error:.3f} degC"]
-        if self.interval is not None:
-            low, high = self.interval
-            parts[0] += f", {self.multiple:.2f} times the least possible"
-            drawn = f" (95 % {low:.3f} to {high:.3f})" if low < high else ""
-            parts.append(f"score {self.score:.3f}{drawn}")
+        error = f"{self.env}: mean error {self.mean_error:.3f} degC"
         alike = ", all alike" if np.ptp(self.errors) == 0.0 else ""
-        parts += [f"valve travel {self.travel:.0f} t/h", f"{len(self.errors)} episodes{alike}"]
-        if self.score is None:
-            parts.append("no bound is kept: see python -m benchmarks.bounds --help")
-        return "; ".join(parts)
+        runs = f"valve travel {self.travel:.0f} t/h; {len(self.errors)} episodes{alike}"
+        if self.interval is None:
+            return f"{error}; {runs}; no bound is kept: see python -m benchmarks.bounds --help"
+        low, high = self.interval
+        drawn = f" (95 % {low:.3f} to {high:.3f})" if low < high else ""
+        score = f"{self.multiple:.2f} times the least possible; score {self.score:.3f}{drawn}"
+        return f"{error}, {score}; {runs}"
 
 
 def evaluate(
@@ -198,14 +196,11 @@ def _run(
 
 
 def least_errors(parameters: Parameters, samples: int, seeds: range) -> Values | None:
-    """Return the least possible mean error of each episode, degC, or None if it is not kept.
-
-    Where only noise and load are drawn, one bound holds for all episodes and any seeds.
-    """
+    """Return the least possible mean error of each episode, degC, or None if it is not kept."""
     least = _kept().get(case_of(parameters))
     if least is None or samples != SAMPLES:
         return None
-    if len(least) == 1:
+    if len(least) == 1:  # only noise and load are drawn, if anything: it holds for any seeds
         return np.repeat(least, len(seeds))
     first, beyond = seeds.start - SEED, seeds.stop - SEED
     return least[first:beyond] if first >= 0 and beyond <= len(least) else None

@@ -361,10 +361,10 @@ class ScoreCallback(BaseCallback):
 
     def _hand_over(self) -> None:
         """Give the statistics of the training to the environments of the scores."""
-        normalised = self.model.get_vec_normalize_env() is not None
+        if self.model.get_vec_normalize_env() is None or not isinstance(self._env, VecEnv):
+            return
         try:
-            if normalised and isinstance(self._env, VecEnv):
-                synchronise(self.training_env, self._env)
+            synchronise(self.training_env, self._env)
         except (AssertionError, AttributeError) as error:
             raise ValueError(f"env must be wrapped as in training: {error}") from error
 
