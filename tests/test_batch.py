@@ -213,12 +213,6 @@ def test_what_is_returned_can_be_overwritten(library, plant, window, rng):
             assert_equal(returned, twin.reset(options=options))
 
 
-def collected(env, steps, name):
-    """Return an info of all samples from k = 1 on, shape (steps, n), with no flow."""
-    actions = np.zeros((env.num_envs, 1))
-    return np.stack([plain(env.step(actions)[-1][name]) for _ in range(steps)])
-
-
 def assert_mean(values, expected):
     """Compare a mean to within five standard errors, those between plants if they are columns.
 
@@ -234,11 +228,11 @@ class TestDraws:
         variance, c = 0.5, np.array([1.0, -0.35740, -0.03392])
         env = library.make(400, output_window=1, c=c, **{f"{name}_variance": variance})
         env.reset(seed=4)
-        if name == "noise":
-            noise = collected(env, 250, "noise")[2:] / variance**0.5
-        else:  # white, and all of the reading
-            steps = (plain(env.step(np.zeros((400, 1)))) for _ in range(250))
-            noise, c = np.array([step[0][:, -1] for step in steps]) / variance**0.5, np.ones(1)
+        steps = [plain(env.step(np.zeros((400, 1)))) for _ in range(250)]
+        noise = np.array([infos["noise"] for *_, infos in steps])[2:]
+        if name == "measurement_noise":  # white, and all of the reading
+            noise, c = np.array([observations[:, -1] for observations, *_ in steps]), np.ones(1)
+        noise = noise / variance**0.5
         for lag in (0, 1, 2, 3, 7, 19, 20):
             product = noise[lag:] * noise[: len(noise) - lag]
             assert_mean(product, np.dot(c[lag:], c[: max(len(c) - lag, 0)]))
