@@ -218,8 +218,7 @@ Answer = tuple[str, Any, str]  # the name of a task, its result, and its error o
 class FanOut:
     """Where tasks run, by joblib, and how many at once. With one job they run in this process.
 
-    A result does not depend on which process runs the task, or when, as long as all its
-    randomness comes from its arguments.
+    A result depends on neither, as long as all randomness of a task comes from its arguments.
     """
 
     jobs: Count | None = None
@@ -234,8 +233,7 @@ class FanOut:
 
         Tasks are functions without arguments, by name, such as a `functools.partial` of a
         function of a module. Results that are kept already are yielded first. A progress bar
-        has the title, if there is one. `UnfinishedError`, at the end, says which tasks raised
-        an exception, or that a process was killed.
+        has the title, if there is one. `UnfinishedError`, at the end, says what went wrong.
         """
         missing, errors = dict(tasks), {}
         with progress_bar(title, len(tasks)) as advance:
@@ -253,10 +251,9 @@ class FanOut:
                     kept.save(tasks[name], result)
                 yield name, result
         if errors:
-            last = [f"{name}: {text.split(chr(10))[-1]}" for name, text in errors.items()]
             said = f"{len(errors)} of {len(tasks)} tasks failed; the others are done"
-            whole = [text for text in errors.values() if "\n" in text]  # with a traceback
-            raise UnfinishedError("\n".join([said, *last[:10], *whole[:1]]))
+            shown = [f"{name}: {text}" for name, text in errors.items()]
+            raise UnfinishedError("\n".join([said, *shown[:3]]))
 
     def _answers(self, tasks: Mapping[str, Task]) -> Iterator[Answer]:
         """Run tasks, and yield each answer as it comes."""

@@ -50,14 +50,6 @@ class Section:
     # PNG files in the report's folder, and for each what it shows, in a sentence.
     pictures: Mapping[str, str] = field(default_factory=dict)
 
-    def markdown(self, folder: Path) -> list[str]:
-        """Return the paragraphs, with the pictures that are in the folder."""
-        parts = [f"## {self.title}"] * bool(self.title) + [*self.text]
-        if self.table is not None:
-            parts.append(self.table.to_markdown(index=False, disable_numparse=True))
-        there = [name for name in self.pictures if (folder / name).exists()]
-        return parts + [f"![{self.pictures[name]}]({name})" for name in there]
-
 
 def write_report(
     folder: Path,
@@ -76,11 +68,17 @@ def write_report(
     called = sys.argv[1:] if command in sys.argv[0] else []
     line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])
     commit = origin["commit"]  # a hash of 40 digits, possibly with "-dirty"
-    parts = [part for section in sections for part in section.markdown(folder)]
+    parts = [f"# {title}"]
     if "missing" in origin:
-        parts.insert(0, f"**Unfinished: {origin['missing']}.**")
+        parts.append(f"**Unfinished: {origin['missing']}.**")
+    for section in sections:
+        parts += [f"## {section.title}"] * bool(section.title) + [*section.text]
+        if section.table is not None:
+            parts.append(section.table.to_markdown(index=False, disable_numparse=True))
+        there = [name for name in section.pictures if (folder / name).exists()]
+        parts += [f"![{section.pictures[name]}]({name})" for name in there]
     made = f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}\n"
-    page = "\n\n".join([f"# {title}", *parts, made])
+    page = "\n\n".join([*parts, made])
     write_text(folder / "report.md", page)
 
     def embedded(found: re.Match[str]) -> str:

@@ -88,26 +88,22 @@ class Kept:
 
     folder: Path
 
-    def path(self, task: Callable[[], Any]) -> Path | None:
-        """Return the file of a task, named after its function and arguments, if it has one."""
+    def path(self, task: Callable[[], Any]) -> Path:
+        """Return the file of a task, named after its function and arguments."""
         import joblib  # here: slow to import
 
-        name = commit()
-        if not name.isalnum():  # there is none, or it is dirty
-            return None
-        return self.folder / name[:12] / f"{joblib.hash(task)}.pkl"
+        return self.folder / commit()[:12] / f"{joblib.hash(task)}.pkl"
 
     def load(self, task: Callable[[], Any]) -> Any:
         """Return the result of a task; None if it is missing or damaged."""
-        path = self.path(task)
         with suppress(Exception):  # whatever a damaged file raises
-            return pickle.loads(path.read_bytes()) if path else None
+            return pickle.loads(self.path(task).read_bytes()) if commit().isalnum() else None
         return None
 
     def save(self, task: Callable[[], Any], result: Any) -> None:
         """Write the result of a task, completely or not at all."""
-        if path := self.path(task):
-            with replacing(path) as partial:
+        if commit().isalnum():  # neither missing nor dirty
+            with replacing(self.path(task)) as partial:
                 partial.write_bytes(pickle.dumps(result))
 
 
