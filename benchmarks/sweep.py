@@ -120,9 +120,8 @@ def work(options: Options) -> str:
 
 def design(options: Options, nominal: Arguments) -> list[Arguments]:
     """Return the arguments in which the plants of the design differ from the nominal one."""
-    gains, delays = np.linspace(0.75, 1.65, 10).round(6).tolist(), range(2, 42, 2)
-    cells = itertools.product(gains, delays)
-    plants = [{"delay": delay, "gain_factor": gain} for gain, delay in cells]
+    gains = np.linspace(0.75, 1.65, 10).round(6).tolist()
+    plants = [{"delay": at, "gain_factor": gain} for gain in gains for at in range(2, 42, 2)]
     if options.design == "random":
         plants = random_design(options.plants or 200, options.design_seed or 0, SAMPLES)
     elif options.plants or options.design_seed is not None:
@@ -150,8 +149,7 @@ def scale_of(case: Arguments, runs: int) -> dict[str, Any]:
 
     found = {**run_agent(ROSTER["nothing"], case, case, runs), "limit": math.nan}
     with suppress(ValueError):
-        least = least_possible(samples=SAMPLES, kind="reference", **case)
-        found["limit"] = least.value
+        found["limit"] = least_possible(samples=SAMPLES, kind="reference", **case).value
     return found
 
 
@@ -179,8 +177,7 @@ def table(
                 "oscillates": of["swing"] > idle["swing"] + OSCILLATES,
                 "useless": of["mae"] >= idle["mae"],
             }
-            row = {"plant": i, "agent": agent, **of, **compared, **plant}
-            rows.append(pd.DataFrame(row))
+            rows.append(pd.DataFrame({"plant": i, "agent": agent, **of, **compared, **plant}))
     return pd.concat(rows, ignore_index=True)
 
 

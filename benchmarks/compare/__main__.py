@@ -24,10 +24,7 @@ _CASES = (
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Run controllers on the same cases in the same noise, and write a report.
-
-    The report has tables, data and pictures.
-    """
+    """Run controllers on the same cases in the same noise, and write a report."""
 
     agents: AgentNames = COMPARED
     controllers: ControllerOptions = field(default_factory=ControllerOptions)
@@ -74,8 +71,7 @@ def work(options: Options) -> str:
         if missing := len(tasks) - len(found):
             made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
         if finished := [found[name] for name in cells if name in found]:
-            about = {
-                **made,
+            about = made | {
                 "options": {**asdict(options), "agents": [*controllers]},
                 "seeds": [*range(SEED, SEED + options.runs)],
                 "scenarios": {each.name: vars(each) for each in scenarios},

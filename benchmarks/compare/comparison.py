@@ -277,9 +277,8 @@ def score_table(
     cells = estimates["scores"].map(lambda each: written(each.mean(), ".2f"))
     table = _by_agent(estimates, cells, [*scores])
     travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
-    of_agents = [f"{travels[agent].mean():,.0f}" for agent in scores]
     table.insert(1, "score", [f"{score:.3f}" for score in scores.values()])
-    table.insert(2, "travel (t/h)", of_agents)
+    table.insert(2, "travel (t/h)", [f"{travels[agent].mean():,.0f}" for agent in scores])
     return table
 
 

@@ -64,8 +64,8 @@ def work(options: Options) -> str:
     report.draw(found, out / "identify.png")
     for name, content in {"plant": plant, "ranges": ranges, "controllers": advised}.items():
         write_json(out / f"{name}.json", content)
-    title = f"The plant of {options.log.name}"
-    write_report(out, title, report.report(found, advised), "identify", made)
+    sections = report.report(found, advised)
+    write_report(out, f"The plant of {options.log.name}", sections, "identify", made)
     return f"The plant and the report are in {out}/"
 
 

@@ -40,8 +40,7 @@ def sensitivities(controller: PIController, back: Complex, answers: Complex) -> 
     near = 1.0 + answers * (np.polyval(up[::-1], back) / np.polyval(down[::-1], back))
     turns = np.unwrap(np.angle(near), axis=-1)
     stable = np.abs(turns[..., -1] - turns[..., 0] - math.pi / 2.0) < 1.0
-    peaks = np.where(stable, 1.0 / np.abs(near).min(axis=-1), np.inf)
-    return np.asarray(peaks.max(axis=-1))
+    return np.asarray(np.where(stable, 1.0 / np.abs(near).min(axis=-1), np.inf).max(axis=-1))
 
 
 def tuned(model: Model) -> tuple[PIController, list[float], float] | None:
@@ -169,16 +168,14 @@ def _noise(left: Array, a: Array) -> tuple[Array, float]:
 
 def _ranges(model: Model, arguments: dict[str, Any]) -> dict[str, list[float]]:
     """Return the intervals, as ranges to draw from."""
-    names = "delay", "dead_zone", "gain", "time_constant"
-    delay, zone, gain, constant = (model.estimates[name] for name in names)
+    delay, zone, gain, constant = model.estimates.values()
     chance = 2.0 * np.sqrt(2.0 / len(model.log.flow))  # of a variance, about
-    factors = np.sort([gain.low / gain.value, gain.high / gain.value])
     whole, most = arguments["delay"], max(-model.u_min, model.u_max)
     ranges = {
         "delay": [min(int(delay.low), whole), max(int(delay.high), whole)],
         "dead_zone": [zone.low, min(zone.high, 0.99 * most)],
         "noise_variance": [arguments["noise_variance"] * x for x in (1 - chance, 1 + chance)],
-        "gain_factor": np.clip(factors, 0.1, 10.0).tolist(),
+        "gain_factor": np.clip(np.sort(np.array(gain[1:]) / gain.value), 0.1, 10.0).tolist(),
     }
     pole = complex(slowest_pole(arguments["a"]) or 0.0)
     if pole.imag == 0.0 and 0.0 < pole.real < 1.0:

@@ -161,8 +161,8 @@ class Fit:
             decay = np.exp(-times / each)
             found.append(decay.real if each.imag >= 0.0 else decay.imag)
         found += [now.simulated(np.heaviside(times - at, 1.0), self.h) for at in self.loads]
-        ones = np.ones(len(self.temperature))
-        return np.column_stack([*map(self.means, found), ones]), inputs
+        found.append(np.ones(len(times)))
+        return np.column_stack([self.means(each) for each in found]), inputs
 
     @cached_property
     def solution(self) -> Solution:

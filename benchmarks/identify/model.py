@@ -58,7 +58,6 @@ class Model:
         remarks = {
             f"The valve seems to have a {valve.name} of {size} {unit}; plant.json can hold "
             "limits and a plain dead zone alone.": valve.name not in ("none", "dead zone"),
-            f"The log is sampled {best.rows} times as often as the plant needs.": best.rows > 1,
             f"Loads seem to have moved the temperature at {times} min.": bool(best.loads),
             f"plant.json cannot hold {', '.join(log.disturbances)}.": bool(log.disturbances),
         }

@@ -40,9 +40,8 @@ def report(model: Model, advised: dict[str, Any]) -> list[Section]:
         f"{each['slowed']:.2f} times slower than by the rule."
         for each in advised["recommended"]
     ]
-    refused = [f"**Nothing is recommended.** {' '.join(advised['warnings'])}"]
     text = [
-        *(advice or refused),
+        *(advice or [f"**Nothing is recommended.** {' '.join(advised['warnings'])}"]),
         "Fitted to the first two thirds of the log, the model explains "
         f"{100 * max(model.explained[0], 0.0):.1f} % of the temperature's variance in the "
         "last, by simulation from the flow, but for a straight line.",
@@ -64,7 +63,7 @@ def draw(model: Model, path: Path) -> None:
     minutes = (np.arange(len(log.flow)) * h / 60.0)[SHOWN]
     with drawn(path, 5, TITLE) as figure:
         places = figure.subplot_mosaic([["y", "y"], ["u", "step"]], height_ratios=[3, 2])
-        above, below, step = (places[name] for name in ("y", "u", "step"))
+        above, below, step = places.values()
         above.plot(minutes, log.temperature[SHOWN], color="0.5", lw=1, label="recorded")
         above.plot(minutes, model.simulated[SHOWN], color=COLOURS[1], label="model")
         above.set(xlabel="time (min)", ylabel=f"temperature ({degree})")

@@ -197,8 +197,7 @@ def _with_loads(fit: Fit) -> Fit:
     end = len(fit.flow) * fit.h
     spacing = max(fit.scale / 4.0, end / 300.0)
     for _ in range(MOST_LOADS - len(fit.loads)):
-        times = np.arange(spacing, end, spacing).tolist()
-        more = (replace(fit, loads=(*fit.loads, at)) for at in times)
+        more = (replace(fit, loads=(*fit.loads, at)) for at in np.arange(spacing, end, spacing))
         likeliest = min(more, key=by_deviance)
         if likeliest.deviance > fit.deviance - LOAD:
             break
@@ -265,11 +264,12 @@ def _walk(
     """Return plants of a shape by Metropolis' walk over parameters and dead zones."""
     at, size, drawn = int(np.argmax(zones.weight)), len(fit.p), []
     now = replace(fit, flow=zones.fits[at].flow)
-    ends = [
-        now.at(fit.p + d).solution.errors - now.at(fit.p - d).solution.errors
-        for d in 0.01 * np.eye(size)
-    ]
-    slopes = np.column_stack(ends) / 0.02
+    slopes = np.column_stack(
+        [
+            (now.at(fit.p + d).solution.errors - now.at(fit.p - d).solution.errors) / 0.02
+            for d in 0.01 * np.eye(size)
+        ]
+    )
     information = slopes.T @ slopes / np.mean(now.solution.errors**2) + np.eye(size)
     root = 1.5 * SPREAD / np.sqrt(size) * np.linalg.cholesky(np.linalg.inv(information))
     longest = max(len(fit.flow) * fit.h / 5.0, fit.units[0].slowest)
@@ -281,8 +281,7 @@ def _walk(
 
     for step in range(1, THIN * count + 1):
         tried = now.at(now.p + root @ generator.standard_normal(size))
-        within = tried.p[0] >= 0.0 and tried.units[0].slowest <= longest
-        if within and accepted(tried):
+        if tried.p[0] >= 0.0 and tried.units[0].slowest <= longest and accepted(tried):
             now = tried
         if step % THIN == 0:
             other = int(generator.choice(len(zones.weight), p=zones.weight))

@@ -129,8 +129,7 @@ def main(seed: int, rounds: int = 10) -> None:
     """Print the table, and write it where the page takes its numbers from."""
     faults = (["none"] * 10 + [*FAULTS]) * rounds
     found = pd.DataFrame([tried(seed + i, fault) for i, fault in enumerate(faults)])
-    faulty = found[found["fault"] != "none"]
-    rows = pd.concat([found, faulty.assign(fault="all faults")])
+    rows = pd.concat([found, found[found["fault"] != "none"].assign(fault="all faults")])
     how = dict.fromkeys(["logs", "recommended", "unsafe", "by one move"], "sum")
     how |= dict.fromkeys(["delay", "gain", "dead_zone"], "mean")
     how |= dict.fromkeys(["Ms", "Ms, delay a fifth off"], "max")
