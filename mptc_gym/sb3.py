@@ -68,7 +68,7 @@ class GymnasiumVecEnv(VecEnv):
         # Of each environment, the number of its batch and its own number there.
         self._places = [(i, j) for i, each in enumerate(batches) for j in range(each.num_envs)]
         edges = accumulate((batch.num_envs for batch in batches), initial=0)
-        self._parts = [*zip(batches, starmap(slice, pairwise(edges)), strict=True)]
+        self._parts: Any = [*zip(batches, starmap(slice, pairwise(edges)), strict=True)]
         spaces = batches[0].single_observation_space, batches[0].single_action_space
         super().__init__(len(self._places), *spaces)
         self._totals = np.zeros((2, self.num_envs))  # return and length of each episode
@@ -81,8 +81,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def reset(self) -> NDArray[Any]:
         """Reset all environments, with the seeds set by `seed`."""
-        seeds: Any = self._seeds
-        resets = [batch.reset(seed=seeds[part]) for batch, part in self._parts]
+        resets = [batch.reset(seed=self._seeds[part]) for batch, part in self._parts]
         self._reset_seeds()
         self._totals[:] = 0.0
         self.reset_infos = [_alone(resets[i][-1], j) for i, j in self._places]
