@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, Final, cast
 
 import gymnasium
@@ -137,23 +138,22 @@ def is_environment(env: Any) -> bool:
 
 
 def layers(env: Any) -> Iterator[Any]:
-    """Yield environments and all in them; of other processes, if they run, copied plants."""
+    """Yield environments and all in them; of running processes, copies of what matters."""
     yield env
     for name in ("venv", "env", "envs", "batches"):
         inside = vars(env).get(name, ())
         for each in inside if isinstance(inside, list | tuple) else (inside,):
             if is_environment(each):
                 yield from layers(each)
-    yield from _asked(env, "unwrapped")
-
-
-def _asked(env: Any, name: str) -> list[Any]:
-    """Return an attribute of a layer, or of environments in its processes, if they run."""
-    with suppress(Exception):  # whatever closed ones raise
-        if "processes" in vars(env):
-            ask = getattr(env, "env_method", None) or env.call
-            return [*env.get_attr(name)] if any(ask("has_wrapper_attr", name)) else []
-    return [vars(env)[name]] if name in vars(env) else []
+    if "processes" in vars(env):
+        ask = getattr(env, "env_method", None) or env.call
+        with suppress(Exception):  # whatever closed ones raise
+            yield from env.get_attr("unwrapped")
+            for name in ("_increments", "update_running_mean"):
+                has = ask("has_wrapper_attr", name)
+                # To ask one that has it not would end its process.
+                found = env.get_attr(name) if all(has) else filter(None, has)
+                yield from (SimpleNamespace(**{name: each}) for each in found)
 
 
 def natives(env: Any) -> list[MiddlePointEnv | MiddlePointVectorEnv]:
@@ -164,7 +164,8 @@ def natives(env: Any) -> list[MiddlePointEnv | MiddlePointVectorEnv]:
 
 def overlap(env: Any, other: Any) -> bool:
     """Whether environments have a layer in common."""
-    return not {*map(id, layers(env))}.isdisjoint(map(id, layers(other)))
+    others = [*layers(other)]
+    return any(each is one for each in layers(env) for one in others)
 
 
 class FromVecEnv:
@@ -197,7 +198,7 @@ def _columns(infos: list[dict[str, Any]]) -> Infos:
 def _normalisers(env: Any) -> Iterator[tuple[Any, str]]:
     """Yield all that normalises, with the name of the flag that freezes its statistics."""
     for layer in layers(env):
-        if _asked(layer, "update_running_mean"):
+        if "update_running_mean" in vars(layer):
             raise ValueError(
                 "env must not normalise in other processes, where its statistics cannot be "
                 "frozen: use DummyVecEnv or SyncVectorEnv"
@@ -345,8 +346,8 @@ def _traits(env: Any) -> dict[str, set[Any]]:
     kinds = {kind.__name__ for each in shown for kind in type(each).mro()}
     found: dict[str, set[Any]] = {"wrappers": kinds & {"VecNormalize", "VecFrameStack"}}
     if plants := natives(env):  # unlike closed processes, which cannot be asked
-        moves = [each for layer in every for each in _asked(layer, "_increments")]
-        found["action wrappers"] = {f"IncrementalAction{each}" for each in moves}
+        moves = [vars(each).get("_increments") for each in every]
+        found["action wrappers"] = {f"IncrementalAction{each}" for each in moves if each}
         found["windows"] = {plant.parameters.windows for plant in plants}
     return found
 

@@ -433,8 +433,9 @@ REFUSED = {
     "new NormalizeObservation": (
         lambda: (law, wrappers.NormalizeObservation(made())),
         "NormalizeObservation, which has seen noth"),
-    "normalised in processes": (
-        lambda: (law, processes(lambda: wrappers.NormalizeObservation(made()))),
+    "normalised in one of the processes": (
+        lambda: (law, AsyncVectorEnv(
+            [made, lambda: wrappers.NormalizeReward(made())], context="fork")),
         "not normalise in other processes"),
     "closed processes": (lambda: (law, closed(processes())), "an open environment"),
     "Monitor in mid-episode": (
