@@ -1,12 +1,9 @@
 """Declare and run the commands `python -m benchmarks.NAME`, and their tasks in parallel.
 
-A command is a file, `benchmarks/NAME.py`, or a folder with a `__main__.py`. In it stand
-
-- a dataclass of options, decorated by `options`: its docstring is the head of the help, and the
-  string under a field the help of that option. A field of another such dataclass adds its own;
-- a function `work` of these options, which prints what it finds and returns the closing line.
-  What is slow to import, it imports itself, so that the help takes no time;
-- `main = command("NAME", Options, work)`, which the last line calls.
+A command is a file, `benchmarks/NAME.py`, or a folder with a `__main__.py`. It has a dataclass
+of `options`, whose docstrings are the help, and a function `work` of these. This prints what it
+finds, returns the closing line, and imports what is slow to import. The last line calls
+`main = command("NAME", Options, work)`.
 """
 
 import errno
@@ -36,7 +33,6 @@ EXTRAS = {
     "torch": "torch",
 }
 SIGNALS = signal.SIGINT, signal.SIGTERM
-FULL = errno.ENOSPC, errno.EDQUOT, errno.EPIPE  # a disk, or a reader that has gone
 
 
 def stop(error: BaseException, program: str = "python -m benchmarks") -> NoReturn:
@@ -187,8 +183,8 @@ def finish(work: Callable[[], str], program: str) -> int:
     except (UsageError, ImportError) as error:
         stop(error, program)
     except OSError as error:
-        if error.errno not in FULL:
-            raise
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EPIPE):
+            raise  # it is no full disk, and no reader that has gone
         print(f"{program}: the output is cut off: {error.strerror}", file=sys.stderr)
         # What is left is flushed at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -269,13 +265,13 @@ class FanOut:
         jobs = max(1, min(self.jobs or joblib.cpu_count(), len(calls)))
         try:
             with joblib.parallel_config("loky", inner_max_num_threads=1):
-                parallel = joblib.Parallel(
-                    jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs"
-                )
+                parallel = joblib.Parallel(jobs, return_as="generator_unordered", batch_size=1)
                 # Processes that start now ignore Ctrl-C: this one ends them.
                 before = signal.signal(signal.SIGINT, signal.SIG_IGN)
                 answers: Iterator[Answer] = parallel(calls)
                 signal.signal(signal.SIGINT, before)
+            # Of tasks that nobody waits for any more, as an error ends the command.
+            warnings.filterwarnings("ignore", module="joblib")
             yield from answers
         except TerminatedWorkerError as error:
             raise UnfinishedError(
@@ -314,8 +310,6 @@ def _connect() -> None:
     from ray.util.joblib import register_ray
 
     register_ray()
-    # `ray job submit` has uploaded the same code.
-    os.environ.setdefault("RAY_OVERRIDE_JOB_RUNTIME_ENV", "1")
     stays = "/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py", "published", "*.md"
     try:
         ray.init(
