@@ -43,13 +43,11 @@ class LeastPossible(Estimate):
     The ends of the interval equal `value` where nothing is drawn.
     """
 
-    kind: str
-    """One of `KINDS`."""
-    idle: Estimate
-    """Mean |e| of the same episodes without control, degC."""
+    kind: str  # one of `KINDS`
+    idle: Estimate  # mean |e| of the same episodes without control, degC
+    # Terms of the mean, degC; element i is for the episode of seed `seed + i`. For the kind
+    # "causal" only their mean is a bound.
     episodes: tuple[float, ...]
-    """Terms of the mean, degC; element i is for the episode of seed `seed + i`. For the kind
-    "causal" only their mean is a bound."""
 
     def score(self, errors: ArrayLike) -> Array:
         """Return scores of mean errors, degC: 0 without control, 1 for `value`.

@@ -54,18 +54,12 @@ class IdleValve:
 class Trajectory:
     """The signals of a batch of runs, k = 0 to N - 1; every array has shape (N, runs)."""
 
-    setpoint: Array
-    """y_d(k), degC."""
-    output: Array
-    """y(k), degC."""
-    command: Array
-    """u(k), t/h."""
-    applied: Array
-    """u_a(k), t/h."""
-    next_error: Array
-    """e(k + 1), degC, which the reward of sample k is for. Mean errors are over k = 1 to N."""
-    next_setpoint: Array
-    """y_d(k + 1), degC."""
+    setpoint: Array  # y_d(k), degC
+    output: Array  # y(k), degC
+    command: Array  # u(k), t/h
+    applied: Array  # u_a(k), t/h
+    next_error: Array  # e(k + 1), degC, which the reward of sample k is for
+    next_setpoint: Array  # y_d(k + 1), degC
 
     def __getitem__(self, samples: slice) -> Trajectory:
         """Return the signals of some samples."""
