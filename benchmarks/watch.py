@@ -66,8 +66,7 @@ def equal_steps(setpoint: NDArray[np.float64]) -> list[tuple[int, int]]:
 def write_film(path: Path, case: Scenario, controller: Controller, seed: int) -> str:
     """Write a film of equal steps of a run, and return its title.
 
-    Errors are multiples of the reference's on the same step. The first picture shows all. Then
-    the run goes on from sample to sample.
+    The first picture shows all. Then the run goes on from sample to sample.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -33,8 +33,7 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
             text = written(score.value, ".3f")
             axes.annotate(text, (1.01, place), xycoords=("axes fraction", "data"), va="center")
         axes.set_yticks(range(len(scores)), [label(agent) for agent in scores])
-        axes.set_ylim(len(scores) - 0.5, -0.5)
-        axes.set_xscale("log")
+        axes.set(ylim=(len(scores) - 0.5, -0.5), xscale="log")
         axes.set_xlim(1.1 * FARTHEST, NEAREST / 1.3)
         shown = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, NEAREST)
         axes.set_xticks(shown, [f"{1 - away:g}" for away in shown])
@@ -54,10 +53,7 @@ def _mark(axes: Axes, x: float, y: float, look: tuple[str, str], inside: bool) -
 def plot_travel(
     runs: pd.DataFrame, estimates: pd.DataFrame, agents: Sequence[str], path: Path
 ) -> None:
-    """Draw the error of every controller against its valve travel, a panel for each case.
-
-    Both are medians over the runs. A valve that never moves is not drawn.
-    """
+    """Draw the median error and travel of every valve that moves, a panel for each case."""
     measures = runs.groupby(["scenario", "agent"], sort=False)[["mae", "total_variation"]]
     medians = measures.median().query("total_variation > 0").reset_index()
     if medians.empty:
@@ -71,8 +67,7 @@ def plot_travel(
             for agent, x, y in zip(rows["agent"], travel, excess, strict=True):
                 _mark(axes, x, max(y, NEAREST), style[agent], y >= NEAREST)
             scale_by_excess(axes, "y", *excess.clip(NEAREST).agg(["min", "max"]))
-            axes.set_xscale("log")
-            axes.set_xlim(0.7 * travel.min(), 1.4 * travel.max())
+            axes.set(xscale="log", xlim=(0.7 * travel.min(), 1.4 * travel.max()))
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_locator(NullLocator())
@@ -93,8 +88,7 @@ def plot_responses(
     """Draw output and applied input over time, a row for every controller, the best first.
 
     Where the set point is held, the error is drawn in place of the output, and of a run without
-    load only the beginning. `responses` holds the rows of all controllers, `errors` their mean
-    errors.
+    load only the beginning.
     """
     shown, plant = responses["agent"].unique(), scenario.parameters
     agents = [*errors[shown].sort_values(kind="stable").index]
@@ -102,8 +96,7 @@ def plot_responses(
     if held:
         if not plant.is_disturbed:
             responses = responses[responses["time_s"] <= 60 * HELD]
-        outputs = [f"output_{name}" for name in ("median", "p10", "p90")]
-        below = responses[outputs].rsub(responses["setpoint"], axis="index")
+        below = responses.filter(like="output_").rsub(responses["setpoint"], axis="index")
         responses = responses.assign(setpoint=0.0, **below)
     height, style = 1.0 + 1.05 * len(agents), looks(agents)
     with drawn(path, height, scenario.title) as figure:
