@@ -12,7 +12,7 @@ import json
 import pkgutil
 import tempfile
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import accumulate, pairwise, starmap
 from pathlib import Path
@@ -163,7 +163,7 @@ def make_vec_env(
     *,
     seed: int | None = None,
     group: int = 1,
-    wrapper: Mapping[str, Any] | None = None,
+    wrapper: Mapping[str, Any] | Callable[..., Any] | None = None,
     **arguments: Any,
 ) -> GymnasiumVecEnv:
     """Make plants that are stepped together, for the algorithms of Stable-Baselines3.
@@ -182,17 +182,19 @@ def make_vec_env(
         Number of neighbouring plants that share a seed: they draw the same noise, load and
         set points, and differ only in what a policy explores.
     wrapper
-        Arguments of `IncrementalAction`, to add it. Other wrappers cannot take a batch: use
-        `stable_baselines3.common.env_util.make_vec_env`.
+        Adds `IncrementalAction`: its arguments, or the class itself for its defaults. Others
+        cannot take a batch: use `stable_baselines3.common.env_util.make_vec_env`.
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)
     mode = arguments.pop("render_mode", None)  # of the batch alone, not of its spec
     single = make_one(env, arguments)
-    if wrapper is not None:
-        if not isinstance(wrapper, Mapping):
-            reject("wrapper", wrapper, "the arguments of IncrementalAction")
+    if isinstance(wrapper, Mapping):
         single = IncrementalAction(single, **wrapper)
+    elif callable(wrapper):
+        single = wrapper(single)
+    elif wrapper is not None:
+        reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
     batch = native_batch(single, n_envs, autoreset_mode=_SAME_STEP, render_mode=mode)
     if batch is None:
         reject("env", single, "of this package, in no wrapper other than IncrementalAction")

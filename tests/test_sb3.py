@@ -50,7 +50,9 @@ class TestBatches:
             made = [partial(one, **given) for n, given in TWO for _ in range(n)]
         else:
             given = {**TRAINING, "max_episode_steps": 7}
-            batch = make_vec_env(HARD, 4, wrapper=VELOCITY, **given)
+            batch = make_vec_env(
+                HARD, 4, wrapper=partial(IncrementalAction, **VELOCITY), **given
+            )
             made = [lambda: IncrementalAction(gymnasium.make(HARD, **given), **VELOCITY)] * 4
         theirs = DummyVecEnv([lambda make=make: Monitor(make()) for make in made])
         for each in (batch, theirs):
