@@ -1,7 +1,5 @@
 """Fixtures and helpers that several test files use."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

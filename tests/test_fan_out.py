@@ -47,14 +47,6 @@ def run(given, folder=None, jobs=2):
     return dict(FanOut(jobs=jobs).stream(given, kept=folder and Kept(folder)))
 
 
-@pytest.fixture
-def commit(monkeypatch):
-    """Return a function that says at which commit the checkout is."""
-    commit = partial(monkeypatch.setattr, storage, "commit")
-    commit(lambda: "c0ffee")
-    return lambda name: commit(lambda: name)
-
-
 def test_jobs_and_order_do_not_matter():
     there = work(5)
     there["plant 0"] = partial(draw, 0, None, 0.3)  # the first is not ready first
@@ -84,8 +76,8 @@ def test_a_killed_process_is_a_sentence():
 
 
 class TestKept:
-    @pytest.mark.usefixtures("commit")
-    def test_a_damaged_result_is_made_again(self, tmp_path):
+    def test_a_damaged_result_is_made_again(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(storage, "commit", lambda: "c0ffee")
         whole = run(work(3), tmp_path, jobs=1)
         file = sorted(tmp_path.rglob("*.pkl"))[1]
         kept = file.read_bytes()
@@ -95,11 +87,11 @@ class TestKept:
             assert file.read_bytes() == kept
 
     def test_nothing_is_taken_from_another_commit_or_kept_of_edited_code(
-        self, tmp_path, commit
+        self, tmp_path, monkeypatch
     ):
         (calls := tmp_path / "calls").mkdir()
         for name, drawn in (("a", 1), ("a", 1), ("b", 2), ("a-dirty", 3), ("a-dirty", 4)):
-            commit(name)
+            monkeypatch.setattr(storage, "commit", partial(str, name))
             run(work(1, calls), tmp_path / "out", jobs=1)
             assert len([*calls.iterdir()]) == drawn, name
         assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a", "b"]
