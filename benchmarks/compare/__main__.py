@@ -13,7 +13,6 @@ from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, SETPOINTS, PlantOptions
 from mptc_gym.evaluation import SEED
 
-COMPARED = tuple(name for name, controller in ROSTER.items() if controller.compared)
 _CASES = (
     f"Cases to run (default: all). Of the paper: {', '.join(SCENARIOS)}. With --presets: "
     f"{', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set: "
@@ -26,7 +25,7 @@ _CASES = (
 class Options:
     """Run controllers on the same cases in the same noise, and write a report."""
 
-    agents: AgentNames = COMPARED
+    agents: AgentNames = tuple(name for name, each in ROSTER.items() if each.compared)
     controllers: ControllerOptions = field(default_factory=ControllerOptions)
     scenarios: Annotated[Names | None, Parameter(help=_CASES)] = None
     plant: PlantOptions = field(default_factory=PlantOptions)
@@ -73,7 +72,7 @@ def work(options: Options) -> str:
         if finished := [found[name] for name in cells if name in found]:
             about = made | {
                 "options": {**asdict(options), "agents": [*controllers]},
-                "seeds": [*range(SEED, SEED + options.runs)],
+                "seeds": [*range(SEED, SEED + runs)],
                 "scenarios": {each.name: vars(each) for each in scenarios},
                 "policies": {each.agent: each.policies for each in finished if each.policies},
             }
