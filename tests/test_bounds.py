@@ -17,7 +17,6 @@ from benchmarks.bounds.unknown import noise_variance, unknown
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
-from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS
 from mptc_gym import Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.signals import Ranges
@@ -295,21 +294,15 @@ class TestPredictiveController:
 
 
 def test_the_command_keeps_the_order_and_prints_what_was_ready(capsys, monkeypatch):
-    def interrupted(case, *more, compute=command.row):
-        if case.name == "noisy":
-            raise KeyboardInterrupt
-        return compute(case, *more)
+    def last_first(_, tasks, *__):
+        yield from ((name, tasks[name]()) for name in reversed(tasks))
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "PRESET_SCENARIOS", {"noisy": PRESET_SCENARIOS["noisy"]})
-    monkeypatch.setattr(command, "SCENARIOS", {"constant": SCENARIOS["constant"]})
-    given, answers = ["--episodes", "1", "--mpc", "1", "--jobs", "1"], command.FanOut.stream
-    with monkeypatch.context() as patch:  # the last is ready first
-        patch.setattr(command.FanOut, "stream", lambda *given: reversed([*answers(*given)]))
-        patch.setattr(command, "row", lambda case, *_: [case.name])
-        assert main(given) == 0
-    shown = capsys.readouterr().out
-    assert shown.index("\nconstant ") < shown.index("\nnoisy ")
-    monkeypatch.setattr(command, "row", interrupted)
-    assert main(given) == 130
-    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    monkeypatch.setattr(command.FanOut, "stream", last_first)
+    for name, case in (("SCENARIOS", "constant"), ("PRESET_SCENARIOS", "dead-zone-7")):
+        monkeypatch.setattr(command, name, {case: vars(command)[name][case]})
+    assert main(["--episodes", "1", "--mpc", "1"]) == 130
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line[:1] > " "]
+    names = [name for name, *_ in rows]
+    assert names.index("constant") < names.index("dead-zone-7")
     assert ["constant", "5.0000", "0.2307", "0.2307", "0.2307"] in rows

@@ -134,10 +134,7 @@ class TestOwnControllers:
             ("raise SystemExit(3)", "--agent: .* cannot be loaded: SystemExit: 3"),
             ("class Mine: pass", "policy must be a function, or an object with predict or act"),
             ("class Mine: observation = 3", "--agent: .* cannot be loaded: TypeError"),
-            (
-                "class Mine: observation = {'dead_zone': 0.0}",
-                "out of .* got {'dead_zone': 0.0}",
-            ),
+            ("class Mine: observation = {'delay': 0}", "out of .* got {'delay': 0}"),
             (
                 "class Mine: reset = dict; act = lambda self, o: 0.0",
                 r"policy must return finite actions, shape \(2, 1\), got .*, shape \(\)",
